@@ -87,8 +87,6 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
     """The trials of each group behind a cell, or behind a row where no column is named."""
     if column is not None and column.name.startswith("ceiling"):
         return (_resampled(study),)
-    if row.query:
-        return (Source(row.id, "first decisions that were only asked", row.query, ()),)
     predicate = row.counts or _predicate(table, column)
     if column is not None and column.within:
         predicate += f" AND {column.within}"

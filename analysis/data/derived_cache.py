@@ -40,7 +40,6 @@ ROWS = {
     "decisions": "(FROM decisions SELECT * EXCLUDE (prompt, rationale))",
     "calls": "(FROM calls SELECT * EXCLUDE (request, reply, error))",
     "specs": "specs",
-    "human_first_actions": "human_first_actions",
     "sweeps": "sweeps",
     "sweep_trials": "sweep_trials",
     "views": "(FROM duckdb_views() SELECT sql WHERE database_name = current_database())",

@@ -75,11 +75,6 @@ def human_trials(db: Path) -> pd.DataFrame:
     return load(TRIALS, db)
 
 
-def first_actions(db: Path) -> int:
-    """Of how many trials first actions are imported; raises UsageError."""
-    return int(load("SELECT count(DISTINCT trial) AS n FROM human_first_actions", db)["n"].iloc[0])
-
-
 def of_published_pairs(trials: pd.DataFrame) -> pd.DataFrame:
     """The trials of the nine published pairs; all, where there is none of these."""
     own = trials["pair"].isin(PAIRS.values())

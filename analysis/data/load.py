@@ -145,6 +145,19 @@ LEFT JOIN speeds AS later ON later.trial_id = said.trial_id AND later.spec_hash 
     AND later.side = said.side AND later.time_s = said.time_s + 1
 ORDER BY ALL
 """
+# One row a vehicle: the acceleration of the first step that its driver controls, and the word of
+# the first decision. Where each driver takes control at its own exit the other one cruises yet:
+# that is no first action.
+FIRST_ACTIONS = """
+SELECT trial_id, spec_hash, if(side = ego, 'left', 'right') AS side, first_mps2, tactical
+FROM (
+    SELECT trial_id, spec_hash, side, arg_min(acceleration_mps2, step) AS first_mps2
+    FROM states WHERE time_s > 0 GROUP BY ALL
+) JOIN trial_drivers USING (trial_id, spec_hash)
+LEFT JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash, side)
+ANTI JOIN (FROM specs WHERE spec->>'$.scenario.control_start' = 'own_exit') USING (spec_hash)
+ORDER BY ALL
+"""
 # How many calls of a variant's spec share their reply with a baseline's spec.
 SHARED = """
 WITH used AS (

@@ -16,13 +16,13 @@ import pandas as pd
 
 from analysis.data.collision_rules import judged
 from analysis.data.derived_cache import options_text, present_state
-from analysis.data.first_actions import FIRST_ACTIONS, HUMAN_FIRST_ACTIONS
 from analysis.data.imported_humans import RECORDINGS, Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
     ASKED_TRIALS,
     DEVIATIONS,
     EGO_SPEEDS,
+    FIRST_ACTIONS,
     PLANS,
     SHARED,
     SPEEDS,
@@ -373,13 +373,8 @@ class Study:
 
     @cached_property
     def first_actions(self) -> pd.DataFrame:
-        """One row a vehicle: its first acceleration under control, its mean over a second."""
+        """One row a vehicle: its first acceleration under control, and its driver's word then."""
         return self._read(FIRST_ACTIONS)
-
-    @cached_property
-    def human_first_actions(self) -> pd.DataFrame:
-        """The imported first actions of humans, one row a vehicle."""
-        return self._read(HUMAN_FIRST_ACTIONS)
 
     @cached_property
     def words(self) -> pd.DataFrame:

@@ -91,9 +91,9 @@ def letter(axis: Axes, name: str, height: float) -> None:
     axis.text(-0.02, height, name, transform=axis.transAxes, fontweight="bold", ha="right")
 
 
-def draw_points(axis: Axes, found: list[Point], shift_m: float, style: Style) -> None:
-    """Estimates by projected headway with their intervals, drawn ``shift_m`` beside it."""
-    x = np.array([p.headway_m for p in found]) + shift_m
+def draw_points(axis: Axes, found: list[Point], shift: float, style: Style) -> None:
+    """Draw estimates with their intervals, ``shift`` beside their places on the axis."""
+    x = np.array([p.x for p in found]) + shift
     y = np.array([p.estimate.value for p in found], dtype=float)
     low = np.array([p.estimate.low for p in found], dtype=float)
     high = np.array([p.estimate.high for p in found], dtype=float)

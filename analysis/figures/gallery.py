@@ -34,7 +34,6 @@ from analysis.figures.drawing import (
 )
 from analysis.figures.factor_figure import figure_of_factors
 from analysis.figures.first_action_figure import figure_of_first_actions
-from analysis.figures.first_look_figure import figure_of_first_looks
 from analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     Point,
@@ -220,18 +219,10 @@ FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
         "Each factor's levels, pooled over all other factors, by every metric: its rate, mean or "
         "median with the 95 % interval that the table of this name prints.",
     ),
-    "first-look-surface": (
-        figure_of_first_looks,
-        "First situations asked without the loop, by the driver's own projected headway and own "
-        "relative velocity: the share of M among the answers with a word, with the line of even "
-        "odds by a logit (dashed), and the mean first action.",
-    ),
     "first-action": (
         figure_of_first_actions,
-        "Net acceleration of the first step under control. (A) Means by own relative velocity, "
-        "with intervals of Student's t over trials. (B to D) Shares of first actions below each "
-        "acceleration, of drivers that are slower than the other, as fast, and faster; of humans "
-        "before an import between the published quantiles.",
+        "Mean net acceleration of the first step under control by own relative velocity, own minus "
+        "other, with 95 % intervals clustered by trial; of humans before an import as published.",
     ),
 }
 

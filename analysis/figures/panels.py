@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from analysis.data.reference_data import published
 from analysis.data.study import Group, Study, of_group
-from analysis.stats.intervals import Estimate, mean, proportion
+from analysis.metrics import Bounded
+from analysis.stats.intervals import mean, proportion
 from analysis.stats.regressions import gap_design
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
@@ -21,10 +22,10 @@ HUMAN_VELOCITIES_MPS = sorted({c.relative_velocity_mps for c in HUMAN_CONDITIONS
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One condition of a group: projected headway in m, and the estimate there."""
+    """A place on an axis, as a projected headway in m, and the estimate there."""
 
-    headway_m: float
-    estimate: Estimate
+    x: float
+    estimate: Bounded
 
 
 def drawn_groups(study: Study, groups: Iterable[Group]) -> list[Group]:

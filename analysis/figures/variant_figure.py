@@ -46,7 +46,7 @@ from analysis.figures.styles import (
     Style,
     turned,
 )
-from analysis.stats.intervals import Estimate
+from analysis.metrics import Bounded
 from merge_runner.prompts.blocks import title_of
 
 # Laid out by hand: many rows of equal panels need no solver. In inches.
@@ -187,7 +187,7 @@ def _scales(axes: NDArray[np.object_], groups: list[Group], study: Study) -> Non
         axis.set_xticks([-farthest_m, 0, farthest_m])
 
 
-def _limits(found: list[Estimate], lines: list[float]) -> tuple[float, float]:
+def _limits(found: list[Bounded], lines: list[float]) -> tuple[float, float]:
     """Limits that contain all values and lines, and 19 of 20 bounds of intervals."""
     values = [*lines, *(one.value for one in found if one.value is not None)]
     lows = [one.low for one in found if one.low is not None] or values

@@ -82,42 +82,6 @@ def human_import(
     sys.exit(1 if report.unreadable or report.differing else 0)
 
 
-@human_app.command("import-first-actions")
-def human_import_first_actions(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE",
-            help="The public page initial_action.html, or a CSV with relative_velocity_mps, "
-            "merged_first, left_mps2 and right_mps2.",
-        ),
-    ],
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Put them in the place of what was imported before.")
-    ] = False,
-    db: DbOption = DEFAULT_DB,
-) -> None:
-    """Add the humans' first actions."""
-    from analysis.human.archive import Unreadable
-    from analysis.human.first_actions import read_first_actions, rows_of
-    from merge_runner.results.store import Store
-
-    try:
-        trials, left_out = read_first_actions(file.read_bytes())
-    except OSError as exc:
-        raise UsageError(f"{file} cannot be read: {exc.strerror}") from exc
-    except Unreadable as exc:
-        raise UsageError(
-            f"{file}: {exc}; name docs/plots/initial_action.html of "
-            "github.com/tud-hri/simple-merging-experiment, or a CSV"
-        ) from exc
-    added = Store(db).add_human_first_actions(rows_of(trials), replace=replace)
-    print_out(
-        f"{len(trials) if added else 0} trials added, {0 if added else len(trials)} there already, "
-        f"{left_out} left out: their pedals do not tell the relative velocity"
-    )
-
-
 @human_app.command("status")
 def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
     """Count the human trials, beside the published counts."""
@@ -126,19 +90,15 @@ def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None
         OUTCOMES,
         by_condition,
         by_pair,
-        first_actions,
         human_trials,
         imported,
     )
     from analysis.data.reference_data import HUMAN_DOI
 
     trials = human_trials(db) if db.exists() else None
-    actions = first_actions(db) if db.exists() else 0
     if as_json:
-        print_out(json.dumps(_counts(trials, actions), ensure_ascii=False))
+        print_out(json.dumps(_counts(trials), ensure_ascii=False))
         return
-    if actions:
-        print_out(f"first actions of {actions} trials are imported")
     if trials is None or trials.empty:
         print_out(
             "no human recordings are imported: merge-runner human import PATH, where PATH is the "
@@ -155,10 +115,10 @@ def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None
         print_out(line)
 
 
-def _counts(trials: pd.DataFrame | None, first_actions: int) -> dict[str, object]:
+def _counts(trials: pd.DataFrame | None) -> dict[str, object]:
     from analysis.data.imported_humans import by_condition, by_pair, imported
 
-    counts: dict[str, object] = {"first_actions": first_actions}
+    counts: dict[str, object] = {}
     if trials is not None and not trials.empty:
         for name, frame in (("pairs", by_pair(trials)), ("conditions", by_condition(trials))):
             counts[name] = frame.to_dict("index")

@@ -11,7 +11,6 @@ from analysis.data.study import Group, Study
 from analysis.metrics import BOXES, Metric, shown_in
 from analysis.report.ablated import ablation_sentences
 from analysis.report.alarms import mismatch
-from analysis.report.first_look import first_look
 from analysis.report.unlike import unlike
 from analysis.stats.against_humans import by_known_pairs, contrast_with_humans
 from analysis.stats.group_scores import Score, fits, score, unjudged
@@ -124,7 +123,6 @@ def _shown(study: Study, group: Group) -> list[str]:
         *texts,
         _collisions(study, alike),
         *(_told(study, alike, metric) for metric in shown_in("conclusions")),
-        *first_look(study, group),
         *unlike(study, alike),
     ]
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import jinja2
 import pandas as pd
 
-from analysis.data.first_looks import first_looks
 from analysis.data.provenance import provenance
 from analysis.data.reference_data import published
 from analysis.data.study import Study
@@ -48,7 +47,6 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     links = Links(study)
     empty = {
         "factors": not levels_by_factor(study),
-        "first-look-surface": not first_looks(study),
         **{table.name: not table.rows for table in tables if table.name == "words"},
     }
     left_out = {name for name, is_empty in empty.items() if is_empty}

@@ -11,9 +11,8 @@ from functools import cache
 
 import pandas as pd
 
-from analysis.data.first_actions import HOLD_MPS2
 from analysis.data.study import Study, of_group
-from analysis.stats.first_look import Seat
+from analysis.stats.first_action import HOLD_MPS2, Seat
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import Estimate, proportion
 from analysis.stats.regressions import Regression, who_first_firth

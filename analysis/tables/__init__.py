@@ -39,14 +39,10 @@ TABLES = {
     "attempts": "attempts",
     "fallbacks": "fallbacks",
     "first-action": "first_action",
-    "first-action-faults": "first_action",
     "words": "words",
-    "first-look-surface": "first_looks",
 }
-
-
-# Tables of drivers that were only asked, and those that also have these.
-OF_ASKED, OF_BOTH = ("first-look-surface",), ("first-action", "first-action-faults")
+# The table that also has drivers that were only asked.
+OF_ASKED = "first-action"
 
 
 def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
@@ -60,8 +56,7 @@ def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
 
 def _with_unjudged(table: Table, study: Study) -> Table:
     """The table with a row, of a note alone, for each group that it leaves out as not judged."""
-    groups = study.unjudged if table.name not in OF_ASKED else []
-    groups = groups + (study.unjudged_asked if table.name in (*OF_ASKED, *OF_BOTH) else [])
+    groups = study.unjudged + (study.unjudged_asked if table.name == OF_ASKED else [])
     rows = [Row(group.id, (group.id,), _named(table, group), group.unjudged) for group in groups]
     shown = {name for row in table.rows for name in row.groups}
     return replace(table, rows=[*table.rows, *(row for row in rows if row.id not in shown)])

@@ -49,8 +49,7 @@ class Row:
     trials. ``beside`` is the paper's driver whose row it is compared with, if any, and
     ``stand_in_for`` the models in whose names a scripted stand-in answered. ``references`` are the
     groups that the comparing columns compare it with, and ``cited`` the shipped file that its
-    ``published`` columns are computed from. ``query`` lists what it rests on where that is no
-    group's trials.
+    ``published`` columns are computed from.
     """
 
     id: str
@@ -64,7 +63,6 @@ class Row:
     references: tuple[str, ...] = ()
     published: tuple[str, ...] = ()
     cited: str = ""
-    query: str = ""
 
 
 GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "setting"))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from analysis.data.first_actions import HOLD_MPS2
 from analysis.data.study import Study
-from analysis.stats.first_look import Seat, seats
+from analysis.stats.first_action import HOLD_MPS2, Seat, seats
 from analysis.stats.intervals import Estimate
 from analysis.stats.words import CUES, Words
 from analysis.stats.words import words as words_of

@@ -206,22 +206,6 @@ COMMENT ON COLUMN calls.reply IS 'the body that came';
 COMMENT ON COLUMN calls.scripted IS 'a scripted stand-in answered, whoever was asked';
 COMMENT ON COLUMN calls.batch_id IS 'the provider''s batch that it was a line of; NULL: of none';
 
-CREATE TABLE human_first_actions (
-    trial INTEGER NOT NULL,
-    side VARCHAR NOT NULL,
-    relative_velocity_mps DOUBLE NOT NULL,
-    merged_first VARCHAR,
-    first_mps2 DOUBLE NOT NULL,
-    PRIMARY KEY (trial, side)
-);
-COMMENT ON TABLE human_first_actions IS 'A human''s first action, decoded from the published page '
-    'by its user; the pair is not known.';
-COMMENT ON COLUMN human_first_actions.trial IS 'counts the trials of the page from 1';
-COMMENT ON COLUMN human_first_actions.side IS 'left, right';
-COMMENT ON COLUMN human_first_actions.relative_velocity_mps IS 'of the trial''s condition, left minus right';
-COMMENT ON COLUMN human_first_actions.merged_first IS 'left, right, NULL: collided';
-COMMENT ON COLUMN human_first_actions.first_mps2 IS 'net acceleration at the first sample under control';
-
 -- How a driver is named: by its model, and by its endpoint where that is not the provider's own.
 CREATE MACRO driver_name(model, endpoint) AS
     model || coalesce(' at ' || nullif(regexp_extract(endpoint, '://([^/]+)', 1), ''), '');

@@ -177,24 +177,6 @@ class Store:
             there = len(records) - added - len(differing)
             return added, there, [trial_id for trial_id, _ in differing]
 
-    def add_human_first_actions(self, rows: Sequence[Row], *, replace: bool = False) -> bool:
-        """Store first actions of humans; False: they are there.
-
-        Others are replaced only if asked for; else raises UsageError.
-        """
-        with self._writing() as connection:
-            there = connection.execute("FROM human_first_actions ORDER BY trial, side").fetchall()
-            if there == sorted(rows, key=itemgetter(0, 1)):
-                return False
-            if there and not replace:
-                raise UsageError(
-                    f"{self.path} holds {len(there)} other first actions, which stay: add "
-                    "--replace, or name another database with --db"
-                )
-            connection.execute("DELETE FROM human_first_actions")
-            append(connection, "human_first_actions", rows)
-            return True
-
     @contextmanager
     def _writing(self, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
         with (

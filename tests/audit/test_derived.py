@@ -79,7 +79,7 @@ def columns() -> list[tuple[str, str, str]]:
             "SELECT table_name, column_name, data_type FROM duckdb_columns() "
             "WHERE table_name IN (SELECT table_name FROM duckdb_tables()) "
             # What a user imports has no reply that it could follow from.
-            "AND table_name NOT IN ('meta', 'human_first_actions')"
+            "AND table_name <> 'meta'"
         ).fetchall()
 
 

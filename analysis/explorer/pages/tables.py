@@ -34,9 +34,7 @@ ABOUT = {
     "attempts": "what became of the calls",
     "fallbacks": "the measures with and without trials that had a fallback",
     "first-action": "the first action of every driver, by own relative velocity, beside humans",
-    "first-action-faults": "what in the first actions differs from the humans",
     "words": "what follows a tactical word, and what the first word follows",
-    "first-look-surface": "first situations that were only asked, and what headway is worth",
 }
 # The figures of the report, which are drawn when they are asked for.
 FIGURES = {
@@ -45,7 +43,6 @@ FIGURES = {
     "ablation-matrix": "which indicators hold for which driver and variant",
     "distributions": "every metric that is no share: median, quartiles and every trial",
     "factors": "each level of a study's factors, by every metric",
-    "first-look-surface": "first situations that were only asked",
     "first-action": "the first action, by own relative velocity",
 }
 # How a table can be downloaded, by the suffix of the file: its format, and the file's type.

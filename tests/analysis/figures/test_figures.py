@@ -69,7 +69,7 @@ def test_a_folder_that_cannot_be_made_is_said(small, tmp_path):
 def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(study):
     group = study.models[0]
     points = {
-        (velocity, point.headway_m): point.estimate
+        (velocity, point.x): point.estimate
         for velocity in HUMAN_VELOCITIES_MPS
         for point in left_first(group, velocity)
     }
@@ -83,13 +83,13 @@ def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(
         (gap,) = [
             point.estimate
             for point in gaps(group, condition.relative_velocity_mps)
-            if point.headway_m == condition.projected_headway_m
+            if point.x == condition.projected_headway_m
         ]
         assert gap == mean(trials["gap_m"])
         (both,) = [
             point.estimate
             for point in deviations(group, condition.relative_velocity_mps)
-            if point.headway_m == condition.projected_headway_m
+            if point.x == condition.projected_headway_m
         ]
         assert both.n == 2 * len(trials), "each trial gives two values"
         assert both.value == pytest.approx(trials["rmse_mps"].mean())
@@ -220,8 +220,7 @@ def test_no_name_is_cut_and_none_lies_over_another(name, long_names):
 
 
 @pytest.mark.usefixtures("few_draws")
-# In these trials nothing was only asked: tests of first looks have some.
-@pytest.mark.parametrize("name", [name for name in FIGURES if name != "first-look-surface"])
+@pytest.mark.parametrize("name", FIGURES)
 def test_every_figure_says_who_is_a_stand_in_and_names_its_variant(name, long_names):
     figure = FIGURES[name][0](long_names)
     texts = [text.get_text().replace("\n", " ") for text in figure.findobj(Text)]
@@ -255,9 +254,7 @@ def test_each_group_has_a_row_of_its_own_with_its_trials(study):
                 found = points(group, velocity)
                 line = axis.containers[index].lines[0]
                 assert list(line.get_ydata()) == [p.estimate.value for p in found]
-                assert line.get_xdata() == pytest.approx(
-                    [p.headway_m + 0.3 * (index - 1) for p in found]
-                )
+                assert line.get_xdata() == pytest.approx([p.x + 0.3 * (index - 1) for p in found])
 
 
 @pytest.mark.slow

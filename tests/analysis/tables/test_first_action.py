@@ -12,8 +12,11 @@ import pytest
 from analysis.data.load import load
 from analysis.data.study import Study
 from analysis.explain import explain
+from analysis.explorer.catalogue import Catalogue
+from analysis.figures.first_action_figure import figure_of_first_actions
 from analysis.tables import make_tables
 from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Drive, write_study, yielding
 
@@ -57,57 +60,46 @@ def rows(db):
 
 
 def test_the_human_slope_stands_beside_each_drivers(rows):
-    assert rows["human/all"].values["slope"] == -0.338
-    assert rows["human/all"].values["slope_ci"] == pytest.approx((-0.375, -0.301))
-    assert [rows[f"human/{v}"].values["mean"] for v in ("-0.8", "0", "0.8")] == [
-        0.211,
-        -0.013,
-        -0.330,
-    ]
+    human = rows["human"].values
+    assert human["slope"] == -0.338
+    assert human["slope_ci"] == pytest.approx((-0.375, -0.301))
+    means = ("mean_slower", "mean_equal", "mean_faster")
+    assert [human[name] for name in means] == [0.211, -0.013, -0.330]
+    assert human["exchange_rate"] == pytest.approx(2.97, abs=5e-3)
     for driver, slope in (("alike", -0.34), ("blind", 0.0)):
-        low, high = rows[f"{driver}/baseline/all"].values["slope_ci"]
+        low, high = rows[f"{driver}/baseline"].values["slope_ci"]
         assert low < slope < high
 
 
-def test_the_numbers_of_a_class_are_those_of_the_states(db, rows):
+def test_the_numbers_of_a_driver_are_those_of_the_states(db, rows):
     found = load(
-        "SELECT acceleration_mps2 AS a FROM states JOIN trials USING (trial_id, spec_hash) "
-        "WHERE model_left = 'alike' AND step = 1 AND abs(relative_velocity_mps "
-        "* if(side = 'left', 1, -1) + 0.8) < 1e-9",
-        db,
-    )["a"]
-    values = rows["alike/baseline/-0.8"].values
-    assert values["velocity"] == "0.8 m/s slower"
-    assert values["n"] == len(found) == 32
-    assert values["mean"] == pytest.approx(found.mean())
-    assert values["sd"] == pytest.approx(found.std())
-    assert values["se"] == pytest.approx(found.std() / np.sqrt(32), rel=1e-6)
-    assert values["slow_percent"] == pytest.approx(100 * (found < -0.2).mean())
-    assert values["hold_percent"] == pytest.approx(100 * (found.abs() <= 0.2).mean())
-    assert values["go_percent"] == pytest.approx(100 * (found > 0.2).mean())
-    assert values["first_second"] == pytest.approx(found.mean()), "it is held for a second"
-
-
-def test_what_both_drivers_of_a_trial_do_is_counted_by_trial(db, rows):
-    found = load(
-        "SELECT min(acceleration_mps2) AS low, max(acceleration_mps2) AS high FROM states "
-        "WHERE trial_id LIKE 'blind/%' AND step = 1 GROUP BY trial_id",
+        "SELECT acceleration_mps2 AS a, "
+        "relative_velocity_mps * if(side = 'left', 1, -1) AS v "
+        "FROM states JOIN trials USING (trial_id, spec_hash) "
+        "WHERE model_left = 'alike' AND step = 1",
         db,
     )
-    values = rows["blind/baseline/all"].values
-    assert values["both_go_percent"] == pytest.approx(100 * (found["low"] > 0.2).mean())
-    assert values["both_slow_percent"] == pytest.approx(100 * (found["high"] < -0.2).mean())
-    assert values["both_slow_percent"] > 0
+    values = rows["alike/baseline"].values
+    assert values["n"] == len(found) == 88
+    for name, there in (
+        ("slower", found["v"] < 0),
+        ("equal", found["v"] == 0),
+        ("faster", found["v"] > 0),
+    ):
+        assert values[f"mean_{name}"] == pytest.approx(found["a"][there].mean())
+    assert values["brake_percent"] == pytest.approx(100 * (found["a"] < -0.2).mean())
+    assert values["hold_percent"] == pytest.approx(100 * (found["a"].abs() <= 0.2).mean())
+    assert values["go_percent"] == pytest.approx(100 * (found["a"] > 0.2).mean())
+    assert values["slope"] == pytest.approx(np.polyfit(found["v"], found["a"], 1)[0])
+    assert "exchange_rate" not in values, "there is no word"
 
 
-def test_a_row_leads_to_the_trials_of_its_relative_velocity(db):
+def test_a_row_leads_to_its_trials(db):
     study = Study(db)
     (table,) = make_tables(study, ["first-action"])
-    (source,) = explain(study, table, "alike/baseline/-0.8:mean").sources
-    assert len(source.trials) == 32
-    assert not any("_0/" in trial for trial in source.trials)
-    assert len(explain(study, table, "alike/baseline/0:mean").sources[0].trials) == 12
-    (human,) = explain(study, table, "human/all:slope").sources
+    (source,) = explain(study, table, "alike/baseline:slope").sources
+    assert len(source.trials) == 44
+    (human,) = explain(study, table, "human:slope").sources
     assert "initial_action.html" in human.text
 
 
@@ -118,8 +110,8 @@ def test_drag_counts_as_it_was_realised(tmp_path):
         ScenarioConfig(resistance="human"),
     )
     rows = {row.id: row.values for row in make_tables(Study(db), ["first-action"])[0].rows}
-    assert rows["o3/baseline/0"]["mean"] == pytest.approx(-1.0)
-    assert rows["o3/baseline/all"]["slow_percent"] == 100
+    assert rows["o3/baseline"]["mean_equal"] == pytest.approx(-1.0)
+    assert rows["o3/baseline"]["brake_percent"] == 100
 
 
 def test_the_two_drivers_of_a_mixed_pair_have_rows_of_their_own(db, tmp_path):
@@ -127,15 +119,12 @@ def test_the_two_drivers_of_a_mixed_pair_have_rows_of_their_own(db, tmp_path):
     mixed.write_bytes(db.read_bytes())
     with duckdb.connect(str(mixed)) as connection:
         connection.execute("UPDATE trials SET model_right = 'other' WHERE model_left = 'alike'")
-    first, faults = make_tables(Study(mixed), ["first-action", "first-action-faults"])
-    rows = {row.id: row.values for row in first.rows}
-    left, right = (rows[f"alike+other/baseline/{side}/all"] for side in ("left", "right"))
+    (table,) = make_tables(Study(mixed), ["first-action"])
+    rows = {row.id: row.values for row in table.rows}
+    left, right = (rows[f"alike+other/baseline/{side}"] for side in ("left", "right"))
     assert (left["n"], right["n"]) == (44, 44)
     assert left["driver"] == "alike of alike+other"
-    assert left["mean"] != right["mean"]
-    assert "both_go_percent" not in left
-    named = [row.values["fault"] for row in faults.rows if row.id.startswith("alike+other")]
-    assert "side" not in named
+    assert left["slope"] != right["slope"]
 
 
 @pytest.mark.slow
@@ -177,9 +166,9 @@ def test_a_driver_without_chance_in_a_mixed_pair_counts_once_in_each_situation(t
         connection.execute("UPDATE specs SET spec = ?", [json.dumps(spec)])
     (table,) = make_tables(Study(db), ["first-action"])
     rows = {row.id: row.values for row in table.rows}
-    assert rows["alike+zero/baseline/left/all"]["n"] == 44
-    assert rows["alike+zero/baseline/right/all"]["n"] == 11
-    assert rows["alike+zero/baseline/right/all"]["mean"] == pytest.approx(0.25)
+    assert rows["alike+zero/baseline/left"]["n"] == 44
+    assert rows["alike+zero/baseline/right"]["n"] == 11
+    assert rows["alike+zero/baseline/right"]["mean_equal"] == pytest.approx(0.25)
     (note,) = [note for note in table.notes if "declares no chance" in note]
     assert note.startswith("zero of alike+zero: it declares no chance, and does the same")
 
@@ -206,25 +195,78 @@ def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_action
             run = prepare(tmp_path, *played, 2, *models)
             assert run.code == 0, run.err
     study = Study(tmp_path / "results/merge.duckdb")
-    first, faults = make_tables(study, ["first-action", "first-action-faults"])
-    for table in (first, faults):
-        driven = {row.id: row for row in table.rows if "human" not in row.id}
-        asked = {name: row for name, row in driven.items() if " [asked]/" in name}
-        assert len(asked) == len(driven) / 2
-        for name, row in asked.items():
-            twin = driven[name.replace(" [asked]", "")]
-            assert " [asked]" in row.values["driver"]
-            assert row.values | {"driver": twin.values["driver"]} == twin.values
-        (note, _) = [note for note in table.notes if "asked without the loop" in note]
-        assert note.startswith("emulator [asked]/baseline: ")
-        assert "in 22 trials" in note
-    (source,) = explain(study, first, "emulator [asked]/baseline/0.8:mean").sources
-    assert len(source.trials) == len(load(source.query, study.db)) == 16
+    (table,) = make_tables(study, ["first-action"])
+    driven = {row.id: row for row in table.rows if row.id != "human"}
+    asked = {name: row for name, row in driven.items() if " [asked]/" in name}
+    assert len(asked) == len(driven) / 2 == 3
+    for name, row in asked.items():
+        twin = driven[name.replace(" [asked]", "")]
+        assert " [asked]" in row.values["driver"]
+        assert row.values | {"driver": twin.values["driver"]} == twin.values
+    (note, _) = [note for note in table.notes if "asked without the loop" in note]
+    assert note.startswith("emulator [asked]/baseline: ")
+    assert "in 22 trials" in note
+    (source,) = explain(study, table, "emulator [asked]/baseline:slope").sources
+    assert len(source.trials) == len(load(source.query, study.db)) == 22
     assert all(trial.startswith("seat/") for trial in source.trials)
     narrowed = make_tables(Study(study.db, ["emulator"]), ["first-action"])[0].rows
     assert {row.groups[0] for row in narrowed} == {"emulator/baseline", "emulator [asked]/baseline"}
     of_model = Study(study.db, where={"model": ["emulator"]})
     assert [group.id for group in of_model.asked] == ["emulator [asked]/baseline"]
+
+
+@pytest.fixture(scope="module")
+def asked(prepare, tmp_path_factory):
+    """The emulator and a program, asked on a grid, and a trial that was driven."""
+    folder = tmp_path_factory.mktemp("asked")
+    grid = ("--grid", "h=-6:6:2,dv=-1.6:1.6:0.8")
+    for ask in (
+        ("seat", "first", "--samples", 4, *grid),
+        ("seat", "first", "--model", "projected-order", "--samples", 2, *grid),
+        ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0"),
+    ):
+        run = prepare(folder, *ask)
+        assert run.code == 0, run.err
+    return Study(folder / "results/merge.duckdb")
+
+
+@pytest.mark.slow
+def test_the_planted_exchange_rate_of_who_was_only_asked_is_found_beside_the_humans(asked):
+    (table,) = make_tables(asked, ["first-action"])
+    rows = {row.id: row.values for row in table.rows}
+    own = rows["emulator [asked]/baseline"]
+    assert own["n"] == 7 * 5 * 2 * 4
+    assert own["exchange_rate_ci"][0] < 3.30 / 1.11 < own["exchange_rate_ci"][1]
+    program = rows["projected-order [asked]/baseline"]
+    assert program["n"] == 7 * 5 * 2, "each answer counts once"
+
+
+@pytest.mark.slow
+def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
+    study = Study(asked.db, ["projected-order"], where={"model": ["projected-order"]})
+    assert [group.name for group in study.asked] == ["projected-order [asked]"]
+    assert study.models == []
+    with pytest.raises(UsageError, match=r"valid: human, emulator, .*projected-order"):
+        Study(asked.db, ["idm"])
+
+
+@pytest.mark.slow
+def test_the_explorer_lists_no_situation_and_no_run_that_only_asked(asked):
+    catalogue = Catalogue(asked.db)
+    catalogue.refresh()
+    assert [row["source"] for row in catalogue.ask("SELECT source FROM listed")] == ["llm"]
+    (sweep,) = catalogue.ask("SELECT config::VARCHAR AS config FROM sweeps")
+    assert "seat" not in json.loads(sweep["config"])
+
+
+@pytest.mark.slow
+def test_the_figure_has_one_panel_with_each_driver_also_one_that_was_only_asked(asked):
+    figure = figure_of_first_actions(asked)
+    (axis,) = figure.axes
+    (legend,) = figure.legends
+    names = [text.get_text().split("\n")[0] for text in legend.get_texts()]
+    assert names[0] == "humans"
+    assert len(names) == len(axis.containers) == 4
 
 
 @pytest.mark.slow
@@ -236,39 +278,11 @@ def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(
     run = prepare(tmp_path, "sweep", "mine.toml")
     assert run.code == 0, run.err
     study = Study(tmp_path / "results/merge.duckdb")
-    first, faults, words = make_tables(study, ["first-action", "first-action-faults", "words"])
+    first, words = make_tables(study, ["first-action", "words"])
     (row,) = [row for row in first.rows if row.id.startswith("emulator")]
     assert row.values["n"] == 0
-    assert not faults.rows
-    for table in (first, faults):
-        assert any('"own_exit" one driver acts while' in note for note in table.notes)
+    assert any('"own_exit" one driver acts while' in note for note in first.notes)
     assert words.rows[0].values["first_n"] == 8, "each driver has a first word, also a later one"
-
-
-def test_of_a_driver_that_does_not_look_this_fault_alone_is_shown(tmp_path):
-    study = Study(write_study(tmp_path / "t.duckdb", following("blind", 0.0)))
-    (table,) = make_tables(study, ["first-action-faults"])
-    shown = {row.values["fault"]: row.values["shown"] for row in table.rows}
-    assert shown == {"late": False, "relative velocity": True, "side": False, "level": False}
-    says = {row.values["fault"]: row.values["says"] for row in table.rows}
-    assert says["relative velocity"] == "it responds less to the relative velocity"
-
-
-@pytest.mark.slow
-def test_a_relative_velocity_that_no_human_had_has_a_row_and_is_not_compared(db, tmp_path):
-    own = tmp_path / "t.duckdb"
-    own.write_bytes(db.read_bytes())
-    with duckdb.connect(str(own)) as connection:
-        connection.execute(
-            "UPDATE trials SET relative_velocity_mps = 1.6, condition = 'own' "
-            "WHERE condition = 'L_4_8'"
-        )
-    first, faults = make_tables(Study(own), ["first-action", "first-action-faults"])
-    rows = {row.id: row.values for row in first.rows}
-    assert rows["alike/baseline/1.6"]["velocity"] == "1.6 m/s faster"
-    assert "crps" not in rows["alike/baseline/1.6"]
-    assert rows["alike/baseline/0.8"]["n"] == 28
-    assert len(faults.rows) == 8
 
 
 def spoken(drives, tmp_path, words):

@@ -1,0 +1,165 @@
+"""First actions: their response to the own relative velocity, and what headway is worth in words.
+
+A first action is the net acceleration of a vehicle over the first step that its driver controls.
+Both of a trial are correlated, so standard errors are clustered by trial, of recorded humans by
+pair.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from math import sqrt
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from analysis.data.reference_data import human_outcomes
+from analysis.data.study import Group, Study, of_group
+from analysis.metrics import Bounded
+from analysis.stats.intervals import interval
+from analysis.stats.regressions import Array, unfit_for_logit
+from merge_runner.drivers.registry import has_chance
+from merge_runner.records import SIDES
+
+# A human pedal seldom holds a speed exactly: within this a driver holds, beyond it goes or brakes.
+HOLD_MPS2 = 0.2
+# First actions are equal but for the last digits, as of a vehicle that drove on the other side.
+SAME_MPS2 = 1e-9
+
+
+@dataclass(frozen=True)
+class Seat:
+    """A driver of a group: one on both sides, or one of a mixed pair, the ego on the left."""
+
+    group: Group
+    sides: tuple[int, ...]
+
+    @property
+    def side(self) -> str:
+        """``left`` or ``right`` of a mixed pair, else empty."""
+        return SIDES[self.sides[0]] if len(self.sides) == 1 else ""
+
+    @property
+    def name(self) -> str:
+        """The group's label, or that of one of a mixed pair."""
+        model = self.group.models[self.sides[0]]
+        return self.group.label_of(model) if self.side else self.group.label
+
+
+@dataclass(frozen=True, slots=True)
+class Clustered(Bounded):
+    """An estimate with its cluster-robust standard error and 95 % interval."""
+
+    se: float | None
+
+
+def seats(group: Group) -> list[Seat]:
+    """Return the drivers of a group."""
+    return [Seat(group, (0, 1))] if len(group.models) == 1 else [Seat(group, (s,)) for s in (0, 1)]
+
+
+@cache
+def first_actions(study: Study, seat: Seat) -> pd.DataFrame:
+    """Return a driver's first actions in trials that ended, one row each.
+
+    ``headway_m`` and ``velocity_mps`` are the driver's own, minus the other's; ``cluster`` numbers
+    trials or pairs; ``tactical`` is the word of the first decision, if it has one.
+    """
+    rows = _stored(study, seat)
+    if repeats_itself(study, seat):
+        rows = rows.drop_duplicates(["condition", "side"])
+    sign = rows["side"].map({"left": 1.0, "right": -1.0})
+    cluster = rows["pair"].where(rows["pair"].notna(), rows["trial_id"] + rows["spec_hash"])
+    return rows.assign(
+        headway_m=sign * rows["projected_headway_m"] + 0.0,
+        velocity_mps=sign * rows["relative_velocity_mps"] + 0.0,
+        cluster=pd.factorize(cluster)[0],
+    )
+
+
+def repeats_itself(study: Study, seat: Seat) -> bool:
+    """Return whether one of a mixed pair declares no chance, and repeats its first actions.
+
+    The trials of two drivers without chance are equal, and are left out of their group.
+    """
+    rows = _stored(study, seat)
+    sat = np.where(rows["ego"] == seat.side, *SIDES)
+    known = set(zip(rows["spec_hash"], sat, strict=True))
+    if not seat.side or any(has_chance(study.specs.get(name, {}), [side]) for name, side in known):
+        return False
+    ways = rows.groupby("condition")["first_mps2"]
+    return bool((ways.size() > 1).any() and (ways.max() - ways.min() < SAME_MPS2).all())
+
+
+@cache
+def _stored(study: Study, seat: Seat) -> pd.DataFrame:
+    columns = ["trial_id", "spec_hash", "condition", "projected_headway_m", "relative_velocity_mps",
+               "pair", "ego"]  # fmt: skip
+    trials = seat.group.ended[columns]
+    rows = of_group(study.first_actions, seat.group, trials).merge(
+        trials, on=["trial_id", "spec_hash"]
+    )
+    return rows[rows["side"].isin([SIDES[side] for side in seat.sides])]
+
+
+def slope(rows: pd.DataFrame) -> Clustered | None:
+    """Return the slope of the first action on the own relative velocity, in m/s² per m/s."""
+    return _least_squares(rows, np.column_stack([np.ones(len(rows)), rows["velocity_mps"]]))
+
+
+def mean(rows: pd.DataFrame) -> Clustered | None:
+    """Return the mean first action in m/s²."""
+    return _least_squares(rows, np.ones((len(rows), 1)))
+
+
+def _least_squares(rows: pd.DataFrame, design: Array) -> Clustered | None:
+    """Return the last coefficient; None where the rows do not determine it or its error."""
+    from statsmodels.regression.linear_model import OLS
+
+    terms = design.shape[1]
+    if rows["cluster"].nunique() <= terms or np.linalg.matrix_rank(design) < terms:
+        return None
+    by_cluster = {"groups": rows["cluster"].to_numpy()}
+    fit = OLS(rows["first_mps2"].to_numpy(float), design).fit(
+        cov_type="cluster", cov_kwds=by_cluster, use_t=True
+    )
+    low, high = map(float, fit.conf_int()[-1])
+    return Clustered(float(fit.params[-1]), low, high, float(fit.bse[-1]))
+
+
+def exchange_rate(rows: pd.DataFrame) -> Clustered | None:
+    """Return how many m of headway are worth 1 m/s of relative velocity in the word M.
+
+    It is minus the ratio of two slopes of a logit, with the interval of the delta method; None
+    where the logit has no finite estimate.
+    """
+    spoken = rows[rows["tactical"].notna()]
+    points = spoken[["headway_m", "velocity_mps"]].to_numpy(float)
+    merging = (spoken["tactical"] == "M").to_numpy(float)
+    return _ratio(points, merging, spoken["cluster"].to_numpy())
+
+
+@cache
+def human_exchange_rate() -> Clustered | None:
+    """Return the same of who merged first in the published human trials: 3.304 / 1.111."""
+    trials = human_outcomes().query("status == 'finished'")
+    points = trials[["projected_headway_m", "relative_velocity_mps"]].to_numpy(float)
+    left = (trials["merged_first"] == "left").to_numpy(float)
+    return _ratio(points, left, np.arange(len(trials)))
+
+
+def _ratio(points: Array, chosen: Array, cluster: NDArray[Any]) -> Clustered | None:
+    from statsmodels.discrete.discrete_model import Logit
+
+    design = np.column_stack([np.ones(len(points)), points])
+    if unfit_for_logit(design, chosen):
+        return None
+    fit = Logit(chosen, design).fit(disp=0, cov_type="cluster", cov_kwds={"groups": cluster})
+    _, headway, velocity = map(float, fit.params)
+    gradient = np.array([0.0, velocity / headway**2, -1 / headway])
+    se = sqrt(float(gradient @ fit.cov_params() @ gradient))
+    rate = -velocity / headway
+    return Clustered(rate, *interval(rate, se, len(np.unique(cluster)) - 1), se)

@@ -1,0 +1,117 @@
+"""First actions: planted slopes and exchange rates are found, with intervals that hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.special import expit
+
+from analysis.data.reference_data import published
+from analysis.stats.first_action import exchange_rate, human_exchange_rate, mean, slope
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+
+SLOPE, SPREAD = -0.34, 0.63
+HEADWAY, VELOCITY = 1.11, -3.30
+# The correlation of two humans' first actions in a trial is about 0.3.
+TOGETHER = 0.3
+STUDIES = 200
+
+
+def drawn(rng, trials=198):
+    """First actions with a planted slope and words with a planted rate, of both drivers."""
+    conditions = list(HUMAN_CONDITIONS.values())
+    headway = np.resize([one.projected_headway_m for one in conditions], trials)
+    velocity = np.resize([one.relative_velocity_mps for one in conditions], trials)
+    errors = rng.multivariate_normal([0, 0], [[1, TOGETHER], [TOGETHER, 1]], trials)
+    sides = [
+        pd.DataFrame(
+            {
+                "cluster": np.arange(trials),
+                "headway_m": sign * headway,
+                "velocity_mps": sign * velocity,
+                "first_mps2": SLOPE * sign * velocity + SPREAD * errors[:, side],
+            }
+        )
+        for side, sign in enumerate((1, -1))
+    ]
+    rows = pd.concat(sides, ignore_index=True)
+    odds = HEADWAY * rows["headway_m"] + VELOCITY * rows["velocity_mps"]
+    return rows.assign(tactical=np.where(rng.random(len(rows)) < expit(odds), "M", "Y"))
+
+
+def test_the_published_slope_is_that_of_the_published_means():
+    classes = published("human_first_actions")
+    known = published("human_first_action_trials").set_index("measure")["value"]
+    at, means = classes["relative_velocity_mps"], classes["mean_mps2"]
+    fitted = np.polyfit(at, means, 1, w=np.sqrt(classes["n"]))[0]
+    assert fitted == pytest.approx(float(known["slope_mps2_per_mps"]), abs=1e-3)
+
+
+def test_the_published_human_rate_is_that_of_the_published_coefficients():
+    rate = human_exchange_rate()
+    assert rate.value == pytest.approx(3.304 / 1.111, abs=2e-3)
+    assert rate.low < 2.97 < rate.high
+    assert 0.3 < rate.high - rate.low < 1.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("estimate", "truth"), [(slope, SLOPE), (mean, 0.0), (exchange_rate, -VELOCITY / HEADWAY)]
+)
+def test_intervals_cover_the_truth_as_often_as_they_say(estimate, truth):
+    rng = np.random.default_rng(4)
+    found = [estimate(drawn(rng)) for _ in range(STUDIES)]  # few have separated words, and no rate
+    inside = np.mean([one.low < truth < one.high for one in found if one])
+    assert 0.9 <= inside <= 0.99  # three standard errors of such a share
+
+
+def test_two_actions_of_a_trial_that_depend_on_each_other_are_not_counted_as_two():
+    """The other driver does the opposite: nothing new is learnt from it."""
+    rows = drawn(np.random.default_rng(5))
+    half = rows.iloc[: len(rows) // 2]
+    mirrored = half.assign(
+        headway_m=-half["headway_m"],
+        velocity_mps=-half["velocity_mps"],
+        first_mps2=-half["first_mps2"],
+        tactical=half["tactical"].map({"M": "Y", "Y": "M"}),
+    )
+    both = pd.concat([half, mirrored], ignore_index=True)
+    alone = both.assign(cluster=np.arange(len(both)))
+    for estimate in (slope, exchange_rate):
+        assert estimate(both).value == pytest.approx(estimate(alone).value)
+        assert estimate(both).se > 1.3 * estimate(alone).se
+
+
+def test_the_errors_are_those_of_a_cluster_sandwich_with_students_t():
+    rows = drawn(np.random.default_rng(6), 30)
+    design = np.column_stack([np.ones(60), rows["velocity_mps"]])
+    bread = np.linalg.inv(design.T @ design)
+    residuals = rows["first_mps2"] - design @ (bread @ design.T @ rows["first_mps2"])
+    sums = pd.DataFrame(design * residuals.to_numpy()[:, None]).groupby(rows["cluster"]).sum()
+    scale = 30 / 29 * 59 / 58
+    expected = np.sqrt((bread @ (sums.T @ sums).to_numpy() @ bread * scale)[1, 1])
+    found = slope(rows)
+    assert found.se == pytest.approx(expected)
+    assert (found.high - found.value) / found.se == pytest.approx(2.04523, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "estimate"),
+    [
+        ({"velocity_mps": 0.8}, slope),
+        ({"cluster": 0}, slope),
+        ({"cluster": 0}, mean),
+        ({"tactical": "M"}, exchange_rate),
+        ({"tactical": None}, exchange_rate),
+        ({"headway_m": 0.0}, exchange_rate),
+    ],
+)
+def test_where_the_rows_tell_nothing_there_is_no_estimate(changes, estimate):
+    assert estimate(drawn(np.random.default_rng(7), 22).assign(**changes)) is None
+
+
+def test_separated_words_have_no_rate():
+    rows = drawn(np.random.default_rng(8))
+    odds = HEADWAY * rows["headway_m"] + VELOCITY * rows["velocity_mps"]
+    assert exchange_rate(rows.assign(tactical=np.where(odds > 0, "M", "Y"))) is None
