@@ -37,7 +37,11 @@ def source_digest(driver: type) -> str:
                 sources[name] = source
                 waiting += _imported(name, source)
     if driver.__module__ not in sources:
-        raise UsageError(f"{driver.__qualname__} is in no module of its own")
+        raise UsageError(
+            f"the source of {driver.__qualname__} cannot be found, as that of a class of a "
+            "notebook or a script: put it into a file of its own, such as my_driver.py, and "
+            "import it"
+        )
     code = [(name, code_of(source)) for name, source in sorted(sources.items())]
     return hashlib.sha256(repr(code).encode()).hexdigest()
 
@@ -73,6 +77,8 @@ def _is_text(value: ast.expr) -> bool:
 
 def _source(name: str) -> str | None:
     """The source of a module; None where the name is that of something within one."""
+    if name == "__main__":  # what is typed into a notebook is in no file
+        return None
     try:
         found = find_spec(name)
     except (ModuleNotFoundError, ValueError):

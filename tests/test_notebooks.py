@@ -85,8 +85,8 @@ async def test_a_study_is_run_in_a_notebook_and_looked_at_by_factor(executed):
     assert "gap_m" in tables
 
 
-async def test_an_edited_cell_is_another_driver_and_a_metric_is_in_the_tables(executed):
-    _, played, again, _, table = map(shown, await executed(named(OWN)))
+async def test_an_edited_file_is_another_driver_and_a_metric_is_in_the_tables(executed):
+    _, _, played, again, _, table = map(shown, await executed(named(OWN)))
     assert played.splitlines()[-1] == "22"
     assert again.splitlines()[-1] == "(0, set())"
     assert "hardest_braking_mps2" in table

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -16,7 +15,6 @@ from merge_runner.drivers.base import Driver, take_seat
 from merge_runner.drivers.pace import program_pace
 from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.errors import UsageError
-from merge_runner.main_source import MAIN, main_source
 from merge_runner.records import SIDES, Side, TrialSpec, other_side
 from merge_runner.registry import Registry, require
 from merge_runner.source import source_digest
@@ -148,16 +146,8 @@ class Program:
         The world and the records, which it shares with language models, are covered by the version
         of the spec.
         """
-        if self.main_source:
-            return hashlib.sha256(repr(sorted(self.main_source.items())).encode()).hexdigest()
         assert isinstance(self.driver, type)
         return source_digest(self.driver)
-
-    @property
-    def main_source(self) -> dict[str, str]:
-        """Its source by name where a notebook or a script defines it; see ``main_source``."""
-        assert isinstance(self.driver, type)
-        return main_source(self.driver) if self.driver.__module__ == MAIN else {}
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """See MakeDriver."""

@@ -353,10 +353,6 @@ class Plan:
             ]
         if self.study.is_own:
             config["study"] = {"text": self.study.text, "plugins": self.study.plugins}
-        drivers = {name for arm in self.arms for name in arm.sides.values()} & {*PROGRAMS}
-        sources = {name: PROGRAMS[name].main_source for name in sorted(drivers)}
-        if any(sources.values()):
-            config["main"] = {name: source for name, source in sources.items() if source}
         return config
 
     def _trial_id(self, arm: Arm, condition: str, repetition: int) -> str:

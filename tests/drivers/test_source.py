@@ -14,7 +14,7 @@ from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.run.plan import make_plan
 from merge_runner.source import code_of, source_digest
-from tests.harness import PROJECT
+from tests.harness import PROJECT, environment
 
 PACKAGE = {
     "__init__.py": "",
@@ -125,6 +125,35 @@ def test_a_driver_without_its_source_is_refused(digest, monkeypatch):
     mine = type("Mine", (), {"__module__": "plugged.driver"})
     with pytest.raises(UsageError, match=r"the source of plugged\.driver is not there"):
         source_digest(mine)
+
+
+IN_A_CELL = """
+from merge_runner.drivers.registry import PROGRAMS, Program
+from merge_runner.run.plan import make_plan
+
+class Mine:
+    async def decide(self, observation, number):
+        return self.seat.held(0.0)
+
+PROGRAMS.register("mine", Program(Mine, "keeps its speed"))
+list(make_plan("baseline", "mine").trial_specs())
+"""
+
+
+@pytest.mark.parametrize("how", [("-c", IN_A_CELL), ("mine.py",), ("-m", "mine")])
+def test_a_driver_of_no_file_that_can_be_imported_is_refused_in_one_line(tmp_path, how):
+    (tmp_path / "mine.py").write_text(IN_A_CELL)
+    done = subprocess.run(
+        [sys.executable, *how],
+        cwd=tmp_path,
+        env=environment(PYTHONPATH=str(PROJECT)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    said = done.stderr.splitlines()[-1]
+    assert said.startswith("merge_runner.errors.UsageError: the source of Mine cannot be found")
+    assert said.endswith("put it into a file of its own, such as my_driver.py, and import it")
 
 
 def test_programs_have_a_source_of_their_own_and_share_what_both_rest_on(monkeypatch):
