@@ -16,32 +16,23 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-from merge_runner.errors import CacheFailed, RecordingError, UsageError
-from merge_runner.llm.cache_db import (
-    FAILURES,
-    FORMAT,
-    format_of,
-    open_disk,
-    open_read_only,
-    set_format,
-)
+from merge_runner.errors import CacheFailed, RecordingError
+from merge_runner.llm.cache_db import FAILURES, open_disk, open_read_only
 from merge_runner.llm.content_hashes import manner, without_prompt
 from merge_runner.llm.model_lock import ModelLocks
 from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.llm.write_batcher import BatchWriter, Operation, ResultT
 from merge_runner.records import Attempt, ChatRequest, is_scripted
 
-ENTRY_VERSION = 1
 CHECKSUM_LENGTH = 32
 BATCH = 1_000
 ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 # Prefixes of keys that are no call keys.
 _MODEL, _UNANSWERED, _DAMAGED, _AGAIN = "model ", "attempts ", "damaged ", "again "
-_OLD_ENDPOINTS = "endpoints "
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,22 +44,17 @@ class CachedCall:
 
     def to_json(self) -> str:
         """The entry as one JSON text."""
-        return _STORED.dump_json(_Stored(ENTRY_VERSION, self)).decode()
+        return _STORED.dump_json(_Stored(1, self)).decode()
 
     @classmethod
     def from_json(cls, text: str) -> CachedCall:
-        """Read an entry; raises RecordingError, or UsageError for one of a newer version."""
+        """Read an entry; raises RecordingError."""
         try:
             stored = _STORED.validate_json(text, strict=True)
         except ValidationError as exc:
             raise RecordingError(
                 f"the recorded reply is damaged: {exc.errors()[0]['msg']}"
             ) from exc
-        if stored.version > ENTRY_VERSION:
-            raise UsageError(
-                f"a recorded reply has version {stored.version}, written by a newer merge-runner; "
-                f"this one reads up to {ENTRY_VERSION}: update merge-runner"
-            )
         if not stored.entry.attempts:
             raise RecordingError("the recorded reply is damaged: it holds no attempt")
         return stored.entry
@@ -78,7 +64,7 @@ class CachedCall:
 class _Stored:
     """An entry as it lies in the cache."""
 
-    version: int
+    version: Literal[1]
     entry: CachedCall
 
 
@@ -183,8 +169,6 @@ class ResponseCache:
         self._disk = open_read_only(folder) if read_only else open_disk(folder)
         self._writer = BatchWriter(self.run_now)
         self._new: list[CachedCall] = []
-        if not read_only and format_of(self._disk) < FORMAT:
-            self.run_now([self._bring_up_to_date])
 
     @cached_property
     def _overlay(self) -> Mapping[str, CachedCall]:
@@ -440,17 +424,6 @@ class ResponseCache:
                     known.add(entry)
             self._keep_stats(model, known)
 
-    def _bring_up_to_date(self) -> None:
-        """An operation: bring a folder of an earlier format up to date."""
-        # Formats before the third knew less of each model. Read again: another process may have
-        # been quicker.
-        if format_of(self._disk) < 3:
-            for name in self._disk.names(_OLD_ENDPOINTS) + self._disk.names(_MODEL):
-                self._disk.delete(name)
-            for model, known in self._counted_anew().items():
-                self._keep_stats(model, known)
-        set_format(self._disk)
-
     def _keep_stats(self, model: str, stats: ModelStats) -> None:
         self.replace_twice(_MODEL + model, _STATS.dump_json(stats).decode())
 
@@ -478,12 +451,12 @@ class ResponseCache:
                 entry = _verified(*row)
                 check_body(entry.request.body)
                 yield entry
-            except (RecordingError, UsageError, *DAMAGED) as exc:
+            except (RecordingError, *DAMAGED) as exc:
                 left_out.append(str(exc))
 
 
 def _verified(key: str, text: str) -> CachedCall:
-    """The entry that a row holds; those of the first format have no checksum.
+    """Return the entry that a row holds.
 
     Raises RecordingError unless it is whole and belongs to its key: a reply to one request must
     never answer another.
@@ -502,12 +475,7 @@ def _behind_checksum(text: str) -> str:
 
 
 def _checked(text: str) -> str:
-    """What was put behind a checksum; the JSON of earlier formats stands alone.
-
-    Raises RecordingError where the checksum is wrong.
-    """
-    if text.startswith(("{", "[")):
-        return text
+    """Return what was put behind a checksum; raises RecordingError where that is wrong."""
     content = text[CHECKSUM_LENGTH:]
     if text != _behind_checksum(content):
         raise RecordingError("the recorded reply is damaged: its checksum is wrong")

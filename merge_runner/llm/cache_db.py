@@ -23,7 +23,7 @@ from merge_runner.errors import RecordingError, UsageError
 from merge_runner.text_safety import one_line
 
 FILE = "cache.db"
-FORMAT = 4
+FORMAT = "4"
 _FORMAT, _OPENED = "format", "opened"
 BUSY_S = 600.0  # another process may be writing long replies to a slow disk
 LONGEST = 2**28
@@ -116,6 +116,7 @@ class TextDisk:
         self._reading = _reading(self._file)
         try:
             _refuse_other_layout(self._file, self._reading)
+            self._refuse_other_format()
         except (UsageError, *FAILURES):
             self.close()  # so that SQLite leaves no file beside it
             raise
@@ -206,6 +207,20 @@ class TextDisk:
         if self._store is not None:
             self._store.close()
 
+    def _refuse_other_format(self) -> None:
+        """Raise UsageError for a folder of another version; the first version left no mark."""
+        try:
+            mark = self.get(_FORMAT) or "1"
+        except RecordingError:
+            return  # damaged, and each entry is checked
+        if mark != FORMAT:
+            raise UsageError(
+                f"the cache {self._file.parent} has format {one_line(mark[:9])}, and this "
+                f"merge-runner has format {FORMAT}: name another folder with --cache; "
+                "`merge-runner recording import FILE --cache NEW` makes one from a recording of "
+                "its replies"
+            )
+
     @property
     def _connection(self) -> sqlite3.Connection:
         return self._reading if self._store is None else self._store._con
@@ -240,7 +255,7 @@ class TextDisk:
 def open_disk(folder: Path) -> TextDisk:
     """Open or make the folder and see that it can be written.
 
-    Raises UsageError for a folder that cannot be used, is damaged, or is of a newer format.
+    Raises UsageError for a folder that cannot be used, is damaged, or has another format.
     """
     with _usable(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -249,15 +264,8 @@ def open_disk(folder: Path) -> TextDisk:
             _refuse_traps(folder / FILE)
             _make(folder / FILE)
         disk = TextDisk(folder)
-        version = format_of(disk)
-        if version <= FORMAT:
-            with disk.transaction():
-                disk.set(_OPENED, "")  # it can be written
-    if version > FORMAT:
-        raise UsageError(
-            f"the cache {folder} has format {version}, written by a newer merge-runner; this one "
-            f"reads up to {FORMAT}: update merge-runner, or name another with --cache"
-        )
+        with disk.transaction():
+            disk.set(_OPENED, "")  # it can be written
     return disk
 
 
@@ -267,20 +275,6 @@ def open_read_only(folder: Path) -> TextDisk:
         raise UsageError(f"there is no cache in {folder}")
     with _usable(folder):
         return TextDisk(folder, read_only=True)
-
-
-def format_of(disk: TextDisk) -> int:
-    """The format of a folder; the first one had no mark, and a damaged one is taken for that."""
-    try:
-        mark = disk.get(_FORMAT) or ""
-    except RecordingError:
-        mark = ""
-    return int(mark) if mark.isascii() and mark.isdigit() else 1
-
-
-def set_format(disk: TextDisk) -> None:
-    """Mark a folder as one of this program's format."""
-    disk.set(_FORMAT, str(FORMAT))
 
 
 @contextlib.contextmanager
@@ -315,7 +309,7 @@ def _make(file: Path) -> None:
 def _lay_out(folder: Path) -> None:
     """Make what is missing of a file; one that another process has made stays as it is."""
     made = _opened(folder)
-    made.add(_FORMAT, str(FORMAT))
+    made.add(_FORMAT, FORMAT)
     made.close()
 
 

@@ -14,7 +14,7 @@ from merge_runner.llm.ledger import IN_FLIGHT, UNRECORDED, Ledger, Reason, Relea
 
 MEANING = {
     IN_FLIGHT: "in flight now, or when a run was killed",
-    UNRECORDED: "by an earlier version, which noted no reason",
+    UNRECORDED: "the note of the reason is damaged",
 }
 
 

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, CallTotals, ResponseCache
+from merge_runner.llm.cache_db import FORMAT
 from merge_runner.llm.content_hashes import make_request, manner
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage
@@ -253,8 +254,10 @@ def test_only_text_can_be_stored(cache, stock, monkeypatch):
 
 def test_nothing_is_ever_evicted(folder):
     """Also not from a folder that another program made with a limit."""
-    small = diskcache.Cache(str(folder), size_limit=1, cull_limit=10)
+    small = diskcache.Cache(str(folder), size_limit=1, cull_limit=0)
     assert small.eviction_policy == "least-recently-stored"
+    small["format"] = FORMAT
+    small.reset("cull_limit", 10)
     small.close()
     cache = ResponseCache(folder)
     for number in range(20):
@@ -337,14 +340,6 @@ def test_damaged_facts_about_a_model_are_counted_anew(cache, stock):
     assert cache.stats("m").cost_usd == 7
 
 
-async def test_a_claim_whose_reply_cannot_be_read_is_given_up(cache, stock):
-    key = entry(1).request.key
-    stock[key] = entry(1).to_json().replace('"version":1', '"version":99')
-    for _ in range(2):
-        with pytest.raises(UsageError, match="version"):
-            await cache.claim(key)
-
-
 async def test_damaged_attempts_are_set_aside_and_good_ones_are_not(cache, stock):
     key = entry(1).request.key
     await cache.write(lambda: cache.keep_unanswered(key, entry(1).attempts))
@@ -357,17 +352,21 @@ async def test_damaged_attempts_are_set_aside_and_good_ones_are_not(cache, stock
     assert stock[f"damaged {name}"] == "no JSON"
 
 
-@pytest.mark.parametrize("version", ["1", "2"])
-def test_a_folder_of_an_earlier_format_is_counted_once(folder, stock, version):
-    cache = ResponseCache(folder)
-    cache.put_now([entry(1, cost_usd=1), entry(2, cost_usd=2)])
-    stock["format"] = version
-    stock["model m"] = '{"endpoints": ["openai"], "answers": 9, "cost_usd": 9.0}'
-    for _ in range(2):  # as two processes do that saw the old mark at once
-        cache._bring_up_to_date()
-        assert cache.stats("m").cost_usd == 3
-        assert cache.recorded_endpoints("m") == ["openai"]
+@pytest.mark.parametrize("mark", [None, "3", "5"])
+@pytest.mark.parametrize("read_only", [False, True])
+def test_a_folder_of_another_format_is_refused_and_left_alone(
+    folder, cache, stock, mark, read_only
+):
+    del stock["format"]
+    if mark is not None:
+        stock["format"] = mark
+    stock.close()
     cache.close()
+    before = (folder / "cache.db").read_bytes()
+    told = f"has format {mark or 1}, and this merge-runner has format 4: .*import FILE --cache NEW`"
+    with pytest.raises(UsageError, match=told):
+        ResponseCache(folder, read_only=read_only)
+    assert (folder / "cache.db").read_bytes() == before
 
 
 def told(number, *, model="m", endpoint="openai", effort="low", **attempt):

@@ -13,7 +13,7 @@ import diskcache
 import pytest
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import CachedCall, ResponseCache, _behind_checksum
 from merge_runner.llm.cache_import import import_folder
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.records import Attempt, Slot
@@ -342,10 +342,10 @@ def test_an_answer_is_never_used_for_another_question(folder, own, field, value)
 
 
 def plant(folder, key, content):
-    """An entry without a checksum, as the first version wrote it."""
+    """An entry behind a checksum that fits."""
     with database(folder) as opened:
         done = opened.execute(
-            "UPDATE Cache SET value = ? WHERE key = ?", [json.dumps(content), key]
+            "UPDATE Cache SET value = ? WHERE key = ?", [_behind_checksum(json.dumps(content)), key]
         )
         assert done.rowcount == 1
 
@@ -381,10 +381,11 @@ def test_a_request_that_nobody_sends_is_refused(folder, own):
         provider="openai", endpoint="openai", model="m", path="/p", headers={}, body=["x"],
         slot=Slot("A1", 1, "left", 1, 0),
     )  # fmt: skip
+    whole = CachedCall(made, FIRST.attempts)
     with database(folder) as opened:
         opened.execute(
             "UPDATE Cache SET key = ?, value = ? WHERE key = ?",
-            [made.key, CachedCall(made, FIRST.attempts).to_json(), FIRST.request.key],
+            [made.key, _behind_checksum(whole.to_json()), FIRST.request.key],
         )
     with pytest.raises(RecordingError, match="not a canonical JSON object"):
         import_folder(folder, own)
