@@ -41,7 +41,6 @@ from merge_runner.llm.content_hashes import canonical_json, spec_hash
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.records import SIDES, Side
 from merge_runner.registry import require
-from merge_runner.results.levels import LEVELS
 from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF, listed_levels
@@ -58,13 +57,14 @@ MEAN_SPEED = "mean_speed_mps"
 # Factors that every study has, and levels that others are compared with.
 FIRST = (MODEL, PROMPT)
 USUAL = (BASELINE, DEFAULT, SELF)
+LEVELS = "FROM trial_levels"
 ONLY_ASKED = " [asked]"  # ends the name of a driver that was only asked
 # One row a trial and factor of drivers that were only asked.
-ASKED = f"""
-SELECT trial_id, spec_hash, driver, factor, value FROM ({LEVELS})
+ASKED = """
+SELECT trial_id, spec_hash, driver, factor, value FROM trial_levels
 JOIN trial_drivers USING (trial_id, spec_hash)
 SEMI JOIN (FROM trials WHERE source = 'seat') USING (trial_id, spec_hash) ORDER BY ALL
-"""  # noqa: S608 # constants
+"""
 NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5

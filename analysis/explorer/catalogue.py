@@ -23,7 +23,6 @@ from merge_runner.drivers.registry import language_models, stand_in, unresponsiv
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, more_memory, schema_sql
-from merge_runner.results.levels import LEVELS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer, quoted
@@ -45,7 +44,7 @@ ORDER BY one.trial_id, one.spec_hash, base.spec_hash
 # What is known of each trial. Texts and prompts stay in the database. ``tried`` are its attempts,
 # counted where they are alike; ``levels`` are those of its study's own factors, ``flaws`` says of
 # each invalid reply what is wrong with it, and ``posed`` on which sides a stand-in answered.
-LISTED = f"""
+LISTED = """
 CREATE SEQUENCE numbers;
 CREATE TABLE listed (
     number INTEGER DEFAULT nextval('numbers'), trial_id VARCHAR, spec_hash VARCHAR,
@@ -64,7 +63,6 @@ CREATE TABLE listed (
     levels VARCHAR[]
 );
 CREATE TABLE levels (number INTEGER, factor VARCHAR, level VARCHAR);
-CREATE VIEW new_levels AS {LEVELS};
 CREATE VIEW tried AS SELECT number, unnest(tried, recursive := true) FROM listed;
 CREATE TABLE noted (trial_id VARCHAR, spec_hash VARCHAR, tag VARCHAR);
 CREATE VIEW tagged AS SELECT number, tag FROM noted JOIN listed USING (trial_id, spec_hash);
@@ -75,7 +73,7 @@ CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, ask
 CREATE TABLE driven (trial_id VARCHAR, spec_hash VARCHAR, made STRUCT(side VARCHAR,
     time_s DOUBLE, fallback BOOLEAN)[]);
 CREATE TABLE called AS SELECT trial_id, spec_hash, attempts, cost_usd, posed, tried FROM listed;
-"""  # noqa: S608 # constants
+"""
 # The trials of each sweep, and how often what went wrong in a trial. Equal failures are counted
 # together: an error is named by its words before the particulars, without numbers and hashes.
 GROUPED = """
@@ -183,7 +181,7 @@ LEFT JOIN (
             USING (trial_id, spec_hash))
     WHERE time_s >= 0 GROUP BY ALL
 ) USING (trial_id, spec_hash);
-INSERT INTO levels SELECT number, factor, value FROM new_levels
+INSERT INTO levels SELECT number, factor, value FROM trial_levels
     JOIN listed USING (trial_id, spec_hash) WHERE factor <> 'prompt';
 """  # noqa: S608 # constants
 # Of the trials that were listed last, the collisions; those without a fallback need no decisions.

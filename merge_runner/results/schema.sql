@@ -267,6 +267,25 @@ COMMENT ON COLUMN trial_drivers.ego IS 'the side of the driver that is named fir
     'model before a program, else the first in the alphabet; of two equal ones, and of humans, the '
     'left one';
 
+CREATE VIEW trial_levels AS
+WITH own AS (FROM trial_factors WHERE factor <> 'prompt')
+FROM own SEMI JOIN trials USING (trial_id, spec_hash)
+UNION ALL
+SELECT trial_id, spec_hash, unnest(['model', 'prompt']),
+    unnest([if(model_left = model_right OR coalesce(opponent, 'self') <> 'self', one,
+        one || '+' || other), variant])
+FROM (
+    SELECT *, if(ego = 'left', model_left, model_right) AS one,
+        if(ego = 'left', model_right, model_left) AS other
+    FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
+) AS trials LEFT JOIN (
+    SELECT trial_id, spec_hash, value AS opponent FROM own WHERE factor = 'opponent'
+) USING (trial_id, spec_hash)
+WHERE source <> 'human';
+COMMENT ON VIEW trial_levels IS 'What was designed: a row for each factor of a driven trial, those of its '
+    'study, and the model and the prompt that it had. Who meets an opponent is the model; of a pair '
+    'without one both are, the ego first.';
+
 CREATE VIEW attempts AS
 SELECT calls.*, source, variant, condition, sample_set,
     CASE side WHEN 'left' THEN model_left ELSE model_right END AS model,

@@ -38,7 +38,6 @@ from merge_runner.results.database import (
     update_measures,
 )
 from merge_runner.results.first_looks import FIRST_LOOKS
-from merge_runner.results.levels import LEVELS
 from merge_runner.results.rows import Row, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.served_model import other_models, sql_of
@@ -397,8 +396,8 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 "GROUP BY ALL ORDER BY ALL",
             ),
             levels=rows(
-                "SELECT factor, value, status, merged_first, count(*) "  # noqa: S608 # constants
-                f"FROM trials JOIN ({LEVELS}) USING (trial_id, spec_hash)",
+                "SELECT factor, value, status, merged_first, count(*) "
+                "FROM trials JOIN trial_levels USING (trial_id, spec_hash)",
                 "GROUP BY ALL ORDER BY ALL",
             ),
             ledger=_ledger(attempts),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from analysis.data.human_counts import human_counts, published_accounts
+from analysis.data.studies import DESCRIPTIONS
 from analysis.explorer.analysis_worker import HUMAN
 from analysis.explorer.catalogue import FACTOR, Filter
 from analysis.explorer.charts import Kind, drawn
@@ -21,7 +22,6 @@ from analysis.explorer.urls import HOME
 from analysis.metrics import GAP, LEFT_FIRST
 from analysis.tables.formats import notes_of, printed
 from analysis.tables.model import Table, from_text
-from merge_runner.results.levels import DESCRIPTIONS
 from merge_runner.results.validity import not_judged
 from merge_runner.study.crossing import PROMPT
 
