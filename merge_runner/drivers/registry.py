@@ -54,10 +54,10 @@ class Program:
     program reads its parameters from its seat, so that a study can set them. ``sets`` are named
     sets of further parameters, of which the parameter ``set`` chooses one. ``check`` raises
     UsageError for parameters that cannot be, ``check_clock`` for a clock in s (the time between two
-    decisions) that cannot be beside them. ``data`` are human trials that it
-    replays. ``chance`` declares
-    that it draws by the seed of its seat: the analysis counts equal trials of drivers that do not
-    once. ``based_on`` names the program that a study has given other parameters or another clock.
+    decisions) that cannot be beside them. ``data`` are human trials that it replays. ``chance``
+    declares that it draws by the seed of its seat: the analysis counts equal trials of drivers that
+    do not once. ``based_on`` names the program that a study has given other parameters or another
+    clock.
     """
 
     driver: Callable[[ProgramSeat], Driver]

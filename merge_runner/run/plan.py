@@ -455,7 +455,7 @@ def _replayed(arm: Arm) -> list[tuple[Program, HumanTrials]]:
 
 def _read_humans(arms: Iterable[Arm], db: Path) -> None:
     """Read the human trials of a database where a program replays them."""
-    if replayed := [humans for arm in arms for _, humans in _replayed(arm)]:
+    if replayed := {humans for arm in arms for _, humans in _replayed(arm)}:
         with read_database(db) if db.is_file() else nullcontext() as connection:
             for humans in replayed:
                 humans.read(connection)
