@@ -22,7 +22,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import language_models, stand_in, unresponsive
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
-from merge_runner.results.database import Instance, more_memory, schema_sql
+from merge_runner.results.database import Instance, schema_sql
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer, quoted
@@ -464,10 +464,7 @@ class Catalogue:
     def copy(self, sql: str) -> None:
         """Run statements of ours that copy texts of the database; raises UsageError, StoreError."""
         try:
-            with (
-                reading(self.db, self._instance) as connection,
-                more_memory(connection, one_thread=True),
-            ):
+            with reading(self.db, self._instance) as connection:
                 connection.execute(sql)
         except StoreLocked:
             raise

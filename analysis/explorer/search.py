@@ -21,7 +21,6 @@ from analysis.explorer.catalogue import SEVERAL, Catalogue, Filter
 from analysis.explorer.reading import Row, records
 from analysis.explorer.snippets import Snippet, snippet
 from merge_runner.errors import StoreLocked
-from merge_runner.results.database import more_memory
 from merge_runner.text_safety import quoted
 
 PAGE = 50
@@ -147,8 +146,7 @@ class Words:
             self._prepare(connection, wanted.kind)
             with suppress(StoreLocked):  # what is read is searched
                 self._take(connection, wanted.kind)
-            with more_memory(connection):
-                return _searched(connection, wanted, page)
+            return _searched(connection, wanted, page)
 
     def every(self, kind: str) -> list[Row]:
         """What all drivers said, in the order of the trials; raises StoreError."""
@@ -156,14 +154,13 @@ class Words:
             self._prepare(connection, kind)
             while _unread(connection, kind):
                 self._take(connection, kind)
-            with more_memory(connection):
-                return records(
-                    connection,
-                    "SELECT number, side, decision, time_s, tactical, switch, failure, text "  # noqa: S608 # constants
-                    f"FROM words.{kind} JOIN listed USING (number) "
-                    "ORDER BY trial_id, spec_hash, decision, side",
-                    (),
-                )
+            return records(
+                connection,
+                "SELECT number, side, decision, time_s, tactical, switch, failure, text "  # noqa: S608 # constants
+                f"FROM words.{kind} JOIN listed USING (number) "
+                "ORDER BY trial_id, spec_hash, decision, side",
+                (),
+            )
 
     @property
     def folder(self) -> Path | None:

@@ -13,7 +13,7 @@ from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import ChatRequest, Slot
 from merge_runner.results.comparison import Spans, TrialKey, in_batches, rows_of_trials
-from merge_runner.results.database import by_name, read_database, room_for_texts
+from merge_runner.results.database import by_name, read_database
 from merge_runner.results.rows import call_row
 
 TRIALS = """
@@ -27,7 +27,7 @@ def audit_cache(path: Path, folder: Path, sweep_id: str | None = None) -> Audit:
     findings: list[Finding] = []
     keys: set[str] = set()
     try:
-        with read_database(path) as connection, room_for_texts(connection):
+        with read_database(path) as connection:
             trials = connection.execute(TRIALS, [sweep_id]).fetchall()
             read = partial(_attempts, connection)
             for rows in in_batches(connection, trials, ["calls"], read):

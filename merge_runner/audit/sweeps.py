@@ -29,7 +29,7 @@ from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreError, UsageError, unknown_name
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.records import SIDES
-from merge_runner.results.database import append, by_name, read_database, room_for_texts
+from merge_runner.results.database import append, by_name, read_database
 from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import other_models
@@ -143,7 +143,7 @@ def audit_database(path: Path) -> list[Audit]:
 @contextmanager
 def _reading(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
     try:
-        with read_database(path) as connection, room_for_texts(connection):
+        with read_database(path) as connection:
             yield connection
     except duckdb.Error as exc:
         raise StoreError(f"{path} cannot be audited: {first_line(exc)}") from exc

@@ -29,24 +29,21 @@ PATIENCE_S = 60.0
 ROWS_AT_ONCE = 100
 ROWS_OF_A_GROUP = 8_192
 """Of what is written: a group is rewritten, in memory, with each transaction until it is full."""
-# How many bytes of the file a call takes where replies are short, compressed and with its share of
-# the states. By how much the file may exceed that for its row groups still to be merged, and for
-# its texts to be read without more memory.
-BYTES_OF_A_CALL, MERGED_BYTES, SHORT_BYTES = 3_000, 2**26, 2**23
-MANY_BYTES = 2**28
-"""A file of that size has so many rows that joining them takes more memory: 45,000 trials of 8
-calls, or 20,000 of 20."""
+BYTES_OF_A_CALL, MERGED_BYTES = 3_000, 2**26
+"""How many a call takes where replies are short, compressed and with its share of the states, and
+by how much the file may exceed that for its row groups still to be merged."""
 LOG = logging.getLogger(__name__)
 Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
-    "memory_limit": "200MB",  # the default is a share of the machine's; most of it caches the file
+    # The defaults are shares of the machine's, and most of that memory would cache the file. A
+    # thread unpacks the texts of 2,048 rows at once: 128 MB where replies are of 64 KB.
+    "memory_limit": "1GB",
+    "threads": 2,
     "max_vacuum_tasks": 0,  # see merge_small_groups
     # Of new files: the oldest DuckDB that can open them.
     "storage_compatibility_version": "v1.2.0",
     "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
 }
-TEXTS: Settings = {**SETTINGS, "memory_limit": "1GB"}
-"""Where the texts of replies are read: 2,048 of 64 KB take a quarter of it, JSON of them more."""
 REBUILD = (
     "move it away, or name another with --db, and run the same sweep again: it is rebuilt from the "
     "cache without a call"
@@ -94,15 +91,14 @@ class Instance:
     it may be unusable, and a new one is made.
     """
 
-    def __init__(self, settings: Settings = SETTINGS) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self._connection: duckdb.DuckDBPyConnection | None = None
         self._numbers = itertools.count()
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
         """A separate connection to the instance."""
         if self._connection is None:
-            self._connection = in_memory(self._settings)
+            self._connection = in_memory(SETTINGS)
         return self._connection.cursor()
 
     def name(self) -> str:
@@ -193,46 +189,13 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
     connection.execute(f"SET max_vacuum_tasks = {tasks}")
 
 
-@contextmanager
-def room_for_texts(connection: duckdb.DuckDBPyConnection) -> Iterator[None]:
-    """Allow more memory while long texts are read, or very many rows.
-
-    Of long texts a thread unpacks those of 2,048 rows at once: then there is only one.
-    """
-    long = _bytes_of_texts(connection) > SHORT_BYTES
-    if not (long or _calls_and_bytes(connection)[1] > MANY_BYTES):
-        yield
-        return
-    with more_memory(connection, one_thread=long):
-        yield
-
-
-@contextmanager
-def more_memory(
-    connection: duckdb.DuckDBPyConnection, *, one_thread: bool = False
-) -> Iterator[None]:
-    """Allow as much memory as texts of 64 KB take, however small a file they are in."""
-    threads = "SET threads = 1" if one_thread else "RESET threads"
-    connection.execute(f"SET memory_limit = '{TEXTS['memory_limit']}'; {threads}")
-    try:
-        yield
-    finally:
-        connection.execute(f"SET memory_limit = '{SETTINGS['memory_limit']}'; RESET threads")
-
-
 def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
     """How much larger the open file is than it would be with short replies."""
-    calls, size = _calls_and_bytes(connection)
-    return size - calls * BYTES_OF_A_CALL
-
-
-def _calls_and_bytes(connection: duckdb.DuckDBPyConnection) -> tuple[int, int]:
-    """How many calls the open file has, about, and its size; of no file (0, 0)."""
-    row = connection.execute(
-        "SELECT path, estimated_size FROM duckdb_tables() JOIN duckdb_databases() "
+    (calls, path), *_ = connection.execute(
+        "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
-    ).fetchone()
-    return (row[1], Path(row[0]).stat().st_size) if row else (0, 0)
+    ).fetchall()
+    return Path(path).stat().st_size - int(calls) * BYTES_OF_A_CALL
 
 
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:

@@ -23,7 +23,7 @@ from merge_runner.results.comparison import FACTORS, PLACES, TrialKey, rows_of_t
 from merge_runner.results.database import (
     PATIENCE_S,
     SCHEMA_VERSION,
-    TEXTS,
+    SETTINGS,
     Instance,
     append,
     by_name,
@@ -32,7 +32,6 @@ from merge_runner.results.database import (
     merge_small_groups,
     open_database,
     read_database,
-    room_for_texts,
     schema_sql,
     unreadable_is_usage,
     update_measures,
@@ -211,7 +210,7 @@ def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
     """The result of a query, to be fetched; the database is locked until then."""
     # The settings hold for a whole instance, and cannot be taken back.
     with (
-        read_database(path, Instance(TEXTS)) as connection,
+        read_database(path, Instance()) as connection,
         at_signals(connection.interrupt),
         answering(connection, sql) as result,
     ):
@@ -243,8 +242,8 @@ def answering(
         raise  # a query reaches no file but the database, so it is the database that is damaged
     except duckdb.OutOfMemoryException as exc:
         raise UsageError(
-            f"the query needs more than the {TEXTS['memory_limit']} of memory that it may use: ask "
-            "for fewer rows or columns at once; requests and replies are long"
+            f"the query needs more than the {SETTINGS['memory_limit']} of memory that it may use: "
+            "ask for fewer rows or columns at once; requests and replies are long"
         ) from exc
     except duckdb.Error as exc:
         if "pytz" in str(exc):
@@ -268,7 +267,7 @@ def results_digest(path: Path) -> tuple[str, int]:
     not when, where or at what price: no clock times, latencies, costs, cache keys or spec hashes.
     """
     digests: dict[TrialKey, Any] = {}
-    with read_database(path) as connection, room_for_texts(connection):
+    with read_database(path) as connection:
         # The first and the third of the columns order the rows of a trial.
         for columns, table in (
             (

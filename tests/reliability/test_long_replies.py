@@ -18,16 +18,13 @@ from merge_runner.cli import app
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.database import (
     BYTES_OF_A_CALL,
-    MANY_BYTES,
     MERGED_BYTES,
     ROWS_OF_A_GROUP,
     SETTINGS,
-    SHORT_BYTES,
     append,
     in_memory,
     merge_small_groups,
     open_database,
-    room_for_texts,
     schema_sql,
 )
 from merge_runner.results.recording import export_recording, read_recording
@@ -152,40 +149,23 @@ def test_small_groups_are_merged_to_ones_that_fit_into_memory(tmp_path):
     assert max(groups) <= (ROWS_OF_A_GROUP,)
 
 
-def test_small_groups_are_merged_unless_texts_are_long_and_long_or_many_rows_have_more_memory(
-    tmp_path,
-):
-    def told(size):
-        """The tasks of merging, and the memory for texts, where the file has this size."""
+def test_small_groups_are_merged_unless_texts_are_long(tmp_path):
+    def tasks(size):
+        """The tasks of merging where the file has this size."""
         os.truncate(file, size)
         merge_small_groups(connection)
-        with room_for_texts(connection):
-            names = ("max_vacuum_tasks", "memory_limit")
-            settings = [f"current_setting('{name}')" for name in names]
-            return connection.execute(f"SELECT {', '.join(settings)}").fetchone()
+        return connection.execute("SELECT current_setting('max_vacuum_tasks')").fetchone()
 
     file = tmp_path / "file.duckdb"
     connection = in_memory(SETTINGS)
     connection.execute(f"ATTACH '{file}' AS file; USE file")
     connection.execute("CREATE TABLE calls AS SELECT * FROM range(10_000)")
     connection.execute("CHECKPOINT")
-    of_calls = 10_000 * BYTES_OF_A_CALL
-    short, long = "190.7 MiB", "953.6 MiB"
-    assert told(of_calls + SHORT_BYTES) == (100, short)
-    assert told(of_calls + SHORT_BYTES + 1) == (100, long)
-    assert told(of_calls + MERGED_BYTES + 1) == (0, long)
-    assert connection.execute("SELECT current_setting('memory_limit')").fetchone() == (short,)
-    connection.execute("CREATE OR REPLACE TABLE calls AS SELECT * FROM range(100_000)")
-    connection.execute("CHECKPOINT")
-    assert told(MANY_BYTES) == (100, short)
-    assert told(MANY_BYTES + 1) == (100, long)
+    short = 10_000 * BYTES_OF_A_CALL + MERGED_BYTES
+    assert tasks(short) == (100,)
+    assert tasks(short + 1) == (0,)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="4.2: a transaction holds all replies of a trial, and merges row groups of others",
-)
 @pytest.mark.long
 @pytest.mark.parametrize(("reply_mb", "trials", "seconds"), [(15, 1, 8), (2, 4, 30)])
 async def test_every_reply_below_max_reply_mb_is_stored(
