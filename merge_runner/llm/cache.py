@@ -21,7 +21,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError
-from merge_runner.llm.cache_db import FAILURES, open_disk, open_read_only
+from merge_runner.llm.cache_db import FAILURES, open_read_only, open_store
 from merge_runner.llm.content_hashes import manner, without_prompt
 from merge_runner.llm.model_lock import ModelLocks
 from merge_runner.llm.verify import DAMAGED, check_body, check_call
@@ -32,7 +32,7 @@ CHECKSUM_LENGTH = 32
 BATCH = 1_000
 ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 # Prefixes of keys that are no call keys.
-_MODEL, _UNANSWERED, _DAMAGED, _AGAIN = "model ", "attempts ", "damaged ", "again "
+_MODEL, _UNANSWERED, _DAMAGED = "model ", "attempts ", "damaged "
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +166,7 @@ class ResponseCache:
         self.locks = ModelLocks(folder)
         self._claimed: set[str] = set()
         self._read_overlay = overlay
-        self._disk = open_read_only(folder) if read_only else open_disk(folder)
+        self._store = open_read_only(folder) if read_only else open_store(folder)
         self._writer = BatchWriter(self.run_now)
         self._new: list[CachedCall] = []
 
@@ -243,7 +243,7 @@ class ResponseCache:
         def operation() -> list[str]:
             found = damaged()  # again: an import may have moved it since
             for name in found:
-                self._disk.set_aside(name, _DAMAGED + name)
+                self._store.quarantine(name, _DAMAGED + name)
             return found
 
         moved: list[str] = self.run_now([operation])[0] if damaged() else []
@@ -256,7 +256,7 @@ class ResponseCache:
 
     def keep_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """An operation: keep the attempts at a call that has no answer yet."""
-        self._disk.set(_UNANSWERED + key, _behind_checksum(ATTEMPTS.dump_json(attempts).decode()))
+        self._store.set(_UNANSWERED + key, _behind_checksum(ATTEMPTS.dump_json(attempts).decode()))
 
     async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """Keep the attempts at a call that has no answer yet, durably."""
@@ -269,7 +269,7 @@ class ResponseCache:
     def run_now(self, operations: list[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread."""
         try:
-            with self._disk.transaction():
+            with self._store.transaction():
                 results = [operation() for operation in operations]
                 self._count(self._new)
         except FAILURES as exc:
@@ -287,49 +287,29 @@ class ResponseCache:
         Raises RecordingError where it is no text, CacheFailed where the folder cannot be read.
         """
         with self._readable():
-            return self._disk.get(name)
+            return self._store.get(name)
 
     def replace(self, name: str, text: str) -> None:
         """An operation: keep a text under a name that is no call key."""
-        self._disk.set(name, text)
+        self._store.set(name, text)
 
     def remove(self, name: str) -> None:
         """An operation: forget what is under a name that is no call key."""
-        self._disk.delete(name)
+        self._store.delete(name)
 
     def names(self, prefix: str) -> list[str]:
         """The names that begin so, of what is no call."""
         with self._readable():
-            return self._disk.names(prefix)
+            return self._store.names(prefix)
 
-    def names_kept_twice(self, prefix: str) -> list[str]:
-        """The names that begin so, of texts that are kept twice."""
-        again = (name.removeprefix(_AGAIN) for name in self.names(_AGAIN + prefix))
-        return sorted({*self.names(prefix), *again})
+    def read_checked(self, name: str) -> str | None:
+        """Return a text that was kept behind a checksum; raises RecordingError."""
+        text = self.read(name)
+        return None if text is None else _checked(text)
 
-    def read_twice(self, name: str) -> str | None:
-        """A text that was kept twice, of which one must be whole; else raises RecordingError."""
-        damage: RecordingError | None = None
-        for each in (name, _AGAIN + name):
-            try:
-                text = self.read(each)
-                if text is not None:
-                    return _checked(text)
-            except RecordingError as exc:
-                damage = exc
-        if damage:
-            raise damage
-        return None
-
-    def replace_twice(self, name: str, text: str) -> None:
-        """An operation: keep a text in two rows, so that one damaged row does not lose it."""
-        for each in (name, _AGAIN + name):
-            self._disk.set(each, _behind_checksum(text))
-
-    def remove_twice(self, name: str) -> None:
-        """An operation: forget a text that is kept twice."""
-        for each in (name, _AGAIN + name):
-            self._disk.delete(each)
+    def replace_checked(self, name: str, text: str) -> None:
+        """Keep a text behind a checksum, as an operation."""
+        self._store.set(name, _behind_checksum(text))
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
         """All entries, of the folder and of the overlay, each verified.
@@ -360,13 +340,13 @@ class ResponseCache:
 
     def cost_usd(self) -> float:
         """What all entries of the folder cost when they were made."""
-        models = (name.removeprefix(_MODEL) for name in self.names_kept_twice(_MODEL))
+        models = (name.removeprefix(_MODEL) for name in self.names(_MODEL))
         return sum(self.stats(model).cost_usd for model in models)
 
     def close(self) -> None:
         """Close the folder, and free its locks."""
         self.locks.close()
-        self._disk.close()
+        self._store.close()
 
     def _keep(self, entry: CachedCall) -> CachedCall:
         key = entry.request.key
@@ -374,9 +354,9 @@ class ResponseCache:
             if kept := self._kept(key):
                 return kept  # a kept reply is never replaced
         except RecordingError:
-            self._disk.set_aside(key, _DAMAGED + key)
-        self._disk.add(key, _behind_checksum(entry.to_json()))
-        self._disk.delete(_UNANSWERED + key)
+            self._store.quarantine(key, _DAMAGED + key)
+        self._store.set(key, _behind_checksum(entry.to_json()))
+        self._store.delete(_UNANSWERED + key)
         self._new.append(entry)
         return entry
 
@@ -396,13 +376,12 @@ class ResponseCache:
             yield
         except FAILURES as exc:
             raise self._failed(
-                f"read: {exc}. Repair or move it; the database and any exported recording are not "
-                f"affected, and `merge-runner recording import {self.folder}` takes what can be "
-                "read of it into another, named with --cache"
+                f"read: {exc}. Put a copy of it back, or name another with --cache; the database "
+                "and any exported recording are not affected"
             ) from exc
 
     def _failed(self, how: str) -> CacheFailed:
-        if self._disk.in_place:
+        if self._store.in_place:
             return CacheFailed(f"the cache {self.folder} cannot be {how}")
         return CacheFailed(
             f"the cache {self.folder} was removed, moved or replaced while it was in use, and what "
@@ -425,12 +404,12 @@ class ResponseCache:
             self._keep_stats(model, known)
 
     def _keep_stats(self, model: str, stats: ModelStats) -> None:
-        self.replace_twice(_MODEL + model, _STATS.dump_json(stats).decode())
+        self.replace_checked(_MODEL + model, _STATS.dump_json(stats).decode())
 
     def _stats(self, model: str) -> ModelStats | None:
         """The stats of a model; None where they are damaged."""
         try:
-            text = self.read_twice(_MODEL + model)
+            text = self.read_checked(_MODEL + model)
             return ModelStats() if text is None else _STATS.validate_json(text)
         except (RecordingError, ValidationError):
             return None
@@ -444,7 +423,7 @@ class ResponseCache:
 
     def _own_entries(self, left_out: list[str]) -> Iterator[CachedCall]:
         """The entries of the folder; see ``entries``."""
-        for row in self._disk.calls():
+        for row in self._store.calls():
             try:
                 if isinstance(row, RecordingError):
                     raise row

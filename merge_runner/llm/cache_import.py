@@ -1,4 +1,4 @@
-"""Replies of a cache folder from elsewhere: each is verified, and nothing else of it is used."""
+"""Replies of another cache folder: each is verified, and nothing else of it is used."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ _SET_ASIDE = TypeAdapter(list[SetAside])
 
 def scopes(cache: ResponseCache) -> list[str]:
     """The names of all ledgers in a cache."""
-    return [name.removeprefix(_SPENT) for name in cache.names_kept_twice(_SPENT)]
+    return [name.removeprefix(_SPENT) for name in cache.names(_SPENT)]
 
 
 class Ledger:
@@ -275,7 +275,7 @@ class Ledger:
     def read(self) -> Spending:
         """The current state; raises UsageError where its record is damaged."""
         try:
-            text = self._cache.read_twice(self._name)
+            text = self._cache.read_checked(self._name)
             self.spending = Spending() if text is None else _SPENDING.validate_json(text)
             if not (self.spending.spent_usd >= 0 and self.spending.reserved_usd >= 0):
                 raise RecordingError("no sweep can have spent that")
@@ -290,7 +290,7 @@ class Ledger:
 
     def _write(self, spending: Spending) -> None:
         self.spending = spending
-        self._cache.replace_twice(self._name, _SPENDING.dump_json(spending).decode())
+        self._cache.replace_checked(self._name, _SPENDING.dump_json(spending).decode())
 
 
 def _begun(number: int) -> Attempt:

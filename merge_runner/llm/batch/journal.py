@@ -93,14 +93,14 @@ class Journal:
     def batch(self, mark: str) -> OpenBatch | None:
         """An open batch; None where there is none. A damaged row is none."""
         try:
-            text = self._cache.read_twice(_BATCH + mark)
+            text = self._cache.read_checked(_BATCH + mark)
             return None if text is None else _OPEN_BATCH.validate_json(text)
         except (RecordingError, ValidationError):
             return None
 
     def batches(self) -> list[OpenBatch]:
         """All open batches, the oldest first."""
-        marks = (name.removeprefix(_BATCH) for name in self._cache.names_kept_twice(_BATCH))
+        marks = (name.removeprefix(_BATCH) for name in self._cache.names(_BATCH))
         found = [batch for batch in map(self.batch, marks) if batch is not None]
         return sorted(found, key=lambda batch: batch.submitted_at)
 
@@ -132,7 +132,7 @@ class Journal:
                 line = OpenLine(batch.mark, attempts[key])
                 self._cache.replace(_LINE + key, _OPEN_LINE.dump_json(line).decode())
             for mark in instead_of:
-                self._cache.remove_twice(_BATCH + mark)
+                self._cache.remove(_BATCH + mark)
             if begun:
                 self._write(taken)
             return taken
@@ -161,7 +161,7 @@ class Journal:
                     self._cache.remove(_LINE + key)
             for batch in self.batches():
                 if not self.waiting(batch):
-                    self._cache.remove_twice(_BATCH + batch.mark)
+                    self._cache.remove(_BATCH + batch.mark)
                     if batch.sure:
                         times[batch.batch_id] = batch.submitted_at
             recent = {each: at for each, at in times.items() if at >= oldest}
@@ -187,7 +187,7 @@ class Journal:
             return True  # whoever asks for the call will set what is damaged aside
 
     def _write(self, batch: OpenBatch) -> None:
-        self._cache.replace_twice(_BATCH + batch.mark, _OPEN_BATCH.dump_json(batch).decode())
+        self._cache.replace_checked(_BATCH + batch.mark, _OPEN_BATCH.dump_json(batch).decode())
 
 
 def now() -> str:
