@@ -9,10 +9,10 @@ import json
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -314,34 +314,25 @@ def _serve(db: Path, port: int, reader: str | None) -> None:
 def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[str]) -> None:
     from analysis.explorer.export import export_folder, export_page
 
-    if file is not None:
-        refuse_another_kind(file, HTML, "page of HTML")
     try:
-        for path in export_folder(db, folder, wanted, _watched) if folder is not None else ():
-            say(f"wrote {path}")
-        for path in export_page(db, file, wanted, _watched) if file is not None else ():
-            say(f"wrote {path}")
+        if folder is not None:
+            index = export_folder(db, folder, wanted, _told_now_and_then())
+            say(f"open {index}, or send the folder {folder}")
+        if file is not None:
+            say(f"wrote {export_page(db, file, wanted)}")
     except KeyboardInterrupt:
         say("interrupted: run the same command again")
         sys.exit(INTERRUPTED)
-    if folder is not None:
-        say(f"open {folder / 'index.html'}, or send the folder {folder}")
 
 
-def _watched(things: Sequence[Any], name: str) -> Iterable[Any]:
-    """Show how far a loop is: on a terminal as a bar, else in a line now and then."""
-    from rich.console import Console
-    from rich.progress import track
+def _told_now_and_then() -> Callable[[int], None]:
+    """Return what says the number of pages so far, now and then."""
+    said = time.monotonic()
 
-    if sys.stderr.isatty():
-        return track(things, name, console=Console(stderr=True), transient=True)
-    return _told(things, name)
+    def told(pages: int) -> None:
+        nonlocal said
+        if time.monotonic() - said >= TOLD_EVERY_S:
+            say(f"{pages} pages so far")
+            said = time.monotonic()
 
-
-def _told(things: Sequence[Any], name: str) -> Iterator[Any]:
-    told = time.monotonic()
-    for done, thing in enumerate(things):
-        if time.monotonic() - told >= TOLD_EVERY_S:
-            say(f"{name}: {100 * done // len(things)} %")
-            told = time.monotonic()
-        yield thing
+    return told

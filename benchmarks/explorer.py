@@ -4,9 +4,6 @@
 medians in ms, from a request of a keep-alive client to the end of the page: ``list_ms`` of the list
 of trials, ``filtered_ms`` of its third page in one condition, sorted by gap, and ``trial_ms`` of
 trials with a decision shown.
-
-An export is the whole program, of a study of which no table has been made; ``size_mb`` is what its
-folder takes.
 """
 
 from __future__ import annotations
@@ -18,8 +15,8 @@ from statistics import median
 
 import httpx
 
-from benchmarks.cases import Bench, Figures, figures_of, study_of
-from benchmarks.processes import PROGRAM, PYTHON, run, serving
+from benchmarks.cases import Bench, Figures, study_of
+from benchmarks.processes import PROGRAM, PYTHON, serving
 from merge_runner.results.store import query
 
 ASKED, TIMEOUT_S, POLL_S = 20, 60.0, 0.05
@@ -59,18 +56,6 @@ def explorer_floor(bench: Bench) -> Figures:
         return {
             f"{name}_ms": _ask(client, [name] * ASKED)[0] for name in ("list", "filtered", "trial")
         }
-
-
-def export(trials: int) -> Callable[[Bench], Figures]:
-    """A study as a folder of pages."""
-
-    def measure(bench: Bench) -> Figures:
-        db, folder = study_of(bench, trials, anew=True), bench.fresh("exported")
-        ran = run([*PROGRAM, "view", "--db", str(db), "--export", str(folder)])
-        size = sum(path.stat().st_size for path in folder.iterdir())
-        return {**figures_of(ran, calls=0), "size_mb": size / 1e6}
-
-    return measure
 
 
 @contextmanager

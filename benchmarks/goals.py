@@ -212,18 +212,6 @@ GOALS = (
         unit="ms",
     ),
     Goal(
-        "export of 11,000 trials, cold",
-        90,
-        lambda m: m("export of 11,000", "wall_s"),
-        unit="s",
-    ),
-    Goal(
-        "export of 11,000 trials: its folder",
-        100,
-        lambda m: m("export of 11,000", "size_mb"),
-        unit="MB",
-    ),
-    Goal(
         "soak: answered calls asked again",
         0,
         lambda m: m("soak of 10,000", "answered_asked_again"),

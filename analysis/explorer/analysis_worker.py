@@ -43,7 +43,7 @@ class Numbers:
 
         Where no table has the cell, the answer says so as ``absent``.
 
-        ``study``, which reads it, ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``cells NAME...``,
+        ``study``, which reads it, ``tables NAME...``, ``cell TABLE ROW COLUMN``,
         ``figure NAME``, or ``home FACTOR`` with an empty factor for drivers and prompts; what
         follows the last is ignored. Raises MergeRunnerError.
         """
@@ -57,8 +57,6 @@ class Numbers:
                 return self._tables(names)
             case ["cell", table, row, column]:
                 return self._cell(table, row, column)
-            case ["cells", *names]:
-                return self._counted() | self._cells(names)
             case ["home", factor, *_]:
                 return self._counted() | home_panels(self.study, factor)
             case ["figure", name]:
@@ -129,29 +127,6 @@ class Numbers:
                 for source in sources_of(self.study, table, row, column)
             ],
         }
-
-    def _cells(self, names: Sequence[str]) -> dict[str, Any]:
-        """The trials behind every number of some tables.
-
-        ``sets`` are lists of (trial, spec), ``cells`` has the number of one by TABLE/ROW:COLUMN.
-        """
-        from analysis.explain import sources_of
-
-        sets: dict[tuple[tuple[str, str], ...], int] = {}
-        cells = {}
-        for name, table in self._finished(names).items():
-            for row in table.rows:
-                for column in table.columns:
-                    if column.kind == "text" or row.values.get(column.name) is None:
-                        continue
-                    behind = tuple(
-                        key
-                        for source in sources_of(self.study, table, row, column)
-                        for key in self._keys(source)
-                    )
-                    if behind:
-                        cells[f"{name}/{row.id}:{column.name}"] = sets.setdefault(behind, len(sets))
-        return {"cells": cells, "sets": list(sets)}
 
     def _figure(self, name: str) -> str:
         from analysis.figures.gallery import rendered

@@ -27,8 +27,8 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from analysis.explorer.assets import STATIC
-from analysis.explorer.export import page_of_trials
 from analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
+from analysis.explorer.offline import page_of_trials
 from analysis.explorer.pages import (
     ablations,
     comparing,
@@ -121,9 +121,8 @@ def _trial_routes(site: Site) -> list[Route]:
         if asked.get("as") != "page":
             return trial.trial_page(site, named, asked)
         rows = [trial.find(site, named, asked), comparing.named(site, asked.get("compare", ""))]
-        file = f"{FILE_NAME.sub('-', named)}.html"
-        page = page_of_trials(site, [row for row in rows if row is not None], file)
-        return _download(page, "text/html", file)
+        page = page_of_trials(site, [row for row in rows if row is not None])
+        return _download(page, "text/html", f"{FILE_NAME.sub('-', named)}.html")
 
     def fragment(request: Request) -> str:
         return trial.decision_fragment(site, request.path_params["trial"], request.query_params)

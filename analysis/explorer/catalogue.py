@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
@@ -352,6 +353,16 @@ class Catalogue:
             self._name_replayed()
             self._memory.execute(GROUPED)
             return not self.held
+
+    def keep(self, numbers: Sequence[int]) -> None:
+        """List no trials but those with these numbers."""
+        with self._lock:
+            for table in ("listed", "levels"):
+                self._memory.execute(
+                    f"DELETE FROM {table} WHERE number NOT IN (SELECT unnest(?))",  # noqa: S608 # constants
+                    [numbers],
+                )
+            self._memory.execute(GROUPED)
 
     def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
         """Each facet's values with how many trials they would leave, the other facets as wanted."""

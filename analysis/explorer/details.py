@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,18 +15,13 @@ from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.drivers.registry import unresponsive
 from merge_runner.records import SIDES, Side
 
-# One trial, or all of some lists, of a table; by the numbers of their rows, since else what is long
-# is read of all, to find a few.
 ONE = "WHERE trial_id = $trial AND spec_hash = $spec"
-MANY = """WHERE rowid IN (SELECT rowid FROM {table} SEMI JOIN (
-    SELECT unnest($trials::VARCHAR[]) AS trial_id, unnest($specs::VARCHAR[]) AS spec_hash
-) USING (trial_id, spec_hash))"""
-STATES = """
+STATES = f"""
 SELECT trial_id, spec_hash, side, list(time_s ORDER BY step) AS time_s,
     list(position_m ORDER BY step) AS position_m, list(velocity_mps ORDER BY step) AS velocity_mps,
     list(acceleration_mps2 ORDER BY step) AS acceleration_mps2
-FROM states {which} GROUP BY ALL
-"""
+FROM states {ONE} GROUP BY ALL
+"""  # noqa: S608 # constants
 # Where a call got no answer the trial ended, and what the other driver decided is never driven.
 DECISIONS = f"""
 SELECT decision, time_s, side, valid, failure, tactical, plan, applied, fallback, rationale,
@@ -37,24 +32,16 @@ SELECT DISTINCT decision, side, false AS valid, false AS fallback, true AS lost
 FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) {ONE}
 ORDER BY decision, side
 """  # noqa: S608 # constants
-TASKS = """
+TASKS = f"""
 SELECT trial_id, spec_hash, source, spec
-FROM (FROM trials {which}) LEFT JOIN specs USING (spec_hash)
-"""
-# What is known of a decision that was never made.
-UNDECIDED = dict.fromkeys(
-    ("time_s", "failure", "tactical", "plan", "applied", "rationale"), None
-) | {"valid": False, "fallback": False}
+FROM (FROM trials {ONE}) LEFT JOIN specs USING (spec_hash)
+"""  # noqa: S608 # constants
 # Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz.
 HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
 DECIDED = "SELECT * FROM decisions {which} ORDER BY decision, side"
 ATTEMPTS = "SELECT * FROM calls {which} ORDER BY decision, side, attempt"
-WHOLE = {TASKS: "trials", STATES: "states", DECIDED: "decisions", ATTEMPTS: "calls"}
 # One decision, of those with the one before it.
 NUMBERED = f"{ONE} AND side = $side AND decision IN ($number, $number - $before)"
-
-
-Key = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,36 +86,19 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     """Read a trial that is known to be there."""
     key = {"trial": trial_id, "spec": spec_hash}
     with reading(db) as connection:
-        states = records(connection, STATES.format(which=ONE), key)
+        states = records(connection, STATES, key)
         decisions = records(connection, DECISIONS, key)
-        (task,) = records(connection, TASKS.format(which=ONE), key)
+        (task,) = records(connection, TASKS, key)
     return _trial(task, states, decisions)
 
 
-def read_whole(
-    db: Path, keys: Sequence[Key]
-) -> Iterator[tuple[Trial, dict[tuple[str, int], Decision]]]:
-    """Read trials that are known to be there, each with its decisions by side and number.
-
-    In as many queries as for one: what these have found is in memory at once.
-    """
-    wanted = {"trials": [trial for trial, _ in keys], "specs": [spec for _, spec in keys]}
+def read_whole(db: Path, trial_id: str, spec_hash: str) -> dict[tuple[str, int], Decision]:
+    """Read all decisions of a trial that is known to be there, by side and number."""
+    key = {"trial": trial_id, "spec": spec_hash}
     with reading(db) as connection:
-        tasks, states, decided, attempts = (
-            _by_trial(records(connection, sql.format(which=MANY.format(table=table)), wanted))
-            for sql, table in WHOLE.items()
-        )
-    for key in keys:
-        decisions = _decisions(decided.get(key, []), attempts.get(key, []))
-        listed = [{**UNDECIDED, **one.row} for one in decisions.values()]
-        yield _trial(tasks[key][0], states.get(key, []), listed), decisions
-
-
-def _by_trial(rows: list[Row]) -> dict[Key, list[Row]]:
-    found: dict[Key, list[Row]] = {}
-    for row in rows:
-        found.setdefault((row["trial_id"], row["spec_hash"]), []).append(row)
-    return found
+        rows = records(connection, DECIDED.format(which=ONE), key)
+        attempts = records(connection, ATTEMPTS.format(which=ONE), key)
+    return _decisions(rows, attempts)
 
 
 def _trial(task: Row, states: list[Row], decisions: list[Row]) -> Trial:

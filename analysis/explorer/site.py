@@ -6,10 +6,8 @@ import contextlib
 import hashlib
 import shlex
 import threading
-from collections.abc import Iterator, MutableMapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import jinja2
 
@@ -22,7 +20,7 @@ from analysis.explorer.glossary import sections
 from analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
 from analysis.explorer.query_process import Sandbox
 from analysis.explorer.search import Words
-from analysis.explorer.urls import HOME, Links, StaticLinks
+from analysis.explorer.urls import HOME, Links
 from analysis.explorer.views import clock, condition_text
 from analysis.metrics import METRICS
 from merge_runner.errors import MergeRunnerError
@@ -39,23 +37,6 @@ PAGES = {
     "Ablations": "ablations",
     "SQL": "sql",
 }
-
-
-OF_DICTS = frozenset(dir(dict))
-
-
-class _Environment(jinja2.Environment):
-    """Templates, quicker in what pages do most: a page of a trial asks for thousands of values."""
-
-    def getattr(self, obj: object, attribute: str) -> object:
-        """An entry of a row at once: Jinja tries attributes first, each with an exception."""
-        if type(obj) is dict and attribute in obj and attribute not in OF_DICTS:
-            return obj[attribute]
-        return super().getattr(obj, attribute)
-
-    def make_globals(self, d: MutableMapping[str, Any] | None) -> MutableMapping[str, Any]:
-        """What all templates see, as it is: Jinja looks it up through a chain of two."""
-        return super().make_globals(d) if d else self.globals
 
 
 class NotThere(Exception):
@@ -76,7 +57,7 @@ def news_of(shown: object, seen: str, state: str = "all") -> str:
 
 @dataclass
 class Site:
-    """The explorer of one database; pages with static links stand alone, without a server."""
+    """The explorer of one database."""
 
     db: Path
     at: Links = field(default_factory=Links)
@@ -84,11 +65,8 @@ class Site:
     """What to type to run this program."""
     reader: str = "reader"
     """Who writes notes."""
-    shared: dict[str, object] = field(default_factory=dict)
-    """What else all templates see."""
 
     def __post_init__(self) -> None:
-        self.static = isinstance(self.at, StaticLinks)
         self._first_reading: threading.Thread | None = None
         self._conditions: dict[str, str] = {}
         self.catalogue = Catalogue(self.db)
@@ -96,7 +74,7 @@ class Site:
         self.computing = Computing(self.db)
         self.words = Words(self.catalogue)
         self.notes = Notes(self.db, self.reader)
-        self._environment = _Environment(
+        self._environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(TEMPLATES),
             autoescape=True,
             auto_reload=False,
@@ -111,19 +89,16 @@ class Site:
             metrics=METRICS,
             notes=self.notes,
             note_limits={"text": LONGEST_TEXT, "tags": MOST_TAGS * (LONGEST_TAG + 2)},
-            pages={name: page for name, page in PAGES.items() if self.at.to(page)},
+            pages=PAGES,
             share=self.share,
             program=self.program,
-            shell="static.html" if self.static else "base.html",
-            static=self.static,
             styles=STYLES,
-            study=self.db.name if self.static else str(self.db),
+            study=str(self.db),
             visible=visible,
             clock=clock,
             condition_text=condition_text,
             in_words=self.in_words,
             glossary=sections(),
-            **self.shared,
         )
 
     def begin(self) -> None:
@@ -160,13 +135,9 @@ class Site:
         return shlex.join([self.program, "view", *db, *options])
 
     def render(self, template: str, **values: object) -> str:
-        """A page, or a part of one."""
-        return "".join(self.pieces(template, **values))
-
-    def pieces(self, template: str, **values: object) -> Iterator[str]:
-        """The same as texts one after another: those of the template, and the values in it."""
-        held = self.catalogue.held
-        return self._environment.get_template(template).generate({"held": held, **values})
+        """Return a page, or a part of one."""
+        found = self._environment.get_template(template)
+        return found.render({"held": self.catalogue.held, **values})
 
     def close(self) -> None:
         """Leave nothing behind."""

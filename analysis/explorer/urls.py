@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 from urllib.parse import quote, urlencode
 
-# What an address may spell in another way.
-_ODD = re.compile(r"[^A-Za-z0-9_.-]")
 # Without exponents and names: float() also reads "1e999" and "nan".
 _SECONDS = re.compile(r"[0-9]{1,12}(\.[0-9]{1,6})?")
 
@@ -18,7 +16,7 @@ HOME = "index"
 
 
 class Links:
-    """Addresses of the pages as a server gives them."""
+    """Addresses of the pages."""
 
     def to(self, name: str, /, **state: object) -> str:
         """A page of its own: ``trials``, ``sql``."""
@@ -72,85 +70,6 @@ class Links:
     def static(self, name: str) -> str:
         """A script or a style."""
         return f"/static/{name}"
-
-
-# The pages that the export of a whole study has beside the trials, each as a file of this name.
-EXPORTED = (*(HOME, "sweeps", "trials", "words", "notes", "tables", "ablations", "glossary"),)
-
-
-class StaticLinks(Links):
-    """Addresses of an exported study: files beside each other, a page of trials a condition.
-
-    ``pages`` are those that there are; ``alone`` is the only file. ``behind`` gets the cells whose
-    trials the list knows, ``figures`` those that are drawn.
-    """
-
-    def __init__(self, pages: Collection[str] = EXPORTED, alone: str = "") -> None:
-        self.pages = () if alone else pages
-        self.alone = alone
-        self.behind: Collection[str] = ()
-        self.figures: Collection[str] = ()
-
-    def to(self, name: str, /, **state: object) -> str:
-        """A page, or nothing where only a server has it; grouped otherwise it is another file."""
-        if name not in self.pages:
-            return ""
-        return f"{name}{_grouped(state)}.html" + query_of(state)
-
-    def trial(self, row: Mapping[str, Any], **state: object) -> str:
-        """A trial on the page of its condition."""
-        named = {"trial": row["trial_id"], "spec": row["spec_hash"], **state}
-        return (quote(self.alone) or bundle_name(row["condition"])) + query_of(named)
-
-    def decision(self, row: Mapping[str, Any], side: str, number: int) -> str:
-        """Nothing: the page has it."""
-        return ""
-
-    def others(self, row: Mapping[str, Any]) -> str:
-        """Nothing: a page lays its own trials beside each other."""
-        return ""
-
-    def raw(self, row: Mapping[str, Any], side: str, number: int) -> str:
-        """Nothing: no server has it."""
-        return ""
-
-    def table(self, name: str, **state: object) -> str:
-        """A table of the analysis."""
-        return f"table-{name}.html"
-
-    def table_file(self, name: str, suffix: str) -> str:
-        """A table as a file beside the pages."""
-        return f"table-{name}.{suffix}"
-
-    def figure(self, name: str) -> str:
-        """A figure as a file beside the pages, if it could be drawn."""
-        return f"{name}.svg" if name in self.figures else ""
-
-    def cell(self, table: str, row: str, column: str) -> str:
-        """The trials behind a cell, where there are any."""
-        known = f"{table}/{row}:{column}" in self.behind
-        return super().cell(table, row, column) if known else ""
-
-    def sweep(self, sweep_id: str) -> str:
-        """A sweep's page: a file, whose name means the same in an address."""
-        return f"sweep-{_ODD.sub('_', sweep_id)}.html"
-
-    def condition(self, name: str, **state: object) -> str:
-        """All trials of a condition in one picture, or nothing where only trials are exported."""
-        if HOME not in self.pages:
-            return ""
-        return f"condition{_grouped(state)}-{_ODD.sub('_', name)}.html" + query_of(state)
-
-
-def _grouped(state: dict[str, object]) -> str:
-    """What the name of an exported page says of its grouping, which is taken out of its state."""
-    by = str(state.pop("by", ""))
-    return f"-by-{_ODD.sub('_', by)}" if by else ""
-
-
-def bundle_name(condition: str) -> str:
-    """The file with the trials of a condition."""
-    return f"trials-{condition}.html"
 
 
 def query_of(state: Mapping[str, Any]) -> str:

@@ -235,8 +235,7 @@ def main() -> None:
         db = made(Path(folder), kind)
         for _ in write_report(db, None, db.with_name("report.html"), db.with_name("files")):
             pass
-        for _ in export_folder(db, db.with_name("pages"), []):
-            pass
+        export_folder(db, db.with_name("pages"))
         sys.stdout.write(f"{db.parent}: {KINDS[kind].__doc__}\n")
 
 

@@ -59,9 +59,13 @@ def test_a_page_fits_its_window_and_axe_finds_nothing_serious(page, address):
 
 @pytest.mark.long
 def test_exported_pages_fit_and_axe_finds_nothing_serious(page, exported):
-    for path in sorted(exported.glob("*.html")):
+    one = ("index", "trials", "trials-emulator-baseline-N_0_0-rep01", "conditions-N_0_0", "notes",
+           "sweeps", "tables", "tables-attempts", "ablations", "glossary")  # fmt: skip
+    for path in sorted(exported.rglob("*.html")):
+        if path.stem not in one:
+            continue
         page.goto(f"file://{path}")
-        if path.name.startswith("trials-"):
+        if "rep01" in path.name:
             expect(page.locator("#charts .uplot")).to_have_count(3)
         assert (path.name, findings(page)) == (path.name, [])
 

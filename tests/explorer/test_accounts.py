@@ -13,12 +13,10 @@ from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.export import export_folder
 from analysis.explorer.site import Site
 from merge_runner.results.store import Store
 from tests.analysis.accounts.crashes import CLOSING_IN, EXAMPLES, drive
 from tests.analysis.studies import as_humans, played, write_study
-from tests.explorer.packed import unpacked
 
 HOST = "127.0.0.1:8700"
 
@@ -149,12 +147,3 @@ def test_a_replay_is_given_its_marks(client):
         {"t": 1.6, "side": "left", "kind": "last chance", "text": "last moment to brake"},
         {"t": 2.0, "side": "right", "kind": "last chance", "text": "last moment to brake"},
     ]
-
-
-def test_an_exported_list_is_filtered_by_account_too(db, tmp_path):
-    pages = {path.name: path for path in export_folder(db, tmp_path / "pages", ["*"])}
-    text = pages["trials.html"].read_text(encoding="utf-8")
-    assert '<option value="one too little">one too little (1)</option>' in text
-    listed = re.search(r'id="packed-list">(.*?)</script>', text, re.DOTALL)[1]
-    accounts = unpacked(json.loads(listed)["index"])["levels"]["account"]
-    assert accounts["of"].count(accounts["values"].index("one too little")) == 1

@@ -10,13 +10,11 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import duckdb
 import pytest
-from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
-from analysis.explorer.export import export_folder
 from analysis.explorer.site import Site
-from analysis.explorer.urls import StaticLinks
+from tests.explorer.exporting import export_with_a_table
 
 HOST = "127.0.0.1:8700"
 
@@ -67,11 +65,6 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
     assert "<code>merge-runner sweep mine.toml --model cheap --model dear</code>" in stopped
 
 
-def test_the_exported_page_of_a_sweep_of_several_models_is_where_its_link_leads():
-    link = StaticLinks().sweep("mine-cheap,dear+sleepy-20261122T1324")
-    assert link == unquote(link) == "sweep-mine-cheap_dear_sleepy-20261122T1324.html"
-
-
 ASK = """
 import sys
 from pathlib import Path
@@ -102,40 +95,27 @@ def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(pla
 
 
 @pytest.mark.long
-def test_an_exported_list_filters_by_factor(played, tmp_path, browser):
-    list(export_folder(played.db, tmp_path / "out", ["cheap*"]))
-    page = browser.new_page()
-    page.goto(f"file://{tmp_path}/out/trials.html?factor.temperature=0.2")
-    expect(page.locator("#listed")).to_have_text("12")
-    page.select_option("[name='factor.opponent']", "sleepy")
-    expect(page.locator("#listed")).to_have_text("6")
-    page.close()
-
-
-@pytest.mark.long
-def test_an_exported_study_answers_by_any_factor(played, tmp_path, monkeypatch):
-    monkeypatch.setattr("analysis.explorer.export.TABLES", ["attempts"])
-    pages = {path.name: path.read_text() for path in export_folder(played.db, tmp_path / "o", [])}
-    grouped = [name for name in pages if name.startswith("index")]
-    assert grouped == [
-        *("index.html", "index-by-prompt.html"),
-        *(f"index-by-{name}.html" for name in ("model", "opponent", "temperature")),
-    ]
+def test_an_exported_study_answers_by_any_factor(played, tmp_path):
+    files = export_with_a_table(played.db, tmp_path / "o")
+    pages = {path.name: path.read_text() for path in files.glob("*.html")}
+    grouped = {f"by-{name}.html" for name in ("prompt", "model", "opponent", "temperature")}
+    assert grouped < pages.keys()
     for name in grouped:
         (ways,) = re.findall(r'<p class="groups">(.*?)</p>', pages[name])
-        assert set(re.findall(r'href="([^"]*)"', ways)) == {*grouped} - {name}
-    heads = pages["index-by-temperature.html"].split('id="collisions"')[1].split("</thead>")[0]
+        assert set(re.findall(r'href="([^"]*)"', ways)) == {"../index.html", *grouped} - {name}
+    text = pages["by-temperature.html"]
+    heads = text.split('id="collisions"')[1].split("</thead>")[0]
     levels = [head.strip() for head in re.findall(r'<th scope="col">([^<]*)<', heads)]
     assert {"0.2", "1.0"} < {*levels}
-    assert "The left vehicle merging first" in pages["index-by-temperature.html"]
-    assert 'aria-label="0.2, N_0_0:' in pages["index-by-temperature.html"]
-    assert 'href="trials.html?condition=N_0_0&amp;outcome=' in pages["index-by-temperature.html"]
+    assert "The left vehicle merging first" in text
+    assert "0.2, N_0_0:" in text
+    (sweep,) = (name for name in pages if name.startswith("sweeps-"))
+    assert unquote(sweep) == sweep
+    lists = set(re.findall(r'href="(trials-[^"]*factor[^"]*)"', text))
+    assert lists
+    assert lists < pages.keys()
     # Pairs of two different drivers were played: a condition has a page for each view of them.
-    views = {
-        "condition-N_0_0.html",
-        "condition-by-side-N_0_0.html",
-        "condition-by-driver-N_0_0.html",
-    }
+    views = {f"conditions-N_0_0{by}.html" for by in ("", "-by-side", "-by-driver")}
     assert views < pages.keys()
-    (ways,) = re.findall(r'<p class="groups">(.*?)</p>', pages["condition-by-side-N_0_0.html"])
-    assert set(re.findall(r'href="([^"]*)"', ways)) == views - {"condition-by-side-N_0_0.html"}
+    (ways,) = re.findall(r'<p class="groups">(.*?)</p>', pages["conditions-N_0_0-by-side.html"])
+    assert set(re.findall(r'href="([^"]*)"', ways)) == views - {"conditions-N_0_0-by-side.html"}

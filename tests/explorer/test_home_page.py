@@ -25,7 +25,6 @@ from analysis.explorer.pages.home import Played, account_rows, home_page
 from analysis.explorer.pages.tables import FIGURES
 from analysis.explorer.site import NothingNew, Site
 from analysis.explorer.task_picture import task_picture
-from analysis.explorer.urls import StaticLinks
 from analysis.figures.gallery import FIGURES as DRAWN
 from analysis.figures.styles import COLOURS
 from analysis.metrics import shown_in
@@ -195,19 +194,6 @@ def test_the_strip_says_what_to_type_and_nothing_twice(db, tmp_path):
     assert (
         "the database holds only" in client.get(again).text or "Finished" in client.get(again).text
     )
-    site.computing.close()
-
-
-def test_an_exported_study_begins_with_it_and_says_nothing_of_runs(db):
-    site = Site(db, StaticLinks(), shared={"inlined": None})
-    site.catalogue.refresh()
-    assert site.at.to("index") == "index.html"
-    site.computing = Computing(db, Never)
-    site._environment.globals["shell"] = "base.html"
-    text = home_page(site, {})
-    assert "Do they drive like humans?" in text
-    assert 'id="strip"' not in text
-    assert "trials.html?condition=" in text
     site.computing.close()
 
 

@@ -11,10 +11,10 @@ from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
 from analysis.explorer.catalogue import Filter
-from analysis.explorer.export import export_folder
 from analysis.explorer.pictures import sparkline, speed_range
 from analysis.explorer.site import Site
 from tests.analysis.studies import Drive, as_humans, write_study, yielding
+from tests.explorer.exporting import export
 
 HOST = "127.0.0.1:8700"
 HIDDEN = "o3\u202egpj\u200b"
@@ -122,9 +122,15 @@ def test_a_name_that_hides_something_is_neutral_where_it_is_found_to_compare_wit
 
 
 @pytest.mark.slow
-def test_a_name_that_hides_something_is_neutral_in_an_export(db, tmp_path):
-    list(export_folder(db, tmp_path / "pages", ["*"]))
-    for page in tmp_path.glob("pages/*.html"):
+def test_a_name_that_hides_something_is_neutral_on_every_page_of_an_export(
+    db, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("analysis.explorer.catalogue.PAGE", 7)
+    monkeypatch.setattr("analysis.explorer.pages.trials.PAGE", 7)
+    files = export(db, tmp_path / "pages", ["*"])
+    assert len([*files.glob("trials-page-*.html")]) == 2
+    for page in tmp_path.glob("pages/**/*.html"):
         said = Texts(page.read_text()).said
         assert not any({"\u202e", "\u200b"} & set(text) for text in said)
-    assert "o3[U+202E]gpj[U+200B]" in (tmp_path / "pages" / "trials.html").read_text()
+    lists = [(tmp_path / "pages/index.html"), *files.glob("trials-page-*.html")]
+    assert sum("o3[U+202E]gpj[U+200B]" in page.read_text() for page in lists) == 1

@@ -14,11 +14,11 @@ from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import MOST_NOTED, explorer
-from analysis.explorer.export import export_folder
 from analysis.explorer.notes import LONGEST_NAME, LONGEST_TEXT, Notes, reader_of
 from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
 from tests.explorer.axe import serious
+from tests.explorer.exporting import export, export_with_a_table
 from tests.explorer.hostile import HOSTILE
 from tests.explorer.serving import served
 from tests.explorer.test_listing import HOST, Texts
@@ -260,23 +260,29 @@ def test_notes_are_written_from_the_keyboard(page, db):
 
 
 @pytest.mark.long
-def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(
-    page, db, tmp_path, monkeypatch
-):
+def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(page, db, tmp_path):
     client = asking(db)
     noted(client, text="It hesitates.", tags="late", side="left", decision="1")
-    noted(asking(db, "ben"), trial="emulator/baseline/L_4_0/rep01", text="not exported")
-    list(export_folder(db, tmp_path / "pages", ["emulator/baseline/N_0_0/*"]))
-    page.goto(f"file://{tmp_path}/pages/notes.html")
-    expect(page.locator(".all-notes tbody tr")).to_have_count(1)
-    page.locator(".all-notes tbody a").click()
+    other = "emulator/baseline/L_4_0/rep01"
+    noted(asking(db, "ben"), trial=other, text="not of these trials")
+    files = export_with_a_table(db, tmp_path / "pages")
+    page.goto(f"file://{files}/notes.html")
+    expect(page.locator(".all-notes tbody tr")).to_have_count(2)
+    expect(page.locator("button", has_text="withdraw")).to_have_count(0)
+    page.locator(".all-notes tbody a").last.click()
     expect(page.locator("#noted")).to_contain_text("It hesitates.")
     expect(page.locator("#note")).to_have_count(0)
-    (line,) = csv.DictReader((tmp_path / "pages" / "notes.csv").open())
-    assert (line["text"], line["trial_id"]) == ("It hesitates.", "emulator/baseline/N_0_0/rep01")
-    page.goto(f"file://{tmp_path}/pages/trials.html?tag=late")
-    expect(page.locator("tbody tr:visible")).to_have_count(1)
+    lines = csv.DictReader((files / "notes.csv").open())
+    assert [(line["text"], line["trial_id"]) for line in lines] == [
+        ("It hesitates.", "emulator/baseline/N_0_0/rep01"),
+        ("not of these trials", other),
+    ]
+    files = export(db, tmp_path / "few", ["emulator/baseline/N_0_0/*"])
+    pages = {path.name: path.read_text() for path in files.glob("*.html")}
+    assert "It hesitates." in pages["trials-emulator-baseline-N_0_0-rep01.html"]
+    assert "not of these trials" not in "".join(pages.values())
+    assert "notes.html" not in pages
     noted(client, text="sk-proj-abcdefghijklmnop0123")
     with pytest.raises(UsageError, match="looks like a key"):
-        list(export_folder(db, tmp_path / "more", ["emulator/baseline/N_0_0/*"]))
+        export(db, tmp_path / "more", ["emulator/baseline/N_0_0/*"])
     assert not (tmp_path / "more").exists()

@@ -11,7 +11,6 @@ from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
-from analysis.explorer.export import export_folder
 from analysis.explorer.search import PAGE
 from analysis.explorer.site import Site
 from tests.analysis.studies import Drive, Said, write_study
@@ -188,23 +187,3 @@ def test_words_are_searched_from_the_keyboard_and_lead_to_the_decision(page):
     page.keyboard.press("Enter")
     expect(page.locator(".decision-panel")).to_contain_text("<script>document.title='owned'")
     assert "owned" not in page.title()
-
-
-@pytest.mark.long
-def test_an_exported_study_finds_the_same_in_the_browser(page, db, tmp_path, client):
-    list(export_folder(db, tmp_path / "pages", ["*"]))
-    page.context.set_offline(True)
-    page.goto(f"file://{tmp_path}/pages/words.html")
-    for query in ("brake", '"collision course"', "BRAK", "STRAßE", '"gap is small"', "nothing"):
-        page.locator("#search").fill(query)
-        expect(page.locator("#totals")).to_contain_text(f"{len(found(client, q=query))} decisions")
-    page.locator("#search").fill("brake course")
-    assert page.locator("mark").all_text_contents() == ["course", "brake"]
-    mark = "it => getComputedStyle(it, '::before').content"
-    assert page.locator(".hits .outcome").evaluate(mark) not in {"none", "normal"}
-    page.get_by_label("change of mind").select_option("M to Y")
-    expect(page.locator(".hits tbody tr")).to_have_count(1)
-    page.reload()
-    assert serious(page) == []
-    page.locator(".hits a").click()
-    expect(page.locator(".decision-panel")).to_contain_text("collision course")

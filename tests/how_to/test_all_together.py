@@ -69,7 +69,7 @@ async def test_one_of_each_kind_goes_through_every_command(run, tmp_path):
         ("view", "--export", "pages"),
     ):
         await run(*command)
-    assert "talker-1" in (tmp_path / "pages/trials.html").read_text()
+    assert "talker-1" in (tmp_path / "pages/files/trials.html").read_text()
     report = (tmp_path / "report.html").read_text()
     for name in ("talker-1 at ", "+impulsive", "A8", "mean |a|"):
         assert name in tables, name

@@ -88,9 +88,11 @@ def test_the_report_shows_and_tells_it(report):
 def test_the_exported_pages_show_it(study, installed):
     run = study.run("view", "--export", "pages", **installed)
     assert run.code == 0, run.err
-    pages = {path.name: unescape(path.read_text()) for path in study.folder.glob("pages/*.html")}
+    pages = {
+        path.name: unescape(path.read_text()) for path in study.folder.glob("pages/files/*.html")
+    }
     assert HEADING in pages["ablations.html"]
-    assert all(HEADING in pages[f"table-{name}.html"] for name in ("indicators", "contrasts"))
+    assert all(HEADING in pages[f"tables-{name}.html"] for name in ("indicators", "contrasts"))
 
 
 @pytest.mark.slow

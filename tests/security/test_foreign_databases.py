@@ -14,11 +14,6 @@ def change(db, sql):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="2.6: the name of a condition is part of a path as it is",
-)
 @pytest.mark.parametrize("name", ["a/b", "../up"])
 async def test_no_name_of_a_condition_leads_out_of_the_folder_of_an_export(
     merge_runner, tmp_path, name

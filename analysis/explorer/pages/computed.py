@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
-from analysis.explorer.analysis_process import LONGEST_S, Request, Result, Waiting
+from analysis.explorer.analysis_process import Request, Result, Waiting
 from analysis.explorer.child import NoAnswer
 from analysis.explorer.site import NotThere, Site
 from analysis.explorer.urls import query_of, seconds
@@ -55,8 +55,6 @@ def computed(
 ) -> Computed:
     """Ask for something, and wait for it for a moment; raises NotThere where no table holds it."""
     state = site.catalogue.state()
-    if site.static:
-        wait_s = LONGEST_S  # a page that stands alone must hold the result
     since, failure = seconds(asked.get("since", "")), ""
     found: Result | Waiting | None = None
     try:

@@ -77,7 +77,7 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     wanted = Filter(condition=name, model=asked.get("model", ""), variant=asked.get("variant", ""))
     chosen = {key: value for key, value in wanted.chosen.items() if key != "condition"}
     alone = all(row["model"] == HUMAN for row in groups)
-    rows = _rows(site, wanted, with_humans=site.static or alone)
+    rows = _rows(site, wanted, with_humans=alone)
     if by == "driver":
         rows = [row for row in rows if _mixed(row["model"])]
     drawn = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from analysis.explorer.notes import Note, tags_of
 from analysis.explorer.pages.trial import find
@@ -15,26 +15,20 @@ from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.text_safety import csv_writer
 
-Trials = Collection[tuple[str, str]]
-"""Some trials, each as its name and its spec."""
 COLUMNS = ("at", "reader", "trial_id", "spec_hash", "side", "decision", "tags", "text")
 
 
-def notes_page(site: Site, among: Trials | None = None) -> str:
-    """All notes, the latest first, or those of some trials."""
-    shown = _notes(site, among)
-    return site.render(
-        "notes.html",
-        here="notes",
-        kept=site.notes.kept(),
-        shown=[(note, _address(site, note)) for note in reversed(shown)],
-    )
+def notes_page(site: Site) -> str:
+    """Return all notes, the latest first."""
+    kept = site.notes.kept()
+    shown = [(note, _address(site, note)) for note in reversed(kept.notes)]
+    return site.render("notes.html", here="notes", kept=kept, shown=shown)
 
 
-def notes_csv(site: Site, among: Trials | None = None) -> str:
-    """Return the notes of all trials or of some as CSV."""
+def notes_csv(site: Site) -> str:
+    """Return all notes as CSV."""
     lines = io.StringIO()
-    csv_writer(lines).writerows(map(csv_cell, row) for row in note_rows(_notes(site, among)))
+    csv_writer(lines).writerows(map(csv_cell, row) for row in note_rows(site.notes.kept().notes))
     return lines.getvalue()
 
 
@@ -65,7 +59,3 @@ def _address(site: Site, note: Note) -> str:
         return ""
     at = {} if note.decision is None else {"side": note.side, "decision": note.decision}
     return site.at.trial(row, **at)
-
-
-def _notes(site: Site, among: Trials | None) -> list[Note]:
-    return [note for note in site.notes.kept().notes if among is None or note.trial in among]

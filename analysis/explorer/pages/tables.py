@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from analysis.explorer.analysis_process import Request
@@ -55,8 +55,7 @@ FILE_WAIT_S = 300.0
 
 def tables_page(site: Site) -> str:
     """The list of all tables and figures."""
-    there = {name: text for name, text in FIGURES.items() if site.at.figure(name)}
-    return site.render("tables.html", here="tables", about=ABOUT, figures=there)
+    return site.render("tables.html", here="tables", about=ABOUT, figures=FIGURES)
 
 
 def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
@@ -66,27 +65,6 @@ def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
     form, kind = FILES[suffix]
     (text,) = awaited(site, ("tables", _named(name, TABLES, "table")))["tables"]
     return render([from_text(text)], form) + "\n", kind
-
-
-def table_files(site: Site, name: str) -> Iterator[tuple[str, str]]:
-    """A table's files by their names, for an export; nothing where its page says why not."""
-    found = computed(site, ("tables", name), {})
-    if found.result is None:
-        return
-    (text,) = found.result.content["tables"]
-    for suffix, (form, _) in FILES.items():
-        yield site.at.table_file(name, suffix), render([from_text(text)], form) + "\n"
-
-
-def figure_requests() -> list[Request]:
-    """What is asked for all figures."""
-    return [("figure", name) for name in FIGURES]
-
-
-def figures(site: Site) -> dict[str, str]:
-    """All figures by name, for an export, but those that cannot be drawn."""
-    found = {name: computed(site, (kind, name), {}).result for kind, name in figure_requests()}
-    return {name: result.content["svg"] for name, result in found.items() if result is not None}
 
 
 def figure_svg(site: Site, name: str) -> str:

@@ -11,7 +11,7 @@ from markupsafe import Markup, escape
 from analysis.accounts.account import Account
 from analysis.explorer import views
 from analysis.explorer.assets import REPLAY
-from analysis.explorer.details import Decision, Trial, read_decision, read_trial
+from analysis.explorer.details import Decision, Trial, read_decision, read_trial, read_whole
 from analysis.explorer.display_text import clamped, shortened
 from analysis.explorer.pictures import step_points
 from analysis.explorer.reading import Row
@@ -31,9 +31,13 @@ OFFERS = {
 
 
 def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
-    """A trial, with the decision that the address names."""
+    """Return a trial, with the decision that the address names.
+
+    With ``as=whole`` it has the panels of all of its decisions, and needs no server for them.
+    """
     row = find(site, trial_id, asked)
     trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
+    panels = whole_panels(site, row, trial) if asked.get("as") == "whole" else {}
     panel, number = "", whole(asked.get("decision", ""))
     if asked.get("side") in SIDES and number is not None:
         try:
@@ -46,7 +50,19 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
         **shown(site, row, trial),
         scripts=REPLAY,
         panel=Markup(panel),  # noqa: S704 # rendered by a template of ours, which escapes
+        panels=panels,
     )
+
+
+def whole_panels(site: Site, row: Row, trial: Trial) -> dict[str, Markup]:
+    """Return the panels of all decisions of a trial, by side and number."""
+    others = site.catalogue.others
+    return {
+        f"{side}/{number}": Markup(  # noqa: S704 # as above
+            site.render("_decision.html", **panel_values(site, row, trial, found, others))
+        )
+        for (side, number), found in read_whole(site.db, row["trial_id"], row["spec_hash"]).items()
+    }
 
 
 def shown(site: Site, row: Row, trial: Trial) -> dict[str, Any]:

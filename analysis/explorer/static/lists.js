@@ -3,11 +3,11 @@
 (() => {
   const rowsOf = (page) => [...page.querySelectorAll("[data-list] tbody tr:not([hidden])")];
   const leads = (row) => row.querySelector("a")?.href;
-  // The list of an export turns its pages by itself: no other page can ask it for the next one.
-  const turn = (page, rel) => (document.documentElement.dataset.static ? undefined : page.querySelector(`.paging a[rel=${rel}]`)?.href);
+  // A file cannot read another one.
+  const turn = (page, rel) => (location.protocol === "file:" ? undefined : page.querySelector(`.paging a[rel=${rel}]`)?.href);
   const kept = () => JSON.parse(sessionStorage.getItem("list") ?? "null");
   const keep = (list) => sessionStorage.setItem("list", JSON.stringify(list));
-  // An exported page holds many trials; a name may have several specs.
+  // A page without a server may hold several trials; a name may have several specs.
   const same = (one, other) => {
     const [a, b] = [one, other].map((text) => new URL(text));
     const spec = [a, b].map((url) => url.searchParams.get("spec"));
@@ -92,7 +92,7 @@
     return here(list) >= 0 ? list.address : document.getElementById("trial").dataset.back;
   };
   window.place = {
-    lead, back, restore,
+    lead, back,
     step: (by) => (document.getElementById("trial") ? go(by) : choose(chosen + by, true)),
   };
 })();

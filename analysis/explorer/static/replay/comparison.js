@@ -2,6 +2,7 @@
 // A second trial beside this one: found by its name, or offered.
 replay.comparison = (scene, { changed }) => {
   const at = (id) => document.getElementById(id);
+  if (!at("compare-form")) return { lay: async () => {} }; // of a page without a server
   const { close, field } = replay.finding(at("compare-form"));
   const say = (...words) => {
     at("ghost-key").hidden = words.length === 0;

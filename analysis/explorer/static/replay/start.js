@@ -1,6 +1,7 @@
 "use strict";
 // The replay of a trial: its parts, the keys, and the address, which tells the state.
-// Where panels and other trials come from; a page without a server has its own.
+// Where panels and other trials come from; a page without a server holds them.
+replay.held = (link, part) => part.querySelector(`template[data-of="${link.dataset.side}/${link.dataset.n}"]`)?.innerHTML;
 window.explorer ??= (() => {
   const answer = async (address) => {
     const reply = await fetch(address);
@@ -10,7 +11,7 @@ window.explorer ??= (() => {
   const other = async (asked) =>
     (await answer(`${document.getElementById("trial").dataset.others}&${new URLSearchParams(asked)}`)).json();
   return {
-    panel: async (link) => (await answer(link.dataset.panel)).text(),
+    panel: async (link) => replay.held(link, document) ?? (await answer(link.dataset.panel)).text(),
     data: (compare) => other({ compare }),
     search: (q) => other({ q }),
     offer: (offer) => other({ offer }),
@@ -118,7 +119,7 @@ window.startReplay = () => {
     if (clock.key(event)) event.preventDefault();
     else if (event.key === "]") step(1);
     else if (event.key === "[") step(-1);
-    else if (event.key === "c") { at("compare").focus(); event.preventDefault(); }
+    else if (event.key === "c" && at("compare")) { at("compare").focus(); event.preventDefault(); }
     else if (event.key === "Escape" && !free() && place.back()) location.href = place.back();
   });
 

@@ -1,0 +1,134 @@
+"""Pages as they open without a server: what needs one is left out, and links lead to files."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from html import escape, unescape
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from markupsafe import Markup
+
+from analysis.explorer.assets import STATIC
+from analysis.explorer.display_text import visible
+from analysis.explorer.leaks import Leaks
+from analysis.explorer.pages.comparing import At, offered
+from analysis.explorer.pages.trial import trial_page
+from analysis.explorer.reading import Row
+from analysis.explorer.site import Site
+from analysis.explorer.urls import query_of
+
+# What a template marks, and forms but these.
+_SERVED = r'<(\w+)\b[^>]*\sdata-served\b[^>]*>.*?</\1>|<form\b(?![^>]*"(?:{})").*?</form>'
+HELP, COMPARE = "dialog", "compare-form"
+# What htmx and our scripts would ask a server for.
+_ASKED = re.compile(r'\s(?:hx-[a-z-]+|data-panel|data-others)="[^"]*"')
+_LINK = re.compile(r'<a\b([^>]*?)\shref="([^"]*)"([^>]*)>(.*?)</a>', re.DOTALL)
+_BACK = re.compile(r'\sdata-back="([^"]*)"')
+_HEAD, _FOOT = '<meta charset="utf-8">', '<dialog id="help"'
+_POLICY = '\n<meta http-equiv="Content-Security-Policy" content="{}">'
+_NOTE = (
+    '<footer class="quiet small">{}, written by <code>merge-runner view</code>. Search, filters, '
+    "SQL and new notes need its server.</footer>\n"
+)
+_MAIN = re.compile(r'(<main id="main"[^>]*>)(.*)(</main>)', re.DOTALL)
+_STYLE = re.compile(r'<link rel="stylesheet" href="/static/([^"]+)">\n')
+_SCRIPT = re.compile(r'<script src="/static/([^"]+)" defer></script>\n?')
+_ICON = re.compile(r'<link rel="icon"[^>]*>\n')
+
+
+def offline(
+    text: str,
+    study: str,
+    policy: str,
+    address: Callable[[str], str],
+    forms: Sequence[str] = (HELP,),
+) -> str:
+    """Return a served page as one without a server, with these ``forms`` alone.
+
+    ``address`` returns where a link leads then; what leads nowhere is text.
+    """
+
+    def link(found: re.Match[str]) -> str:
+        before, href, after, words = found.groups()
+        leads = href if href.startswith("#") else escape(address(unescape(href)))
+        if not leads:
+            return "" if "data-page" in before else words
+        return f'<a{before} href="{leads}"{after}>{words}</a>'
+
+    def back(found: re.Match[str]) -> str:
+        return f' data-back="{escape(address(unescape(found[1])))}"'
+
+    served = _SERVED.format("|".join(forms))
+    text = _ASKED.sub("", re.sub(served, "", text, flags=re.DOTALL))
+    text = _LINK.sub(link, _BACK.sub(back, text))
+    text = text.replace(_HEAD, _HEAD + _POLICY.format(policy), 1)
+    return text.replace(_FOOT, _NOTE.format(escape(visible(study))) + _FOOT, 1)
+
+
+def page_of_trials(site: Site, rows: Sequence[Row]) -> str:
+    """Return one page with trials, its styles and scripts within; raises UsageError."""
+    held = {(row["trial_id"], row["spec_hash"]): row for row in rows}
+
+    def address(served: str) -> str:
+        parts = urlsplit(served)
+        trial, asked = unquote(parts.path.removeprefix("/trials/")), dict(parse_qsl(parts.query))
+        there = (trial, asked.get("spec")) in held
+        return query_of({"trial": trial, **asked}) if there else ""
+
+    forms = (HELP, COMPARE) if len(held) > 1 else (HELP,)
+    pages = []
+    for trial_id, spec_hash in held:
+        page = trial_page(site, trial_id, {"spec": spec_hash, "as": "whole"})
+        pages.append(offline(page, site.db.name, "POLICY", address, forms))
+    page = pages[0]
+    if len(pages) > 1:
+        several = site.render("_several.html", held=list(_held(site, held, pages)))
+        page = _MAIN.sub(lambda found: found[1] + several + found[3], page)
+    Leaks(site.db).refuse("the page", [page])
+    return _inlined(page)
+
+
+def _held(
+    site: Site, held: Mapping[At, Row], pages: Sequence[str]
+) -> Iterator[tuple[Row, str, Markup, dict[str, str]]]:
+    """Give each trial of a page, its address there, its main part, and what is offered beside it.
+
+    What is offered are keys of others that the page holds, by kind.
+    """
+    found: dict[At, dict[str, At]] = {}
+    for condition in {row["condition"] for row in held.values()}:
+        alike = [key for key, row in held.items() if row["condition"] == condition]
+        found |= offered(site, condition, alike)
+    for (key, row), page in zip(held.items(), pages, strict=True):
+        trial_id, spec_hash = key
+        offers = {kind: "@".join(at) for kind, at in found.get(key, {}).items() if at in held}
+        main = _MAIN.search(page)
+        assert main is not None
+        address = query_of({"trial": trial_id, "spec": spec_hash})
+        yield row, address, Markup(main[2]), offers  # noqa: S704 # rendered by a template of ours
+
+
+def _inlined(page: str) -> str:
+    """Return a page with the texts of its styles and scripts, which alone its policy lets run."""
+
+    def texts(names: Iterable[str]) -> list[str]:
+        return [(STATIC / name).read_text(encoding="utf-8") for name in names]
+
+    styles, scripts = texts(_STYLE.findall(page)), texts(_SCRIPT.findall(page))
+    hashes = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+        for text in (*styles, *scripts)
+    )
+    policy = (
+        f"default-src 'none'; img-src data:; script-src {hashes}; style-src {hashes}; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    for pattern in (_STYLE, _SCRIPT, _ICON):
+        page = pattern.sub("", page)
+    page = page.replace('content="POLICY"', f'content="{policy}"', 1)
+    head = "".join(f"<style>{text}</style>\n" for text in styles)
+    foot = "".join(f"<script>{text}</script>\n" for text in scripts)
+    return page.replace("</head>", f"{head}</head>", 1).replace("</body>", f"{foot}</body>")

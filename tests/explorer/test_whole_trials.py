@@ -1,0 +1,53 @@
+"""What a page of a trial holds that needs no server, and what is marked in a prompt."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from analysis.explorer.catalogue import Filter
+from analysis.explorer.details import read_decision, read_trial, read_whole
+from analysis.explorer.pages.trial import decision_fragment, whole_panels
+from analysis.explorer.prompts import parts_of
+from analysis.explorer.site import Site
+
+WORDS = st.lists(st.sampled_from(["give", "way", ",", "3.5", "\n", "m/s"])).map(" ".join)
+
+
+@pytest.fixture
+def site(study):
+    site = Site(study)
+    site.catalogue.refresh()
+    yield site
+    site.close()
+
+
+def test_the_panels_of_a_whole_trial_are_those_that_a_server_shows(site):
+    panels = 0
+    for row in site.catalogue.every(Filter()):
+        key = row["trial_id"], row["spec_hash"]
+        trial, decisions = read_trial(site.db, *key), read_whole(site.db, *key)
+        assert [(d["side"], d["decision"]) for d in trial.decisions] == list(decisions)
+        for (side, number), decision in decisions.items():
+            assert decision == read_decision(site.db, *key, side, number)
+        for name, panel in whole_panels(site, row, trial).items():
+            side, number = name.split("/")
+            asked = {"spec": row["spec_hash"], "side": side, "decision": number}
+            assert panel == decision_fragment(site, row["trial_id"], asked)
+            panels += 1
+    assert panels > 50
+
+
+@given(WORDS, WORDS)
+def test_a_compared_prompt_holds_the_prompt_in_order(before, now):
+    pieces = [piece for part in parts_of(now, before) for piece in part.pieces]
+    kept = "".join(text for change, text in pieces if change != "gone")
+    assert kept.split() == now.split()
+
+
+def test_only_what_changed_is_marked_in_a_line_of_many_equal_words():
+    (part,) = parts_of(
+        "I see a car. " * 500 + "It is 7 m ahead.", "I see a car. " * 500 + "It is 9 m ahead."
+    )
+    assert [(c, t.strip()) for c, t in part.pieces if c != "same"] == [("gone", "9"), ("new", "7")]
