@@ -10,7 +10,7 @@ import duckdb
 
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.results.data_dictionary import SchemaColumn, SchemaTable, tables, units
-from merge_runner.results.database import Instance, fetched, read_database
+from merge_runner.results.database import fetched, read_database
 from merge_runner.results.provenance import program
 from merge_runner.results.query_output import write_csv
 from merge_runner.results.wide_trials import (
@@ -46,7 +46,7 @@ def export_tables(
     names = [*(table.name for table in (*tables(), *(table for table, _ in also))), NAME]
     _refuse_other_content(folder, names)
     try:
-        with read_database(db, Instance()) as connection:
+        with read_database(db) as connection:
             folder.mkdir(parents=True, exist_ok=True)
             wide = wide_trials(connection.execute(FACTORS.format(only="")).fetchall())
             known = [*tables(), *(table for table, _ in also), _described(connection, wide)]

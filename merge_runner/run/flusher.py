@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import sys
 from collections.abc import Callable
 from itertools import accumulate, chain
 
 from merge_runner.errors import StoreError, StoreLocked
-from merge_runner.records import TrialRecord
+from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.store import Store
-from merge_runner.run.spill import Spill
 
 EVERY_S = 1.0
 BATCH = 64
@@ -21,9 +19,8 @@ BATCH_OF_REPLAY = 4 * BATCH
 """Of trials that take no time: a transaction costs as much as storing dozens of them."""
 MOST_PENDING = 8 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
-# While storing fails, as when another program holds the file: how many bytes may wait in memory
-# before they are spilled, and before trials wait because spilling fails, too.
-SPILLED_BYTES, MOST_STUCK_BYTES = 2**27, 2**29
+MOST_HELD = 4 * BATCH
+"""Trials in memory while storing fails, as when another program holds the file."""
 LOCK_PATIENCE_S = 2.0
 # How long the end of a sweep retries what is no lock, such as a full disk. A lock is waited for.
 LAST_PATIENCE_S = 3.0
@@ -33,7 +30,6 @@ AGAIN = (
     "When that is fixed, run the same command again: it writes them from the recorded replies "
     "without a call."
 )
-LOG = logging.getLogger(__name__)
 
 
 def size_of(record: TrialRecord) -> int:
@@ -46,22 +42,23 @@ def size_of(record: TrialRecord) -> int:
 class Flusher:
     """Collects ended trials and stores them about once a second.
 
-    Trials that cannot be stored wait in memory, and many of them in a file beside the database,
-    while others are played; where storing is merely slow, new trials wait for it. ``differing``
-    maps trials that were already stored with other values to the columns that differ.
+    While storing fails, trials beyond MOST_HELD are dropped and others are played; where storing is
+    merely slow, new trials wait for it. ``dropped`` trials can be played again from the recorded
+    replies; failed ones cannot, and stay in memory. ``differing`` maps trials that were already
+    stored with other values to the columns that differ.
     """
 
     def __init__(
         self, store: Store, sweep_id: str, say: Callable[[str], None], batch: int = BATCH
     ) -> None:
         self.differing: dict[str, list[str]] = {}
+        self.dropped: list[TrialSpec] = []
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
         self._batch = batch
         self._pending: list[TrialRecord] = []
         self._bytes = 0
-        self._spill = Spill()
         self._problem: StoreError | None = None
         self._said = ""
         self._closing = False
@@ -69,27 +66,28 @@ class Flusher:
         self._task = asyncio.create_task(self._run())
 
     def add(self, record: TrialRecord) -> None:
-        """Store this trial with the next batch."""
+        """Store this trial with the next batch, or drop it while storing fails."""
         self._pending.append(record)
         self._bytes += size_of(record)
+        if self._problem is not None:
+            self._drop_excess()
         if len(self._pending) >= self._batch or self._bytes >= BATCH_BYTES:
             self._awake.set()
 
     async def room(self) -> None:
-        """Wait while too much is still to be stored, unless storing has ended."""
+        """Wait while too much is still to be stored, unless storing fails or has ended."""
         while self._is_full() and not self._task.done():
             self._tried.clear()
             await self._tried.wait()
 
     def _is_full(self) -> bool:
-        if self._problem is not None:
-            return self._bytes > MOST_STUCK_BYTES
-        return len(self._pending) > MOST_PENDING or self._bytes > MOST_PENDING_BYTES
+        is_much = len(self._pending) > MOST_PENDING or self._bytes > MOST_PENDING_BYTES
+        return is_much and self._problem is None
 
     @property
     def left(self) -> int:
         """How many trials are not stored yet."""
-        return len(self._pending) + self._spill.trials
+        return len(self._pending) + len(self.dropped)
 
     @property
     def problem(self) -> str:
@@ -100,17 +98,17 @@ class Flusher:
         return f"{what} to be stored: {self._problem}"
 
     async def close(self) -> None:
-        """Store what is left, and leave the database reachable.
+        """Store the trials in memory, and leave the database reachable.
 
         Waits for a program that holds it as long as that does; raises StoreError for anything else
-        that lasts.
+        that lasts. More trials may be added later, and stored by the next call.
         """
         self._closing = True
         self._awake.set()
         await self._task
         loop = asyncio.get_running_loop()
         began, waiting = loop.time(), False
-        while not await self._flush() or self.left:
+        while not await self._flush() or self._pending:
             if isinstance(self._problem, StoreLocked):
                 if not waiting:
                     self._say(
@@ -131,15 +129,11 @@ class Flusher:
                 async with asyncio.timeout(EVERY_S):
                     await self._awake.wait()
             self._awake.clear()
-            while self.left and not self._closing and await self._flush():
+            while self._pending and not self._closing and await self._flush():
                 continue
 
     async def _flush(self) -> bool:
         """Write one batch, which may be empty; False if that did not work."""
-        if not self._pending and self._spill.trials and self._problem is None:
-            taken = await asyncio.to_thread(self._spill.take)
-            self._bytes += sum(map(size_of, taken))
-            self._pending = taken + self._pending
         sizes = accumulate(map(size_of, self._pending[: self._batch]))
         # At least one: a single trial may be larger than a batch should be.
         number = max(1, sum(size <= BATCH_BYTES for size in sizes))
@@ -155,8 +149,7 @@ class Flusher:
             if self.left and str(exc) != self._said:  # it is tried again every second
                 self._said = str(exc)
                 self._say(f"the sweep goes on; {self.problem}")
-            if self._bytes > SPILLED_BYTES:
-                await self._spill_pending()
+            self._drop_excess()
             return False
         else:
             self._problem = None
@@ -166,15 +159,17 @@ class Flusher:
         finally:
             self._tried.set()
 
-    async def _spill_pending(self) -> None:
-        """Move the trials in memory to the file, unless that cannot be written either."""
-        for _ in range(0, len(self._pending), BATCH):
-            batch = self._pending[:BATCH]
-            try:
-                await asyncio.to_thread(self._spill.put, batch, self._store.path.parent)
-            except OSError as exc:
-                LOG.debug("trials that wait to be stored stay in memory: %s", exc)
-                return
-            # Others were added meanwhile, behind these.
-            del self._pending[: len(batch)]
-            self._bytes -= sum(map(size_of, batch))
+    def _drop_excess(self) -> None:
+        """Drop the newest trials beyond what may wait, which are in no batch under way."""
+        newest: list[TrialRecord] = []
+        while len(self._pending) > MOST_HELD or (
+            self._bytes > MOST_PENDING_BYTES and len(self._pending) > 1
+        ):
+            newest.append(self._pending.pop())
+            self._bytes -= size_of(newest[-1])
+        for record in reversed(newest):
+            if record.status == "failed":
+                self._pending.append(record)
+                self._bytes += size_of(record)
+            else:
+                self.dropped.append(record.spec)

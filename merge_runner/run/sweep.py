@@ -48,7 +48,7 @@ from merge_runner.run.clients import (
 )
 from merge_runner.run.estimate import Estimate, Todo, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
-from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, Flusher
+from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, MOST_HELD, Flusher
 from merge_runner.run.local_runner import LocalRunner, TrialRunner
 from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
 from merge_runner.run.plan import Options, Plan, usual_prompts
@@ -445,14 +445,14 @@ class Sweep:
 
     async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> None:
         """Store what has ended and is not stored yet; Ctrl-C ends the waiting for that."""
-        closing = asyncio.create_task(flusher.close())
+        closing = asyncio.create_task(self._store_all(flusher))
         with on_interrupt(closing.cancel, closing.cancel):
             await asyncio.wait([closing])
         if closing.cancelled():
             outcome.gave_up = True
             why = f": {flusher.problem}. {AGAIN}" if flusher.problem else ". " + GO_ON
             outcome.fail(INTERRUPTED, f"Interrupted{why}")
-        elif isinstance(error := closing.exception(), StoreError):
+        elif isinstance(error := closing.exception(), MergeRunnerError):
             outcome.fail(error.exit_code, str(error))
         elif error is not None:
             raise error
@@ -463,6 +463,25 @@ class Sweep:
                 f"which is left as it is: {_differing(flusher.differing)}. Replay into "
                 "another --db.",
             )
+
+    async def _store_all(self, flusher: Flusher) -> None:
+        """Store the trials in memory, and play those again that were dropped: without a call."""
+
+        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+            assert isinstance(record, TrialRecord)  # what asks nobody needs no money
+            flusher.add(record)
+
+        await flusher.close()
+        if flusher.dropped:
+            self._say(
+                f"{len(flusher.dropped)} trials that are not stored yet are played again from the "
+                "recorded replies, without a call; Ctrl-C leaves them to the next run"
+            )
+        while flusher.dropped:
+            again, flusher.dropped = flusher.dropped[:MOST_HELD], flusher.dropped[MOST_HELD:]
+            clients = sealed_clients(self._plan, self._cache)
+            await LocalRunner(self._plan, clients, in_flight=1).play(again, ended)
+            await flusher.close()
 
     def _end(self, outcome: Outcome) -> None:
         """Note how the sweep ended, read back what the database holds of it, and audit that."""

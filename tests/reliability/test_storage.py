@@ -11,12 +11,16 @@ import sys
 
 import duckdb
 import pytest
+from aiohttp import web
 
+from merge_runner.errors import StoreLocked
+from merge_runner.records import SLOT_HEADER
 from merge_runner.results.database import SCHEMA_VERSION
 from merge_runner.results.store import Store, results_digest
-from merge_runner.run.plan import make_plan
+from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.sweep import Sweep
 from tests.gate import HANGS_S, Gate
-from tests.harness import watched
+from tests.harness import FAST, watched
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
 NOTEBOOK = """
@@ -149,6 +153,115 @@ async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_
         assert again.returncode == 0, err
         assert json.loads(out)["calls"]["live"] == 0
         assert json.loads(out)["trials"]["planned"] == 3
+
+
+PATIENT = """
+[patient]
+provider = "emulator"
+format = "openai-chat"
+id = "scripted-driver"
+max_output_tokens = 4000
+price = "free"
+timeout_s = 600
+"""
+SHORT = """
+models = ["patient"]
+repetitions = 30
+conditions = ["L_4_0", "N_0_0", "R_-4_0", "L_2_-8", "R_-2_8", "L_4_8", "R_-4_8", "L_4_-8", "L_0_-8",
+    "R_0_8"]
+[scenario]
+timeout_s = 2
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("until", ["the end", "Ctrl-C"])
+async def test_a_notebook_that_holds_the_database_all_night_costs_no_trial_and_no_call(
+    merge_runner, tmp_path, until
+):
+    (tmp_path / "models.toml").write_text(PATIENT)
+    (tmp_path / "short.toml").write_text(SHORT)
+    sweep = ("sweep", "short.toml", "--json", *FAST)
+    gate = Gate(30)
+    async with watched(gate.middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        night = await merge_runner.fork(*sweep, **env)
+        while not gate.held:
+            await asyncio.sleep(0.02)
+        holder = await notebook(tmp_path / "results/merge.duckdb", "write")
+        gate.open()
+        await night.said("the playing has ended; 300 trials wait to be stored")
+        asked = server.requests
+        if until == "Ctrl-C":
+            night.send_signal(signal.SIGINT)
+            _, err = await night.communicate()
+            assert night.returncode == 130, err
+            assert f"(PID {holder.pid}): close it there. When that is fixed, run" in err.decode()
+            night = await merge_runner.fork(*sweep, **env)
+            await night.said(f"(PID {holder.pid})")
+        holder.stdin.close()
+        out, err = await night.communicate()
+    assert night.returncode == 0, err
+    summary = json.loads(out)
+    assert summary["trials"]["planned"] == summary["trials"]["timeout"] == 300
+    assert summary["audit"]["findings"] == []
+    assert server.requests == asked
+    assert max(server.asked.values()) == 1
+    if until == "the end":
+        assert b"44 trials that are not stored yet are played again from the recorded" in err
+        assert summary["calls"]["live"] == asked
+    again = await merge_runner("replay", "short.toml", "--db", "again.duckdb")
+    assert again.code == 0, again.err
+    digest = results_digest(tmp_path / "results/merge.duckdb")
+    assert digest == results_digest(tmp_path / "again.duckdb")
+    assert digest[1] == 300
+
+
+@pytest.mark.parametrize("driver", ["constant", "emulator+idm"])
+async def test_what_was_dropped_is_played_again_and_failed_trials_are_kept_as_they_are(
+    tmp_path, monkeypatch, driver
+):
+    """A few may wait here, so that a few trials are enough."""
+
+    def write(store, *args, **options):
+        if not is_free:
+            raise StoreLocked("somebody reads")
+        return written(store, *args, **options)
+
+    def say(line):
+        said.append(line)
+        if "the playing has ended" in line:
+            is_free.append(True)
+
+    async def fails(request, handler):
+        slot = json.loads(request.headers[SLOT_HEADER])
+        if slot["condition"] == "N_0_0" and slot["decision"] == 2:
+            return web.json_response({"error": {"message": "no"}}, status=400)
+        return await handler(request)
+
+    said, is_free, written = [], [], Store.write
+    monkeypatch.setattr(Store, "write", write)
+    monkeypatch.setattr("merge_runner.run.flusher.MOST_HELD", 2)
+    monkeypatch.setattr("merge_runner.run.sweep.MOST_HELD", 2)
+    async with watched(fails) as server:
+        monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
+        plan = make_plan("baseline", driver, repetitions=1)
+        held = await Sweep(plan, Options(tmp_path / "held", tmp_path / "c"), say=say).run()
+        asked = server.requests
+    failed = driver != "constant"
+    assert any("trials that are not stored yet are played again" in line for line in said)
+    assert held.exit_code == failed, held.messages
+    assert [trial_id for trial_id, _ in held.facts.failed] == [
+        f"{driver}/baseline/N_0_0/rep01"
+    ] * failed
+    assert all("HTTP 400" in error for _, error in held.facts.failed)
+    assert held.meter.calls_live == asked - failed
+    assert results_digest(tmp_path / "held")[1] == 11
+    replay = Options(tmp_path / "new", tmp_path / "c", replay=True)
+    again = await Sweep(plan, replay, say=said.append).run()
+    if not failed:
+        assert again.exit_code == 0
+        assert results_digest(tmp_path / "held") == results_digest(tmp_path / "new")
 
 
 async def test_a_truncated_database_is_left_alone_and_rebuilt_from_the_cache(

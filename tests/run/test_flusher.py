@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from merge_runner.errors import StoreLocked
+from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.records import (
     Attempt,
     ChatReply,
@@ -22,8 +22,6 @@ from merge_runner.run.flusher import (
     BATCH_OF_REPLAY,
     MOST_PENDING,
     MOST_PENDING_BYTES,
-    MOST_STUCK_BYTES,
-    SPILLED_BYTES,
     Flusher,
 )
 from tests.gate import HANGS_S
@@ -105,52 +103,74 @@ async def test_trials_that_take_no_time_are_stored_in_fewer_transactions(batch, 
 class Held(Slow):
     """A store that another program holds until it is told to go on."""
 
-    def __init__(self, path):
-        super().__init__()
-        self.path = path
-
     def write(self, sweep_id, batch, *, patience_s):
         if not self.go_on.is_set():
             raise StoreLocked("somebody reads")
-        self.written.extend(record.end_time_s for record in batch)
+        self.written.extend(record.spec.order for record in batch)
         return {}
 
 
-def long_trials(number):
-    one = trial(SPILLED_BYTES // 4)
-    return [replace(one, end_time_s=float(place)) for place in range(number)]
+def ended(order, status="finished", size=0):
+    return replace(trial(size), spec=replace(SPEC, order=order), status=status)
 
 
-async def test_what_cannot_be_stored_is_spilled_and_stored_whole_and_in_order(tmp_path):
-    store, said = Held(tmp_path / "results.duckdb"), []
-    flusher = Flusher(store, "sweep", said.append)
-    for record in long_trials(6):
-        flusher.add(record)
-        await asyncio.wait_for(flusher.room(), HANGS_S)
+async def is_refused(flusher):
+    """Wait until storing has failed."""
     async with asyncio.timeout(HANGS_S):
-        while flusher._bytes > SPILLED_BYTES:
-            await asyncio.sleep(0.05)
-    assert flusher.left == 6
-    assert flusher.problem == "6 trials wait to be stored: somebody reads"
+        while not flusher.problem:
+            await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize("known", [True, False])
+async def test_while_the_database_is_held_256_trials_stay_in_memory_and_the_failed_ones(known):
+    store, said = Held(), []
+    flusher = Flusher(store, "sweep", said.append)
+    flusher.add(ended(0))
+    if known:
+        await is_refused(flusher)
+    for order in range(1, 500):
+        flusher.add(ended(order, "failed" if order in (300, 400) else "collided"))
+        await asyncio.wait_for(flusher.room(), HANGS_S)
+    await is_refused(flusher)
+    assert [record.spec.order for record in flusher._pending] == [*range(256), 300, 400]
+    assert [spec.order for spec in flusher.dropped] == [*range(256, 300), *range(301, 400),
+                                                        *range(401, 500)]  # fmt: skip
+    assert flusher.problem == "500 trials wait to be stored: somebody reads"
     closing = asyncio.create_task(flusher.close())
     async with asyncio.timeout(HANGS_S):
-        while "Ctrl-C ends the waiting" not in said[-1]:
+        while "500 trials wait to be stored: somebody reads. Ctrl-C ends" not in said[-1]:
             await asyncio.sleep(0.05)
         store.go_on.set()
         await closing
-    assert sorted(store.written) == list(map(float, range(6)))
-    assert (flusher.left, flusher._bytes, flusher.problem) == (0, 0, "")
-    assert list(tmp_path.iterdir()) == []
+    assert store.written == [*range(256), 300, 400]
+    assert (flusher.left, flusher._bytes, flusher.problem) == (242, 0, "")
+    # They may come again, and are stored by the next call.
+    flusher.add(ended(256))
+    await asyncio.wait_for(flusher.close(), HANGS_S)
+    assert store.written[-1] == 256
 
 
-async def test_what_can_neither_be_stored_nor_spilled_fills_the_memory_up_to_a_limit(tmp_path):
-    flusher = Flusher(Held(tmp_path / "no such folder/results.duckdb"), "sweep", lambda line: None)
-    text = trial(MOST_STUCK_BYTES // 4)
-    for _ in range(4):
-        flusher.add(text)
-    async with asyncio.timeout(HANGS_S):
-        while not flusher._problem:
-            await asyncio.sleep(0.01)
-    flusher._task.cancel()
-    await asyncio.gather(flusher._task, return_exceptions=True)
-    assert flusher._is_full()
+async def test_while_the_database_is_held_long_replies_stay_up_to_a_bound_and_a_first_one_always():
+    store = Held()
+    flusher = Flusher(store, "sweep", lambda line: None)
+    flusher.add(ended(0, size=MOST_PENDING_BYTES + 1))
+    await is_refused(flusher)
+    flusher.add(ended(1))
+    assert [spec.order for spec in flusher.dropped] == [1]
+    store.go_on.set()
+    await flusher.close()
+    store.go_on.clear()
+    for order in range(2, 8):
+        flusher.add(ended(order, size=MOST_PENDING_BYTES // 4))
+    await asyncio.gather(flusher._flush())
+    assert [record.spec.order for record in flusher._pending] == [2, 3, 4]
+    assert [spec.order for spec in flusher.dropped] == [1, 5, 6, 7]
+
+
+async def test_what_is_dropped_counts_as_not_stored_where_the_disk_is_full(monkeypatch):
+    monkeypatch.setattr("merge_runner.run.flusher.LAST_PATIENCE_S", 0.0)
+    flusher = Flusher(Refusing(StoreError("the disk is full")), "sweep", lambda line: None)
+    for order in range(300):
+        flusher.add(ended(order))
+    with pytest.raises(StoreError, match=r"^300 trials are not stored: the disk is full\. When"):
+        await asyncio.wait_for(flusher.close(), HANGS_S)
