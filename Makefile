@@ -60,7 +60,7 @@ lock: ## renew the lock files (needs uv)
 	uv pip compile $(LOCK) --group test --resolution lowest-direct -o requirements-lowest.lock pyproject.toml
 	uv pip compile $(LOCK) --group pyproject.toml:peer -o requirements-peer.lock
 
-LOCK := --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
+LOCK := --quiet --universal --no-strip-extras --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock"
 # What requirements.lock has already.
 OTHERS = $(shell sed -n 's/^\([a-z0-9-]*\)==.*/--no-emit-package \1/p' requirements.lock)
