@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,9 @@ from tests.zygote import Zygote
 
 # No agreement is kept: no test must pass because another one agreed.
 os.environ["XDG_STATE_HOME"] = os.devnull
+
+# A script that starts the tests with `&` lets them ignore Ctrl-C, and programs would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The gate depends on neither luck nor load.
 settings.register_profile("gate", derandomize=True, deadline=None)
