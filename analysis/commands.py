@@ -28,6 +28,7 @@ from merge_runner.cli.options import (
     beside_study,
     levels,
     listed,
+    use_study,
 )
 from merge_runner.cli.output import print_out, say, terminal_width
 from merge_runner.errors import UsageError
@@ -123,6 +124,7 @@ def tables(
         raise UsageError("--by FACTOR goes with the table factors: tables factors --by FACTOR")
     if as_driver is not None and against is None:
         raise UsageError("--as DRIVER goes with --against paper")
+    use_study(study_file, trust=trust)
     from analysis.tables import finished_tables
     from analysis.tables.formats import render, with_columns
 
@@ -153,6 +155,7 @@ def explain(
     as_json: JsonOption = False,
 ) -> None:
     """Explain a cell of a table: its meaning, query and trials."""
+    use_study(study_file, trust=trust)
     from analysis.explain import explain as explain_cell
     from analysis.tables import finished_tables
 
@@ -178,6 +181,7 @@ def figures(
     trust: TrustOption = False,
 ) -> None:
     """Draw all figures as PDF and PNG."""
+    use_study(study_file, trust=trust)
     from analysis.figures.gallery import write_figures
 
     deque(write_figures(_study(db, models, where, study_file), out), maxlen=0)
@@ -218,6 +222,7 @@ def report(
     trust: TrustOption = False,
 ) -> None:
     """Write conclusions, tables and figures as one HTML file."""
+    use_study(study_file, trust=trust)
     from analysis.report.writer import write_report
 
     refuse_another_kind(out, HTML, "page of HTML")
@@ -290,6 +295,7 @@ def view(
     trust: TrustOption = False,
 ) -> None:
     """Serve the explorer: trials, decisions and sweeps in a browser."""
+    use_study(study_file, trust=trust)
     if export is None and single is None:
         if trials is not None:
             raise UsageError("--trials goes with --export DIR or --single FILE.html")

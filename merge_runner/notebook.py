@@ -254,7 +254,7 @@ def _texts(levels: JsonValue) -> list[str]:
 
 @contextmanager
 def _alone() -> Iterator[None]:
-    """What a study adds is registered for the whole process, so one is played at a time."""
+    """The catalogue in use is that of the whole process, so one study is played at a time."""
     if not _playing.acquire(blocking=False):
         raise UsageError("another study is running in this process: wait for its end")
     try:

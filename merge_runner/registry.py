@@ -5,16 +5,19 @@ imported before the first look into any table; what it registers is then as good
 
     [project.entry-points.merge_runner]
     anything = "my_package.my_drivers"
+
+What a study adds is in a ``Catalogue`` of its own, which the tables show while it is in use.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from merge_runner.errors import UsageError, unknown_name
 
@@ -25,33 +28,18 @@ GROUP = "merge_runner"
 # What can stand in a trial's id, on the command line and in an address.
 NAME = re.compile(r"[A-Za-z0-9_.-]+")
 T = TypeVar("T")
-_registries: list[Registry[Any]] = []
-# Who registers now: the program and what is installed, or a part of a study.
-_owner = [""]
-_changes = [0]
 
 
-def unregister(owner: str) -> None:
-    """Take out all that an owner has registered."""
-    for registry in _registries:
-        registry.drop(owner)
-    _changes[0] += 1
+@dataclass(frozen=True, eq=False, slots=True)
+class Catalogue:
+    """The parts that a study adds, by kind and name.
 
+    ``text`` is the study's file, ``plugins`` the sources of its plug-ins by file name.
+    """
 
-@contextmanager
-def registering(owner: str) -> Iterator[None]:
-    """What is registered meanwhile takes the place of all that the same owner had registered."""
-    unregister(owner)
-    _owner.append(owner)
-    try:
-        yield
-    finally:
-        _owner.pop()
-
-
-def changes() -> int:
-    """How often something was registered anew; what is derived from a registry holds until then."""
-    return _changes[0]
+    text: str = ""
+    plugins: Mapping[str, str] = field(default_factory=dict)
+    parts: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
@@ -64,64 +52,81 @@ def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
 class Registry(Mapping[str, T]):
     """The things of one kind by name, in the order in which they were registered."""
 
+    catalogue: ClassVar[Catalogue] = Catalogue()
+    collecting: ClassVar[bool] = False
+
     def __init__(self, kind: str) -> None:
         """``kind`` is what one of them is called in messages."""
         self.kind = kind
         self._things: dict[str, T] = {}
-        self._owners: dict[str, str] = {}
-        _registries.append(self)
+        self._replaceable: set[str] = set()
 
     def register(self, name: str, thing: T) -> T:
         """Add a thing, and return it; raises UsageError where the name is taken or odd."""
         if not NAME.fullmatch(name):
             raise UsageError(f"the {self.kind} {name!r} needs a name of letters, digits, _ - and .")
-        if name in self._things:
+        if name in self._things or name in self._of_study:
             raise UsageError(f"there is a {self.kind} {name!r} already")
-        self._things[name] = thing
-        self._owners[name] = _owner[-1]
+        things = in_use().parts.setdefault(self.kind, {}) if self.collecting else self._things
+        things[name] = thing
         return thing
 
     def replace(self, name: str, thing: T) -> T:
         """Like ``register``, but in place of what was registered here by ``replace`` before."""
-        with registering(f"{self.kind} {name}"):
-            return self.register(name, thing)
-
-    def drop(self, owner: str) -> None:
-        """Take out what an owner has registered."""
-        for name in [name for name, theirs in self._owners.items() if theirs == owner]:
-            del self._things[name], self._owners[name]
+        if name in self._replaceable:
+            del self._things[name]
+        self.register(name, thing)
+        self._replaceable.add(name)
+        use(replace(in_use()))  # another object, so that nothing derived from the old thing is kept
+        return thing
 
     def require(self, name: str, hint: str = "") -> T:
         """See ``require``."""
         return require(self, self.kind, name, hint)
 
+    @property
+    def _of_study(self) -> Mapping[str, T]:
+        return in_use().parts.get(self.kind, {})
+
     def __getitem__(self, name: str) -> T:
         """The thing of this name; raises KeyError."""
         load_plugins()
-        return self._things[name]
+        study = self._of_study
+        return study[name] if name in study else self._things[name]
 
     def __iter__(self) -> Iterator[str]:
         """All names."""
         load_plugins()
-        return iter(self._things)
+        return iter({**self._things, **self._of_study})
 
     def __len__(self) -> int:
         """How many there are."""
         load_plugins()
-        return len(self._things)
+        return len({**self._things, **self._of_study})
 
 
-_study_texts: list[str] = []
+def in_use() -> Catalogue:
+    """Return the catalogue that the registries show beside what is installed."""
+    return Registry.catalogue
 
 
-def study_texts() -> Sequence[str]:
-    """The file of the study that is adopted and the sources of its plug-ins; empty without one."""
-    return _study_texts
+def use(catalogue: Catalogue) -> None:
+    """Show this catalogue in the registries, in place of the one before."""
+    Registry.catalogue = catalogue
 
 
-def note_study(texts: Iterable[str]) -> None:
-    """Keep the texts of the study that is adopted now."""
-    _study_texts[:] = texts
+@contextmanager
+def collecting(catalogue: Catalogue) -> Iterator[Catalogue]:
+    """Put what is registered meanwhile into a catalogue, and then use the one before again."""
+    load_plugins()  # first: a study may build on what is installed
+    before = in_use()
+    use(catalogue)
+    Registry.collecting = True
+    try:
+        yield catalogue
+    finally:
+        Registry.collecting = False
+        use(before)
 
 
 # What the code of somebody else may raise while it is imported.

@@ -59,7 +59,7 @@ def _afterwards():
     yield
     for registry, names in zip(registries, before, strict=True):
         for name in set(registry) - names:
-            registry.drop(f"{registry.kind} {name}")
+            del registry._things[name]
 
 
 @pytest.mark.slow

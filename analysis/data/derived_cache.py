@@ -19,7 +19,7 @@ import duckdb
 import analysis
 import merge_runner
 from merge_runner.errors import StoreError
-from merge_runner.registry import plugin_sources, plugins, study_texts
+from merge_runner.registry import in_use, plugin_sources, plugins
 from merge_runner.results.database import open_database, read_database
 from merge_runner.text_safety import first_line
 
@@ -88,7 +88,7 @@ def state(connection: duckdb.DuckDBPyConnection) -> str:
             for name, rows in ROWS.items()
         )
     ).fetchall()
-    study = json.dumps(study_texts()) if study_texts() else ""
+    study = json.dumps([in_use().text, in_use().plugins])
     return hashlib.sha256(f"{program()} {study}{sorted(sums)}".encode()).hexdigest()
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
-from analysis.explorer.child import adopt_given, serve
+from analysis.explorer.child import serve, use_given
 from analysis.metrics import GAP, LEFT_FIRST, Metric
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
@@ -262,6 +262,6 @@ def _published_gaps() -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    adopt_given()
+    use_given()
     numbers = Numbers(Path(sys.argv[1]))
     serve(lambda request: (numbers.answer(request), b""))

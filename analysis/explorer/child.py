@@ -15,7 +15,6 @@ import threading
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from merge_runner.errors import MergeRunnerError
@@ -67,11 +66,10 @@ class Child:
             raise NoAnswer(f"no process can be started: {exc.strerror}") from exc
 
     def give_study(self) -> None:
-        """Send the study that is registered here, whatever stands in its files by now."""
-        from merge_runner.study.parts import adopted  # the process of queries has no use for it
+        """Send the study that is in use here, whatever stands in its files by now."""
+        from merge_runner.registry import in_use  # the process of queries has no use for it
 
-        study = adopted()
-        sent = (study.text, str(study.path), study.plugins) if study and study.is_own else None
+        sent = (in_use().text, in_use().plugins)
         assert self.process.stdin is not None
         with suppress(BrokenPipeError):  # whoever asks it is told that it ended
             self.process.stdin.write(json.dumps(sent).encode() + b"\n")
@@ -133,15 +131,15 @@ class Child:
                     pipe.close()
 
 
-def adopt_given() -> None:
-    """In the child: register the study that ``give_study`` sends."""
-    from merge_runner.study.file import StudyFile, StudySource
-    from merge_runner.study.parts import adopt
+def use_given() -> None:
+    """In the child: use the study that ``give_study`` sends."""
+    from merge_runner.registry import use
+    from merge_runner.study.file import StudyFile
+    from merge_runner.study.parts import catalogue_of
 
-    if sent := json.loads(sys.stdin.readline()):
-        text, path, plugins = sent
-        file = StudyFile.model_validate(tomllib.loads(text))
-        adopt(StudySource(Path(path).stem, file, text, Path(path), plugins))
+    text, plugins = json.loads(sys.stdin.readline())
+    if text:
+        use(catalogue_of(StudyFile.model_validate(tomllib.loads(text)), text, plugins))
 
 
 def serve(answer: Callable[[Any], Answer]) -> None:

@@ -29,11 +29,12 @@ from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreError, UsageError, unknown_name
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.records import SIDES
+from merge_runner.registry import in_use, use
 from merge_runner.results.database import append, by_name, read_database
 from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import other_models
-from merge_runner.study.parts import adopt_declared, adopted
+from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import first_line
 
 TABLES = """
@@ -181,21 +182,21 @@ def _audit(
             for program in PROGRAMS.values():
                 if program.data is not None:
                     program.data.read(connection)
-        _adopt_stored(config)
+        _use_stored(config)
         check_derived(connection, specs, config, audit)
     audit.findings = [replace(finding, sweep=sweep_id) for finding in audit.findings]
     return audit
 
 
-def _adopt_stored(config: SweepConfig) -> None:
-    """Register the prompts and conditions of a sweep's study, unless a user named a study.
+def _use_stored(config: SweepConfig) -> None:
+    """Use the prompts and conditions of a sweep's study, unless a user named a study.
 
     The stored plug-ins are somebody's code and never run; trials that need them are not derived,
     and neither are those of a study that cannot be read here.
     """
-    if config.study is not None and adopted() is None:
+    if config.study is not None and not in_use().text:
         with suppress(UsageError):
-            adopt_declared(config.study.text)
+            use(declared_catalogue(config.study.text))
 
 
 def _models(config: SweepConfig) -> set[tuple[str, str, str]]:

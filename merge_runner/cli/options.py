@@ -187,18 +187,9 @@ TrustOption = Annotated[
     bool,
     typer.Option(
         "--trust",
-        is_eager=True,  # before --study is looked at
         help="Run the study's code and send keys where its models.toml says, unasked.",
     ),
 ]
-
-
-def _adopt(context: typer.Context, file: str | None) -> str | None:
-    if file is not None:
-        from merge_runner.study.parts import load_study
-
-        load_study(file, trust=context.params["trust"])
-    return file
 
 
 StudyOption = Annotated[
@@ -206,7 +197,6 @@ StudyOption = Annotated[
     typer.Option(
         "--study",
         metavar="FILE",
-        callback=_adopt,
         help="A study's file: tables, figures and reports are of its trials alone, its plug-ins "
         "run, and its prompts, conditions, drivers and metrics are known.",
     ),
@@ -229,6 +219,14 @@ RecordingOption = Annotated[
         help="Also replay from this file, without importing it; may be repeated.",
     ),
 ]
+
+
+def use_study(file: str | None, *, trust: bool) -> None:
+    """Use what the study of ``--study`` adds, once the user agrees to its code."""
+    if file is not None:
+        from merge_runner.study.parts import load_study
+
+        load_study(file, trust=trust)
 
 
 def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:

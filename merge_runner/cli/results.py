@@ -18,6 +18,7 @@ from merge_runner.cli.options import (
     JsonOption,
     StudyOption,
     TrustOption,
+    use_study,
 )
 from merge_runner.cli.output import agree, print_out, say
 from merge_runner.errors import UsageError
@@ -93,6 +94,7 @@ def audit(
         audit_sweep,
     )
 
+    use_study(study, trust=trust)
     skipped: list[str] = []
     if recording is not None:
         if sweep_id is not None or cache is not None:

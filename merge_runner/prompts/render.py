@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from functools import cache
+from functools import lru_cache
 from statistics import fmean
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import Fields, blocks_of, named
 from merge_runner.prompts.state_lines import LINES, NOT_SEEN
 from merge_runner.records import Observation, Road
-from merge_runner.registry import changes
+from merge_runner.registry import Catalogue, in_use
 
 KMH_OF_MPS = 3.6
 MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
@@ -30,14 +30,14 @@ def render_prompt(
     ``remaining_plan`` is the unexecuted rest of the last valid plan (normalised accelerations),
     None before the first.
     """
-    template, lines = _template(variant, observation.road, changes())
+    template, lines = _template(variant, observation.road, in_use())
     values = {name: LINES[name](observation) for name in lines}
     prompt = template.format_map({**_fields(observation, remaining_plan, scenario), **values})
     return prompt if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", prompt)
 
 
-@cache
-def _template(variant: str, road: Road, _: int) -> tuple[str, list[str]]:
+@lru_cache
+def _template(variant: str, road: Road, _: Catalogue) -> tuple[str, list[str]]:
     """The blocks of a variant that a road has, one below the other; and the lines that they name.
 
     These take longer than all other fields, and few prompts have them.

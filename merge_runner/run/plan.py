@@ -415,8 +415,8 @@ def make_plan(
 ) -> Plan:
     """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
-    Registers what the study adds (``study.parts.load_study``, which ``trust`` is for), and the
-    human trials of ``db`` where they are to be replayed. Raises UsageError.
+    Uses the study's catalogue (``study.parts.load_study``, which ``trust`` is for), and the human
+    trials of ``db`` where they are to be replayed. Raises UsageError.
     """
     asked = (models,) if isinstance(models, str) else tuple(models)
     study = load_study(sweep, asked, trust=trust)

@@ -1,10 +1,9 @@
-"""What a study adds to the registries: its plug-ins, drivers, prompts and conditions."""
+"""The catalogue of a study: its plug-ins, drivers, prompts and conditions."""
 
 from __future__ import annotations
 
 import re
 import sys
-import threading
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,14 +25,7 @@ from merge_runner.prompts.blocks import (
     Variant,
     blocks_of,
 )
-from merge_runner.registry import (
-    FAULTS,
-    changes,
-    load_plugins,
-    note_study,
-    registering,
-    unregister,
-)
+from merge_runner.registry import FAULTS, Catalogue, collecting, use
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
 from merge_runner.study.crossing import chosen_models, driver_names
 from merge_runner.study.file import (
@@ -50,14 +42,12 @@ from merge_runner.study.trust import require_agreement
 LAST = "the end"
 PACKAGE = "study_plugins"
 """The package of a study's plug-ins: one imports from another by ``from .other import thing``."""
-_lock = threading.RLock()
-_adopted: list[tuple[StudySource, int]] = []
 
 
 def load_study(
     name: str, models: Sequence[str] | None = None, *, trust: bool = False
 ) -> StudySource:
-    """Read a study and register what it adds, once the user agrees to its code.
+    """Read a study and use its catalogue, once the user agrees to its code.
 
     ``models`` are those that are to be asked, in place of the file's own; None: nobody is asked.
     The user also agrees to where their keys go. ``trust`` agrees. Raises UsageError.
@@ -66,33 +56,29 @@ def load_study(
     file = study.file
     asked = () if models is None else driver_names(file, chosen_models(file, models))
     require_agreement(study, asked, trust=trust)
-    adopt(study)
+    use(catalogue_of(file, study.text, study.plugins))
     return study
 
 
-def adopt(study: StudySource) -> None:
-    """Register what a study adds, in place of what the study before it added.
+def catalogue_of(file: StudyFile, text: str, plugins: Mapping[str, str]) -> Catalogue:
+    """Run a study's plug-ins and return what they and its file add; raises UsageError.
 
-    Its plug-ins run: the user has agreed to them (``load_study``). Raises UsageError.
+    The user has agreed to the code (``load_study``).
     """
-    load_plugins()  # first: a study may build on what is installed
-    with _lock:  # a Dask worker may play for several threads at once
-        if _adopted == [(study, changes())]:
-            return
-        _adopted.clear()
-        load_plugin_files(study.plugins)
-        _register(study.file)
-        note_study([study.text, *study.plugins.values()])
-        _adopted.append((study, changes()))
+    with collecting(Catalogue(text, plugins)) as catalogue:
+        _run_plugins(plugins)
+        for condition in file.conditions or ():
+            if condition.is_own:
+                CONDITIONS.register(condition.name, _condition(condition))
+        for name, prompt in _by_dependence(file.prompts):
+            VARIANTS.register(name, _variant(name, prompt))
+        for name, driver in file.drivers.items():
+            PROGRAMS.register(name, _program(name, driver))
+    return catalogue
 
 
-def adopted() -> StudySource | None:
-    """The study whose parts are registered now, if any."""
-    return _adopted[-1][0] if _adopted else None
-
-
-def adopt_declared(text: str) -> None:
-    """Register the drivers, prompts and conditions of a study's file, but run none of its plug-ins.
+def declared_catalogue(text: str) -> Catalogue:
+    """Return what a study's file declares itself; none of its plug-ins run.
 
     Drivers of a program that is not here are left out. Raises UsageError.
     """
@@ -102,42 +88,20 @@ def adopt_declared(text: str) -> None:
         raise UsageError(f"the stored study cannot be read: {exc}") from exc
     file = validated(StudyFile, content, "the stored study")
     here = {name: driver for name, driver in file.drivers.items() if driver.program in PROGRAMS}
-    _register(file.model_copy(update={"drivers": here}))
+    return catalogue_of(file.model_copy(update={"drivers": here}), text, {})
 
 
-def _register(file: StudyFile) -> None:
-    with registering("study"):
-        for condition in file.conditions or ():
-            if condition.is_own:
-                CONDITIONS.register(condition.name, _condition(condition))
-        for name, prompt in _by_dependence(file.prompts):
-            VARIANTS.register(name, _variant(name, prompt))
-        for name, driver in file.drivers.items():
-            PROGRAMS.register(name, _program(name, driver))
-
-
-def load_plugin_files(sources: Mapping[str, str]) -> None:
-    """Run plug-ins, given by file name and source, in place of those of the study before.
-
-    All of them are run anew where one was edited, since one may import from another.
-    """
-    wanted = {_module(file): _Source(file, source) for file, source in sources.items()}
-    if len(wanted) < len(sources):
-        raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
-    loaded = {
-        name: module.__loader__
-        for name, module in sys.modules.items()
-        if name.startswith(f"{PACKAGE}.")
-    }
-    if loaded == wanted:
-        return
-    for name in loaded:
+def _run_plugins(sources: Mapping[str, str]) -> None:
+    """Run plug-ins, given by file name and source, as the modules of one package."""
+    for name in [name for name in sys.modules if name.startswith(f"{PACKAGE}.")]:
         del sys.modules[name]
-        unregister(name)
+    loaders = {_module(file): _Source(file, source) for file, source in sources.items()}
+    if len(loaders) < len(sources):
+        raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
     package = sys.modules[PACKAGE] = ModuleType(PACKAGE)
     package.__path__ = []
-    for name, source in wanted.items():
-        _run(name, source)
+    for name, loader in loaders.items():
+        _run(name, loader)
 
 
 def _module(file: str) -> str:
@@ -157,7 +121,7 @@ def _by_dependence(prompts: Mapping[str, StudyPrompt]) -> Iterator[tuple[str, St
         yield from ((name, waiting.pop(name)) for name in ready)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Source(InspectLoader):
     """A module whose source is given, so that its hash and its text are known everywhere."""
 
@@ -167,11 +131,8 @@ class _Source(InspectLoader):
     def get_source(self, fullname: str) -> str:
         return self.source
 
-    def is_package(self, fullname: str) -> bool:
-        return False
-
     def get_code(self, fullname: str) -> CodeType:
-        return compile(self.source, self.file, "exec", dont_inherit=True)
+        return self.source_to_code(self.source, self.file)
 
 
 def _run(name: str, loader: _Source) -> None:
@@ -179,11 +140,8 @@ def _run(name: str, loader: _Source) -> None:
     assert spec is not None
     module = sys.modules[name] = module_from_spec(spec)
     try:
-        with registering(name):
-            loader.exec_module(module)
+        loader.exec_module(module)
     except (UsageError, AssertionError, *FAULTS) as exc:
-        del sys.modules[name]
-        unregister(name)
         lines = [f.lineno for f in extract_tb(exc.__traceback__) if f.filename == loader.file]
         line = lines[-1] if lines else getattr(exc, "lineno", None)
         where = f"{loader.file}, line {line}" if line else loader.file

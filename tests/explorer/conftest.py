@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 
+from merge_runner.registry import Catalogue, Registry
 from merge_runner.results.store import Store
 from tests.analysis.studies import Drive, Said, as_humans, played
 from tests.explorer.hostile import hostile_trial
@@ -34,8 +35,8 @@ def pytest_runtest_setup(item):
 
 @pytest.fixture(autouse=True)
 def no_study_of_another_test(monkeypatch):
-    """What an explorer starts reads the adopted study anew: one of another test may be gone."""
-    monkeypatch.setattr("merge_runner.study.parts._adopted", [])
+    """The study of another test is in use no longer."""
+    monkeypatch.setattr(Registry, "catalogue", Catalogue())
 
 
 @pytest.fixture(scope="session")

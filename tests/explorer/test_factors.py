@@ -69,10 +69,9 @@ ASK = """
 import sys
 from pathlib import Path
 from analysis.explorer.analysis_process import worker
-from merge_runner.study.file import read_study
-from merge_runner.study.parts import adopt
+from merge_runner.study.parts import load_study
 
-adopt(read_study(sys.argv[2]))
+load_study(sys.argv[2], trust=True)
 Path(sys.argv[2]).with_name("mine.py").write_text("raise RuntimeError('nobody agreed to this')")
 child = worker(Path(sys.argv[1]))
 said, _ = child.ask(["tables", "factors"], seconds=60, most_bytes=2**24)

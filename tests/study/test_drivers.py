@@ -10,8 +10,9 @@ from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES, ChatReply, ChatRequest
+from merge_runner.registry import use
 from merge_runner.run.plan import make_plan
-from merge_runner.study.parts import adopt_declared
+from merge_runner.study.parts import declared_catalogue
 from merge_runner.trial import play_trial
 
 PLUGIN = """
@@ -153,10 +154,10 @@ def test_a_clock_cannot_make_a_program_without_a_rate_faster_than_the_prompt_rat
     assert specs(faster)[0]["left"]["rate_hz"] == 2.0
 
 
-def test_a_stored_study_registers_its_drivers_without_running_its_plugins(plan_of):
+def test_a_stored_study_has_its_drivers_without_running_its_plugins(plan_of):
     text = plan_of(MINE + '[drivers.slow]\nprogram = "constant"\nclock = 2.0\n', "mine").study.text
     plan_of("", "constant")
-    adopt_declared(text.replace("braking", "not-installed"))
+    use(declared_catalogue(text.replace("braking", "not-installed")))
     assert PROGRAMS["slow"].rate_hz == 0.5
     assert "mine" not in PROGRAMS
 

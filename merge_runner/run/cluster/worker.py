@@ -15,13 +15,14 @@ from distributed.comm import connect
 from merge_runner.errors import MergeRunnerError, TrialSuspended
 from merge_runner.llm.meter import Meter
 from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.registry import use
 from merge_runner.run.clients import live_clients
 from merge_runner.run.cluster.batch import Batch, fingerprint
 from merge_runner.run.cluster.link import Link, LinkLost, taken_apart
 from merge_runner.run.cluster.remote import RemoteBudget, RemoteCache, RemoteRateLimit
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.signals import FROM_TERMINAL
-from merge_runner.study.parts import adopt
+from merge_runner.study.parts import catalogue_of
 
 REPORT_EVERY_S = 0.5
 
@@ -73,7 +74,8 @@ class _Worker:
 
     async def _play(self, batch: Batch, link: Link) -> None:
         entries = batch.plan.entries
-        adopt(batch.plan.study)
+        study = batch.plan.study
+        use(catalogue_of(study.file, study.text, study.plugins))
         async with AsyncExitStack() as stack:
             clients = live_clients(
                 batch.plan,

@@ -210,7 +210,7 @@ def test_a_warm_table_waits_for_no_heavy_library(db, tmp_path):
         "heavy = {'pandas', 'scipy', 'statsmodels', 'matplotlib', 'numpy'} & sys.modules.keys(); "
         "assert not heavy, heavy"
     )
-    for warm in (False, True):  # in a process of its own: a test here may have adopted a study
+    for warm in (False, True):  # in a process of its own: a test here may have a study in use
         done = subprocess.run(
             [sys.executable, "-c", check, str(db)], capture_output=True, text=True, check=False
         )
