@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from itertools import product
 from operator import itemgetter
 
@@ -21,7 +22,6 @@ from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES, Side, other_side
 from merge_runner.registry import require
 from merge_runner.study.file import BASELINE, EVERY_PROMPT, StudyFile
-from merge_runner.study.world_step import with_world_step
 
 MODEL, PROMPT, OPPONENT, SELF, DEFAULT = "model", "prompt", "opponent", "self", "default"
 PERCEPTION, PERFECT_ONE = "perception", "perfect"
@@ -29,6 +29,7 @@ _PERCEPTIONS = tuple(f"{PERCEPTION}_{side}" for side in SIDES)
 SET_BY = {PERCEPTION: _PERCEPTIONS, **{name: (name,) for name in _PERCEPTIONS}}
 """The factors of perception, with the switches of the scenario that each sets."""
 MOST_TRIALS = 1_000_000
+FINEST = 1_000_000  # steps a second: decimals like 0.05 become the fractions that they stand for
 Levels = Mapping[str, JsonValue]
 
 
@@ -256,7 +257,7 @@ def _arm(
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
     programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
-    scenario = _perceived(file, with_world_step(scenario, programs), levels)
+    scenario = _perceived(file, _with_world_step(scenario, programs), levels)
     for name, program in programs.items():
         _refuse_hurry(name, program, scenario)
         pace_of(scenario, program.in_spec(name))
@@ -289,6 +290,26 @@ def _arm(
         or prompt,
         ego=ego_side(sides, registry, str(levels.get(OPPONENT, SELF))),
     )
+
+
+def _with_world_step(scenario: ScenarioConfig, programs: Mapping[str, Program]) -> ScenarioConfig:
+    """The scenario with the largest step of which every program's interval is a whole number.
+
+    A language model's plan keeps its actions, of which each then lasts several steps. A ``step_s``
+    that a study gives stays: what does not fit it is refused (``drivers.pace``). Raises UsageError.
+    """
+    rates_hz = [program.rate_hz for program in programs.values() if program.rate_hz is not None]
+    if "step_s" in scenario.model_fields_set or not rates_hz:
+        return scenario
+    times_s = [scenario.step_s, scenario.action_s, *(1 / rate_hz for rate_hz in rates_hz)]
+    exact = [Fraction(time_s).limit_denominator(FINEST) for time_s in times_s]
+    whole = math.lcm(*(time.denominator for time in exact))
+    step_s = math.gcd(*(int(time * whole) for time in exact)) / whole
+    if step_s == scenario.step_s:
+        return scenario
+    given = scenario.model_dump(exclude_unset=True)
+    fine = {**given, "step_s": step_s, "plan_step_s": scenario.action_s}
+    return validated(ScenarioConfig, fine, f"a world for {', '.join(programs)}")
 
 
 def _refuse_hurry(name: str, program: Program, scenario: ScenarioConfig) -> None:

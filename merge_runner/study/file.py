@@ -104,14 +104,14 @@ class StudyCondition(Frozen):
     mean_speed_mps: Rate = MEAN_SPEED_MPS
 
     @property
-    def is_own(self) -> bool:
-        """Whether the study defines it."""
-        return "projected_headway_m" in self.model_fields_set
+    def numbers(self) -> dict[str, float]:
+        """Those of a condition of the study's own; empty for one that is known."""
+        return self.model_dump(exclude={"name"}, exclude_unset=True)
 
     @model_validator(mode="after")
     def _whole(self) -> StudyCondition:
         numbers = self.projected_headway_m, self.relative_velocity_mps
-        if self.model_fields_set != {"name"} and None in numbers:
+        if self.numbers and None in numbers:
             raise ValueError(
                 "a condition of your own needs projected_headway_m and relative_velocity_mps"
             )
@@ -199,7 +199,7 @@ class StudySource:
     def is_own(self) -> bool:
         """Whether it holds more than names of what there is."""
         file = self.file
-        own_conditions = any(condition.is_own for condition in file.conditions or ())
+        own_conditions = any(condition.numbers for condition in file.conditions or ())
         own_parts = file.prompts or file.drivers or file.plugins.files or own_conditions
         return bool(file.factors or own_parts)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from graphlib import CycleError, TopologicalSorter
 from importlib.abc import InspectLoader
 from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
@@ -30,7 +31,6 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
 from merge_runner.study.crossing import chosen_models, driver_names
 from merge_runner.study.file import (
     AddedText,
-    StudyCondition,
     StudyDriver,
     StudyFile,
     StudyPrompt,
@@ -68,9 +68,9 @@ def catalogue_of(file: StudyFile, text: str, plugins: Mapping[str, str]) -> Cata
     with collecting(Catalogue(text, plugins)) as catalogue:
         _run_plugins(plugins)
         for condition in file.conditions or ():
-            if condition.is_own:
-                CONDITIONS.register(condition.name, _condition(condition))
-        for name, prompt in _by_dependence(file.prompts):
+            if condition.numbers:
+                CONDITIONS.register(condition.name, Condition(**condition.numbers))
+        for name, prompt in _by_dependence(file.prompts).items():
             VARIANTS.register(name, _variant(name, prompt))
         for name, driver in file.drivers.items():
             PROGRAMS.register(name, _program(name, driver))
@@ -109,16 +109,17 @@ def _module(file: str) -> str:
     return f"{PACKAGE}.{stem}"
 
 
-def _by_dependence(prompts: Mapping[str, StudyPrompt]) -> Iterator[tuple[str, StudyPrompt]]:
+def _by_dependence(prompts: Mapping[str, StudyPrompt]) -> dict[str, StudyPrompt]:
     """The prompts, each after the one that it is based on."""
-    waiting = dict(prompts)
-    while waiting:
-        ready = [name for name, prompt in waiting.items() if prompt.based_on not in waiting]
-        if not ready:
-            if own := [name for name in waiting if name in VARIANTS]:
-                raise UsageError(f"there is a variant {own[0]!r} already")
-            raise UsageError(f"the prompts {', '.join(waiting)} are based on each other")
-        yield from ((name, waiting.pop(name)) for name in ready)
+    based_on = {
+        name: {prompt.based_on} & prompts.keys() - VARIANTS.keys()
+        for name, prompt in prompts.items()
+    }
+    try:
+        return {name: prompts[name] for name in TopologicalSorter(based_on).static_order()}
+    except CycleError as exc:
+        names = ", ".join(dict.fromkeys(exc.args[1]))
+        raise UsageError(f"the prompts {names} are based on each other") from None
 
 
 @dataclass
@@ -158,14 +159,6 @@ def _program(name: str, driver: StudyDriver) -> Program:
         raise UsageError(f"[drivers.{name}]: {exc}") from exc
 
 
-def _condition(condition: StudyCondition) -> Condition:
-    assert condition.projected_headway_m is not None  # the file's validation
-    assert condition.relative_velocity_mps is not None
-    return Condition(
-        condition.projected_headway_m, condition.relative_velocity_mps, condition.mean_speed_mps
-    )
-
-
 def _variant(name: str, prompt: StudyPrompt) -> Variant:
     """The variant that a prompt of a study is; raises UsageError."""
     blocks = dict(blocks_of(prompt.based_on))
@@ -175,37 +168,35 @@ def _variant(name: str, prompt: StudyPrompt) -> Variant:
     for each in prompt.remove:
         del blocks[each]
     for each, texts in prompt.replace.items():
-        old = blocks[each]
-        blocks[each] = Block(old.meaning, texts.merge, texts.straight, before=old.before)
+        blocks[each] = replace(blocks[each], merge=texts.merge, straight=texts.straight)
     for number, added in enumerate(prompt.add, 1):
-        blocks = dict(_inserted(name, blocks, number, added))
-    _refuse_twice(name, blocks)
+        blocks = _with_added(name, blocks, number, added)
+    if {SITUATION, TABLE} <= blocks.keys() and blocks[SITUATION].merge == BLOCKS[SITUATION].merge:
+        raise UsageError(
+            f"the prompt {name} says the situation twice, in {SITUATION} and in {TABLE}: write "
+            f'remove = ["{SITUATION}"]'
+        )
     if prompt.order:
         blocks = _ordered(name, blocks, prompt.order)
-    changed = {each for each, block in before.items() if blocks.get(each) != block}
     return Variant(
-        removes=frozenset(changed),
+        removes=frozenset(each for each, block in before.items() if blocks.get(each) != block),
         adds=frozenset(each for each, block in blocks.items() if before.get(each) != block),
         title=prompt.title,
         blocks=tuple(blocks.items()),
     )
 
 
-def _refuse_twice(prompt: str, blocks: Mapping[str, Block]) -> None:
-    """Raise UsageError where the table stands beside the list that it is in place of."""
-    both = {SITUATION, TABLE} <= blocks.keys()
-    if both and blocks[SITUATION].merge == BLOCKS[SITUATION].merge:
-        raise UsageError(
-            f"the prompt {prompt} says the situation twice, in {SITUATION} and in {TABLE}: write "
-            f'remove = ["{SITUATION}"]'
-        )
-
-
-def _inserted(
+def _with_added(
     prompt: str, blocks: Mapping[str, Block], number: int, added: AddedText
-) -> Iterator[tuple[str, Block]]:
-    """The blocks with an added one in its place."""
-    name, block = _added(prompt, number, added)
+) -> dict[str, Block]:
+    """The blocks with an added one in its place; raises UsageError."""
+    name = added.block or f"{prompt}.{number}"
+    if added.block is not None:
+        block = BLOCKS.require(name, f"the prompt {prompt} adds it")
+    else:
+        merge = added.text if added.merge is None else added.merge
+        straight = added.text if added.straight is None else added.straight
+        block = Block(f"added by {prompt}", merge, straight, before=None)
     if name in blocks:
         raise UsageError(f"the prompt {prompt} adds the block {name!r}, which it has already")
     anchor = added.before or added.after or _own_place(block, blocks)
@@ -214,18 +205,8 @@ def _inserted(
     names = list(blocks)
     place = len(names) if anchor is None else names.index(anchor) + (added.after is not None)
     follower = names[place] if place < len(names) else LAST
-    yield from list(blocks.items())[:place]
-    yield name, replace(block, before=follower)
-    yield from list(blocks.items())[place:]
-
-
-def _added(prompt: str, number: int, added: AddedText) -> tuple[str, Block]:
-    """The name of an added block, and the block; raises UsageError."""
-    if added.block is not None:
-        return added.block, BLOCKS.require(added.block, f"the prompt {prompt} adds it")
-    merge = added.merge if added.text is None else added.text
-    straight = added.straight if added.text is None else added.text
-    return f"{prompt}.{number}", Block(f"added by {prompt}", merge, straight, before=None)
+    whole = list(blocks.items())
+    return dict([*whole[:place], (name, replace(block, before=follower)), *whole[place:]])
 
 
 def _own_place(block: Block, blocks: Mapping[str, Block]) -> str | None:
