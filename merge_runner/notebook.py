@@ -201,7 +201,7 @@ class Study:
     def seat_first(
         self, grid: str | None = None, *, yes: bool = False, **how: Unpack[RunOptions]
     ) -> StudyOutcome:
-        """Ask only what drivers do first, as ``merge-runner seat first``; ``grid`` is its --grid.
+        """Ask only what drivers do first, as ``sweep --first``; ``grid`` is its --grid.
 
         Each situation is asked as often as the study has repetitions.
         """

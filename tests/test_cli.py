@@ -26,13 +26,13 @@ from tests.harness import PROGRAM, environment
 COMMANDS = {
     *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
     *("tables", "figures", "report", "explain", "human", "ledger", "view"),
-    *("init", "export", "forget", "seat", "power"),
+    *("init", "export", "forget", "power"),
 }
 # The promised options; more may be there.
 SWEEP_OPTIONS = {
     *("--model", "--reps", "--conditions", "--variants", "--sample-set", "--db", "--cache"),
     *("--in-flight", "--rpm", "--tpm", "--max-cost", "--dry-run", "--yes", "--replay", "--json"),
-    *("--dask", "--strict-model", "--order-seed"),
+    *("--dask", "--strict-model", "--order-seed", "--first", "--grid"),
 }
 
 

@@ -145,7 +145,7 @@ def _human_notes(study: Study) -> Iterator[str]:
 def _asked_notes(study: Study) -> Iterator[str]:
     for group in study.asked:
         yield (
-            f"{group.id}: asked without the loop (`merge-runner seat first`), in "
+            f"{group.id}: asked without the loop (`merge-runner sweep --first`), in "
             f"{len(group.ended)} trials that end before a second decision"
         )
         if group.repeated:

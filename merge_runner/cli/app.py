@@ -18,7 +18,6 @@ from merge_runner.cli.models import models
 from merge_runner.cli.output import print_out, say
 from merge_runner.cli.recording import recording_app
 from merge_runner.cli.results import audit, digest, forget, sql
-from merge_runner.cli.seat import seat_app
 from merge_runner.cli.stand_in import emulate
 from merge_runner.cli.sweep import init, replay, sweep
 from merge_runner.errors import MergeRunnerError, UsageError
@@ -60,7 +59,6 @@ app.callback()(common)
 for _command in (init, sweep, replay, sql, digest, audit, ledger, forget, models, emulate):
     app.command()(_command)
 app.add_typer(recording_app, name="recording")
-app.add_typer(seat_app, name="seat")
 
 
 def alone(command: str | None) -> typer.Typer:

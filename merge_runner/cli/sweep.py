@@ -5,8 +5,9 @@ from __future__ import annotations
 import shlex
 import sys
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -64,6 +65,20 @@ def init(
 
 def sweep(
     studies: StudiesArgument,
+    first: Annotated[
+        bool,
+        typer.Option("--first", help="Only the first decision of both sides, without the trial."),
+    ] = False,
+    grid: Annotated[
+        str | None,
+        typer.Option(
+            "--grid",
+            metavar="GRID",
+            help="With --first, in the place of the study's conditions: "
+            "h=FROM:TO:STEP,dv=FROM:TO:STEP, projected headways in m and relative velocities in "
+            "m/s; usual: -6:6:2 and -1.6:1.6:0.4.",
+        ),
+    ] = None,
     model: ModelOption = None,
     only: OnlyOption = None,
     mirror: MirrorOption = False,
@@ -116,10 +131,15 @@ def sweep(
 ) -> None:
     """Play all trials of one or more sweeps that are not stored yet."""
     from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.seat import first_situations, grid_conditions
 
     check_money_and_replay(max_cost, recording, replay=replay)
     if dask is not None and replay:
         raise UsageError("a replay needs no cluster: leave --dask out")
+    if grid is not None and not first:
+        raise UsageError("--grid goes with --first")
+    if grid is not None and conditions is not None:
+        raise UsageError("--grid takes the place of --conditions: give one of them")
     options = Options(
         db=db,
         cache=cache,
@@ -143,7 +163,7 @@ def sweep(
             name,
             model or (),
             reps,
-            listed(conditions),
+            listed(conditions) if grid is None else grid_conditions(grid),
             listed(variants),
             sample_set=sample_set,
             order_seed=order_seed,
@@ -154,12 +174,12 @@ def sweep(
         )
         if dask is not None and plan.replays_humans:
             raise UsageError("human trials are replayed in this process: leave --dask out")
-        return plan
+        return first_situations(plan) if first else plan
 
     if len(studies) > 1:  # all are looked at before the first one is played
         ledgers = [planned(name).ledger for name in studies]
         options = replace(options, ledgers=() if max_cost is None else ledgers)
-    whole = any(part is not None for part in (reps, conditions, variants))
+    whole = any(part is not None for part in (reps, grid, conditions, variants))
     codes = []
     for name in studies:
         if len(studies) > 1:
@@ -175,39 +195,7 @@ def sweep(
     sys.exit(next(filter(None, codes), 0))
 
 
-def replay(
-    studies: StudiesArgument,
-    model: ModelOption = None,
-    only: OnlyOption = None,
-    mirror: MirrorOption = False,
-    reps: RepsOption = None,
-    conditions: ConditionsOption = None,
-    variants: VariantsOption = None,
-    sample_set: SampleSetOption = 0,
-    db: DbOption = DEFAULT_DB,
-    cache: CacheOption = DEFAULT_CACHE,
-    in_flight: InFlightOption = 200,
-    trust: TrustOption = False,
-    recording: RecordingOption = None,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
-) -> None:
+@wraps(sweep, assigned=["__annotations__"])
+def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
     """Play a sweep from recorded replies alone: no key, no network."""
-    sweep(
-        studies=studies,
-        model=model,
-        only=only,
-        mirror=mirror,
-        reps=reps,
-        conditions=conditions,
-        variants=variants,
-        sample_set=sample_set,
-        db=db,
-        cache=cache,
-        in_flight=in_flight,
-        trust=trust,
-        replay=True,
-        recording=recording,
-        quiet=quiet,
-        as_json=as_json,
-    )
+    sweep(**{**options, "replay": True})

@@ -67,7 +67,7 @@ class RecordedSweep:
         words = ["merge-runner", "replay", self.name]
         if self.seat:
             study = self.name.removesuffix(f"-{self.seat}")
-            words = ["merge-runner", "seat", self.seat, study, "--replay"]
+            words = ["merge-runner", "sweep", study, "--first", "--replay"]
             words += ["--conditions", ",".join(self.conditions)]
         words += [word for model in self.model.split(",") for word in ("--model", model)]
         words += ["--mirror"] * self.mirror

@@ -22,6 +22,7 @@ from tests.harness import FAST, RECORDING, watched
 DB = "results/merge.duckdb"
 TWO = ("--conditions", "N_0_0,L_4_8")
 # A reply of 1000 tokens costs 1 USD at most.
+FIRST = ("sweep", "baseline", "--first")
 PRICED = """
 [paid]
 provider = "emulator"
@@ -36,7 +37,7 @@ price = { input = 0.0, output = 1000.0, source = "test" }
 async def test_22_situations_are_asked_as_often_as_wanted_and_nothing_else_is(merge_runner):
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner("seat", "first", "--samples", 3, "--json", **env)
+        run = await merge_runner(*FIRST, "--reps", 3, "--json", **env)
         assert run.code == 0, run.err
         assert server.requests == 22 * 3
         assert run.summary["calls"] == {"live": 66, "cached": 0}
@@ -53,7 +54,7 @@ async def test_22_situations_are_asked_as_often_as_wanted_and_nothing_else_is(me
 @pytest.mark.long
 async def test_a_sweep_answers_the_situations_and_they_answer_its_first_decisions(merge_runner):
     sweep = ("sweep", "baseline", "--reps", 2, *TWO, "--json")
-    first = ("seat", "first", "--samples", 2, *TWO, "--json")
+    first = (*FIRST, "--reps", 2, *TWO, "--json")
     swept = (await merge_runner(*sweep)).summary
     asked = (await merge_runner(*first)).summary
     assert asked["calls"] == {"live": 0, "cached": 8}
@@ -70,7 +71,7 @@ async def test_a_sweep_answers_the_situations_and_they_answer_its_first_decision
 @pytest.mark.slow
 async def test_a_situation_is_driven_for_a_second_as_its_trial_begins(merge_runner):
     await merge_runner("sweep", "baseline", "--reps", 1, *TWO)
-    await merge_runner("seat", "first", "--samples", 1, *TWO)
+    await merge_runner(*FIRST, "--reps", 1, *TWO)
     query = (
         "select condition, side, step, time_s, position_m, velocity_mps, acceleration_mps2 "
         "from states join trials using (trial_id, spec_hash) where step <= 5 and source {} 'seat' "
@@ -91,21 +92,21 @@ async def test_the_trials_that_were_driven_are_shown_as_before(merge_runner, tmp
     await merge_runner("sweep", "baseline", "--reps", 1, *TWO)
     shown = ("tables", "ablation-quantitative", "attempts", "--format", "csv")
     before = await merge_runner(*shown)
-    await merge_runner("seat", "first", "--samples", 1)
+    await merge_runner(*FIRST, "--reps", 1)
     after = await merge_runner(*shown)
     assert (after.code, after.out) == (0, before.out)
 
 
 @pytest.mark.slow
 async def test_what_is_forgotten_is_asked_again_without_a_call(merge_runner):
-    await merge_runner("seat", "first", "--samples", 1, *TWO)
+    await merge_runner(*FIRST, "--reps", 1, *TWO)
     stored = await merge_runner("digest")
     assert "2 trials" in stored.out
-    again = (await merge_runner("seat", "first", "--samples", 1, *TWO, "--json")).summary
+    again = (await merge_runner(*FIRST, "--reps", 1, *TWO, "--json")).summary
     assert again["trials"]["stored_before"] == 2
     assert (await merge_runner("forget", "*", "--yes")).code == 0
     assert "0 trials" in (await merge_runner("digest")).out
-    anew = (await merge_runner("seat", "first", "--samples", 1, *TWO, "--json")).summary
+    anew = (await merge_runner(*FIRST, "--reps", 1, *TWO, "--json")).summary
     assert anew["calls"] == {"live": 0, "cached": 4}
     assert (await merge_runner("digest")).out == stored.out
 
@@ -118,7 +119,7 @@ async def test_a_killed_run_goes_on_without_asking_anything_again(merge_runner, 
 
     async with watched(slow) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        ask = ("seat", "first", "--samples", 2, "--in-flight", 3, "--json")
+        ask = (*FIRST, "--reps", 2, "--in-flight", 3, "--json")
         process = await merge_runner.fork(*ask, **env)
         while server.requests < 12:
             await asyncio.sleep(0.02)
@@ -132,7 +133,7 @@ async def test_a_killed_run_goes_on_without_asking_anything_again(merge_runner, 
         assert 44 <= server.requests <= 44 + 6
     assert (await merge_runner("audit")).code == 0
     whole = ("--db", "whole.duckdb", "--cache", "whole")
-    await merge_runner("seat", "first", "--samples", 2, *whole)
+    await merge_runner(*FIRST, "--reps", 2, *whole)
     assert results_digest(tmp_path / DB) == results_digest(tmp_path / "whole.duckdb")
 
 
@@ -140,45 +141,45 @@ async def test_a_killed_run_goes_on_without_asking_anything_again(merge_runner, 
 async def test_a_sealed_replay_and_an_imported_recording_give_the_same_digest(
     merge_runner, tmp_path
 ):
-    ask = ("seat", "first", "--grid", "h=-6:6:6,dv=1.2")
-    assert (await merge_runner(*ask, "--samples", 2)).code == 0
+    ask = (*FIRST, "--grid", "h=-6:6:6,dv=1.2")
+    assert (await merge_runner(*ask, "--reps", 2)).code == 0
     assert (await merge_runner("recording", "export", "asked.parquet")).code == 0
     assert (await merge_runner("audit", "--recording", "asked.parquet")).code == 0
     away = {"EMULATOR_BASE_URL": "http://127.0.0.1:9/v1"}
     from_file = ("--recording", "asked.parquet", "--db", "file.duckdb", "--cache", "none")
-    run = await merge_runner(*ask, "--samples", 2, "--replay", *from_file, "--json", **away)
+    run = await merge_runner(*ask, "--reps", 2, "--replay", *from_file, "--json", **away)
     assert (run.code, run.summary["calls"]) == (0, {"live": 0, "cached": 12}), run.err
     assert (await merge_runner("recording", "import", "asked.parquet", "--cache", "new")).code == 0
     from_cache = ("--db", "cache.duckdb", "--cache", "new")
-    assert (await merge_runner(*ask, "--samples", 2, "--replay", *from_cache)).code == 0
+    assert (await merge_runner(*ask, "--reps", 2, "--replay", *from_cache)).code == 0
     digests = {results_digest(tmp_path / name) for name in (DB, "file.duckdb", "cache.duckdb")}
     assert len(digests) == 1
 
 
 @pytest.mark.slow
 async def test_a_replay_without_a_number_plays_the_repetitions_that_a_sweep_recorded(merge_runner):
-    run = await merge_runner("seat", "first", "--replay", "--recording", RECORDING, "--json")
+    run = await merge_runner(*FIRST, "--replay", "--recording", RECORDING, "--json")
     assert run.code == 0, run.err
     assert run.summary["calls"] == {"live": 0, "cached": 220}
 
 
 @pytest.mark.slow
 async def test_a_recording_of_situations_is_no_recording_of_the_sweep(merge_runner):
-    await merge_runner("seat", "first", "--samples", 1, *TWO)
+    await merge_runner(*FIRST, "--reps", 1, *TWO)
     await merge_runner("recording", "export", "asked.parquet")
     replay = ("replay", "baseline", "--reps", 1, *TWO, "--recording", "asked.parquet")
     swept = await merge_runner(*replay, "--db", "new.duckdb", "--cache", "new")
     assert swept.code == 4
     other = ("--db", "other.duckdb", "--cache", "none")
     missed = await merge_runner("replay", "baseline", "--sample-set", 5, *replay[4:], *other)
-    said = "merge-runner seat first baseline --replay --conditions N_0_0,L_4_8"
+    said = "merge-runner sweep baseline --first --replay --conditions N_0_0,L_4_8"
     assert (missed.code, said in missed.err) == (4, True), missed.err
 
 
 async def test_no_more_is_spent_than_the_cap_and_more_money_goes_on(merge_runner, tmp_path):
     (tmp_path / "models.toml").write_text(PRICED)
     (tmp_path / "mine.toml").write_text('repetitions = 2\nconditions = ["N_0_0", "L_4_8"]\n')
-    ask = ("seat", "first", "mine.toml", "--model", "paid", "--json", *FAST)
+    ask = ("sweep", "mine.toml", "--first", "--model", "paid", "--json", *FAST)
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         unasked = await merge_runner(*ask, **env)
@@ -203,13 +204,13 @@ async def test_a_study_with_a_budget_pays_for_its_situations_from_it(merge_runne
 
 
 async def test_an_estimate_counts_one_call_a_situation(merge_runner):
-    run = await merge_runner("seat", "first", "--samples", 2, "--dry-run", "--json")
+    run = await merge_runner(*FIRST, "--reps", 2, "--dry-run", "--json")
     assert (run.summary["trials"], run.summary["calls"]) == (22, 44)
 
 
 @pytest.mark.slow
 async def test_a_program_is_asked_too_and_has_no_word(merge_runner):
-    run = await merge_runner("seat", "first", "--model", "constant", "--samples", 1, "--json")
+    run = await merge_runner(*FIRST, "--model", "constant", "--reps", 1, "--json")
     assert run.code == 0, run.err
     assert {look["share_m"] for look in run.summary["first_looks"]} == {None}
     assert {look["first_action_mps2"] for look in run.summary["first_looks"]} == {0.0}
@@ -218,8 +219,8 @@ async def test_a_program_is_asked_too_and_has_no_word(merge_runner):
 
 @pytest.mark.slow
 async def test_the_two_drivers_of_a_pair_are_summed_up_apart(merge_runner):
-    pair = ("--model", "emulator+constant", "--mirror", "--samples", 1, "--conditions", "N_0_0")
-    run = await merge_runner("seat", "first", *pair, "--json")
+    pair = ("--model", "emulator+constant", "--mirror", "--reps", 1, "--conditions", "N_0_0")
+    run = await merge_runner(*FIRST, *pair, "--json")
     assert run.code == 0, run.err
     looks = run.summary["first_looks"]
     assert [(look["model"], look["side"], look["asked"]) for look in looks] == [
@@ -229,7 +230,7 @@ async def test_the_two_drivers_of_a_pair_are_summed_up_apart(merge_runner):
         ("emulator", "right", 1),
     ]
     assert [look["with_a_word"] for look in looks] == [0, 0, 1, 1]
-    again = await merge_runner("seat", "first", *pair)
+    again = await merge_runner(*FIRST, *pair)
     for model in ("constant", "emulator"):
         assert f"{model} of emulator+constant/baseline: share of M" in again.out
 
@@ -240,19 +241,19 @@ async def test_factors_and_prompts_of_a_study_are_asked(merge_runner, tmp_path):
         'repetitions = 1\nmodels = ["emulator"]\nconditions = ["N_0_0"]\n'
         '[factors]\nprompt = ["baseline", "A4"]\nprompt_rate_hz = [1.0, 0.5]\n'
     )
-    run = await merge_runner("seat", "first", "mine.toml", "--json")
+    run = await merge_runner("sweep", "mine.toml", "--first", "--json")
     assert run.code == 0, run.err
     assert run.summary["calls"]["live"] == 2 * 4
     query = "select distinct end_time_s from trials order by all"
     assert (await merge_runner("sql", query, "--format", "csv")).out.split()[1:] == ["1.0", "2.0"]
     part = await merge_runner(
-        "seat", "first", "mine.toml", "--only", "prompt=A4", "--json", "--db", "part.duckdb"
+        "sweep", "mine.toml", "--first", "--only", "prompt=A4", "--json", "--db", "part.duckdb"
     )
     assert part.summary["trials"]["planned"] == 2
 
 
 async def test_the_usual_grid_is_the_one_that_help_tells(merge_runner):
-    told = " ".join((await merge_runner("seat", "first", "--help")).out.split())
+    told = " ".join((await merge_runner(*FIRST, "--help")).out.split())
     assert "usual: {} and {}".format(*re.findall(r"=([^,]+)", USUAL_GRID)) in told
 
 
@@ -292,12 +293,12 @@ async def test_situations_that_cannot_be_asked_are_refused_before_anything_is(
 ):
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        near = await merge_runner("seat", "first", "--grid", "h=60,dv=0", **env)
-        both = await merge_runner("seat", "first", "--grid", "usual", *TWO, **env)
+        near = await merge_runner(*FIRST, "--grid", "h=60,dv=0", **env)
+        both = await merge_runner(*FIRST, "--grid", "usual", *TWO, **env)
         (tmp_path / "mine.toml").write_text(
             'repetitions = 1\n[scenario]\ncontrol_start = "own_exit"\n'
         )
-        tunnel = await merge_runner("seat", "first", "mine.toml", **env)
+        tunnel = await merge_runner("sweep", "mine.toml", "--first", **env)
         assert server.requests == 0
     assert "error: a projected headway of 60 m, a relative velocity of 0 m/s" in near.err
     assert (near.code, "at the merge point before both are driven" in near.err) == (2, True)
@@ -317,7 +318,7 @@ def test_vehicles_that_collide_at_once_are_no_situation():
 @pytest.mark.slow
 async def test_a_sweep_plays_the_points_of_a_grid_and_takes_what_was_asked(merge_runner):
     point = ("--conditions", "h2_dv-1.2")
-    assert (await merge_runner("seat", "first", "--samples", 1, *point)).code == 0
+    assert (await merge_runner(*FIRST, "--reps", 1, *point)).code == 0
     run = await merge_runner("sweep", "baseline", "--reps", 1, *point, "--json")
     assert (run.code, run.summary["calls"]["cached"]) == (0, 2), run.err
     audit = await merge_runner("audit")
@@ -339,7 +340,17 @@ async def test_no_question_depends_on_an_answer_and_replies_without_a_plan_are_c
     for middle, name in ((None, "usual"), (wordless, "wordless")):
         async with watched(middle) as server:
             places = ("--cache", name, "--db", f"{name}.duckdb")
-            ask = ("seat", "first", "--samples", 2, "--keep-going", *TWO, "--json", *places)
+            ask = (
+                "sweep",
+                "baseline",
+                "--first",
+                "--reps",
+                2,
+                "--keep-going",
+                *TWO,
+                "--json",
+                *places,
+            )
             run = await merge_runner(*ask, EMULATOR_BASE_URL=f"{server.url}/v1")
             assert run.code == 0, run.err
             asked.append(server.asked)

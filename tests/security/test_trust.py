@@ -98,7 +98,7 @@ async def test_a_models_file_beside_a_study_sends_a_key_elsewhere_only_with_an_a
         ("sweep", "{}"),
         ("sweep", "{}", "--dry-run"),
         ("replay", "{}"),
-        ("seat", "first", "{}"),
+        ("sweep", "{}", "--first"),
         ("power", "{}"),
         ("tables", "--study", "{}"),
         ("report", "--study", "{}"),
