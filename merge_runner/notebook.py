@@ -13,8 +13,9 @@ import threading
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, ParamSpec, TypedDict, TypeVar, Unpack
 
 from merge_runner.config import resolve_endpoint
 from merge_runner.drivers.base import Driver
@@ -37,9 +38,25 @@ if TYPE_CHECKING:
     import pandas as pd
     from pydantic import JsonValue
 
+P = ParamSpec("P")
 T = TypeVar("T")
 PARTS = ("repetitions", "conditions", "variants")
 _playing = threading.Lock()
+
+
+def sync(method: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
+    """Return the method as one that blocks; it raises UsageError where an event loop is running."""
+
+    @wraps(method)
+    def blocking(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:
+            return asyncio.run(method(*args, **kwargs))
+        awaited = f"await study.{method.__name__}(...)"
+        raise UsageError(f"an event loop is running, as in a notebook: {awaited}")
+
+    return blocking
 
 
 class RunOptions(TypedDict, total=False):
@@ -180,37 +197,23 @@ class Study:
         """What would be played; raises UsageError."""
         return make_plan(self.file, db=self.db, **self._wanted)
 
-    def dry_run(self, max_cost_usd: float | None = None) -> Estimate:
-        """The trials, calls, tokens, cost and time of a run; nothing is sent."""
-        return _now(self.adry_run(max_cost_usd), "adry_run")
-
     async def adry_run(self, max_cost_usd: float | None = None) -> Estimate:
-        """See ``dry_run``."""
+        """The trials, calls, tokens, cost and time of a run; nothing is sent."""
         plan = self.plan()
         return await unsent(plan, self._options(plan, max_cost_usd=max_cost_usd), say=_say)
 
-    def run(self, *, yes: bool = False, **how: Unpack[RunOptions]) -> StudyOutcome:
-        """Play all trials that are not stored yet; ``yes`` lets it spend money."""
-        return _now(self.arun(yes=yes, **how), "arun")
-
     async def arun(self, *, yes: bool = False, **how: Unpack[RunOptions]) -> StudyOutcome:
-        """See ``run``."""
+        """Play all trials that are not stored yet; ``yes`` lets it spend money."""
         with _alone():
             return await self._run(self.plan(), yes=yes, **how)
 
-    def seat_first(
+    async def aseat_first(
         self, grid: str | None = None, *, yes: bool = False, **how: Unpack[RunOptions]
     ) -> StudyOutcome:
         """Ask only what drivers do first, as ``sweep --first``; ``grid`` is its --grid.
 
         Each situation is asked as often as the study has repetitions.
         """
-        return _now(self.aseat_first(grid, yes=yes, **how), "aseat_first")
-
-    async def aseat_first(
-        self, grid: str | None = None, *, yes: bool = False, **how: Unpack[RunOptions]
-    ) -> StudyOutcome:
-        """See ``seat_first``."""
         wanted = dict(self._wanted)
         if grid is not None:
             if wanted["conditions"] is not None:
@@ -220,12 +223,8 @@ class Study:
             plan = first_situations(make_plan(self.file, db=self.db, **wanted))
             return await self._run(plan, yes=yes, **how)
 
-    def replay(self, *recordings: Path | str) -> StudyOutcome:
-        """Play all trials from recorded replies alone, those of the files first; sends nothing."""
-        return _now(self.areplay(*recordings), "areplay")
-
     async def areplay(self, *recordings: Path | str) -> StudyOutcome:
-        """See ``replay``."""
+        """Play all trials from recorded replies alone, those of the files first; sends nothing."""
         with _alone():
             plan = self.plan()
             files = tuple(map(Path, recordings))
@@ -235,6 +234,9 @@ class Study:
             for note in notes:
                 _say(note)
             return await _played(Sweep(plan, options, say=_say), options)
+
+    dry_run, run = sync(adry_run), sync(arun)
+    seat_first, replay = sync(aseat_first), sync(areplay)
 
     async def _run(self, plan: Plan, *, yes: bool, **how: Unpack[RunOptions]) -> StudyOutcome:
         """Play what is not stored yet of a plan; ``yes`` lets it spend money."""
@@ -287,16 +289,6 @@ async def _played(prepared: Sweep, options: Options) -> StudyOutcome:
         sweep_id=outcome.sweep_id,
         text="\n".join(summary.as_lines(outcome, options, None)),
     )
-
-
-def _now(work: Coroutine[Any, Any, T], awaited: str) -> T:
-    """The result of a coroutine where no event loop is running."""
-    try:
-        asyncio.get_running_loop()
-    except RuntimeError:
-        return asyncio.run(work)
-    work.close()
-    raise UsageError(f"an event loop is running, as in a notebook: await study.{awaited}(...)")
 
 
 def _say(text: str) -> None:
