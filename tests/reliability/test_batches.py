@@ -198,7 +198,7 @@ async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path, p
 
 @pytest.mark.long
 async def test_first_situations_take_one_batch(merge_runner, tmp_path):
-    first = ("seat", "first", "--samples", 1)
+    first = ("sweep", "baseline", "--first", "--reps", 1)
     async with watched(faults=FaultPlan(batch=BatchPlan(polls=8))) as server:
         env = account(server)
         left = await interrupted(merge_runner, server, *first, "--batch", **env)
@@ -235,7 +235,9 @@ async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly
 async def test_an_account_that_takes_few_tokens_gets_smaller_batches(merge_runner):
     plan = BatchPlan(delay_s=0.2, enqueued_tokens=5000)
     async with watched(faults=FaultPlan(batch=plan)) as server:
-        run = await merge_runner("seat", "first", "--samples", 1, "--batch", **account(server))
+        run = await merge_runner(
+            "sweep", "baseline", "--first", "--reps", 1, "--batch", **account(server)
+        )
         batched, alone = await answered(server)
     assert run.code == 0, run.err
     assert "go in smaller batches" in run.err

@@ -39,8 +39,8 @@ async def test_a_live_run_stops_after_20_invalid_decisions_and_keeps_what_was_an
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
-    [("sweep", "baseline", "--reps", 1), ("seat", "first", "--samples", 1)],
-    ids=["sweep", "seat"],
+    [("sweep", "baseline", "--reps", 1), ("sweep", "baseline", "--first", "--reps", 1)],
+    ids=["sweep", "first"],
 )
 async def test_a_run_of_fewer_decisions_says_at_its_end_that_none_is_valid(merge_runner, command):
     part = (*command, "--conditions", "N_0_0", "--json")

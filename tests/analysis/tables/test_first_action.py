@@ -190,7 +190,7 @@ def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_action
     prepare, tmp_path
 ):
     pair = ("--model", "emulator+idm", "--mirror", "--conditions", "L_4_8,R_-4_-8,N_0_0")
-    for played in (("sweep", "baseline", "--reps"), ("seat", "first", "--samples")):
+    for played in (("sweep", "baseline", "--reps"), ("sweep", "baseline", "--first", "--reps")):
         for models in ((), pair):
             run = prepare(tmp_path, *played, 2, *models)
             assert run.code == 0, run.err
@@ -221,8 +221,8 @@ def asked(prepare, tmp_path_factory):
     folder = tmp_path_factory.mktemp("asked")
     grid = ("--grid", "h=-6:6:2,dv=-1.6:1.6:0.8")
     for ask in (
-        ("seat", "first", "--samples", 4, *grid),
-        ("seat", "first", "--model", "projected-order", "--samples", 2, *grid),
+        ("sweep", "baseline", "--first", "--reps", 4, *grid),
+        ("sweep", "baseline", "--first", "--model", "projected-order", "--reps", 2, *grid),
         ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0"),
     ):
         run = prepare(folder, *ask)

@@ -226,7 +226,7 @@ async def test_a_replay_needs_the_same_import_and_says_so(merge_runner, tmp_path
 
 async def test_imported_humans_are_asked_what_they_do_first(merge_runner, db, tmp_path):
     (tmp_path / "mine.toml").write_text(HUMAN)
-    ask = ("mine.toml", "--model", "human-replay+idm", "--samples", 1, "--conditions", "L_4_0")
-    run = await merge_runner("seat", "first", *ask, "--json")
+    ask = ("mine.toml", "--model", "human-replay+idm", "--reps", 1, "--conditions", "L_4_0")
+    run = await merge_runner("sweep", *ask, "--first", "--json")
     assert run.code == 0, run.err
     assert {look["model"] for look in run.summary["first_looks"]} == {"human-replay", "idm"}
