@@ -14,7 +14,7 @@ from datetime import date
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
-from urllib.parse import unquote, urlsplit
+from urllib.parse import SplitResult, unquote, urlsplit
 
 from pydantic import (
     AfterValidator,
@@ -38,7 +38,7 @@ PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
 LONGEST_URL, LONGEST_HOST = 2000, 253
 # A shorter key is a dummy, and may occur in any text.
 SHORTEST_SECRET = 8
-_LABEL = re.compile(r"[a-z0-9_-]{1,63}", re.I)
+_HOST = re.compile(r"[a-z0-9_-]{1,63}(\.[a-z0-9_-]{1,63})*\.?", re.I)
 UNNAMED = "default"
 # What stands for the emulator where it takes the place of a provider.
 REHEARSAL = "rehearsal://localhost"
@@ -322,19 +322,15 @@ class Provider:
 
 
 PROVIDERS: Registry[Provider] = Registry("provider")
-PROVIDERS.register(
-    "openai",
-    Provider(
+for _name, _provider in {
+    "openai": Provider(
         "https://api.openai.com/v1",
         "OPENAI_BASE_URL",
         ("OPENAI_API_KEY",),
         error_members=frozenset({"message", "type", "code"}),
         batch=BatchTerms(price_factor=0.5, source="platform.openai.com/docs/guides/batch, 2026-11"),
     ),
-)
-PROVIDERS.register(
-    "gemini",
-    Provider(
+    "gemini": Provider(
         "https://generativelanguage.googleapis.com",
         "GOOGLE_GEMINI_BASE_URL",
         # The official SDK prefers GOOGLE_API_KEY where both are set.
@@ -345,10 +341,7 @@ PROVIDERS.register(
             price_factor=0.5, source="ai.google.dev/gemini-api/docs/batch-api, 2026-11"
         ),
     ),
-)
-PROVIDERS.register(
-    "anthropic",
-    Provider(
+    "anthropic": Provider(
         "https://api.anthropic.com",
         "ANTHROPIC_BASE_URL",
         ("ANTHROPIC_API_KEY",),
@@ -359,19 +352,13 @@ PROVIDERS.register(
             source="platform.claude.com/docs/en/build-with-claude/batch-processing, 2026-11",
         ),
     ),
-)
-PROVIDERS.register(
-    "openrouter",
-    Provider(
+    "openrouter": Provider(
         "https://openrouter.ai/api/v1",
         key_envs=("OPENROUTER_API_KEY",),
         error_members=frozenset({"message", "code"}),
         parameters=frozenset({"top_k", "min_p", "top_a", "repetition_penalty", "reasoning"}),
     ),
-)
-PROVIDERS.register(
-    "local",
-    Provider(
+    "local": Provider(
         "http://localhost:8000/v1",
         "LOCAL_BASE_URL",
         ("LOCAL_API_KEY",),
@@ -384,10 +371,7 @@ PROVIDERS.register(
         model_env="LOCAL_MODEL",
         if_nobody="start a server (docs/how-to/local-models.md)",
     ),
-)
-PROVIDERS.register(
-    "emulator",
-    Provider(
+    "emulator": Provider(
         "http://127.0.0.1/v1",
         "EMULATOR_BASE_URL",
         key_needed=False,
@@ -395,7 +379,8 @@ PROVIDERS.register(
         batch=BatchTerms(price_factor=0.5, source="as the providers that it stands in for"),
         if_nobody="start it with `merge-runner emulate`",
     ),
-)
+}.items():
+    PROVIDERS.register(_name, _provider)
 
 
 @dataclass(frozen=True, slots=True)
@@ -544,40 +529,40 @@ def normalised_url(url: str, named: str = "base_url") -> str:
     by what it is ``named``.
     """
     url = url.strip()
-    if len(url) > LONGEST_URL or not (url.isascii() and url.isprintable()) or " " in url:
-        raise UsageError(
-            f"{named} is no base URL: it must be of ASCII characters without spaces, {LONGEST_URL} "
-            "at most; write a name of other letters as xn--..."
-        )
-    try:
-        parts = urlsplit(url)
-        port_number = parts.port
-    except ValueError as exc:
-        raise UsageError(f"{named} is no base URL: there can be no such host or port") from exc
-    if parts.scheme not in ("http", "https") or not parts.hostname:
+    if not url.lower().startswith(("http://", "https://")):
         raise UsageError(f"{named} is no base URL: it must begin with http:// or https://")
-    if not is_host(parts.hostname) or port_number == 0:
-        raise UsageError(f"{named} is no base URL: there can be no such host or port")
+    parts = _address(url)
+    if parts is None:
+        raise UsageError(
+            f"{named} is no base URL: there can be no such host or port, or it has a space or "
+            "characters that are not ASCII (write a name of other letters as xn--...)"
+        )
     if "@" in parts.netloc or parts.query or parts.fragment:
         raise UsageError(
             f"{named} has a user name, a password or a part after ? or #, which are not sent: set "
             "the provider's key variable"
         )
-    host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
+    name = parts.hostname or ""
+    host = f"[{name}]" if ":" in name else name
     default_port = 443 if parts.scheme == "https" else 80
-    port = "" if port_number in (None, default_port) else f":{port_number}"
+    port = "" if parts.port in (None, default_port) else f":{parts.port}"
     return f"{parts.scheme}://{host}{port}{parts.path.rstrip('/')}"
 
 
-def is_host(name: str) -> bool:
-    """Whether a name or an address is one that a host can have."""
-    if ":" in name or re.fullmatch(r"\d+(\.\d+){3}", name):
-        try:
-            return "%" not in str(ipaddress.ip_address(name))
-        except ValueError:
-            return False
-    labels = name.removesuffix(".").split(".")
-    return len(name) <= LONGEST_HOST and all(map(_LABEL.fullmatch, labels))
+def _address(url: str) -> SplitResult | None:
+    """The parts of a URL, or None where no host can be reached at it."""
+    if len(url) > LONGEST_URL or not (url.isascii() and url.isprintable()) or " " in url:
+        return None
+    try:
+        parts = urlsplit(url)
+        name = parts.hostname or ""
+        if ":" in name or re.fullmatch(r"\d+(\.\d+){3}", name):
+            is_host = "%" not in str(ipaddress.ip_address(name))
+        else:
+            is_host = len(name) <= LONGEST_HOST and bool(_HOST.fullmatch(name))
+        return parts if is_host and parts.port != 0 else None
+    except ValueError:
+        return None
 
 
 def check_network(base_url: str, env: Mapping[str, str] = os.environ) -> None:
@@ -602,12 +587,7 @@ def _check_proxy(variable: str, value: str) -> None:
             f"{variable} names a {scheme[:20]}:// proxy, and only http:// and https:// ones can be "
             "used: unset it, or put one of these (privoxy, for one) before a SOCKS proxy"
         )
-    try:
-        parts = urlsplit(value if separator else f"http://{value}")
-        usable = parts.port != 0 and is_host(parts.hostname or "")
-    except ValueError:
-        usable = False
-    if not usable or " " in value or not (value.isascii() and value.isprintable()):
+    if _address(value if separator else f"http://{value}") is None:
         raise UsageError(f"{variable} is no URL of a proxy: set it to http://HOST:PORT or unset it")
 
 

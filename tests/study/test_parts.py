@@ -236,6 +236,20 @@ def test_what_cannot_be_is_refused_in_one_line(plan_of, text, plugin, says):
     assert "\n" not in str(caught.value)
 
 
+def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monkeypatch):
+    register = 'CONDITIONS.register("elsewhere", Condition(1.0, 0.0))\n'
+    imports = "from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition\n"
+    (tmp_path / "imported_by_a_plug_in.py").write_text(imports + register)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(CONDITIONS, "_things", dict(CONDITIONS._things))
+    own = f"import imported_by_a_plug_in\n{imports}{register.replace('elsewhere', 'own')}"
+    plan_of('[plugins]\nfiles = ["mine.py"]\n', plugin=own)
+    assert {"elsewhere", "own"} < {*CONDITIONS}
+    make_plan("baseline", "constant")
+    assert "elsewhere" in CONDITIONS
+    assert "own" not in CONDITIONS
+
+
 def test_a_situation_in_other_words_may_stand_beside_the_table(plan_of):
     table = '[prompts.x]\nadd = [{ block = "state.table" }]\n'
     plan_of(table + 'replace = { C0 = "You drive a car." }\n')
