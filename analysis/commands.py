@@ -117,6 +117,12 @@ def tables(
         ),
     ] = None,
     by: ByOption = None,
+    without_fallbacks: Annotated[
+        bool,
+        typer.Option(
+            "--without-fallbacks", help="Without the trials in which a reply held no valid plan."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print the paper's tables III to VII, and further ones."""
@@ -129,7 +135,13 @@ def tables(
     from analysis.tables.formats import render, with_columns
 
     made = finished_tables(
-        db, drivers(models), names or (), where=_at(where), file=study_file, by=by
+        db,
+        drivers(models),
+        names or (),
+        where=_at(where),
+        file=study_file,
+        by=by,
+        without_fallbacks=without_fallbacks,
     )
     if against is not None:
         from analysis.tables.against import against as beside

@@ -14,10 +14,9 @@ from merge_runner.registry import Registry
 from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 
 Estimator = Literal["proportion", "mean", "median"]
-# tables: Tables V and VII, the contrasts, and the sentences and pages made of these; fallbacks,
-# criticality: the tables of these names; distributions: the figure; conclusions: a sentence on
-# each driver.
-Place = Literal["tables", "fallbacks", "criticality", "distributions", "conclusions"]
+# tables: Tables V and VII, the contrasts, and the sentences and pages made of these; criticality:
+# the table of this name; distributions: the figure; conclusions: a sentence on each driver.
+Place = Literal["tables", "criticality", "distributions", "conclusions"]
 PLACES: frozenset[Place] = frozenset(get_args(Place))
 EVERYWHERE = PLACES - {"criticality"}
 # The trials that a metric may be of, in SQL.
@@ -214,7 +213,7 @@ COLLISIONS = register(
         lowest=0.0,
         humans_from="all recordings",
         paper_of_drivers="collided_percent",
-        shown=frozenset({"tables", "fallbacks"}),
+        shown=frozenset({"tables"}),
     )
 )
 BOXES = register(
@@ -232,7 +231,7 @@ BOXES = register(
         lowest=0.0,
         humans_from="outcomes",
         paper_of_humans="collided_percent",
-        shown=frozenset({"tables", "fallbacks"}),
+        shown=frozenset({"tables"}),
     )
 )
 LEFT_FIRST = register(
@@ -247,7 +246,7 @@ LEFT_FIRST = register(
         lowest=0.0,
         highest=100.0,
         humans_from="outcomes",
-        shown=frozenset({"fallbacks"}),
+        shown=frozenset(),
     )
 )
 GAP = register(
@@ -290,7 +289,7 @@ JOINT = register(
         lowest=0.0,
         paper_of_drivers="joint_percent",
         paper_of_humans="joint_percent",
-        shown=frozenset({"tables", "fallbacks"}),
+        shown=frozenset({"tables"}),
     )
 )
 

@@ -107,9 +107,10 @@ def options_text(
     where: Mapping[str, Sequence[str]] | None = None,
     file: str | None = None,
     by: str | None = None,
+    without_fallbacks: bool = False,
 ) -> str:
     """What a table depends on besides the results; the path, since its notes name the database."""
-    return json.dumps([str(db), models, where, file, by])
+    return json.dumps([str(db), models, where, file, by, without_fallbacks])
 
 
 def present_state(db: Path) -> str:

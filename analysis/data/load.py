@@ -169,8 +169,6 @@ SELECT one.spec_hash, base.spec_hash AS baseline, calls, count(*) AS shared
 FROM used AS one JOIN used AS base USING (call_key) JOIN totals ON totals.spec_hash = one.spec_hash
 WHERE one.variant <> 'baseline' AND base.variant = 'baseline' GROUP BY ALL ORDER BY ALL
 """
-# One row a trial and window: RMSE of the speeds from the initial ones, and joint.
-DEVIATIONS = "SELECT * FROM speed_deviations ORDER BY ALL"
 # Fates of the attempts that were answered, also without a plan.
 ANSWERED = ("driven", "fallback")
 # One row a trial and kind of attempt; a retried attempt has no share in the answer's failure.

@@ -20,7 +20,6 @@ from analysis.data.imported_humans import RECORDINGS, Imported, imported, of_pub
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
     ASKED_TRIALS,
-    DEVIATIONS,
     EGO_SPEEDS,
     FIRST_ACTIONS,
     PLANS,
@@ -214,17 +213,20 @@ class Study:
         where: Mapping[str, Sequence[str]] | None = None,
         file: str | None = None,
         by: str | None = None,
+        without_fallbacks: bool = False,
     ) -> None:
         """Read the trials; ``models`` keeps these drivers alone, ``where`` these levels of factors.
 
         ``file`` keeps the trials of this study, and ``by`` is the factor at whose levels the table
-        ``factors`` shows the others. Raises UsageError.
+        ``factors`` shows the others. ``without_fallbacks`` leaves out trials in which a decision
+        had no valid plan. Raises UsageError.
         """
         self.db = Path(db)
         self.chosen = models
         self.where = where
         self.by = by
-        self.options = options_text(self.db, models, where, file, by)
+        self.without_fallbacks = without_fallbacks
+        self.options = options_text(self.db, models, where, file, by, without_fallbacks)
         self.state = present_state(self.db)
         self.studies = read_studies(self.db)
         self.source = None if file is None else read_study(file)
@@ -242,7 +244,10 @@ class Study:
         every = _model_groups(
             driven[self.is_of_file(driven)], specs, found["decisions"], part=bool(self.file)
         )
-        every = [replace(group, levels=_levels(found["levels"], group)) for group in every]
+        every = [
+            self._kept_trials(replace(group, levels=_levels(found["levels"], group)))
+            for group in every
+        ]
         asked = found["asked"][self.is_of_file(found["asked"])]
         drivers = [*(group.driver for group in every), *asked["driver"].unique()]
         valid = list(dict.fromkeys([HUMAN, *drivers]))
@@ -289,8 +294,21 @@ class Study:
         groups = _model_groups(trials, self.specs, decisions, part=bool(self.file))
         return _kept(
             self.where or {},
-            [replace(group, levels=_levels(levels, group)) for group in groups],
+            [self._kept_trials(replace(group, levels=_levels(levels, group))) for group in groups],
         )
+
+    def _kept_trials(self, group: Group) -> Group:
+        """The group, perhaps without its trials that had a fallback; it is judged by all."""
+        if not self.without_fallbacks:
+            return group
+        kept = group.part(lambda trials: ~trials["trial_id"].isin(self._with_fallbacks(group)))
+        if kept.trials.empty:
+            return replace(group, unjudged=group.unjudged or "every trial had a fallback")
+        return replace(kept, narrowed=_among(kept.trials))
+
+    def _with_fallbacks(self, group: Group) -> set[str]:
+        decisions = of_group(self.calls.decisions, group, group.trials)
+        return set(decisions.loc[decisions["fallback"], "trial_id"])
 
     def is_of_file(self, trials: pd.DataFrame) -> pd.Series:
         """Whether each of these trials was played for the study that was chosen, if any was."""
@@ -360,11 +378,6 @@ class Study:
     def ego_speeds(self) -> pd.DataFrame:
         """One row a finished trial: the ego's speeds under control, of equal drivers the left."""
         return self._read(EGO_SPEEDS)
-
-    @cached_property
-    def deviations(self) -> pd.DataFrame:
-        """One row a trial and window: RMSE of the speeds from the initial ones, and joint."""
-        return self._read(DEVIATIONS)
 
     @cached_property
     def plans(self) -> pd.DataFrame:

@@ -118,13 +118,10 @@ def _all_hold(sample: Sample, _: Sample | None) -> Holds:
     return np.asarray(np.logical_and.reduce(found))
 
 
-def _differs(at: int) -> Callable[[Sample, Sample | None], Holds]:
-    def found(sample: Sample, other: Sample | None) -> Holds:
-        assert other is not None
-        fit = firth_differences(sample.draws, other.draws, WHO_FIRST_TERMS[at])
-        return fit.sound & (fit.p[:, at] < ALPHA)
-
-    return found
+def _speed_cue_differs(sample: Sample, other: Sample | None) -> Holds:
+    assert other is not None
+    fit = firth_differences(sample.draws, other.draws, WHO_FIRST_TERMS[SPEED])
+    return fit.sound & (fit.p[:, SPEED] < ALPHA)
 
 
 def _gap_differs(sample: Sample, other: Sample | None) -> Holds:
@@ -158,26 +155,12 @@ BESIDE_HUMANS = (
     Question(
         "differences",
         "relative velocity",
-        _differs(SPEED),
+        _speed_cue_differs,
         replace(SPEED_CUE, furthest=8.0),
     ),
     Question("contrasts", "collisions", _collisions_differ, COLLISIONS, of_who_first=False),
 )
 OF_TWO_ARMS = (
-    Question(
-        "who-first-variants",
-        "projected headway",
-        _differs(HEADWAY),
-        replace(HEADWAY_CUE, furthest=-5.0),
-        lambda truth: HEADWAY_CUE.put(truth, 0.0),
-    ),
-    Question(
-        "who-first-variants",
-        "relative velocity",
-        _differs(SPEED),
-        replace(SPEED_CUE, furthest=8.0),
-        lambda truth: SPEED_CUE.put(truth, 0.0),
-    ),
     Question(
         "contrasts",
         "gap",

@@ -11,32 +11,18 @@ from analysis.data.study import Group, Study
 from analysis.metrics import Metric, compared
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import POWER
-from analysis.stats.variants import variants
 from analysis.tables import finished_tables
 from analysis.tables.model import Row
 from analysis.tables.notes import listed
 from merge_runner.study.file import BASELINE
 
-# How a sentence names each coefficient of the regressions, and its unit.
-SLOPES = {
-    "projected_headway": ("the effect of headway on who merges first", "logits per m"),
-    "relative_velocity": ("the effect of relative velocity on who merges first", "logits per m/s"),
-    "abs_projected_headway": ("the effect of |headway| on the gap", "m per m"),
-    "abs_relative_velocity": ("the effect of |relative velocity| on the gap", "m per m/s"),
-    "headway_x_velocity": (
-        "the effect of headway times relative velocity on the gap",
-        "m per m²/s",
-    ),
-}
-SOURCES = ("contrasts", "who-first-variants", "gap-variants")
-
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a variant changes in one measure or slope, named by ``what``.
+    """What a variant changes in one measure, named by ``what``.
 
-    ``difference``, ``ci`` and ``detectable`` are in the unit of that measure or slope.
-    ``possible`` says whether a test of so few trials can give p < .05 at all.
+    ``difference``, ``ci`` and ``detectable`` are in the unit of that measure. ``possible`` says
+    whether a test of so few trials can give p < .05 at all.
     """
 
     setting: str
@@ -56,28 +42,29 @@ class Change:
 
 
 def _names() -> dict[str, tuple[str, str]]:
-    """Each measure and slope that may differ: how a sentence names it, and its unit."""
-    metrics = {
+    """Each measure that may differ: how a sentence names it, and its unit."""
+    return {
         metric.name: (metric.in_sentences, "points" if metric.rate else metric.unit)
         for metric in compared()
     }
-    return metrics | SLOPES
 
 
 def ablation_sentences(study: Study) -> list[str]:
     """What is shown about the variants of each driver, except those that stand-ins answered."""
-    found = dict(variants(study))
-    shown = [group for group in found if not group.scripted]
+    references = {group.driver: group for group in study.models if group.setting == study.reference}
+    shown = [
+        group for group in study.models if group.setting != study.reference and not group.scripted
+    ]
     if not shown:
         return []
-    # The sentences quote the tables' values, so that text and tables cannot disagree.
-    tables = finished_tables(study.db, None, SOURCES, study)
-    rows = {row.id: row for table in tables for row in table.rows}
+    # The sentences quote the table's values, so that text and table cannot disagree.
+    (table,) = finished_tables(study.db, None, ["contrasts"], study)
+    rows = {row.id: row for row in table.rows}
     return [
         text
         for label in dict.fromkeys(group.label for group in shown)
         for mine in [[group for group in shown if group.label == label]]
-        for text in _of_driver(label, mine, study.reference, found[mine[0]], rows)
+        for text in _of_driver(label, mine, study.reference, references.get(mine[0].driver), rows)
     ]
 
 
@@ -113,26 +100,16 @@ def _changes(group: Group, baseline: Group, rows: dict[str, Row]) -> Iterator[Ch
         if row is not None:
             # Before Holm's correction, which only makes p larger: a lenient bound.
             possible = smallest_p(group, baseline, metric) < ALPHA
-            yield _change(group, metric.name, row, "ci", possible=possible)
-    for slope in SLOPES:
-        row = rows[f"{group.id}/{slope}"]
-        # There is none where a fit failed.
-        if "difference" in row.values:
-            # The smallest p of these tests is unknown, so p < .05 is assumed possible.
-            yield _change(group, slope, row, "difference_ci", possible=True)
-
-
-def _change(group: Group, what: str, row: Row, interval: str, *, possible: bool) -> Change:
-    values: dict[str, Any] = dict(row.values)
-    return Change(
-        group.setting,
-        what,
-        values["difference"],
-        values[interval],
-        values["p_holm"],
-        values.get("detectable"),
-        possible,
-    )
+            values: dict[str, Any] = dict(row.values)
+            yield Change(
+                group.setting,
+                metric.name,
+                values["difference"],
+                values["ci"],
+                values["p_holm"],
+                values.get("detectable"),
+                possible,
+            )
 
 
 def smallest_p(group: Group, baseline: Group, metric: Metric) -> float:
@@ -209,7 +186,7 @@ def _not_compared(
     if lacking:
         yield (
             f"{label}: not compared with {_named(baseline)}: "
-            f"{_grouped(lacking)}. The notes of the tables {', '.join(SOURCES)} say why."
+            f"{_grouped(lacking)}. The notes of the table contrasts say why."
         )
 
 
@@ -218,7 +195,7 @@ def _which(changes: list[Change]) -> str:
 
 
 def _grouped(found: list[tuple[str, str]]) -> str:
-    """Measures and slopes, each with its variants; those with the same variants share a list."""
+    """Measures, each with its variants; those with the same variants share a list."""
     alike: dict[str, list[str]] = {}
     for what, (name, _) in _names().items():
         settings = ", ".join(setting for setting, other in found if other == what)

@@ -5,13 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from analysis.data.study import Group, Study
-from analysis.report.ablated import SLOPES
 from analysis.stats.contrasts import corrected
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import POWER, Difference
 from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions
 from analysis.tables.notes import listed
 
+# How a sentence names each coefficient of the regressions, and its unit.
+SLOPES = {
+    "projected_headway": ("the effect of headway on who merges first", "logits per m"),
+    "relative_velocity": ("the effect of relative velocity on who merges first", "logits per m/s"),
+    "abs_projected_headway": ("the effect of |headway| on the gap", "m per m"),
+    "abs_relative_velocity": ("the effect of |relative velocity| on the gap", "m per m/s"),
+    "headway_x_velocity": (
+        "the effect of headway times relative velocity on the gap",
+        "m per m²/s",
+    ),
+}
 OUTCOMES = {WHO_FIRST: "who merges first", GAP: "the gap"}
 # The intercept's interaction, in words: with every term at 0, nobody is ahead or faster.
 LEVELS = {

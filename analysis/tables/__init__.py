@@ -29,15 +29,10 @@ TABLES = {
     "contrasts": "contrasts",
     "factors": "factors",
     "differences": "differences",
-    "who-first-variants": "variants",
-    "gap-variants": "variants",
     "velocity-profiles": "profiles",
     "conflict-resolution": "conflicts",
     "criticality": "conflicts",
-    "speed-windows": "windows",
-    "gap-definitions": "gaps",
     "attempts": "attempts",
-    "fallbacks": "fallbacks",
     "first-action": "first_action",
     "words": "words",
 }
@@ -76,6 +71,8 @@ def finished_tables(
     where: Mapping[str, Sequence[str]] | None = None,
     file: str | None = None,
     by: str | None = None,
+    *,
+    without_fallbacks: bool = False,
 ) -> list[Table]:
     """The named tables of a database, or all: read from it where stored, else computed.
 
@@ -83,7 +80,8 @@ def finished_tables(
     UsageError for an unknown name.
     """
     wanted = _valid(names)
-    options = study.options if study else options_text(db, models, where, file, by)
+    chosen = (db, models, where, file, by, without_fallbacks)
+    options = study.options if study else options_text(*chosen)
     state = study.state if study else present_state(db)
     kept = finished(db, state, options, wanted)
     found = {name: from_text(text) for name, text in kept.items()}
@@ -92,7 +90,7 @@ def finished_tables(
     if missing:
         from analysis.data.study import Study
 
-        study = study or Study(db, models, where, file, by)
+        study = study or Study(*chosen)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
         # The state is the one before the study was read: trials stored since then outdate it.
         keep_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})

@@ -106,7 +106,9 @@ def footnoted(table: Table, study: Study) -> Table:
             whose.setdefault(text, {})[driver] = None
             row = replace(row, values={**row.values, "driver": f"{driver}*"})  # noqa: PLW2901
         rows.append(row)
-    notes = (f"* {', '.join(drivers)}: {text}" for text, drivers in whose.items())
+    notes = [f"* {', '.join(drivers)}: {text}" for text, drivers in whose.items()]
+    if study.without_fallbacks:
+        notes.append("trials in which a decision had a fallback are left out (--without-fallbacks)")
     return replace(table, rows=rows, notes=(*table.notes, *notes))
 
 

@@ -9,11 +9,10 @@ from analysis.data.reference_data import citation, published
 from analysis.data.study import Group, Study
 from analysis.stats.group_scores import fits
 from analysis.stats.indicators import GAP_MARGIN_M, equivalence_p, furthest_apart
-from analysis.stats.intervals import interval
 from analysis.stats.measures import outcomes_note
 from analysis.stats.mixed import gap_mixed, who_first_mixed
 from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
-from analysis.tables.model import Column, Row, Table, Value, row_of
+from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import sample_notes
 
 TERM_NAMES = {
@@ -30,8 +29,8 @@ TESTED_ELSEWHERE = (
     "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
     "table differences tests it"
 )
-# The columns of Table III, and of its variants' table, that rest on who merged first.
-OF_OUTCOMES = ("n", "b", "se", "z", "ci", "p", "firth_b", "firth_se", "firth_ci", "firth_p")
+# The columns of Table III that rest on who merged first.
+OF_OUTCOMES = ("n", "b", "se", "z", "p", "firth_b", "firth_se", "firth_p")
 RANDOM_INTERCEPT = "random intercept per pair"
 
 
@@ -39,13 +38,13 @@ def who_first(study: Study) -> Table:
     """Table III: logistic regression of left-first on h (m) and dv (m/s)."""
     rows = []
     for term in WHO_FIRST_TERMS:
-        for group in study.baselines:
-            rows += [who_first_row(group, term), *_mixed_rows(group, term, _who_first_mixed)]
+        for group in study.groups:
+            rows += [_who_first_row(group, term), *_mixed_rows(group, term, _who_first_mixed)]
     return Table(
         "who-first",
         "Logistic regression of which driver merged first (1: left)",
         (
-            *key_columns(WITH_MERGER),
+            *_key_columns(WITH_MERGER),
             *_wald_columns("z", WITH_MERGER),
             Column(
                 "firth_b", "Firth b", "number", 2, "Firth's penalised estimate", WITH_MERGER, True
@@ -56,7 +55,7 @@ def who_first(study: Study) -> Table:
         rows,
         (
             TESTED_ELSEWHERE,
-            *sample_notes(study, study.baselines),
+            *sample_notes(study, study.groups),
             *_mixed_notes(study, "S4"),
         ),
         "Table III",
@@ -67,13 +66,13 @@ def gap(study: Study) -> Table:
     """Table IV: linear regression of the gap (m) on |h|, |dv| and h*dv."""
     rows = []
     for term in GAP_TERMS:
-        for group in study.baselines:
-            rows += [gap_row(group, term), *_mixed_rows(group, term, _gap_mixed)]
+        for group in study.groups:
+            rows += [_gap_row(group, term), *_mixed_rows(group, term, _gap_mixed)]
     return Table(
         "gap",
         "Linear regression of the gap at the merge point (m, net of the vehicle length)",
         (
-            *key_columns(WITH_GAP),
+            *_key_columns(WITH_GAP),
             *_wald_columns("t", WITH_GAP),
             Column("hc3_se", "HC3 SE", "number", 3, "HC3 standard error", WITH_GAP, True),
             Column("hc3_p", "HC3 p", "p", 3, "its t test", WITH_GAP, True),
@@ -103,19 +102,17 @@ def gap(study: Study) -> Table:
             f"{GAP_MARGIN_M:g} m apart (two one-sided tests of each with HC3 errors, the largest "
             "p: a small one shows it); joint p, that none of them has an effect (F test)",
             TESTED_ELSEWHERE,
-            *sample_notes(study, study.baselines),
+            *sample_notes(study, study.groups),
             *_mixed_notes(study, "S6"),
         ),
         "Table IV",
     )
 
 
-def key_columns(counts: str, *more: Column) -> tuple[Column, ...]:
-    """The leading columns of a regression table, with ``more`` columns after the driver."""
+def _key_columns(counts: str) -> tuple[Column, ...]:
     return (
         Column("term", "term"),
-        Column("driver", "driver"),
-        *more,
+        *GROUP_COLUMNS,
         Column("n", "n", "count", 0, "trials in the regression", counts),
     )
 
@@ -129,7 +126,7 @@ def _wald_columns(statistic: str, counts: str) -> tuple[Column, ...]:
     )
 
 
-def who_first_row(group: Group, term: str) -> Row:
+def _who_first_row(group: Group, term: str) -> Row:
     """The row of a term of who merged first: by maximum likelihood, and by Firth's fit."""
     # Wald's p fails where conditions nearly separate the outcomes, as those of humans do (Hauck and
     # Donner 1977); Firth's penalty (1993) keeps estimates finite there.
@@ -142,14 +139,14 @@ def who_first_row(group: Group, term: str) -> Row:
             **_values(fit.logit, term),
             **_values(fit.firth, term, "firth_"),
         },
-        problems(fit.logit, fit.firth),
+        _problems(fit.logit, fit.firth),
         outcomes_note(group),
         item=term,
         published=OF_OUTCOMES,
     )
 
 
-def gap_row(group: Group, term: str) -> Row:
+def _gap_row(group: Group, term: str) -> Row:
     """The row of a term of the gap: by least squares, and with HC3 errors.
 
     Before an import, the humans' row holds what the paper prints.
@@ -169,7 +166,7 @@ def gap_row(group: Group, term: str) -> Row:
         furthest = fit.hc3.apart[furthest_apart(fit.hc3)]
         values["equivalence_p"] = float(equivalence_p(furthest.b, furthest.se, fit.hc3.freedom))
         values["velocity_p"] = fit.hc3.velocity_p
-    return row_of(group, values, problems(fit.ols, fit.hc3), item=term)
+    return row_of(group, values, _problems(fit.ols, fit.hc3), item=term)
 
 
 def _values(fit: Regression, term: str, prefix: str = "") -> dict[str, Value]:
@@ -182,12 +179,11 @@ def _values(fit: Regression, term: str, prefix: str = "") -> dict[str, Value]:
         f"{prefix}se": found.se,
         f"{prefix}z": found.statistic,
         f"{prefix}t": found.statistic,
-        f"{prefix}ci": interval(found.b, found.se, fit.freedom),
         f"{prefix}p": found.p,
     }
 
 
-def problems(*found: Regression) -> str:
+def _problems(*found: Regression) -> str:
     """Why fits have no coefficients; empty where all have them."""
     return "; ".join(dict.fromkeys(fit.problem for fit in found if fit.problem))
 
@@ -256,18 +252,16 @@ def _mixed_notes(study: Study, table: str) -> tuple[str, ...]:
 
 
 def _published_gap(group: Group, term: str) -> Row:
-    """The humans' row of Table IV as the paper prints it; its interval follows from b and SE."""
+    """The humans' row of Table IV as the paper prints it."""
     printed = published("paper_gap").query("driver == 'human' and term == @term").iloc[0]
-    n, b, se = int(printed["n"]), float(printed["b"]), float(printed["se"])
     return row_of(
         group,
         {
             "term": TERM_NAMES[term],
-            "n": n,
-            "b": b,
-            "se": se,
+            "n": int(printed["n"]),
+            "b": float(printed["b"]),
+            "se": float(printed["se"]),
             "t": float(printed["t"]),
-            "ci": interval(b, se, n - len(GAP_TERMS)),
             "p": _published_p(str(printed["p"])),
         },
         f"published values, no human traces are imported ({citation('paper_gap')})",

@@ -111,7 +111,6 @@ def test_a_comparison_without_a_judged_driver_says_what_it_takes(tmp_path):
     for name, said in (
         ("differences", "nothing is compared: that takes the humans, and a driver that is judged"),
         ("contrasts", "there is no pair of judged groups to compare"),
-        ("fallbacks", "there is no trial of a judged driver to compare"),
     ):
         (table,) = make_tables(study, [name])
         assert [row.id for row in table.rows] == ["bad/baseline"]

@@ -304,13 +304,6 @@ def test_every_figure_is_offered_and_comes_as_svg(client):
     assert client.get("/figures/nothing.svg").status_code == 404
 
 
-def test_rows_of_fallbacks_in_which_nothing_differs_are_folded(client):
-    text = client.get("/tables/fallbacks").text
-    (rows,) = re.findall(r"<summary>(\d+) rows in which nothing differs", text)
-    assert text.count("<tr id=") == int(rows)
-    assert 'id="table"' not in text
-
-
 def test_no_head_of_a_table_is_empty(client):
     heads = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", client.get("/tables/indicators").text)
     assert heads

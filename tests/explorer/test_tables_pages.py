@@ -385,9 +385,9 @@ def test_a_process_of_its_own_answers_alike_and_another_one_takes_its_place(db):
         computing.ask(("nothing",), (1, 1), wait_s=30)
     computing._child.process.kill()
     computing._child.process.wait()
-    while isinstance(found := computing.ask(("tables", "fallbacks"), (1, 1), wait_s=30), Waiting):
+    while isinstance(found := computing.ask(("tables", "indicators"), (1, 1), wait_s=30), Waiting):
         pass
-    assert found.content == Numbers(db).answer(("tables", "fallbacks"))
+    assert found.content == Numbers(db).answer(("tables", "indicators"))
     computing.close()
     child = worker(db)
     child.close()
@@ -402,7 +402,7 @@ def test_a_process_that_ends_amid_a_request_is_a_failure(db):
 
     computing = Computing(db, Killed)
     with pytest.raises(NoAnswer, match=r"without an answer \(exit code -9\)"):
-        computing.ask(("tables", "fallbacks"), (1, 1), wait_s=30)
+        computing.ask(("tables", "indicators"), (1, 1), wait_s=30)
     computing.close()
 
 

@@ -13,7 +13,7 @@ import pytest
 from tests.harness import FAST, how_to, plugin
 
 NAME, HEADING = "mean_abs_acceleration_mps2", "mean |a| (m/s²)"
-TABLES = ("indicators", "contrasts", "fallbacks")
+TABLES = ("indicators", "contrasts")
 FORMATS = {"text": HEADING, "csv": NAME, "md": r"mean \|a\|", "latex": "$|$a$|$"}
 NOTHING = f"{HEADING}: no human value is published, and no human traces are imported"
 EXPECTED = (

@@ -46,13 +46,13 @@ def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
     baselines = {key: rows for key, rows in judged.items() if key[1] == "baseline"}
     humans = {} if recorded.empty else {("human", ""): recorded}
     # Who went first is published, trial by trial.
-    who = (humans or {("human", ""): measured.published_humans()}) | baselines
+    who = humans or {("human", ""): measured.published_humans()}
     found = {
-        "who-first": _by_term(who, WHO_FIRST, _who_first) | _mixed(recorded, "who-first"),
-        "gap": _by_term(humans | baselines, GAP, _gap) | _mixed(recorded, "gap"),
+        "who-first": _by_term(who | judged, WHO_FIRST, _who_first) | _mixed(recorded, "who-first"),
+        "gap": _by_term(humans | judged, GAP, _gap) | _mixed(recorded, "gap"),
         "ablation-qualitative": {_id(k): _qualities(v) for k, v in (humans | judged).items()},
         "ablation-quantitative": {_id(k): _quantities(v) for k, v in (humans | judged).items()},
-        "indicators": _indicators(who),
+        "indicators": _indicators(who | baselines),
         "differences": _differences(recorded, baselines),
         "contrasts": _prompts(judged, trials.attrs["orders"]) | _humans(recorded, baselines),
         "factors": _factors(judged, trials.attrs["orders"]),

@@ -11,28 +11,23 @@ from analysis.explorer.site import NotThere, Site
 from analysis.table_format import TableFormat
 from analysis.tables import TABLES
 from analysis.tables.formats import render, table_view
-from analysis.tables.model import Row, Table, from_text
+from analysis.tables.model import from_text
 from merge_runner.errors import StoreError
 
 # What each shows, for the list: their own titles are known only when they are made.
 ABOUT = {
-    "who-first": "Table III: who merges first, by headway and relative velocity",
-    "gap": "Table IV: the gap, by headway and relative velocity",
+    "who-first": "Table III: who merges first, by headway and relative velocity, for every prompt",
+    "gap": "Table IV: the gap, by headway and relative velocity, for every prompt",
     "indicators": "Table V: the indicators I1 to I5, the score and the measures",
     "ablation-qualitative": "Table VI: the indicators of every driver and variant",
     "ablation-quantitative": "Table VII: the measures of every driver and variant",
     "contrasts": "every variant against its baseline, every baseline against the humans",
     "factors": "each level of a study's factors, models and prompts, pooled over the others",
     "differences": "who merges first and the gap, against the humans in one model of both",
-    "who-first-variants": "Table III for every prompt variant, and what differs from the baseline",
-    "gap-variants": "Table IV for every prompt variant, and what differs from the baseline",
     "velocity-profiles": "the numbers behind I5, and how much plans are revised",
     "conflict-resolution": "when the conflict is resolved, by condition",
     "criticality": "times to merge and to collision, the hardest acceleration",
-    "speed-windows": "RMSE and joint rate over other windows",
-    "gap-definitions": "the gap and its regression by three definitions of the gap",
     "attempts": "what became of the calls",
-    "fallbacks": "the measures with and without trials that had a fallback",
     "first-action": "the first action of every driver, by own relative velocity, beside humans",
     "words": "what follows a tactical word, and what the first word follows",
 }
@@ -81,11 +76,6 @@ def awaited(site: Site, request: Request) -> dict[str, Any]:
     return found.result.content
 
 
-def is_alike(table: Table, row: Row) -> bool:
-    """Whether a row of ``fallbacks`` compares the same trials with themselves."""
-    return table.name == "fallbacks" and row.values.get("n") == row.values.get("n_without")
-
-
 def _named(name: str, known: Collection[str], what: str) -> str:
     if name not in known:
         raise NotThere(f"there is no {what} {name}; there are {', '.join(known)}")
@@ -95,10 +85,9 @@ def _named(name: str, known: Collection[str], what: str) -> str:
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """One table; raises NotThere."""
     found = computed(site, ("tables", _named(name, TABLES, "table")), asked)
-    shown, alike = None, set[str]()
+    shown = None
     if found.result is not None:
         table = from_text(found.result.content["tables"][0])
-        alike = {row.id for row in table.rows if is_alike(table, row)}
         shown = table_view(
             table,
             lambda table, row, column: site.at.cell(table.name, row.id, column.name),
@@ -113,7 +102,6 @@ def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         files=[(suffix, site.at.table_file(name, suffix)) for suffix in FILES],
         computed=found,
         table=shown,
-        alike=alike,
         before=names[at - 1] if at else None,
         after=names[at + 1] if at + 1 < len(names) else None,
     )

@@ -94,9 +94,9 @@ def test_the_chance_to_find_nothing_is_that_of_a_false_alarm():
     # Two-sided tests at 5 %, of which one side counts; between two arms both do.
     assert search.chance(SPEED_FOUND, Arms(truth, 10), 10) == pytest.approx(0.025, abs=0.015)
     two = Arms(truth, 10, truth, 10)
-    for question in OF_TWO_ARMS[:3]:
-        assert search.chance(question, two, 10) == pytest.approx(0.05, abs=0.025)
-    assert search.chance(OF_TWO_ARMS[3], two, 10) < 0.05  # Fisher's test is conservative
+    gap, collisions = OF_TWO_ARMS
+    assert search.chance(gap, two, 10) == pytest.approx(0.05, abs=0.025)
+    assert search.chance(collisions, two, 10) < 0.05  # Fisher's test is conservative
 
 
 @pytest.mark.parametrize(
@@ -106,10 +106,9 @@ def test_the_chance_to_find_nothing_is_that_of_a_false_alarm():
         (GAP_FOUND, Arms(human(), 10)),
         (BESIDE_HUMANS[0], beside_humans(human(), 10)),
         (BESIDE_HUMANS[1], beside_humans(human(), 10)),
-        (OF_TWO_ARMS[1], Arms(human(), 10, human(), 5)),
-        (OF_TWO_ARMS[2], Arms(human(), 10, human(), 5)),
+        (OF_TWO_ARMS[0], Arms(human(), 10, human(), 5)),
     ],
-    ids=["speed", "gap slope", "humans", "collisions", "two arms", "gap of two arms"],
+    ids=["speed", "gap slope", "humans", "collisions", "gap of two arms"],
 )
 def test_the_smallest_effect_is_found_with_a_chance_of_80_percent_in_other_studies_too(
     question, arms
@@ -173,9 +172,6 @@ def test_a_planted_study_is_told_by_what_is_planted(tmp_path):
     assert (strong.effect, weak.effect) == (-3.3, -0.2)
     assert strong.enough < strong.trials == 110
     assert weak.enough is None
-    (between,) = (each for each in found.chances if each.table == "who-first-variants")
-    assert between.effect == pytest.approx(3.1)
-    assert between.against == "x_relative_speed=-3.3"
     shown = render([table(found)], TableFormat.TEXT)
     (line,) = (line for line in shown.splitlines() if SPEED_FOUND.asked in line and "=-0.2" in line)
     assert line.rstrip().endswith("not findable")
@@ -242,8 +238,6 @@ def test_a_planted_persona_is_supposed_where_the_prompt_contains_it(tmp_path):
         each.arms[0]: each.effect for each in found.chances if each.question == SPEED_FOUND.asked
     }
     assert effects == {"baseline": -3.3, "hurried": pytest.approx(-1.3)}
-    (between,) = (each for each in found.chances if each.table == "who-first-variants")
-    assert between.effect == pytest.approx(2.0)
 
 
 @pytest.mark.slow

@@ -40,16 +40,10 @@ def test_what_a_variant_changes_is_said_with_interval_and_what_not_with_what_cou
     assert f"the gap by {change:+.2f} m (95 % CI {low:+.2f} to {high:+.2f})" in a1
     assert "collisions" not in a1
     (rest,) = [text for text in texts if "no difference from the baseline is shown" in text]
-    assert (
-        "collisions by the scenario's rule, collisions of boxes, joint contributions, the effect "
-        "of headway on who merges first" in rest
-    )
-    slopes = [
-        r.values["detectable"]
-        for r in tables["gap-variants"].rows
-        if r.id in {"o3/A1/abs_projected_headway", "o3/A2/abs_projected_headway"}
-    ]
-    assert f"{min(slopes):.2f} to {max(slopes):.2f} m per m in the effect of |headway|" in rest
+    assert "collisions by the scenario's rule, collisions of boxes and joint contributions" in rest
+    rows = [r for r in tables["contrasts"].rows if r.id.endswith("/baseline/joint_percent")]
+    shares = [r.values["detectable"] for r in rows if r.groups[0].startswith("o3/A")]
+    assert f"{shares[0]:.2f} points in joint contributions" in rest
     assert "RMSE" not in rest
     assert not any("other" in text for text in texts), "it has no variant"
 

@@ -61,9 +61,7 @@ def test_a_trial_that_failed_has_not_collided_by_any_rule(tmp_path):
 
 
 def test_both_rates_stand_in_the_tables_with_what_is_left_out(study):
-    quantitative, indicators, fallbacks = make_tables(
-        study, ["ablation-quantitative", "indicators", "fallbacks"]
-    )
+    quantitative, indicators = make_tables(study, ["ablation-quantitative", "indicators"])
     row = next(row for row in quantitative.rows if row.id == "o3/baseline")
     assert row.values["collided_percent"] == 60
     assert row.values["collided_boxes_percent"] is None
@@ -72,7 +70,6 @@ def test_both_rates_stand_in_the_tables_with_what_is_left_out(study):
     for table, row_id in (
         (quantitative, "o3/baseline"),
         (indicators, "o3/baseline/collided_boxes_percent"),
-        (fallbacks, "o3/baseline/collided_boxes_percent"),
     ):
         note = next(row.note for row in table.rows if row.id == row_id)
         assert "coll. boxes (%): 3 of 5 trials are undecided, since another collision rule" in note

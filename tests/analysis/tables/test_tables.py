@@ -59,7 +59,7 @@ def test_a_table_fits_the_terminal_and_names_the_columns_that_do_not(tables, wid
 
 def test_columns_are_chosen_by_their_names(tables):
     (table,) = with_columns([tables["who-first"]], ["b"])
-    assert [column.name for column in table.columns] == ["term", "driver", "b"]
+    assert [column.name for column in table.columns] == ["term", "driver", "setting", "b"]
     with pytest.raises(UsageError, match=r"unknown column 'bb'; .* Did you mean b\?"):
         with_columns([tables["who-first"]], ["bb"])
 
@@ -193,20 +193,6 @@ def test_against_the_paper_stand_its_values_and_the_difference(tables):
     assert any("arXiv 2604.09609, Table III" in note for note in table.notes)
     with pytest.raises(UsageError, match="valid is paper"):
         against(table, "humans")
-
-
-def test_the_gap_is_told_by_each_of_its_definitions(study, tables):
-    table, regression = tables["gap-definitions"], tables["gap"]
-    group = study.models[0]
-    for column in ("gap_m", "gap_first_sample_m", "gap_mean100_m"):
-        found = group.finished[column]
-        assert cell(table, f"{group.id}/{column}", "n") == len(found)
-        assert cell(table, f"{group.id}/{column}", "gap_m") == pytest.approx(found.mean())
-    for term, name in (("abs_projected_headway", "headway"), ("abs_relative_velocity", "velocity")):
-        for value in ("b", "p"):
-            ours = cell(regression, f"{group.id}/{term}", value)
-            assert cell(table, f"{group.id}/gap_m", f"{name}_{value}") == ours
-            assert cell(table, f"{group.id}/gap_mean100_m", f"{name}_{value}") != ours
 
 
 def test_a_table_that_the_paper_has_not_says_so(tables):
@@ -354,21 +340,16 @@ def test_every_cell_can_be_traced_to_its_trials_and_the_query_that_lists_them(st
     [
         ("who-first", "o3/baseline/intercept", "n"),
         ("gap", "other/baseline/intercept", "n"),
+        ("gap", "o3/A2/intercept", "n"),
         ("ablation-quantitative", "o3/A1", "n"),
         ("indicators", "o3/baseline/joint_percent", "n"),
         ("indicators", "o3/baseline/collided_percent", "n"),
         ("velocity-profiles", "o3/A2", "n"),
-        ("gap-definitions", "o3/A2/gap_mean100_m", "n"),
         ("attempts", "other/baseline", "trials"),
         ("attempts", "other/baseline", "failed"),
         ("attempts", "other/baseline", "other_model"),
         ("attempts", "o3/A1", "invalid"),
         ("attempts", "o3/A1", "no_array"),
-        ("fallbacks", "o3/A1/left_first_percent", "n"),
-        ("fallbacks", "o3/A1/left_first_percent", "n_without"),
-        ("fallbacks", "o3/A1/gap_m", "n_without"),
-        ("fallbacks", "o3/A1/I3", "n_without"),
-        ("fallbacks", "o3/A2/collided_percent", "n_without"),
     ],
 )
 def test_n_is_the_number_of_trials_that_explain_lists(study, tables, name, row, column):
@@ -403,7 +384,7 @@ def test_explain_marks_the_trials_that_a_share_counts(study, tables):
 def test_explain_names_the_valid_rows_and_columns(study, tables):
     with pytest.raises(UsageError, match="valid: human/intercept"):
         explain(study, tables["gap"], "nobody")
-    with pytest.raises(UsageError, match="valid: term, driver, n"):
+    with pytest.raises(UsageError, match="valid: term, driver, setting, n"):
         explain(study, tables["gap"], "o3/baseline/intercept:beta")
     whole = explain(study, tables["gap"], "o3/baseline/intercept")
     assert "driver o3" in whole.value

@@ -1,7 +1,8 @@
-"""What became of the calls, and whether failures bias the outcomes."""
+"""What became of the calls, and the tables without trials that had a fallback."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import replace
 
@@ -12,11 +13,7 @@ from analysis.data.load import load
 from analysis.data.provenance import tally
 from analysis.data.study import Study
 from analysis.explain import explain
-from analysis.metrics import LEFT_FIRST
-from analysis.stats.measures import estimate
-from analysis.stats.regressions import gap_ols
 from analysis.tables import make_tables
-from analysis.tables.fallbacks import without_fallbacks
 from tests.analysis.studies import Drive, Said, write_study, yielding
 
 FAILED = Said(failure="no_array")
@@ -93,49 +90,6 @@ def test_a_driver_that_asks_no_model_has_no_rate_but_a_reason(small):
     assert row.values["fallback_percent"] == 0
 
 
-def test_without_are_the_trials_in_which_every_decision_was_driven_from_its_answer(study, tables):
-    group = next(group for group in study.models if group.id == "o3/A1")
-    had = load(
-        "SELECT DISTINCT trial_id FROM decisions WHERE fallback AND spec_hash = 'o3-A1'", study.db
-    )["trial_id"]
-    kept = without_fallbacks(study, group)
-    assert set(kept.trials["trial_id"]) == set(group.trials["trial_id"]) - set(had)
-    assert (len(group.trials), len(kept.trials)) == (55, 49)
-    table = tables["fallbacks"]
-    rest = group.finished[~group.finished["trial_id"].isin(had)]
-    assert cell(table, "o3/A1/gap_m", "all") == pytest.approx(group.finished["gap_m"].mean())
-    assert cell(table, "o3/A1/gap_m", "without") == pytest.approx(rest["gap_m"].mean())
-    assert cell(table, "o3/A1/gap_m", "difference") == pytest.approx(
-        rest["gap_m"].mean() - group.finished["gap_m"].mean()
-    )
-    left = (rest["merged_first"] == "left").sum()
-    assert cell(table, "o3/A1/left_first_percent", "without") == pytest.approx(100 * left / 49)
-    assert cell(table, "o3/A1/left_first_percent", "ci_without") == pytest.approx(
-        (estimate(kept, LEFT_FIRST).low, estimate(kept, LEFT_FIRST).high)
-    )
-    p = gap_ols(rest).terms["abs_projected_headway"].p
-    assert cell(table, "o3/A1/I3", "paper_without") == (p < 0.05)
-
-
-def test_where_no_trial_had_a_fallback_nothing_differs_and_the_row_says_so(tables):
-    rows = [row for row in tables["fallbacks"].rows if row.groups == ("o3/baseline",)]
-    assert len(rows) == 6 + 4
-    for row in rows:
-        assert "no trial had a fallback: nothing differs" in row.note
-        assert row.values["n"] == row.values["n_without"] == 110
-        assert row.values.get("difference", 0) == 0
-        assert row.values.get("differ") is None
-
-
-def test_where_every_trial_had_a_fallback_nothing_is_left_and_the_row_says_so(tables):
-    rows = [row for row in tables["fallbacks"].rows if row.groups == ("o3/A2",)]
-    for row in rows:
-        assert "every trial had a fallback: nothing is left without" in row.note
-        assert (row.values["n"], row.values["n_without"]) == (55, 0)
-        assert row.values.get("without") is None
-        assert row.values.get("paper_without") is None
-
-
 @pytest.fixture(scope="module")
 def biased(tmp_path_factory):
     """Who is ahead goes first, but in the trials with a fallback the right one always does."""
@@ -150,29 +104,42 @@ def biased(tmp_path_factory):
         Drive("o3", "baseline", "N_0_0", 10 + rep, (0.0,), (0.0,), {1: FAILED}) for rep in (1, 2, 3)
     ]
     path = tmp_path_factory.mktemp("biased") / "t.duckdb"
-    return Study(write_study(path, [*fair, *right, *crash]))
+    return write_study(path, [*fair, *right, *crash])
 
 
-def test_failures_that_bias_the_outcomes_are_seen(biased):
-    (table,) = make_tables(biased, ["fallbacks"])
-    row = row_of(table, "o3/baseline/collided_percent").values
-    assert (row["n"], row["n_without"]) == (113, 55)
-    assert (row["all"], row["without"]) == (pytest.approx(300 / 113), 0)
-    assert row["difference"] == pytest.approx(-300 / 113)
-    assert cell(table, "o3/baseline/left_first_percent", "difference") > 20
-    verdict = row_of(table, "o3/baseline/I3").values
-    assert verdict["differ"] == "≠"
-    assert (verdict["paper"], verdict["paper_without"]) == (False, True)
+def test_failures_that_bias_the_outcomes_are_seen_without_them(biased):
+    names = ["indicators", "attempts"]
+    values = {}
+    for without in (False, True):
+        study = Study(biased, without_fallbacks=without)
+        indicators, attempts = make_tables(study, names)
+        collided = row_of(indicators, "o3/baseline/collided_percent").values
+        verdict = row_of(indicators, "o3/baseline/I3").values["paper"]
+        values[without] = (collided["n"], collided["value"], verdict)
+        assert row_of(attempts, "o3/baseline").values["trials"] == collided["n"]
+        said = any("--without-fallbacks" in note for note in indicators.notes)
+        assert said == without
+    assert values == {False: (113, pytest.approx(300 / 113), False), True: (55, 0, True)}
+    (source,) = explain(study, indicators, "o3/baseline/collided_percent:n").sources
+    assert len(source.trials) == len(load(source.query, biased)) == 55
 
 
-def test_the_two_sides_of_a_measure_explain_their_own_trials(biased):
-    (table,) = make_tables(biased, ["fallbacks"])
-    for row in (f"o3/baseline/{name}" for name in ("collided_percent", "gap_m", "I1", "I4")):
-        for side, other in (("", "all"), ("_without", "without")):
-            found = explain(biased, table, f"{row}:n{side}").sources[0].trials
-            assert len(found) == cell(table, row, f"n{side}")
-            if not row.endswith(("I1", "I4")):
-                assert explain(biased, table, f"{row}:{other}").sources[0].trials == found
+def test_a_driver_whose_every_trial_had_a_fallback_has_a_row_that_says_so(study):
+    kept = Study(study.db, without_fallbacks=True)
+    sizes = {group.id: len(group.trials) for group in kept.models}
+    assert sizes == {"o3/baseline": 110, "o3/A1": 49, "other/baseline": 44}
+    (table,) = make_tables(kept, ["ablation-quantitative"])
+    assert row_of(table, "o3/A2").note == "every trial had a fallback"
+    (kept_away,) = (group for group in kept.unjudged)
+    assert kept_away.id == "o3/A2"
+
+
+def test_the_option_is_that_of_the_tables_and_kept_apart(biased, in_process, capsys):
+    for option, n in (((), "113"), (("--without-fallbacks",), "55"), ((), "113")):
+        csv = ("--db", biased, "--format", "csv", "--columns", "n", *option)
+        assert in_process("tables", "indicators", *csv) == 0
+        shown = capsys.readouterr().out
+        assert re.search(rf"^o3/baseline/collided_percent,.*,o3,{n},", shown, re.MULTILINE)
 
 
 @pytest.mark.slow
@@ -180,11 +147,10 @@ def test_only_failed_trials_leave_nothing_to_compare_and_say_why(tmp_path):
     lost = Said(("timeout", "timeout"), lost=True)
     drives = [replace(drive, said={0: lost}) for drive in yielding("o3", reps=1)]
     study = Study(write_study(tmp_path / "t.duckdb", drives))
-    attempts, fallbacks = make_tables(study, ["attempts", "fallbacks"])
+    (attempts,) = make_tables(study, ["attempts"])
     values = row_of(attempts, "o3/baseline").values
     assert (values["failed"], values["lost"], values["calls"]) == (11, 11, 22)
     assert values["lost_percent"] == 50
-    assert all("no trial ended" in row.note for row in fallbacks.rows)
     with duckdb.connect(str(study.db)) as connection:
         connection.execute("DELETE FROM decisions; DELETE FROM calls WHERE side = 'right'")
     (attempts,) = make_tables(Study(study.db), ["attempts"])
