@@ -88,8 +88,6 @@ def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> t
     if column is not None and column.name.startswith("ceiling"):
         return (_resampled(study),)
     predicate = row.counts or _predicate(table, column)
-    if column is not None and column.within:
-        predicate += f" AND {column.within}"
     whose = {"own": row.groups, "reference": row.references, "both": (*row.groups, *row.references)}
     groups = row.groups if column is None or not row.references else whose[column.of]
     known = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)

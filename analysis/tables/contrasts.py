@@ -88,7 +88,7 @@ def contrasts(study: Study) -> Table:
             RULES_NOTE,
             *_recordings_note(study),
             *replayed_notes(study),
-            *shared_notes(study),
+            *_shared_notes(study),
             *sample_notes(study, study.groups, pooled=False),
             *([] if rows else [f"there is no pair of {judged}groups to compare"]),
         ),
@@ -216,7 +216,7 @@ def _powerless(contrast: Difference, metric: Metric) -> str:
     return f"{metric.heading}: so few trials can show no difference, however large"
 
 
-def shared_notes(study: Study) -> list[str]:
+def _shared_notes(study: Study) -> list[str]:
     """Notes on replies that variants share with the baseline, where their prompts are equal."""
     named = {name: group.id for group in study.models for name in group.trials["spec_hash"]}
     return [

@@ -23,9 +23,8 @@ class Column:
     """One column.
 
     ``meaning`` describes its values in words, and ``counts`` is the SQL predicate for the trials
-    that they rest on. If ``optional``, a value may be missing without a note. ``within`` narrows
-    these trials further, even in rows that have a predicate of their own. ``of`` says whose trials
-    the values rest on: those of the row, those of its ``references``, or both.
+    that they rest on. If ``optional``, a value may be missing without a note. ``of`` says
+    whose trials the values rest on: those of the row, those of its ``references``, or both.
     """
 
     name: str
@@ -35,7 +34,6 @@ class Column:
     meaning: str = ""
     counts: str = "status = 'finished'"
     optional: bool = False
-    within: str = ""
     of: Literal["own", "reference", "both"] = "own"
 
 
