@@ -272,11 +272,11 @@ WITH own AS (FROM trial_factors WHERE factor <> 'prompt')
 FROM own SEMI JOIN trials USING (trial_id, spec_hash)
 UNION ALL
 SELECT trial_id, spec_hash, unnest(['model', 'prompt']),
-    unnest([if(model_left = model_right OR coalesce(opponent, 'self') <> 'self', one,
-        one || '+' || other), variant])
+    unnest([CASE WHEN model_left = model_right OR coalesce(opponent, 'self') <> 'self' THEN one
+        ELSE one || '+' || other END, variant])
 FROM (
-    SELECT *, if(ego = 'left', model_left, model_right) AS one,
-        if(ego = 'left', model_right, model_left) AS other
+    SELECT *, CASE ego WHEN 'left' THEN model_left ELSE model_right END AS one,
+        CASE ego WHEN 'left' THEN model_right ELSE model_left END AS other
     FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
 ) AS trials LEFT JOIN (
     SELECT trial_id, spec_hash, value AS opponent FROM own WHERE factor = 'opponent'

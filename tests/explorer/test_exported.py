@@ -83,8 +83,11 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     page.wait_for_url("**/files/trials-*outcome-collided*.html")
     expect(page.locator("tr.chosen")).to_contain_text("rep03")
     page.get_by_role("link", name="Trials", exact=True).click()
+    expect(page.locator("h1")).to_have_text("Trials")
+    page.wait_for_load_state()  # keys are heard once the scripts have run
     page.keyboard.press("j")
     page.keyboard.press("Enter")
+    expect(page.locator("#next-trial")).to_be_visible()
     first = page.locator("h1").inner_text()
     page.keyboard.press("j")
     expect(page.locator("h1")).not_to_have_text(first)
