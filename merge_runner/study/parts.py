@@ -84,6 +84,7 @@ def catalogue_of(file: StudyFile, text: str, plugins: Mapping[str, str]) -> Cata
 def declared_catalogue(text: str) -> Catalogue:
     """Return what a study's file declares itself; none of its plug-ins run.
 
+    It has no text, since nobody named that study: another sweep's may take its place.
     Drivers of a program that is not here are left out. Raises UsageError.
     """
     try:
@@ -92,7 +93,7 @@ def declared_catalogue(text: str) -> Catalogue:
         raise UsageError(f"the stored study cannot be read: {exc}") from exc
     file = validated(StudyFile, content, "the stored study")
     here = {name: driver for name, driver in file.drivers.items() if driver.program in PROGRAMS}
-    return catalogue_of(file.model_copy(update={"drivers": here}), text, {})
+    return catalogue_of(file.model_copy(update={"drivers": here}), "", {})
 
 
 def _import_others(sources: Iterable[str]) -> None:

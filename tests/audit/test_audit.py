@@ -910,3 +910,17 @@ def test_another_reply_in_the_cache_than_in_the_database_is_found(db, cache):
     damage(db, f"UPDATE calls SET reply = replace(reply::VARCHAR, 'stop', 'halt') WHERE {SLOT}")
     (finding,) = audit("--db", db, "--cache", cache).findings
     assert "the cache holds another reply than the database" in finding["text"]
+
+
+@pytest.mark.slow
+async def test_each_study_of_a_database_is_derived_by_its_own_parts(merge_runner, tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.toml").write_text(
+            'description = "x"\nmodels = ["constant"]\nrepetitions = 1\nconditions = [{ '
+            f'name = "of_{name}", projected_headway_m = 2, relative_velocity_mps = 0.5 }}]\n'
+        )
+        run = await merge_runner("sweep", f"{name}.toml")
+        assert run.code == 0, run.err
+    run = await merge_runner("audit")
+    assert run.code == 0, run.err
+    assert run.out.count("1 derived anew") == 2

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import signal
 import socket
+import threading
 from contextlib import AsyncExitStack
 from functools import partial
 
@@ -15,16 +16,18 @@ from distributed.comm import connect
 from merge_runner.errors import MergeRunnerError, TrialSuspended
 from merge_runner.llm.meter import Meter
 from merge_runner.records import TrialRecord, TrialSpec
-from merge_runner.registry import use
+from merge_runner.registry import in_use, use
 from merge_runner.run.clients import live_clients
 from merge_runner.run.cluster.batch import Batch, fingerprint
 from merge_runner.run.cluster.link import Link, LinkLost, taken_apart
 from merge_runner.run.cluster.remote import RemoteBudget, RemoteCache, RemoteRateLimit
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.signals import FROM_TERMINAL
+from merge_runner.study.file import StudySource
 from merge_runner.study.parts import catalogue_of
 
 REPORT_EVERY_S = 0.5
+_making_catalogue = threading.Lock()
 
 
 def dask_setup(_: object) -> None:
@@ -74,8 +77,7 @@ class _Worker:
 
     async def _play(self, batch: Batch, link: Link) -> None:
         entries = batch.plan.entries
-        study = batch.plan.study
-        use(catalogue_of(study.file, study.text, study.plugins))
+        use_study(batch.plan.study)
         async with AsyncExitStack() as stack:
             clients = live_clients(
                 batch.plan,
@@ -103,6 +105,13 @@ class _Worker:
         self._stopping = True
         if self._work is not None:
             self._work.cancel()
+
+
+def use_study(study: StudySource) -> None:
+    """Use a study's catalogue; the one that other threads play by stays where it is the same."""
+    with _making_catalogue:
+        if (in_use().text, in_use().plugins) != (study.text, study.plugins):
+            use(catalogue_of(study.file, study.text, study.plugins))
 
 
 def _stop_profiler(dask: Worker) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import psutil
 import pytest
@@ -12,11 +13,23 @@ from aiohttp import web
 
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
+from merge_runner.registry import Catalogue, in_use, use
 from merge_runner.run.cluster.connect import connected
+from merge_runner.run.cluster.worker import use_study
+from merge_runner.study.file import read_study
 from tests.gate import HANGS_S
 from tests.harness import PROJECT, environment, watched
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
+
+
+def test_threads_of_a_worker_play_by_one_catalogue():
+    study = read_study("baseline")
+    use(Catalogue())
+    with ThreadPoolExecutor() as threads:
+        used = list(threads.map(lambda _: (use_study(study), in_use())[1], range(8)))
+    assert len({id(catalogue) for catalogue in used}) == 1
+    assert used[0].text == study.text
 
 
 @pytest.mark.slow
