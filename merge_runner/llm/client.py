@@ -12,6 +12,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
+from typing import TYPE_CHECKING
 
 from merge_runner.config import ModelEntry
 from merge_runner.errors import (
@@ -19,6 +20,7 @@ from merge_runner.errors import (
     ModelSwapped,
     ProviderDown,
     RecordingError,
+    ReplayMiss,
     SweepStopped,
 )
 from merge_runner.llm.batch.batches import Batches
@@ -34,6 +36,7 @@ from merge_runner.llm.formats.base import WireFormat
 from merge_runner.llm.http_outcome import (
     AttemptOutcome,
     RawReply,
+    TransportFailure,
     is_web_page,
     judge,
     may_be_charged,
@@ -49,7 +52,6 @@ from merge_runner.llm.shared_services import (
     RateLimitPort,
     Settle,
 )
-from merge_runner.llm.transport import Transport, TransportFailure
 from merge_runner.llm.verify import reply_object
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -61,6 +63,9 @@ from merge_runner.records import (
     says_scripted,
 )
 from merge_runner.served_model import is_other_model
+
+if TYPE_CHECKING:
+    from merge_runner.llm.http import HttpTransport
 
 # Beside a call that takes seconds this delay is nothing.
 CLAIM_POLL_S = 0.1
@@ -87,7 +92,7 @@ class LlmClient:
     entry: ModelEntry
     endpoint: str
     cache: CachePort
-    transport: Transport
+    transport: HttpTransport | None
     limiter: RateLimitPort
     budget: BudgetPort | None = None
     sealed: bool = False
@@ -107,6 +112,8 @@ class LlmClient:
         request = self._request(prompt, slot)
         if recorded := self._recorded(request):
             reply = self._read(recorded)
+        elif self.sealed:
+            raise ReplayMiss("no recorded reply", request)
         elif call := self._calls.get(request.key):
             with call.asked_by_one():
                 reply = await asyncio.shield(call.task)
@@ -213,8 +220,6 @@ class LlmClient:
         opened = self.batches is not None and self.batches.takes_up(call)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
-        if self.sealed:
-            return await self._make(call)
         # Nobody waits for an answer that may take hours.
         alone, stopped = not opened and await self._goes_alone(call), False
         try:
@@ -374,6 +379,7 @@ class LlmClient:
         number = len(call.attempts) + 1
         started_at, started = datetime.now(UTC), time.perf_counter()
         raw: RawReply | None = None
+        assert self.transport is not None, "a sealed client asks nothing"
         try:
             raw = await self.transport.send(
                 call.request, attempt=number, timeout_s=min(self.entry.timeout_s, seconds_left)

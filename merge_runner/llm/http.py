@@ -4,78 +4,96 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import select
 import ssl
+import zlib
 from collections.abc import AsyncIterator, Awaitable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.request import getproxies, proxy_bypass
 from uuid import uuid4
+from weakref import WeakSet
 
 import aiohttp
 import httpx
-from httpx_aiohttp import AiohttpTransport, HttpxAiohttpClient
+from httpx_aiohttp import AiohttpTransport
 
 from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, proxy_secrets
 from merge_runner.errors import UsageError
-from merge_runner.llm.bodies import ENCODING, read_body, read_lines
-from merge_runner.llm.connections import Connections, Trust
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.llm.http_outcome import RawReply
+from merge_runner.llm.http_outcome import ErrorReply, RawReply, TransportFailure
 from merge_runner.llm.masking import Mask
-from merge_runner.llm.transport import ErrorReply, TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
-NO_TIMEOUT = {"timeout": httpx.Timeout(None).as_dict()}
+if TYPE_CHECKING:
+    from aiohttp.client_proto import ResponseHandler
+    from aiohttp.connector import Connection
+
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
+PIECE = 2**18
+HEADERS = {
+    "accept": "*/*",
+    "accept-encoding": "gzip",
+    "content-type": "application/json",
+    "user-agent": "merge-runner",
+}
 T = TypeVar("T")
 
 
-class NoCookies(httpx.Cookies):
-    """Takes no cookie: one would tie calls together that should be independent samples."""
+@dataclass(slots=True)
+class Trust:
+    """Whether an endpoint has kept to one answer for each request.
 
-    def extract_cookies(self, response: httpx.Response) -> None:
-        """Leave them where they are."""
+    ``doubted`` is True once an answer was late or cut, or something came unasked; ``answers_named``
+    while its answers name their requests.
+    """
+
+    doubted: bool = False
+    answers_named: bool = False
+
+    @property
+    def one_each(self) -> bool:
+        """Whether a connection serves one request alone, so that nothing late is taken."""
+        return self.doubted and not self.answers_named
 
 
-class StrictClient(HttpxAiohttpClient):
-    """Keeps no cookie, neither of its own nor of the connections', and no doubtful connection."""
+class Connections(aiohttp.TCPConnector):
+    """Serves a further request on a connection only while it is silent."""
 
-    def __init__(self, trust: Trust, **options: Any) -> None:  # noqa: ANN401 # those of httpx.AsyncClient
-        self._trust = trust
+    def __init__(self, trust: Trust, **options: Any) -> None:  # noqa: ANN401 # aiohttp's own
         super().__init__(**options)
-        self._cookies = NoCookies()
+        self._trust = trust
+        self._used: WeakSet[ResponseHandler] = WeakSet()
 
-    def _init_transport(self, *args: Any, **options: Any) -> httpx.AsyncBaseTransport:  # noqa: ANN401
-        return self._strict(super()._init_transport(*args, **options))
-
-    def _init_proxy_transport(self, *args: Any, **options: Any) -> httpx.AsyncBaseTransport:  # noqa: ANN401
-        return self._strict(super()._init_proxy_transport(*args, **options))
-
-    def _strict(self, transport: httpx.AsyncBaseTransport) -> httpx.AsyncBaseTransport:
-        """The same transport with a session of our own."""
-        assert isinstance(transport, AiohttpTransport)
-        limits, ssl_context = transport.limits, transport.ssl_context
-
-        def session() -> aiohttp.ClientSession:
-            connector = Connections(
-                self._trust,
-                limit=limits.max_connections or 0,
-                keepalive_timeout=limits.keepalive_expiry,
-                ssl=ssl_context,
-            )
-            return aiohttp.ClientSession(connector=connector, cookie_jar=aiohttp.DummyCookieJar())
-
-        transport.client = session
-        return transport
+    async def connect(self, *args: Any, **options: Any) -> Connection:  # noqa: ANN401
+        """A new connection, or one on which nothing has come since its last answer."""
+        while True:
+            connection = await super().connect(*args, **options)
+            handler, channel = connection.protocol, connection.transport
+            assert handler is not None
+            assert channel is not None
+            if handler not in self._used:
+                self._used.add(handler)
+                return connection
+            # The event loop may have had no time to read what has arrived: so ask the system.
+            arrived = select.poll()
+            arrived.register(channel.get_extra_info("socket").fileno(), select.POLLIN)
+            self._trust.doubted |= handler.should_close
+            if not (handler.should_close or arrived.poll(0) or self._trust.one_each):
+                return connection
+            connection.close()
 
 
 class HttpTransport:
     """Sends requests to one endpoint over at most ``connections`` connections.
 
-    A reply of more than ``most_bytes`` is refused. Proxies are those that httpx reads from the
-    environment; loopback never goes through one. Only our own emulator is told the slot. Each
-    attempt has a random id; an answer that names another one is not taken.
+    A reply of more than ``most_bytes`` is refused. Proxies are those of the environment; loopback
+    never goes through one. Only our own emulator is told the slot. Each attempt has a random id; an
+    answer that names another one is not taken. Once an answer was late, cut or came unasked, each
+    connection serves one request, unless the answers name their requests.
     """
 
     def __init__(
@@ -91,12 +109,7 @@ class HttpTransport:
         # transport's own, and the number of the request.
         self._own = str(uuid4())[:24]
         self._ids = map("{:012x}".format, itertools.count(1))
-        self._client = _client(endpoint.base_url, connections, self._trust)
-        self._headers = {
-            **self._client.headers,
-            "accept-encoding": ENCODING,
-            "content-type": "application/json",
-        }
+        self._connections = self._transport(connections)
         self._urls: dict[str, httpx.URL] = {}
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
@@ -107,10 +120,6 @@ class HttpTransport:
             headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
         body = request.body.encode()
         return await self.ask("POST", request.path, headers, body, timeout_s=timeout_s)
-
-    async def get(self, path: str, *, timeout_s: float) -> RawReply:
-        """Ask for what the server tells of itself; raises TransportFailure."""
-        return await self.ask("GET", path, {}, timeout_s=timeout_s)
 
     async def ask(
         self,
@@ -123,13 +132,10 @@ class HttpTransport:
         most_bytes: int | None = None,
     ) -> RawReply:
         """Ask for anything; raises TransportFailure."""
-        own_id = self._own + next(self._ids)
-        request = self._http_request(method, path, headers, body, own_id)
         with self._failures(timeout_s):
             async with asyncio.timeout(timeout_s):
-                reply = await self._client.send(request, stream=True)
+                reply = await self._reply(method, path, headers, body)
                 try:
-                    self._check_id(reply, own_id)
                     return await self._read(reply, most_bytes or self._most_bytes)
                 finally:
                     await reply.aclose()
@@ -142,20 +148,54 @@ class HttpTransport:
         Nothing may be late by more than ``timeout_s``. Raises ErrorReply where the status is not
         200, and TransportFailure.
         """
-        own_id = self._own + next(self._ids)
-        request = self._http_request("GET", path, headers, b"", own_id)
         with self._failures(timeout_s):
-            reply = await _within(timeout_s, self._client.send(request, stream=True))
+            reply = await _within(timeout_s, self._reply("GET", path, headers, b""))
             try:
-                self._check_id(reply, own_id)
                 if reply.status_code != 200:
                     raise ErrorReply(await _within(timeout_s, self._read(reply, self._most_bytes)))
-                encoding = reply.headers.get("content-encoding", "")
-                chunks = _in_time(reply.aiter_raw(), timeout_s)
-                async for line in read_lines(chunks, encoding, self._most_bytes):
-                    yield self._mask(line) if isinstance(line, str) else line
+                chunks = _in_time(_unpacked(reply), timeout_s)
+                async for line in split_lines(chunks, self._most_bytes):
+                    if line is None:
+                        yield _too_long(self._most_bytes)
+                    elif line:
+                        yield self._mask(_decoded(line))
             finally:
                 await reply.aclose()
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._connections.aclose()
+
+    async def _reply(
+        self, method: str, path: str, headers: Mapping[str, str], body: bytes
+    ) -> httpx.Response:
+        """The head of the reply to a request, whose body is still to be read."""
+        own_id = self._own + next(self._ids)
+        sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
+        sent |= dict.fromkeys(ID_HEADERS, own_id)
+        sent["connection"] = "close" if self._trust.one_each else "keep-alive"
+        reply = await self._connections.handle_async_request(
+            httpx.Request(method, self._url(path), headers=sent, content=body)
+        )
+        named = [part.strip() for h in ID_HEADERS for part in reply.headers.get(h, "").split(",")]
+        ours = {part for part in named if part.startswith(self._own)}
+        self._trust.answers_named = bool(ours)
+        if ours - {own_id}:
+            await reply.aclose()
+            raise TransportFailure("wrong_answer", "the server sent the answer to another request")
+        return reply
+
+    async def _read(self, reply: httpx.Response, most_bytes: int) -> RawReply:
+        pieces, size = [], 0
+        async for piece in _unpacked(reply):
+            size += len(piece)
+            if size > most_bytes:
+                raise _too_long(most_bytes)
+            pieces.append(piece)
+        # A provider may echo the key in an error; it must not get into a log or a database.
+        body = self._mask(_decoded(b"".join(pieces)))
+        headers = {name.lower(): value for name, value in reply.headers.items()}
+        return RawReply(reply.status_code, headers, body)
 
     @contextmanager
     def _failures(self, timeout_s: float) -> Iterator[None]:
@@ -171,50 +211,21 @@ class HttpTransport:
         except (httpx.RequestError, aiohttp.ClientError) as exc:
             raise self._failure(exc) from exc
 
-    async def _read(self, reply: httpx.Response, most_bytes: int) -> RawReply:
-        encoding = reply.headers.get("content-encoding", "")
-        body = await read_body(reply.aiter_raw(), encoding, most_bytes)
-        # A provider may echo the key in an error; it must not get into a log or a database.
-        headers = {name.lower(): value for name, value in reply.headers.items()}
-        return RawReply(reply.status_code, headers, self._mask(body))
-
-    def _http_request(
-        self, method: str, path: str, headers: Mapping[str, str], body: bytes, own_id: str
-    ) -> httpx.Request:
-        """The request, made without the client, which would compose all its headers each time."""
-        sent = {**self._headers, **headers, **self._endpoint.auth_headers}
-        sent |= dict.fromkeys(ID_HEADERS, own_id)
-        if self._trust.one_each:
-            sent["connection"] = "close"
-        return httpx.Request(
-            method, self._url(path), headers=sent, content=body, extensions=NO_TIMEOUT
-        )
-
-    def _check_id(self, reply: httpx.Response, own_id: str) -> None:
-        """Refuse the answer to another of our requests, where the server says whose it is."""
-        said = [part.strip() for h in ID_HEADERS for part in reply.headers.get(h, "").split(",")]
-        ours = [part for part in said if part.startswith(self._own)]
-        self._trust.tied = bool(ours)
-        if set(ours) - {own_id}:
-            raise TransportFailure("wrong_answer", "the server sent the answer to another request")
-
     def _failure(self, error: Exception) -> TransportFailure:
-        """What an error of the libraries means: whatever it is, there is no reply."""
+        """The failure that an error of the libraries is: whatever it is, there is no reply."""
         # httpx reports refused, reset and cut connections alike; what aiohttp said is its cause.
         reason = self._mask(str(error)) or type(error).__name__
         cause = error.__cause__ or error
         if isinstance(cause, aiohttp.ClientConnectorCertificateError):
             return TransportFailure("bad_certificate", reason, sent=False, action="refused")
         if isinstance(cause, aiohttp.ClientConnectorError):
-            return TransportFailure("no_connection", self._unreached(cause, reason), sent=False)
+            by_proxy = isinstance(cause, aiohttp.ClientProxyConnectionError)
+            message = f"{self._endpoint.base_url} cannot be reached ({reason})"
+            if isinstance(cause.os_error, ConnectionRefusedError) and not by_proxy:
+                message = f"nothing listens at {self._endpoint.base_url}"
+            return TransportFailure("no_connection", message, sent=False)
         self._trust.doubted = True
         return TransportFailure("connection_lost", reason)
-
-    def _unreached(self, error: aiohttp.ClientConnectorError, reason: str) -> str:
-        proxy = isinstance(error, aiohttp.ClientProxyConnectionError)
-        if isinstance(error.os_error, ConnectionRefusedError) and not proxy:
-            return f"nothing listens at {self._endpoint.base_url}"
-        return f"{self._endpoint.base_url} cannot be reached ({reason})"
 
     def _url(self, path: str) -> httpx.URL:
         """The URL of a path, which is never at another host: the key goes to the configured one."""
@@ -228,13 +239,54 @@ class HttpTransport:
             self._urls[path] = url
         return self._urls[path]
 
-    async def close(self) -> None:
-        """Close all connections."""
-        await self._client.aclose()
+    def _transport(self, connections: int) -> AiohttpTransport:
+        """The connections, by the proxies and certificates of the environment."""
+        url = httpx.URL(self._endpoint.base_url)
+        # An empty one where there is no TLS, since to load the certificates takes long.
+        trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        try:
+            if url.scheme == "https" or url.host not in LOOPBACK:
+                trusted = httpx.create_ssl_context()
+        except OSError as exc:
+            raise UsageError(
+                "the certificates that SSL_CERT_FILE names cannot be read "
+                f"({exc.strerror or exc}): correct it or unset it"
+            ) from exc
+
+        def session() -> aiohttp.ClientSession:
+            return aiohttp.ClientSession(
+                connector=Connections(self._trust, limit=connections, ssl=trusted),
+                cookie_jar=aiohttp.DummyCookieJar(),  # one would tie independent samples together
+            )
+
+        return AiohttpTransport(verify=trusted, client=session, proxy=_proxy(url))
+
+
+def _proxy(url: httpx.URL) -> httpx.Proxy | None:
+    """The proxy that the environment names for an endpoint."""
+    proxies = getproxies()
+    named = proxies.get(url.scheme) or proxies.get("all")
+    if named is None or url.host in LOOPBACK or proxy_bypass(url.netloc.decode()):
+        return None
+    return httpx.Proxy(named if "://" in named else f"http://{named}")
 
 
 def _no_path(path: str) -> UsageError:
     return UsageError(f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml")
+
+
+def _too_long(most_bytes: int) -> TransportFailure:
+    return _refused(f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)")
+
+
+def _refused(why: str) -> TransportFailure:
+    """The failure of a reply that is not taken, and not asked for again."""
+    return TransportFailure("reply_refused", f"the reply is refused: {why}", action="fail")
+
+
+def _decoded(body: bytes) -> str:
+    """Bytes as UTF-8, the encoding of JSON, whatever a header says."""
+    return body.decode("utf-8-sig", errors="replace")
 
 
 async def _within(seconds: float, awaited: Awaitable[T]) -> T:
@@ -248,30 +300,48 @@ async def _in_time(chunks: AsyncIterator[bytes], timeout_s: float) -> AsyncItera
         yield chunk
 
 
-def _client(base_url: str, connections: int, trust: Trust) -> StrictClient:
-    """A client with the proxies and certificates of the environment; raises UsageError."""
-    url = httpx.URL(base_url)
-    by_loopback = url.host in LOOPBACK
-    # An empty one where there is no TLS, since to load the certificates takes long.
-    trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    try:
-        if url.scheme == "https" or not by_loopback:
-            trusted = httpx.create_ssl_context()
-    except OSError as exc:
-        raise UsageError(
-            f"the certificates that SSL_CERT_FILE names cannot be read ({exc.strerror or exc}): "
-            "correct it or unset it"
-        ) from exc
-    try:
-        return StrictClient(
-            trust,
-            verify=trusted,
-            trust_env=not by_loopback,  # the proxies, since the certificates are given
-            limits=httpx.Limits(max_connections=connections, max_keepalive_connections=connections),
-            timeout=None,  # every attempt runs under its own timeout
-        )
-    except (ValueError, httpx.InvalidURL) as exc:
-        raise UsageError(
-            "the proxies of HTTP_PROXY, HTTPS_PROXY, ALL_PROXY and NO_PROXY cannot be read: "
-            "correct them or unset them"
-        ) from exc
+async def _unpacked(reply: httpx.Response) -> AsyncIterator[bytes]:
+    """The pieces of a body without its encoding, which may unpack to a thousand times as much."""
+    encoding = reply.headers.get("content-encoding", "").strip().lower()
+    if encoding in ("", "identity"):
+        async for chunk in reply.aiter_raw():
+            yield chunk
+        return
+    if encoding not in ("gzip", "x-gzip", "deflate"):
+        raise _refused(f"it is encoded as {encoding[:40]!r}, which was not asked for")
+    unpacking = zlib.decompressobj(wbits=32 + zlib.MAX_WBITS)  # tells gzip from deflate
+    cut = False
+    async for chunk in reply.aiter_raw():
+        packed = chunk
+        while packed:
+            try:
+                yield unpacking.decompress(packed, PIECE)
+            except zlib.error as exc:
+                raise TransportFailure("connection_lost", f"the reply is no {encoding}") from exc
+            packed = unpacking.unconsumed_tail
+            if unpacking.unused_data:
+                raise _refused(f"it goes on after the end of its {encoding}")
+            await asyncio.sleep(0)  # other calls go on while a large body is unpacked
+        cut = not unpacking.eof
+    if cut:
+        raise TransportFailure("connection_lost", f"the reply is cut within its {encoding}")
+
+
+async def split_lines(chunks: AsyncIterator[bytes], most_bytes: int) -> AsyncIterator[bytes | None]:
+    """The lines of a body that comes in chunks, or None for one of more than ``most_bytes``.
+
+    Their ends, which may be CRLF, are left out.
+    """
+    pieces: list[bytes] = []
+    size = 0
+    async for chunk in chunks:
+        for number, part in enumerate(chunk.split(b"\n")):
+            if number:
+                yield b"".join(pieces).removesuffix(b"\r") if size <= most_bytes else None
+                pieces, size = [], 0
+            size += len(part)
+            if size <= most_bytes:
+                pieces.append(part)
+            else:  # of a line that is too long nothing is kept
+                pieces.clear()
+    yield b"".join(pieces).removesuffix(b"\r") if size <= most_bytes else None

@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Literal, TypeVar
 
 from merge_runner.config import PROVIDERS
+from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.formats import PASSED_ON
 from merge_runner.llm.formats.base import (
     Meaning,
@@ -79,6 +80,30 @@ class RawReply:
         if isinstance(self.payload, list):
             return self.payload[0] if self.payload else None
         return self.payload
+
+
+class TransportFailure(MergeRunnerError):
+    """An attempt brought no reply; ``outcome`` names the failure in the calls table.
+
+    ``sent`` is False where the request was certainly never sent, so that nobody can charge for it.
+    ``action`` is that of an AttemptOutcome.
+    """
+
+    def __init__(
+        self, outcome: str, message: str, *, sent: bool = True, action: Action = "retry"
+    ) -> None:
+        super().__init__(message)
+        self.outcome = outcome
+        self.sent = sent
+        self.action = action
+
+
+class ErrorReply(MergeRunnerError):
+    """The server replied with an error in place of what it was asked for."""
+
+    def __init__(self, raw: RawReply) -> None:
+        super().__init__(f"HTTP {raw.status}: {raw.error.message}")
+        self.raw = raw
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,7 @@ from merge_runner.config import Endpoint
 from merge_runner.llm.first_call import NOBODY_S
 from merge_runner.llm.formats.base import as_dict, as_dicts, as_text
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.transport import TransportFailure
+from merge_runner.llm.http_outcome import RawReply, TransportFailure
 
 # A server that answers one call at a time may be busy with one.
 TIMEOUT_S = 60.0
@@ -40,7 +39,7 @@ async def _reply(transport: HttpTransport, patience_s: float) -> RawReply:
     began_s = asyncio.get_running_loop().time()
     while True:
         try:
-            return await transport.get("/models", timeout_s=TIMEOUT_S)
+            return await transport.ask("GET", "/models", {}, timeout_s=TIMEOUT_S)
         except TransportFailure as exc:
             waited_s = asyncio.get_running_loop().time() - began_s
             if exc.outcome != "no_connection" or waited_s >= patience_s:

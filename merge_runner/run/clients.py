@@ -33,7 +33,6 @@ from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import is_known
 from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
-from merge_runner.llm.transport import SealedTransport
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan, most_prompts
 from merge_runner.run.rehearsal import SPEED, write_behaviour
@@ -73,7 +72,7 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
             entry=entry,
             endpoint=plan.endpoints[name],
             cache=cache,
-            transport=SealedTransport(),
+            transport=None,
             limiter=Limiter(),
             sealed=True,
         )

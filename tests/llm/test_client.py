@@ -18,11 +18,10 @@ from merge_runner.errors import (
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
-from merge_runner.llm.http_outcome import RawReply
+from merge_runner.llm.http_outcome import RawReply, TransportFailure
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.meter import Meter
-from merge_runner.llm.transport import SealedTransport, TransportFailure
 from merge_runner.records import Slot
 from tests.virtual_time import in_virtual_time, now_s
 
@@ -651,7 +650,8 @@ async def test_a_limit_that_lasts_longer_than_the_deadline_stops_the_sweep(make)
 @in_virtual_time
 async def test_a_sealed_replay_misses_what_is_not_recorded(make):
     await make(answer("recorded")).ask("prompt", slot())
-    client = make(transport=SealedTransport())
+    client = make(transport=None)
+    client.sealed = True
     assert (await client.ask("prompt", slot())).text == "recorded"
     with pytest.raises(ReplayMiss) as caught:
         await client.ask("prompt", slot(2))

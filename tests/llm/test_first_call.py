@@ -9,7 +9,7 @@ import pytest
 from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.first_call import FirstCall
-from merge_runner.llm.transport import TransportFailure
+from merge_runner.llm.http_outcome import TransportFailure
 from tests.llm.test_client import (  # noqa: F401 # fixtures
     PRICE,
     Server,

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ModelEntry, check_network, resolve_endpoint
 from merge_runner.errors import UsageError
-from merge_runner.llm.connections import Connections
-from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.transport import TransportFailure
+from merge_runner.llm.http import Connections, HttpTransport
+from merge_runner.llm.http_outcome import TransportFailure
 from tests.llm.raw_server import a_request
 
 ENTRY = ModelEntry(provider="openai", format="openai-chat", id="m", max_output_tokens=10)

@@ -12,14 +12,12 @@ import subprocess
 import time
 import tracemalloc
 import zlib
-from base64 import b64encode
 
 import pytest
 
 from merge_runner.config import Endpoint
-from merge_runner.llm.bodies import MOST_LEVELS
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.transport import TransportFailure
+from merge_runner.llm.http_outcome import TransportFailure
 from tests.harness import FAST
 from tests.llm.raw_server import CHAT, a_request, head, ok, raw_server
 
@@ -211,34 +209,6 @@ async def test_a_drip_of_single_bytes_runs_into_the_timeout():
     assert failure.value.outcome == "timeout"
 
 
-def nested(levels, inner="1"):
-    opening = ("[", '{"a":')
-    closing = ("]", "}")
-    return (
-        "".join(opening[n % 2] for n in range(levels))
-        + inner
-        + "".join(closing[n % 2] for n in reversed(range(levels)))
-    )
-
-
-BRACKETS = json.dumps("[{" * 1000 + '"\\')  # within a text they are no levels
-
-
-@pytest.mark.parametrize(
-    ("inner", "own"), [("1", 0), ("[]", 1), (BRACKETS, 0), (f"[{','.join(['[[]]'] * 200)}]", 3)]
-)
-async def test_levels_up_to_the_bound_are_taken_and_more_are_refused(inner, own):
-    fits = nested(MOST_LEVELS - own, inner)
-    assert json.loads(fits)
-    assert (await answered(ok(fits.encode()))).body == fits
-    assert "nests deeper" in await refused(ok(nested(MOST_LEVELS - own + 1, inner).encode()))
-
-
-async def test_a_page_is_no_json_and_its_brackets_are_no_levels():
-    page = "<html><script>" + "if(a){b[" * 500 + "</script>"
-    assert (await answered(ok(page.encode(), 502))).body == page
-
-
 BRIEF = {  # a beginning, what is repeated, and an end
     "brackets": (b"", b"[", b""),
     "lists": (b"[", b"[],", b"1]"),
@@ -252,33 +222,9 @@ async def test_sixteen_megabytes_hold_the_loop_for_a_moment_only(parts):
     begin, unit, end = parts
     body = begin + unit * ((16 * MB - 10) // len(unit)) + end
     stall = asyncio.create_task(longest_stall())
-    with contextlib.suppress(TransportFailure):
-        json.loads((await answered(ok(body))).body)
+    assert (await answered(ok(body))).payload is not None or unit == b"["
     stall.cancel()
     assert await stall < 1.5
-
-
-async def test_a_reply_of_a_million_values_is_refused_before_it_is_read():
-    assert "holds more than 1,000,000 values" in await refused(ok(b"[" + b"0," * MB + b"1]"))
-
-
-@pytest.mark.parametrize(
-    "spelt",
-    [
-        "".join(f"\\u{ord(c):04x}" for c in KEY),
-        KEY.replace("/", "\\/"),
-        b64encode(f"user:{KEY}".encode()).decode(),
-        b64encode(KEY.encode()).decode(),
-        KEY.replace("/", "%2F"),
-    ],
-)
-async def test_a_key_that_is_echoed_in_another_spelling_is_masked(spelt):
-    body = f'{{"error": {{"message": "wrong key: {spelt}"}}}}'.encode()
-    reply = await answered(ok(body, 401), auth={"authorization": f"Bearer {KEY}"})
-    message = json.loads(reply.body)["error"]["message"]
-    assert message.startswith("wrong key: ")
-    assert "[key]" in message
-    assert spelt not in reply.body
 
 
 @pytest.fixture(scope="module")
@@ -316,7 +262,6 @@ async def test_a_bad_certificate_ends_a_sweep_at_once_and_nothing_is_sent(
         ({"HTTPS_PROXY": "ftp://proxy.invalid"}, "HTTPS_PROXY names a ftp:// proxy, and only http"),
         ({"ALL_PROXY": f"socks5://u:{KEY}@proxy.invalid"}, "ALL_PROXY names a socks5:// proxy"),
         ({"https_proxy": "http://[::1"}, "https_proxy is no URL of a proxy"),
-        ({"NO_PROXY": "http://a b:c", "HTTP_PROXY": "http://x"}, "cannot be read: correct them"),
         ({"OPENAI_BASE_URL": "https://a..b/v1"}, "OPENAI_BASE_URL is no base URL"),
         ({"OPENAI_BASE_URL": f"https://{'a' * 300}/v1"}, "is no base URL: there can be no such"),
     ],

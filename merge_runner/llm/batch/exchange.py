@@ -29,8 +29,13 @@ from merge_runner.llm.batch.service import (
 )
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import ServerError, WireFormat, as_dicts, as_text
-from merge_runner.llm.http_outcome import TOO_LATE, RawReply, judge_error
-from merge_runner.llm.transport import ErrorReply, TransportFailure
+from merge_runner.llm.http_outcome import (
+    TOO_LATE,
+    ErrorReply,
+    RawReply,
+    TransportFailure,
+    judge_error,
+)
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from merge_runner.config import PROVIDERS, BatchTerms
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.modes import BATCH_MODES, batch_terms, require_batch
 from merge_runner.llm.batch.service import BatchLimits, in_batches
-from merge_runner.llm.bodies import read_lines
 from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.http import split_lines
 from merge_runner.llm.models import load_models
 from tests.llm.batch.conftest import entry_of
 from tests.llm.batch.lines import lines
@@ -78,6 +78,7 @@ def test_lines_are_parted_in_order_into_as_few_batches_as_fit(sizes, most_lines,
 
 @given(st.lists(st.text(alphabet="ab\u2028\u00e9", max_size=9)), st.data())
 async def test_lines_are_the_same_however_a_body_is_cut(texts, data):
+    texts = texts or [""]
     body = "\n".join(texts).encode()
     cuts = data.draw(st.lists(st.integers(0, len(body)), max_size=5).map(sorted))
 
@@ -85,6 +86,4 @@ async def test_lines_are_the_same_however_a_body_is_cut(texts, data):
         for start, end in zip([0, *cuts], [*cuts, len(body)], strict=True):
             yield body[start:end]
 
-    assert [line async for line in read_lines(chunks(), "", 100)] == [
-        each for each in texts if each
-    ]
+    assert [line async for line in split_lines(chunks(), 100)] == [text.encode() for text in texts]
