@@ -457,11 +457,7 @@ class LlmClient:
             dearer = Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
             return cost_usd(self.entry, dearer)
         stray = raw.status == 200 and is_web_page(raw) and not self.first.known
-        return (
-            0.0
-            if stray or not may_be_charged(raw, self._format, self._consequences.own_host)
-            else None
-        )
+        return 0.0 if stray or not may_be_charged(raw, self._consequences.own_host) else None
 
     def _worst_case(self, request: ChatRequest) -> Usage:
         """An upper bound on an attempt's tokens: no tokeniser makes more tokens than bytes."""

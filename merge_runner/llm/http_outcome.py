@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, TypeVar
+from typing import Literal
 
 from merge_runner.config import PROVIDERS
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.formats import PASSED_ON
 from merge_runner.llm.formats.base import (
-    Meaning,
     Reading,
     ServerError,
     WireFormat,
@@ -24,31 +23,43 @@ from merge_runner.llm.formats.base import (
 from merge_runner.llm.formats.delays import server_delay_s
 
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
-T = TypeVar("T")
 NOTHING_READ = Reading("error")
 
+# Azure charges for a prompt that it has looked at, also where it then refuses it.
+CHARGED_ERRORS = frozenset({"content_filter", "context_length_exceeded"})
 TOO_LATE = frozenset({408, 499, 504, 524})
-# What a status means unless a format knows better.
-MEANINGS: dict[int, Meaning] = {
+# What a status means unless a format knows better; any other one means a bad request.
+STATUSES = {
     401: "not_allowed",
     402: "quota_exhausted",
     403: "not_allowed",
     404: "unknown_model",
-    429: "rate_limited",
-}
-TRANSIENT = {
     408: "request_timeout",
     409: "conflict",
-    500: "server_error",
-    502: "server_error",
+    429: "rate_limited",
     503: "overloaded",
     504: "server_timeout",
-    520: "server_error",
-    521: "server_error",
-    522: "server_error",
-    523: "server_error",
     524: "server_timeout",
     529: "overloaded",
+    **dict.fromkeys((500, 502, 520, 521, 522, 523), "server_error"),
+}
+# What to do about it; anything else fails its call.
+ACTIONS: dict[str, Action] = {
+    "refusal": "accept",
+    "quota_exhausted": "quota",
+    "not_allowed": "refused",
+    "unknown_model": "refused",
+    **dict.fromkeys(
+        (
+            "rate_limited",
+            "request_timeout",
+            "conflict",
+            "server_error",
+            "overloaded",
+            "server_timeout",
+        ),
+        "retry",
+    ),
 }
 
 
@@ -125,7 +136,7 @@ class AttemptOutcome:
     of_prompt: bool = False
 
 
-def may_be_charged(raw: RawReply, wire: WireFormat, provider: str | None) -> bool:
+def may_be_charged(raw: RawReply, provider: str | None) -> bool:
     """Whether a reply that tells no usage may stand for work that is charged.
 
     A refusal before any work is not, nor an error in the documented form of the ``provider`` whose
@@ -136,8 +147,7 @@ def may_be_charged(raw: RawReply, wire: WireFormat, provider: str | None) -> boo
         return True
     if raw.status >= 500:
         return provider is None or not _in_its_form(provider, raw)
-    charged = frozenset().union(*(each.charged_errors for each in (wire, *PASSED_ON)))
-    return provider is None and bool(raw.error.names & charged)
+    return provider is None and bool(raw.error.names & CHARGED_ERRORS)
 
 
 def is_web_page(raw: RawReply) -> bool:
@@ -169,43 +179,38 @@ def _judge_success(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
         return AttemptOutcome("retry", "bad_body", "the body has nothing of an answer", reading)
     if reading.outcome != "error":
         return AttemptOutcome("accept", reading.outcome, reading=reading)
-    error = replace(raw.error, status=_status_within(raw.error, wire))
+    error = replace(raw.error, status=status_within(raw.error))
     return replace(judge_error(error, wire), reading=reading)
 
 
-def _status_within(error: ServerError, wire: WireFormat) -> int:
+def status_within(error: ServerError) -> int:
     """The status that an error within a 200 stands for: 400 or 500 if nobody knows it."""
-    if status := _told(wire, lambda each: each.status_of(error)):
-        return status
+    if "rate_limit_exceeded" in error.names:
+        return 429
+    if error.names == {"server_error"}:
+        return 500
     numbers = [int(name) for name in error.names if re.fullmatch("[45][0-9][0-9]", name)]
     return numbers[0] if numbers else 400 if error.names else 500
 
 
-def _told(wire: WireFormat, ask: Callable[[WireFormat], T | None]) -> T | None:
-    """What a format knows of an error, else what a format knows that gateways pass on."""
-    answers = (ask(each) for each in (wire, *PASSED_ON))
-    return next((answer for answer in answers if answer is not None), None)
-
-
 def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
     """What an error means, whatever was asked for."""
-    meaning = _told(wire, lambda each: each.meaning(error)) or MEANINGS.get(error.status)
-    delay = server_delay_s(error, (wire, *PASSED_ON))
-    should_retry = error.headers.get("x-should-retry")
-    message = f"HTTP {error.status}: {error.message}"
-    if meaning == "refusal":
-        return AttemptOutcome("accept", meaning, message, Reading(meaning))
-    if meaning == "quota_exhausted":
-        return AttemptOutcome("quota", meaning, message)
-    if meaning in ("unknown_model", "not_allowed") and should_retry != "true":
-        return AttemptOutcome("refused", meaning, message)
-    if meaning == "request_too_large":
-        return AttemptOutcome("fail", meaning, message)
-    if meaning == "rate_limited":
-        action: Action = "fail" if should_retry == "false" else "retry"
-        return AttemptOutcome(action, meaning, message, delay_s=delay, pause=action == "retry")
-    if should_retry == "true" or (error.status in TRANSIENT and should_retry != "false"):
-        name = TRANSIENT.get(error.status, f"http_{error.status}")
-        return AttemptOutcome("retry", name, message, delay_s=delay)
-    name = TRANSIENT.get(error.status, "bad_request")
-    return AttemptOutcome("fail", name, message, of_prompt=meaning == "bad_prompt")
+    # What a format knows of an error, else what a format knows that gateways pass on.
+    told = filter(None, (each.meaning(error) for each in (wire, *PASSED_ON)))
+    name: str = next(told, None) or STATUSES.get(error.status, "bad_request")
+    action = ACTIONS.get(name, "fail")
+    wish = error.headers.get("x-should-retry")
+    if wish == "true" and action in ("fail", "refused") and name != "request_too_large":
+        action, name = "retry", f"http_{error.status}"
+    elif wish == "false" and action == "retry":
+        action = "fail"
+    of_prompt = name == "bad_prompt"
+    return AttemptOutcome(
+        action,
+        "bad_request" if of_prompt else name,
+        f"HTTP {error.status}: {error.message}",
+        Reading(name) if name == "refusal" else NOTHING_READ,
+        server_delay_s(error, (wire, *PASSED_ON)) if action == "retry" else None,
+        pause=action == "retry" and name == "rate_limited",
+        of_prompt=of_prompt,
+    )

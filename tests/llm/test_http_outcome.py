@@ -4,7 +4,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from merge_runner.llm.formats import FORMATS, PASSED_ON
+from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import Reading, WireFormat, WireRequest
 from merge_runner.llm.http_outcome import RawReply, is_web_page, judge, may_be_charged
 
@@ -318,13 +318,6 @@ LIMITS = [
     (
         "openai-chat",
         429,
-        openai("m", "requests", "rate_limit_exceeded"),
-        {"x-ratelimit-remaining-requests": "0", "x-ratelimit-reset-requests": "6m0s"},
-        360,
-    ),
-    (
-        "openai-chat",
-        429,
         openai(TOKENS, "tokens", "rate_limit_exceeded"),
         {"retry-after": "3", "x-should-retry": "true"},
         3,
@@ -551,7 +544,6 @@ class Stubborn(WireFormat):
     """A format that understands a few errors otherwise than all others."""
 
     members = frozenset({"said"})
-    charged_errors = frozenset({"late_refusal"})
 
     def request(self, entry, prompt):
         return WireRequest("/", {})
@@ -562,29 +554,19 @@ class Stubborn(WireFormat):
     def meaning(self, error):
         return "request_too_large" if "insufficient_quota" in error.names else None
 
-    def status_of(self, error):
-        return 503 if "rate_limit_exceeded" in error.names else None
-
     def delay_s(self, error):
         return 11.0 if "soon" in error.names else None
-
-    def reset_s(self, headers, now):
-        return 12.0 if headers.get("x-left") == "0" else None
 
 
 @pytest.mark.parametrize(
     ("status", "code", "headers", "name", "delay_s"),
     [
         (429, "insufficient_quota", {}, "request_too_large", None),
-        (200, "rate_limit_exceeded", {}, "overloaded", None),
-        (503, "soon", {"x-left": "0"}, "overloaded", 11),
-        (503, None, {"x-left": "0"}, "overloaded", 12),
+        (503, "soon", {}, "overloaded", 11),
         (503, "soon", {"retry-after": "13"}, "overloaded", 13),
         # What only another format knows, as a gateway may pass it on.
         (400, "model_not_found", {}, "unknown_model", None),
         (429, "enforced_spend_limit_reached", {}, "quota_exhausted", None),
-        (429, None, {"x-ratelimit-remaining-tokens": "0", "x-ratelimit-reset-tokens": "14"},
-         "rate_limited", 14),
     ],
 )  # fmt: skip
 def test_a_formats_own_word_on_an_error_goes_before_that_of_others(
@@ -593,12 +575,6 @@ def test_a_formats_own_word_on_an_error_goes_before_that_of_others(
     raw = RawReply(status, headers, json.dumps(openai(code=code)))
     found = judge(raw, Stubborn())
     assert (found.name, found.delay_s) == (name, delay_s)
-
-
-def test_work_that_only_the_format_knows_to_be_charged_may_be_charged():
-    raw = RawReply(400, {}, json.dumps(openai(code="late_refusal")))
-    assert may_be_charged(raw, Stubborn(), None)
-    assert not any(may_be_charged(raw, wire, None) for wire in PASSED_ON)
 
 
 OPENAI_ERROR = {"error": {"message": "m", "type": "server_error", "param": None, "code": None}}
@@ -645,7 +621,7 @@ ANTHROPIC_ERROR = {"type": "error", "error": {"type": "overloaded_error", "messa
 )
 def test_what_may_be_charged_though_no_usage_is_told(provider, status, body, charged):
     text = body if isinstance(body, str) else json.dumps(body)
-    assert may_be_charged(RawReply(status, {}, text), FORMATS["openai-chat"], provider) == charged
+    assert may_be_charged(RawReply(status, {}, text), provider) == charged
 
 
 @pytest.mark.parametrize("status", [400, 429, 500, 503])

@@ -37,6 +37,7 @@ from merge_runner.llm.batch.service import (
 )
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import as_count, as_dict, as_text, first_of, read_error
+from merge_runner.llm.http_outcome import status_within
 from merge_runner.llm.verify import LARGEST_STATUS
 
 # Where the files of a batch stand, whatever the base URL of the server is.
@@ -103,7 +104,7 @@ class OpenAIBatches:
         done = [as_count(counts.get(name)) for name in ("completed", "failed")]
         error = first_of(as_dict(batch.get("errors")).get("data"))
         why = read_error(400, {}, "", {"error": error})
-        why = replace(why, status=self._exchange.wire.status_of(why) or 400)
+        why = replace(why, status=status_within(why) if why.names else 400)
         failed = word.lower() == "failed"
         return BatchStatus(
             state="failed" if failed else "ended" if word.lower() in ENDED else "waiting",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from datetime import datetime
 from typing import Any
 
 from merge_runner.config import ModelEntry
@@ -22,7 +20,6 @@ from merge_runner.llm.formats.base import (
     plain,
     total,
 )
-from merge_runner.llm.formats.delays import NONE_REMAINS, until_s
 from merge_runner.records import Usage
 
 # The version whose sampling default is temperature 1.0; later ones reject the parameter.
@@ -30,7 +27,6 @@ VERSION = "2023-06-01"
 QUOTA = frozenset({"enforced_spend_limit_reached", "contract_spend_limit_reached"})
 # These are reported as invalid requests.
 SPENT = ("credit balance is too low", "spend limit")
-LIMITS = ("requests", "tokens", "input-tokens", "output-tokens")
 
 
 class AnthropicMessages(WireFormat):
@@ -92,17 +88,3 @@ class AnthropicMessages(WireFormat):
         """A spend limit, also where it is an invalid request."""
         spent = error.status == 400 and any(words in error.message for words in SPENT)
         return "quota_exhausted" if spent or error.names & QUOTA else None
-
-    def reset_s(self, headers: Mapping[str, str], now: datetime) -> float | None:
-        """The longest reset among the exhausted limits, which are points in time."""
-        delays = []
-        for kind in LIMITS:
-            limit = f"anthropic-ratelimit-{kind}"
-            if not NONE_REMAINS.fullmatch(headers.get(f"{limit}-remaining", "")):
-                continue
-            try:
-                reset = datetime.fromisoformat(headers.get(f"{limit}-reset", ""))
-            except ValueError:
-                continue
-            delays.append(until_s(reset, now))
-        return max(delays, default=None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from datetime import datetime
 from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue
@@ -89,9 +88,6 @@ class WireFormat(ABC):
     retries_empty: ClassVar[bool] = False
     """Whether an empty answer is a known fault of the service that asking again may mend."""
 
-    charged_errors: ClassVar[frozenset[str]] = frozenset()
-    """The names of errors 400 that a server may send after work that it charges for."""
-
     @abstractmethod
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
         """The request for a prompt."""
@@ -104,16 +100,8 @@ class WireFormat(ABC):
         """What an error means where that is not what its status says."""
         return None
 
-    def status_of(self, error: ServerError) -> int | None:
-        """The status that an error within a 200 stands for, by its names."""
-        return None
-
     def delay_s(self, error: ServerError) -> float | None:
         """How long to wait by a member of the error; its words are read for every format."""
-        return None
-
-    def reset_s(self, headers: Mapping[str, str], now: datetime) -> float | None:
-        """The time until exhausted limits are reset, by headers with lower-case names."""
         return None
 
 
@@ -148,14 +136,9 @@ def as_dict(value: object) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def as_list(value: object) -> list[Any]:
-    """A JSON array, or an empty one where the server sent something else."""
-    return value if isinstance(value, list) else []
-
-
 def as_dicts(value: object) -> list[dict[str, Any]]:
-    """The objects of a JSON array; anything else in it counts as an empty object."""
-    return [as_dict(item) for item in as_list(value)]
+    """The objects of a JSON array, if it is one; anything else in it counts as an empty object."""
+    return [as_dict(item) for item in value] if isinstance(value, list) else []
 
 
 def first_of(value: object) -> dict[str, Any]:

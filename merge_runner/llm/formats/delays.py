@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import TypeGuard
@@ -17,14 +17,11 @@ _PART = (
     r"(ms|milliseconds?|s|secs?|seconds?|m|mins?|minutes?|h|hrs?|hours?|d|days?)(?![a-z])"
 )
 _PARTS = re.compile(_PART, re.I)
-_DURATION = re.compile(rf"{_PART}(?:(?:,|\s|and)*{_PART})*", re.I)
+_IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_PART}(?:(?:,|\s|and)*{_PART})*)", re.I)
 # A header that is sent several times has all its values in one, and a date has a comma of its own.
 _LISTED = re.compile(r"(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*,)?[^,]+", re.I)
 # A server that asks for longer means for ever, and dates end somewhere.
 MOST_S = 366 * 86400.0
-_IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_DURATION.pattern})", re.I)
-# Azure counts on below zero.
-NONE_REMAINS = re.compile(r"0|-\d+")
 
 
 def server_delay_s(
@@ -33,67 +30,46 @@ def server_delay_s(
     """The delay in s that a failed reply asks for, None where it says nothing usable.
 
     Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), a member of the
-    error that one of the ``formats`` knows, "try again in 1.574s" or "retry after 5 minutes" in
-    the message, then the reset times of exhausted limits that one of them knows. Of several values
-    of a header the longest counts, and of a delay a year at most.
+    error that one of the ``formats`` knows, and "try again in 1.574s" or "retry after 5 minutes" in
+    the message. Of several values of a header the longest counts, and of a delay a year at most.
     """
-    at = now or datetime.now(UTC)
-    wires = tuple(formats)
+    in_text = _IN_TEXT.search(error.message)
     candidates = (
-        _longest(error.headers, "retry-after-ms", lambda text: _scaled(text, 1000)),
-        _longest(error.headers, "retry-after", lambda text: _retry_after(text, at)),
-        *(wire.delay_s(error) for wire in wires),
-        _in_text(error.message),
-        *(wire.reset_s(error.headers, at) for wire in wires),
+        _longest(error.headers.get("retry-after-ms", ""), lambda text: float(text) / 1000),
+        _longest(error.headers.get("retry-after", ""), lambda text: _retry_after_s(text, now)),
+        *(wire.delay_s(error) for wire in formats),
+        _duration_s(in_text[1]) if in_text else None,
     )
-    return next((min(d, MOST_S) for d in candidates if _usable(d)), None)
+    return next((min(delay, MOST_S) for delay in candidates if _is_usable(delay)), None)
 
 
-def _usable(delay_s: float | None) -> TypeGuard[float]:
+def _is_usable(delay_s: float | None) -> TypeGuard[float]:
     return delay_s is not None and 0 < delay_s < float("inf")
 
 
-def _longest(
-    headers: Mapping[str, str], name: str, read: Callable[[str], float | None]
-) -> float | None:
-    values = _LISTED.findall(headers.get(name, ""))
-    return max(filter(_usable, map(read, values)), default=None)
+def _longest(header: str, read: Callable[[str], float]) -> float | None:
+    delays = []
+    for text in _LISTED.findall(header):
+        try:
+            delays.append(read(text))
+        except (ValueError, OverflowError):  # the latter: a zone beyond the first or last date
+            continue
+    return max(filter(_is_usable, delays), default=None)
 
 
-def duration_s(text: str) -> float | None:
-    """Seconds of ``6m0s``, ``1h30m``, ``120ms`` or ``5 minutes``; Azure sends a bare ``64``."""
-    if not _DURATION.fullmatch(text.strip()):
-        return _scaled(text, 1)
-    return sum(float(number) * _UNIT_S[_unit(word)] for number, word in _PARTS.findall(text))
+def _duration_s(text: str) -> float:
+    """Seconds of ``6m0s``, ``1h30m``, ``120ms`` or ``5 minutes``."""
+    parts = [(number, unit.lower()) for number, unit in _PARTS.findall(text)]
+    return sum(
+        float(number) * _UNIT_S["ms" if unit.startswith(("ms", "milli")) else unit[0]]
+        for number, unit in parts
+    )
 
 
-def _unit(word: str) -> str:
-    return "ms" if word.lower() in ("ms", "millisecond", "milliseconds") else word[0].lower()
-
-
-def _scaled(text: str | None, per_second: float) -> float | None:
+def _retry_after_s(text: str, now: datetime | None) -> float:
     try:
-        return float(text) / per_second if text else None
+        return float(text)
     except ValueError:
-        return None
-
-
-def _retry_after(text: str, now: datetime) -> float | None:
-    seconds = _scaled(text, 1)
-    if seconds is not None:
-        return seconds
-    try:
-        return until_s(parsedate_to_datetime(text), now)
-    except (ValueError, OverflowError):  # the latter: a zone beyond the first or last date
-        return None
-
-
-def _in_text(message: str) -> float | None:
-    match = _IN_TEXT.search(message)
-    return duration_s(match.group(1)) if match else None
-
-
-def until_s(moment: datetime, now: datetime) -> float:
-    """Seconds until a moment, which is UTC where it names no zone."""
+        moment = parsedate_to_datetime(text)
     aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    return (aware - now).total_seconds()
+    return (aware - (now or datetime.now(UTC))).total_seconds()

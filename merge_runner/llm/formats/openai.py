@@ -1,13 +1,10 @@
-"""What both formats of OpenAI share: usage, errors and limits, also of servers that speak them."""
+"""What both formats of OpenAI share: usage and errors, also of servers that speak them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from datetime import datetime
 from typing import Any
 
 from merge_runner.llm.formats.base import Meaning, ServerError, WireFormat, as_count, as_dict
-from merge_runner.llm.formats.delays import NONE_REMAINS, duration_s
 from merge_runner.records import Usage
 
 QUOTA = frozenset(
@@ -26,14 +23,16 @@ QUOTA = frozenset(
 class OpenAI(WireFormat):
     """A format of OpenAI, with the errors of Azure, OpenRouter and LiteLLM."""
 
-    # Azure charges for a prompt that it has looked at, also where it then refuses it.
-    charged_errors = frozenset({"content_filter", "context_length_exceeded"})
-
     def meaning(self, error: ServerError) -> Meaning | None:
         """Filters, quotas, unknown models and what can never be sent."""
-        if _is_filtered(error):
+        # Azure's content filter, and OpenRouter's moderation.
+        if error.status == 400 and "content_filter" in error.names:
             return "refusal"
-        if _is_in_flight_budget(error):
+        if error.status == 403 and "flagged_input" in error.body:
+            return "refusal"
+        # OpenRouter's want of credit while other requests run: it passes when they end.
+        in_flight = error.status == 402 and "openrouter_in_flight_budget" in error.body
+        if in_flight and "retry-after" in error.headers:
             return "rate_limited"
         if error.names & QUOTA:
             return "quota_exhausted"
@@ -44,21 +43,6 @@ class OpenAI(WireFormat):
         if error.status == 400 and "invalid_prompt" in error.names:
             return "bad_prompt"
         return None
-
-    def status_of(self, error: ServerError) -> int | None:
-        """A failed response arrives with status 200."""
-        if "rate_limit_exceeded" in error.names:
-            return 429
-        return 500 if error.names == {"server_error"} else None
-
-    def reset_s(self, headers: Mapping[str, str], now: datetime) -> float | None:
-        """The longest reset among the limits of which nothing remains."""
-        delays = [
-            duration_s(headers.get(f"x-ratelimit-reset-{kind}", ""))
-            for kind in ("requests", "tokens")
-            if NONE_REMAINS.fullmatch(headers.get(f"x-ratelimit-remaining-{kind}", ""))
-        ]
-        return max((delay for delay in delays if delay is not None), default=None)
 
 
 def usage_of(payload: dict[str, Any], read: str, written: str) -> Usage:
@@ -72,15 +56,3 @@ def usage_of(payload: dict[str, Any], read: str, written: str) -> Usage:
         output_tokens=as_count(usage.get(f"{written}_tokens")),
         reasoning_tokens=as_count(written_details.get("reasoning_tokens")),
     )
-
-
-def _is_filtered(error: ServerError) -> bool:
-    """Azure's content filter, or OpenRouter's moderation."""
-    azure = error.status == 400 and "content_filter" in error.names
-    return azure or (error.status == 403 and "flagged_input" in error.body)
-
-
-def _is_in_flight_budget(error: ServerError) -> bool:
-    """OpenRouter's 402 for want of credit while other requests run: it passes when they end."""
-    in_flight = error.status == 402 and "openrouter_in_flight_budget" in error.body
-    return in_flight and "retry-after" in error.headers

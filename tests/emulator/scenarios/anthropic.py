@@ -49,7 +49,6 @@ SCENES: dict[str, Scene] = {
     "temperature": _error(400, "invalid_request_error", "temperature: not supported"),
     "no_max_tokens": _error(400, "invalid_request_error", "max_tokens: Field required"),
     "no_version": _error(400, "invalid_request_error", "anthropic-version: header is required"),
-    # The exhausted limit resets before the one with something left.
     "rate_limit": _error(
         429,
         "rate_limit_error",

@@ -91,7 +91,7 @@ SCENES: dict[str, dict[str, Scene]] = {
                 }
             },
         ),
-        # It counts below zero, and its reset is a bare number of seconds.
+        # It counts below zero.
         "integer_reset": fixed(
             429,
             {"error": {"code": "RateLimitReached", "message": "Rate limit reached."}},
