@@ -1,20 +1,19 @@
-"""The client of one model: cache, then claim, then money, limiter, transport and record.
+"""The client of one model: what is known, what is sealed, and what is asked.
 
-What an attempt means for its call is decided in consequences.py.
+What an attempt means for its call is decided in http_outcome.py.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TYPE_CHECKING
 
-from merge_runner.config import ModelEntry
+from merge_runner.config import ModelEntry, driver_name, is_own_host
 from merge_runner.errors import (
     CallFailed,
     ModelSwapped,
@@ -28,14 +27,17 @@ from merge_runner.llm.batch.lines import LineEnd
 from merge_runner.llm.budget import Unpaid
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.call import Call, Wait, slot_text
-from merge_runner.llm.consequences import Consequences
 from merge_runner.llm.content_hashes import make_request
-from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import WireFormat
 from merge_runner.llm.http_outcome import (
     AttemptOutcome,
+    Consequences,
+    Deadline,
+    FirstCall,
+    OutOfTime,
     RawReply,
+    RequestFailed,
     TransportFailure,
     is_web_page,
     judge,
@@ -44,14 +46,7 @@ from merge_runner.llm.http_outcome import (
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
 from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import cost_usd
-from merge_runner.llm.retry import Deadline, OutOfTime, RequestFailed, retries
-from merge_runner.llm.shared_services import (
-    AttemptPort,
-    BudgetPort,
-    CachePort,
-    RateLimitPort,
-    Settle,
-)
+from merge_runner.llm.shared_services import AttemptPort, BudgetPort, CachePort, RateLimitPort
 from merge_runner.llm.verify import reply_object
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -83,9 +78,10 @@ class LlmClient:
     who ask for the same key, and goes on when they are cancelled, so that what is paid for is
     kept; ``drain`` waits for it. ``budget`` is None for a model that costs nothing. ``first`` is
     the run's first call to the endpoint, which goes alone. ``sealed`` says that nothing may be
-    asked anew; ``strict`` that an answer of another model stops the sweep. ``model`` is its name in
-    the registry where ``name`` also tells its parameters. ``batches`` are those in which it may be
-    asked, or where its calls may wait already.
+    asked anew, so that there is no ``transport``; ``strict`` that an answer of another model stops
+    the sweep. ``model`` is its name in the registry where ``name`` also tells its parameters.
+    ``batches`` are those in which it may be asked, or where its calls may wait already. ``driver``
+    is its name, with the endpoint where that is not the provider's own.
     """
 
     name: str
@@ -101,34 +97,61 @@ class LlmClient:
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
     batches: Batches | None = None
     meter: Meter = field(default_factory=Meter)
+    driver: str = field(init=False)
+    _wire: WireFormat = field(init=False)
+    _money: BudgetPort = field(init=False)
+    _consequences: Consequences = field(init=False)
     _calls: dict[str, Call] = field(default_factory=dict)
     _stopping: bool = False
+
+    def __post_init__(self) -> None:
+        """Derive what every call needs."""
+        self.driver = driver_name(self.name, self.endpoint)
+        self._wire = FORMATS[self.entry.format]
+        self._money = self.budget or Unpaid(self.cache)
+        provider = self.entry.provider
+        self._consequences = Consequences(
+            self.name,
+            self.entry,
+            self.driver,
+            # The provider whose own host is asked; None: another server in its format.
+            provider if is_own_host(provider, self.endpoint) else None,
+            self.first,
+        )
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """The model's reply for a slot; lower ``order`` is served first.
 
         Raises CallFailed, TrialSuspended or SweepStopped.
         """
-        request = self._request(prompt, slot)
-        if recorded := self._recorded(request):
-            reply = self._read(recorded)
-        elif self.sealed:
+        wire = self._wire.request(self.entry, prompt)
+        request = make_request(
+            provider=self.entry.provider,
+            endpoint=self.endpoint,
+            model=self.entry.id,
+            path=wire.path,
+            headers=wire.headers,
+            body=wire.body,
+            slot=slot,
+        )
+        reply = self._known(request)
+        if reply is None and self.sealed:
             raise ReplayMiss("no recorded reply", request)
-        elif call := self._calls.get(request.key):
-            with call.asked_by_one():
-                reply = await asyncio.shield(call.task)
+        if reply is None:
             # The attempts are counted once, for whoever asked first.
-            reply = replace(reply, earlier=len(reply.attempts))
-        else:
-            # Shielded: the call may be paid for already when its trial is cancelled.
-            call = self._start(request, order)
+            shared = request.key in self._calls
+            call = self._calls[request.key] if shared else self._start(request, order)
             with call.asked_by_one():
+                # Shielded: the call may be paid for already when its trial is cancelled.
                 reply = await asyncio.shield(call.task)
-        other_model = self._other_model(reply)
-        self.meter.count_reply(reply, other_model)
-        if self.strict and other_model is not None:
+            if shared:
+                reply = replace(reply, earlier=len(reply.attempts))
+        served = reply.attempts[-1].model_served
+        is_other = is_other_model(self.entry.id, served, self.entry.aliases)
+        self.meter.count_reply(reply, served if is_other else None)
+        if self.strict and is_other:
             raise ModelSwapped(
-                f"{self.driver}: {other_model} answered where {self.entry.id} was asked for, at "
+                f"{self.driver}: {served} answered where {self.entry.id} was asked for, at "
                 f"{slot_text(slot)}; --strict-model stops the sweep. The reply is kept. To go on "
                 "with it, leave --strict-model out, or name it in `aliases` in "
                 "experiments/models.toml"
@@ -163,47 +186,31 @@ class LlmClient:
         calls = self._calls.values()
         return sum(call.asking for call in calls if call.wait is not None and call.wait.idle)
 
-    @property
-    def _format(self) -> WireFormat:
-        return FORMATS[self.entry.format]
-
-    @property
-    def driver(self) -> str:
-        """Its name, with the endpoint where that is not the provider's own."""
-        return self._consequences.driver
-
-    def _recorded(self, request: ChatRequest) -> CachedCall | None:
-        """The recorded call, None for a damaged one; in a replay that raises CallFailed."""
+    def _known(self, request: ChatRequest) -> ChatReply | None:
+        """The recorded reply; a damaged one is None, and in a replay raises CallFailed."""
         try:
-            return self.cache.get(request.key)
+            recorded = self.cache.get(request.key)
         except RecordingError as exc:
             if self.sealed:
                 raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
             return None
+        return None if recorded is None else self._read(recorded, len(recorded.attempts))
 
-    def _other_model(self, reply: ChatReply) -> str | None:
-        """Who answered, where it is another model than was asked for."""
-        served = reply.attempts[-1].model_served
-        return served if is_other_model(self.entry.id, served, self.entry.aliases) else None
-
-    def _request(self, prompt: str, slot: Slot) -> ChatRequest:
-        wire = self._format.request(self.entry, prompt)
-        return make_request(
-            provider=self.entry.provider,
-            endpoint=self.endpoint,
-            model=self.entry.id,
-            path=wire.path,
-            headers=wire.headers,
-            body=wire.body,
-            slot=slot,
-        )
+    def _read(self, recorded: CachedCall, earlier: int) -> ChatReply:
+        last = recorded.attempts[-1]
+        payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
+        text = self._wire.read(payload).text
+        return ChatReply(text, last.outcome, recorded.request, recorded.attempts, earlier)
 
     def _start(self, request: ChatRequest, order: int) -> Call:
-        worst = self._worst_case(request)
+        # An upper bound: no tokeniser makes more tokens than bytes.
+        worst = Usage(
+            input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
+        )
         worst_usd = cost_usd(self.entry, worst) or 0.0
         asked = Asked(self.driver, slot_text(request.slot), worst_usd, self.model or self.name)
         call = Call(request, order, asked, worst, self._stopping)
-        call.task = asyncio.create_task(self._in_turn(call))
+        call.task = asyncio.create_task(self._call(call))
         self._calls[request.key] = call
 
         def forget(done: asyncio.Task[ChatReply]) -> None:
@@ -214,14 +221,16 @@ class LlmClient:
         call.task.add_done_callback(forget)
         return call
 
-    async def _in_turn(self, call: Call) -> ChatReply:
+    async def _call(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
         # Both before the claim: else another worker would wait for a call that waits here.
         opened = self.batches is not None and self.batches.takes_up(call)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
-        # Nobody waits for an answer that may take hours.
-        alone, stopped = not opened and await self._goes_alone(call), False
+        alone, stopped = False, False
+        if not self.first.passed and not opened:  # nobody waits for an answer that may take hours
+            with call.waiting(f"for the first answer of {self.driver}"):
+                alone = await self.first.turn()
         try:
             return await self._claimed(call)
         except SweepStopped:
@@ -230,13 +239,6 @@ class LlmClient:
         finally:
             if alone and not stopped:
                 self.first.give_turn()
-
-    async def _goes_alone(self, call: Call) -> bool:
-        """Wait for the first answer of the run; True if this call is to bring it."""
-        if self.first.passed:
-            return False
-        with call.waiting(f"for the first answer of {self.driver}"):
-            return await self.first.turn()
 
     async def _claimed(self, call: Call) -> ChatReply:
         """Claim a call, and make it unless it is recorded by now."""
@@ -251,18 +253,19 @@ class LlmClient:
                     f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set "
                     f"aside in the cache as 'damaged {name}', and asked again"
                 )
+            if known.entry:  # whoever held the claim before has made the call
+                return self._read(known.entry, len(known.entry.attempts))
             call.attempts = list(known.attempts)
             if self.batches is not None:
                 call.open = self.batches.rounds.open_line(key, known.attempts)
             if call.open is not None:  # the attempt that has begun there is the one that goes on
                 call.attempts = [each for each in call.attempts if each.number < call.open.attempt]
             call.earlier = len(call.attempts)
-            # Whoever held the claim before may have made the call.
-            return self._read(known.entry) if known.entry else await self._make(call)
+            return await self._attempts(call)
         finally:
             self.cache.release(key)
 
-    async def _make(self, call: Call) -> ChatReply:
+    async def _attempts(self, call: Call) -> ChatReply:
         """Make attempts until one brings an answer, which is kept together with all of them."""
         call.began_s = asyncio.get_running_loop().time()
         deadline = Deadline(self.entry.deadline_s)
@@ -278,7 +281,7 @@ class LlmClient:
                 await asyncio.sleep(seconds)
 
         try:
-            async for attempt in retries(deadline, sleep=sleep):
+            async for attempt in deadline.retries(sleep=sleep):
                 with attempt:
                     return await self._attempt(call, deadline)
         except (OutOfTime, RequestFailed) as exc:
@@ -296,24 +299,114 @@ class LlmClient:
         """Make one attempt; returns its answer, which is kept, or raises what follows from it."""
         if self.batches is not None and (call.open or self._goes_in_batch(call)):
             return await self._attempt_in_batch(call, self.batches)
-        async with self._permitted(call) as (paid, settle):
+        async with AsyncExitStack() as stack:
+            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
+                paid = await stack.enter_async_context(
+                    self._money.attempt(call.order, call.request.key, call.asked)
+                )
+            # A turn must be used as soon as it is given, or the limits do not hold.
+            with call.waiting("for a turn under the rate limits"):
+                # As a provider counts when it admits a request: its text, of which about four bytes
+                # make a token, and the whole output cap.
+                estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
+                settle = await self.limiter.acquire(estimate, order=call.order)
             await paid.begin(call.attempts)
+            started_at, started = datetime.now(UTC), time.perf_counter()
             with deadline.attempt() as seconds_left:
-                outcome, raw = await self._send(call, settle, seconds_left)
-            return await self._concluded(call, paid, outcome, raw)
+                outcome, raw, record = await self._send(call, seconds_left)
+            record = replace(
+                record,
+                started_at=started_at.isoformat(timespec="milliseconds"),
+                latency_s=round(time.perf_counter() - started, 4),
+            )
+            if record.usage.output_tokens is not None:
+                settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
+            return await self._concluded(call, paid, outcome, raw, record)
+
+    async def _send(
+        self, call: Call, seconds_left: float
+    ) -> tuple[AttemptOutcome, RawReply | None, Attempt]:
+        """Send the request once: what came of it, the reply, and the attempt for the record."""
+        assert self.transport is not None, "a sealed client asks nothing"
+        number, timeout_s = len(call.attempts) + 1, min(self.entry.timeout_s, seconds_left)
+        try:
+            raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
+        except TransportFailure as exc:
+            free = self.entry.price == "free" or not exc.sent
+            cost = 0.0 if free else None
+            record = Attempt(number, exc.outcome, error=str(exc), cost_usd=cost)
+            return AttemptOutcome(exc.action, exc.outcome, str(exc)), None, record
+        outcome = judge(raw, self._wire)
+        return outcome, raw, self._record(number, raw, outcome, call.worst)
 
     async def _concluded(
-        self, call: Call, paid: AttemptPort, outcome: AttemptOutcome, raw: RawReply | None
+        self,
+        call: Call,
+        paid: AttemptPort,
+        outcome: AttemptOutcome,
+        raw: RawReply | None,
+        record: Attempt,
     ) -> ChatReply:
         """Keep what an attempt brought: its answer, or why there is none, which is raised."""
+        call.attempts.append(record)
+        self.meter.count_attempt(record)
         self._tell_overrun(call, paid.aside_usd)
         error = self._consequences.error(call, outcome, raw)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
-            return self._answer(call, kept, outcome)
-        self._pause(call, outcome)
+            if kept.attempts[-1] != record:  # an import was first
+                return self._read(kept, call.earlier)
+            text = outcome.reading.text
+            return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
+        if (pause_s := self._consequences.pause_s(call, outcome)) is not None:
+            self.limiter.pause(pause_s)
+            until = datetime.now(UTC) + timedelta(seconds=pause_s)
+            self.meter.notes.append(
+                f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
+                f"{outcome.message or outcome.name}"
+            )
         await paid.settle(call.attempts)  # before the error, which may end the whole run
         raise error
+
+    def _tell_overrun(self, call: Call, aside_usd: float) -> None:
+        spent_usd = call.attempts[-1].cost_usd or 0.0
+        released = aside_usd == 0  # by a user, while a batch was waited for
+        if released or spent_usd <= aside_usd + TOLERANCE_USD:
+            return
+        self.meter.notes.append(
+            f"{self.driver}: {call.asked.slot}: the reply cost {spent_usd:.4f} USD, and "
+            f"{aside_usd:.4f} were set aside for it: the server does not keep to the cap of "
+            f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
+        )
+
+    def _record(self, number: int, raw: RawReply, outcome: AttemptOutcome, worst: Usage) -> Attempt:
+        return Attempt(
+            number=number,
+            outcome=outcome.name,
+            http_status=raw.status,
+            model_served=outcome.reading.model_served,
+            finish_reason=outcome.reading.finish_reason,
+            usage=outcome.reading.usage,
+            reply=raw.body,
+            error=outcome.message,
+            cost_usd=self._cost_usd(raw, outcome.reading.usage, worst),
+            scripted=SCRIPTED_HEADER in raw.headers or says_scripted(raw.body),
+        )
+
+    def _cost_usd(self, raw: RawReply, usage: Usage, worst: Usage) -> float | None:
+        """What a reply cost, by its usage, which an error may have too; None if nobody knows.
+
+        Output beyond the cap is charged even where the server does not say what was read.
+        """
+        if self.entry.price == "free":
+            return 0.0
+        if usage.input_tokens and usage.output_tokens is not None:
+            return cost_usd(self.entry, usage)
+        if (usage.output_tokens or 0) > self.entry.max_output_tokens:
+            return cost_usd(self.entry, replace(worst, output_tokens=usage.output_tokens))
+        stray = raw.status == 200 and is_web_page(raw) and not self.first.known
+        charged = may_be_charged(raw, self._consequences.own_host) and not stray
+        return None if charged else 0.0
 
     def _goes_in_batch(self, call: Call) -> bool:
         """Whether the next attempt at a call goes with the next round."""
@@ -329,12 +422,12 @@ class LlmClient:
                 end = await batches.rounds.ask(line)
             record, outcome = self._line_record(call, end, batches.price_factor)
             record = replace(record, started_at=batches.rounds.submitted_at(line))
-            call.attempts.append(record)
             call.singly |= end.singly
-            self.meter.count_attempt(record)
             try:
                 if end.error is None:
-                    return await self._concluded(call, paid, outcome, end.raw)
+                    return await self._concluded(call, paid, outcome, end.raw, record)
+                call.attempts.append(record)
+                self.meter.count_attempt(record)
                 await paid.settle(call.attempts)
                 raise end.error
             finally:
@@ -351,148 +444,10 @@ class LlmClient:
             record = Attempt(number, end.outcome, error=end.message, cost_usd=0.0 if free else None)
         else:
             # No limit of single calls is meant, and no call waits for one.
-            outcome = replace(judge(end.raw, self._format), pause=False, delay_s=None)
+            outcome = replace(judge(end.raw, self._wire), pause=False, delay_s=None)
             record = self._record(number, end.raw, outcome, call.worst)
             usd = record.cost_usd
             if end.raw.status != 200 and record.usage == Usage():
                 usd = 0.0  # no line that failed is charged
             record = replace(record, cost_usd=None if usd is None else usd * price_factor)
         return replace(record, batch_id=end.batch_id), outcome
-
-    @asynccontextmanager
-    async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, Settle]]:
-        """What an attempt needs before it is sent: its money, then its turn."""
-        # A turn must be used as soon as it is given, or the limits do not hold.
-        async with AsyncExitStack() as stack:
-            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid = await stack.enter_async_context(
-                    self._money.attempt(call.order, call.request.key, call.asked)
-                )
-            with call.waiting("for a turn under the rate limits"):
-                settle = await self.limiter.acquire(_estimated_tokens(call.worst), order=call.order)
-            yield paid, settle
-
-    async def _send(
-        self, call: Call, settle: Settle, seconds_left: float
-    ) -> tuple[AttemptOutcome, RawReply | None]:
-        """Send the request once, and add what came of it to the call's attempts."""
-        number = len(call.attempts) + 1
-        started_at, started = datetime.now(UTC), time.perf_counter()
-        raw: RawReply | None = None
-        assert self.transport is not None, "a sealed client asks nothing"
-        try:
-            raw = await self.transport.send(
-                call.request, attempt=number, timeout_s=min(self.entry.timeout_s, seconds_left)
-            )
-            outcome = judge(raw, self._format)
-            record = self._record(number, raw, outcome, call.worst)
-            if record.usage.output_tokens is not None:
-                settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
-        except TransportFailure as exc:
-            outcome = AttemptOutcome(exc.action, exc.outcome, str(exc))
-            free = self.entry.price == "free" or not exc.sent
-            cost_usd = 0.0 if free else None
-            record = Attempt(number, exc.outcome, error=str(exc), cost_usd=cost_usd)
-        record = _timed(record, started_at, time.perf_counter() - started)
-        call.attempts.append(record)
-        self.meter.count_attempt(record)
-        return outcome, raw
-
-    def _pause(self, call: Call, outcome: AttemptOutcome) -> None:
-        """Let all calls with the same API key wait, where the server asks for it."""
-        pause_s = self._consequences.pause_s(call, outcome)
-        if pause_s is None:
-            return
-        self.limiter.pause(pause_s)
-        until = datetime.now(UTC) + timedelta(seconds=pause_s)
-        self.meter.notes.append(
-            f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
-            f"{outcome.message or outcome.name}"
-        )
-
-    def _tell_overrun(self, call: Call, aside_usd: float) -> None:
-        spent_usd = call.attempts[-1].cost_usd or 0.0
-        released = aside_usd == 0  # by a user, while a batch was waited for
-        if released or spent_usd <= aside_usd + TOLERANCE_USD:
-            return
-        self.meter.notes.append(
-            f"{self.driver}: {call.asked.slot}: the reply cost {spent_usd:.4f} USD, and "
-            f"{aside_usd:.4f} were set aside for it: the server does not keep to the cap of "
-            f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
-        )
-
-    @property
-    def _money(self) -> BudgetPort:
-        return self.budget or Unpaid(self.cache)
-
-    @property
-    def _consequences(self) -> Consequences:
-        return Consequences(self.name, self.entry, self.endpoint, self.first)
-
-    def _record(self, number: int, raw: RawReply, outcome: AttemptOutcome, worst: Usage) -> Attempt:
-        usage = outcome.reading.usage
-        return Attempt(
-            number=number,
-            outcome=outcome.name,
-            http_status=raw.status,
-            model_served=outcome.reading.model_served,
-            finish_reason=outcome.reading.finish_reason,
-            usage=usage,
-            reply=raw.body,
-            error=outcome.message,
-            cost_usd=self._cost_usd(raw, usage, worst),
-            scripted=SCRIPTED_HEADER in raw.headers or says_scripted(raw.body),
-        )
-
-    def _cost_usd(self, raw: RawReply, usage: Usage, worst: Usage) -> float | None:
-        """What a reply cost, by its usage, which an error may have too; None if nobody knows.
-
-        Output beyond the cap is charged even where the server does not say what was read.
-        """
-        if self.entry.price == "free":
-            return 0.0
-        if usage.input_tokens and usage.output_tokens is not None:
-            return cost_usd(self.entry, usage)
-        if (usage.output_tokens or 0) > (worst.output_tokens or 0):
-            dearer = Usage(input_tokens=worst.input_tokens, output_tokens=usage.output_tokens)
-            return cost_usd(self.entry, dearer)
-        stray = raw.status == 200 and is_web_page(raw) and not self.first.known
-        return 0.0 if stray or not may_be_charged(raw, self._consequences.own_host) else None
-
-    def _worst_case(self, request: ChatRequest) -> Usage:
-        """An upper bound on an attempt's tokens: no tokeniser makes more tokens than bytes."""
-        return Usage(
-            input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
-        )
-
-    def _answer(self, call: Call, kept: CachedCall, outcome: AttemptOutcome) -> ChatReply:
-        if kept.attempts[-1] != call.attempts[-1]:  # an import was first
-            return self._read(kept, call.earlier)
-        text = outcome.reading.text
-        return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
-
-    def _read(self, entry: CachedCall, earlier: int | None = None) -> ChatReply:
-        """A recorded reply; without ``earlier`` all its attempts were made by earlier runs."""
-        last = entry.attempts[-1]
-        payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
-        return ChatReply(
-            text=self._format.read(payload).text,
-            outcome=last.outcome,
-            request=entry.request,
-            attempts=entry.attempts,
-            earlier=len(entry.attempts) if earlier is None else earlier,
-        )
-
-
-def _estimated_tokens(worst: Usage) -> int:
-    """What a provider counts when it admits a request: its text, and the whole output cap."""
-    # About four bytes of English make a token.
-    return (worst.input_tokens or 0) // 4 + (worst.output_tokens or 0)
-
-
-def _timed(attempt: Attempt, started_at: datetime, latency_s: float) -> Attempt:
-    return replace(
-        attempt,
-        started_at=started_at.isoformat(timespec="milliseconds"),
-        latency_s=round(latency_s, 4),
-    )

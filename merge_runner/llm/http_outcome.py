@@ -1,17 +1,32 @@
-"""What a raw HTTP reply means: an answer, something to try again, or a reason to stop."""
+"""What a raw HTTP reply means: an answer, something to try again, or a reason to stop.
+
+``judge`` says what a reply is by itself, ``Consequences.error`` what follows for its call and its
+run. The loop of attempts is tenacity's. Ours are the wait, which no server can shorten, and the
+deadline.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import json
+import random
 import re
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, NoReturn
+from urllib.parse import urlsplit
 
-from merge_runner.config import PROVIDERS
-from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.formats import PASSED_ON
+from merge_runner.config import PROVIDERS, ModelEntry
+from merge_runner.errors import (
+    EndpointRefused,
+    MergeRunnerError,
+    ProviderDown,
+    QuotaExhausted,
+    SweepStopped,
+)
+from merge_runner.llm.formats import FORMATS, PASSED_ON
 from merge_runner.llm.formats.base import (
     Reading,
     ServerError,
@@ -22,8 +37,21 @@ from merge_runner.llm.formats.base import (
 )
 from merge_runner.llm.formats.delays import server_delay_s
 
+if TYPE_CHECKING:
+    from tenacity import AsyncRetrying, RetryCallState
+
+    from merge_runner.llm.call import Call
+
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
 NOTHING_READ = Reading("error")
+REGISTRY = "experiments/models.toml"
+FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
+EMPTY_RETRIES = 2
+# At the first call of a run: for how long connections may be refused, and how many refusals mean
+# the configuration; the statuses of a refusal that names the request.
+NOBODY_S = 5.0
+SEVERAL = 3
+REQUEST_ITSELF = (400, 413, 422, 429)
 
 # Azure charges for a prompt that it has looked at, also where it then refuses it.
 CHARGED_ERRORS = frozenset({"content_filter", "context_length_exceeded"})
@@ -214,3 +242,252 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
         pause=action == "retry" and name == "rate_limited",
         of_prompt=of_prompt,
     )
+
+
+class TryAgain(MergeRunnerError):
+    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for."""
+
+    def __init__(self, message: str, delay_s: float | None = None) -> None:
+        super().__init__(message)
+        self.delay_s = delay_s
+
+
+class RequestFailed(MergeRunnerError):
+    """The provider rejects this one request; asking again would not help."""
+
+
+class OutOfTime(MergeRunnerError):
+    """A call's deadline would pass before the next attempt."""
+
+
+def backoff_s(attempts: int) -> float:
+    """The wait after so many failed attempts, without jitter."""
+    # The exponent is bounded: after a thousand attempts the power would fit in no float.
+    return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
+
+
+class Deadline:
+    """How long a call may take: its attempts and the waits between them.
+
+    The wait for a turn does not count: standing in the limiter's queue is no fault of the provider.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._used_s = 0.0
+
+    @contextmanager
+    def attempt(self) -> Iterator[float]:
+        """The time within this counts; yields the seconds that are left for it."""
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        try:
+            yield self._seconds - self._used_s
+        finally:
+            self._used_s += loop.time() - began
+
+    def retries(
+        self, *, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
+    ) -> AsyncRetrying:
+        """A loop of attempts, each a context, that goes on while they raise TryAgain.
+
+        The wait is the backoff, or longer where the server asks for it. Raises OutOfTime where it
+        would pass the deadline.
+        """
+        from tenacity import AsyncRetrying, retry_if_exception_type  # a replay needs none of it
+
+        def wait_s(state: RetryCallState) -> float:
+            # The jitter lets calls that failed together, as when a server restarts, not return
+            # together.
+            jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
+            backoff = min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
+            return max(_failure(state).delay_s or 0.0, backoff)
+
+        def count_wait(state: RetryCallState) -> None:
+            self._used_s += state.upcoming_sleep
+
+        # Looped over, since to wrap a function for each call would take twice the processor time.
+        return AsyncRetrying(
+            retry=retry_if_exception_type(TryAgain),
+            wait=wait_s,
+            stop=lambda state: self._used_s + state.upcoming_sleep >= self._seconds,
+            before_sleep=count_wait,
+            sleep=sleep,
+            retry_error_callback=self._give_up,
+        )
+
+    def _give_up(self, state: RetryCallState) -> NoReturn:
+        last = _failure(state)
+        # Where the server's own wish made the wait too long, that is what to tell.
+        asked_s = last.delay_s
+        if asked_s is None or asked_s < self._seconds:
+            raise OutOfTime(f"no answer within {self._seconds:.0f} s") from last
+        raise OutOfTime(
+            f"the server asks to wait {asked_s:.0f} s, longer than a call's deadline of "
+            f"{self._seconds:.0f} s: run the same command again after that"
+        ) from last
+
+
+def _failure(state: RetryCallState) -> TryAgain:
+    """The error of the last attempt; tenacity calls these hooks after a TryAgain alone."""
+    error = state.outcome.exception() if state.outcome else None
+    assert isinstance(error, TryAgain)
+    return error
+
+
+class FirstCall:
+    """The first live call of a run goes alone: a wrong key, URL or parameter costs one call.
+
+    ``passed`` says that the endpoint has answered in this run, in its format, ``known`` that it
+    ever has.
+    """
+
+    def __init__(self, *, passed: bool = False, known: bool = False) -> None:
+        self.passed = passed
+        self.known = known
+        self.refused = 0
+        self._alone = asyncio.Lock()
+
+    async def turn(self) -> bool:
+        """Wait until a call may go; True if it goes alone, until ``give_turn``."""
+        await self._alone.acquire()
+        if self.passed:  # it was answered while this call waited: nobody goes alone any more
+            self._alone.release()
+        return not self.passed
+
+    def give_turn(self) -> None:
+        """The call that went alone has ended, and another one may go."""
+        self._alone.release()
+
+
+@dataclass(frozen=True, slots=True)
+class Consequences:
+    """What follows from attempts at one model; see LlmClient for the fields."""
+
+    name: str
+    entry: ModelEntry
+    driver: str
+    own_host: str | None
+    first: FirstCall
+
+    def error(
+        self, call: Call, outcome: AttemptOutcome, raw: RawReply | None
+    ) -> MergeRunnerError | None:
+        """What the last attempt at a call means for it; None: it is the answer."""
+        if not self.first.passed and (stop := self._end_of_run(call, outcome, raw)):
+            return stop
+        message = outcome.message or outcome.name
+        if self._is_too_long(outcome):
+            return QuotaExhausted(
+                f"{self.driver}: the provider asks to wait {outcome.delay_s:.0f} s, longer than a "
+                f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
+                "is saved; run the same command again later to go on."
+            )
+        match outcome.action:
+            case "retry":
+                return TryAgain(message, outcome.delay_s)
+            case "fail":
+                which = "reply" if outcome.name == "reply_refused" else "request"
+                return RequestFailed(f"the {which} was rejected")
+            case "quota":
+                return QuotaExhausted(
+                    f"{self.driver}: the account's quota is exhausted ({message}). Every reply so "
+                    "far is saved; when there is credit again, run the same command to go on."
+                )
+            case "refused":
+                return EndpointRefused(f"{self.driver}: {self._advice(outcome)} ({message})")
+        self.first.passed = self.first.known = True
+        # Servers of some formats give an empty answer now and then.
+        empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
+        retries = EMPTY_RETRIES if FORMATS[self.entry.format].retries_empty else 0
+        again = outcome.name == "empty" and empty <= retries
+        return TryAgain("empty answer") if again else None
+
+    def pause_s(self, call: Call, outcome: AttemptOutcome) -> float | None:
+        """For how long all calls with the same key wait; None: they go on."""
+        if not outcome.pause or self._is_too_long(outcome):
+            return None
+        return outcome.delay_s or backoff_s(len(call.own_attempts))
+
+    def _is_too_long(self, outcome: AttemptOutcome) -> bool:
+        return outcome.pause and (outcome.delay_s or 0.0) > self.entry.deadline_s
+
+    def _end_of_run(
+        self, call: Call, outcome: AttemptOutcome, raw: RawReply | None
+    ) -> SweepStopped | None:
+        """The end of the run at its first call, where no other one would fare better."""
+        if raw is None:
+            # A server that is just starting is waited for, but only for seconds.
+            waited_s = asyncio.get_running_loop().time() - call.began_s
+            if outcome.name != "no_connection" or waited_s < NOBODY_S:
+                return None
+            advice = if_nobody(self.name, self.entry)
+            return ProviderDown(f"{self.driver}: {call.last_failure}: {advice}")
+        why = self._refusal(raw, outcome)
+        if why is None:
+            return None
+        # An endpoint that has answered before may mean this prompt alone; several refusals mean the
+        # configuration.
+        self.first.refused += outcome.action == "fail"
+        if self.first.known and self.first.refused < SEVERAL and outcome.action != "accept":
+            return None
+        return EndpointRefused(f"{self.driver}: {why}")
+
+    def _refusal(self, raw: RawReply, outcome: AttemptOutcome) -> str | None:
+        """Why no other call of a run would fare better, and what to set; None: one might."""
+        base_url = set_base_url(self.name, self.entry)
+        if is_web_page(raw) and raw.status == 200:
+            return f"a web page answers there, and no language model: {base_url}"
+        if outcome.name == "bad_body" and isinstance(raw.payload, dict):
+            return f"what answers there does not speak {self.entry.format}: {base_url}"
+        if outcome.action != "fail" or outcome.of_prompt:
+            return None
+        if raw.status not in (200, *REQUEST_ITSELF):
+            return f"no language model answers there: {base_url} ({outcome.message})"
+        named = self._named_parameter(raw)
+        where = f"{f'`{named}` of ' if named else ''}[{self.name}] in {REGISTRY}"
+        return f"the request is refused: look at {where} ({outcome.message})"
+
+    def _named_parameter(self, raw: RawReply) -> str | None:
+        """The parameter that an error names."""
+        error = as_dict(as_dict(raw.first).get("error"))
+        said = f"{error.get('param')} {raw.error.message}"
+        named = (f"parameters.{each}" for each in self.entry.parameters if each in said)
+        is_cap = any(words in said for words in ("max_", "tokens", "Request too large"))
+        return next(named, "max_output_tokens" if is_cap else None)
+
+    def _advice(self, outcome: AttemptOutcome) -> str:
+        """What to do where the endpoint refuses all calls."""
+        entry = self.entry
+        if outcome.name == "not_allowed":
+            key_envs = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
+            key = " or ".join(key_envs) or f"`key_env` of [{self.name}] in {REGISTRY}"
+            return f"the endpoint does not accept the key; set {key} to a valid one"
+        if outcome.name == "bad_certificate":
+            return (
+                "the endpoint's certificate cannot be trusted, and nothing was sent; check the "
+                "base URL, or set SSL_CERT_FILE to the certificates of whoever signed it"
+            )
+        retired = (
+            f", which was announced to shut down on {entry.shutdown}" if entry.shutdown else ""
+        )
+        other = "" if self.own_host else f", or {set_base_url(self.name, entry)}"
+        return f"the endpoint has no model {entry.id!r}{retired}; see `merge-runner models`{other}"
+
+
+def if_nobody(name: str, entry: ModelEntry) -> str:
+    """What to do where nobody answers."""
+    return (
+        f"{PROVIDERS[entry.provider].if_nobody}, or {set_base_url(name, entry)}; then run the same "
+        "command again"
+    )
+
+
+def set_base_url(name: str, entry: ModelEntry) -> str:
+    """What to do about the base URL of an entry, and where it is set."""
+    provider = PROVIDERS[entry.provider]
+    if entry.base_url is not None or provider.base_url_env is None:
+        return f"correct `base_url` of [{name}] in {REGISTRY}"
+    path = urlsplit(provider.base_url).path
+    ending = f" (with {path} at its end)" if path else ""
+    return f"set {provider.base_url_env} to the base URL of the service{ending}, or unset it"

@@ -6,10 +6,9 @@ import asyncio
 from concurrent.futures import ThreadPoolExecutor
 
 from merge_runner.config import Endpoint
-from merge_runner.llm.first_call import NOBODY_S
 from merge_runner.llm.formats.base import as_dict, as_dicts, as_text
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.http_outcome import RawReply, TransportFailure
+from merge_runner.llm.http_outcome import NOBODY_S, RawReply, TransportFailure
 
 # A server that answers one call at a time may be busy with one.
 TIMEOUT_S = 60.0

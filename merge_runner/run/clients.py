@@ -27,7 +27,7 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.budget import Budget, Unpaid
 from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.client import LlmClient
-from merge_runner.llm.first_call import FirstCall
+from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models

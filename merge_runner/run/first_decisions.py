@@ -10,7 +10,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 
 from merge_runner.errors import NoValidDecision
-from merge_runner.llm.first_call import REGISTRY
+from merge_runner.llm.http_outcome import REGISTRY
 from merge_runner.records import Decision
 from merge_runner.text_safety import one_line
 

@@ -16,8 +16,7 @@ from merge_runner.config import (
 )
 from merge_runner.errors import ProviderDown, UsageError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.first_call import REGISTRY, if_nobody
-from merge_runner.llm.http_outcome import TransportFailure
+from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody
 
 # What Ollama adds to a name that has no tag.
 USUAL_TAG = ":latest"

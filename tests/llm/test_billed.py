@@ -23,9 +23,10 @@ from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
-from merge_runner.llm.first_call import FirstCall
+from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
+from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd
@@ -152,6 +153,8 @@ def entry_of(wire, **changes):
 async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
     """Ask for samples at once under a cap of so many worst cases; returns client and cap in USD."""
     entry = entry_of(till.wire)
+    sent = canonical_json(FORMATS[till.wire].request(entry, PROMPT).body).encode()
+    worst = cost_usd(entry, Usage(input_tokens=len(sent), output_tokens=entry.max_output_tokens))
     async with playing(faults, till.middle) as url:
         base_url = f"{url}/v1" if till.wire in OPENAI else url
         transport = HttpTransport(Endpoint("openai", name, base_url, {}), connections=calls)
@@ -162,11 +165,9 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
             cache=cache,
             transport=transport,
             limiter=Limiter(),
+            budget=Budget(Ledger(cache, name), cap * worst, each(worst, "my-model")),
+            first=first or FirstCall(passed=True),
         )
-        worst = cost_usd(entry, client._worst_case(client._request(PROMPT, slot(0))))
-        client.first = first or client.first
-        ledger = Ledger(cache, name)
-        client.budget = Budget(ledger, cap * worst, each(worst, "my-model"))
 
         async def ask(number):
             try:

@@ -18,7 +18,7 @@ from merge_runner.errors import (
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
-from merge_runner.llm.http_outcome import RawReply, TransportFailure
+from merge_runner.llm.http_outcome import FirstCall, RawReply, TransportFailure
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.meter import Meter
@@ -100,7 +100,7 @@ def cache(opened):
 def make(cache):
     """A client whose server gives these replies."""
 
-    def make(*replies, transport=None, limiter=None, cap=None, cache=cache, **changes):
+    def make(*replies, limiter=None, cap=None, cache=cache, first=None, **changes):
         fields = {
             "provider": "openai",
             "format": "openai-chat",
@@ -114,9 +114,10 @@ def make(cache):
             entry=entry,
             endpoint="openai",
             cache=cache,
-            transport=transport or Server(*replies),
+            transport=Server(*replies),
             limiter=limiter or Limiter(),
             budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), cap),
+            first=first or FirstCall(passed=True),
         )
 
     return make
@@ -650,7 +651,7 @@ async def test_a_limit_that_lasts_longer_than_the_deadline_stops_the_sweep(make)
 @in_virtual_time
 async def test_a_sealed_replay_misses_what_is_not_recorded(make):
     await make(answer("recorded")).ask("prompt", slot())
-    client = make(transport=None)
+    client = make(answer("another"))
     client.sealed = True
     assert (await client.ask("prompt", slot())).text == "recorded"
     with pytest.raises(ReplayMiss) as caught:

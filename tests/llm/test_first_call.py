@@ -8,8 +8,7 @@ import pytest
 
 from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.first_call import FirstCall
-from merge_runner.llm.http_outcome import TransportFailure
+from merge_runner.llm.http_outcome import FirstCall, TransportFailure
 from tests.llm.test_client import (  # noqa: F401 # fixtures
     PRICE,
     Server,
@@ -39,9 +38,7 @@ def begin(make):  # noqa: F811
     """A client whose run begins."""
 
     def begin(*replies, known=False, **changes):
-        client = make(*replies, **changes)
-        client.first = FirstCall(known=known)
-        return client
+        return make(*replies, first=FirstCall(known=known), **changes)
 
     return begin
 

@@ -4,14 +4,13 @@ from pathlib import Path
 import pytest
 
 from merge_runner.errors import CallFailed, QuotaExhausted, UsageError
-from merge_runner.llm import retry
-from merge_runner.llm.retry import (
+from merge_runner.llm import http_outcome
+from merge_runner.llm.http_outcome import (
     Deadline,
     OutOfTime,
     RequestFailed,
     TryAgain,
     backoff_s,
-    retries,
 )
 
 
@@ -48,7 +47,7 @@ class Call:
     async def run(self, deadline_s=600.0):
         deadline = Deadline(deadline_s)
 
-        async for context in retries(deadline, sleep=self.sleep):
+        async for context in deadline.retries(sleep=self.sleep):
             with context:
                 turn = await self.take_turn()
                 with deadline.attempt() as seconds_left:
@@ -182,5 +181,5 @@ def test_the_backoff_has_no_end_of_numbers():
 
 def test_no_newer_tenacity_warns_of_how_it_is_used():
     """What it deprecates (names of its waits) is not used: only its loop is."""
-    used = Path(retry.__file__).read_text()
+    used = Path(http_outcome.__file__).read_text()
     assert "tenacity.wait" not in used

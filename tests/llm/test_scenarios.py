@@ -18,8 +18,8 @@ from merge_runner.errors import CallFailed, EndpointRefused, QuotaExhausted
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http import HttpTransport
+from merge_runner.llm.http_outcome import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.retry import FIRST_BACKOFF_S, LONGEST_BACKOFF_S, backoff_s
 from merge_runner.records import Slot
 from tests.emulator.scenarios import SCENARIOS
 from tests.emulator.scenarios.playing import ScenarioPlan, playing

@@ -28,7 +28,7 @@ from merge_runner.llm.batch.following import (
 from merge_runner.llm.batch.journal import Journal, OpenBatch, OpenLine, new_mark, now
 from merge_runner.llm.batch.lines import Line, LineEnd
 from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus, in_batches
-from merge_runner.llm.first_call import NOBODY_S
+from merge_runner.llm.http_outcome import NOBODY_S
 from merge_runner.records import Attempt
 
 # How often it is looked whether a round can be closed: what is seen then decides, not the time.
