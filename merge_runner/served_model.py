@@ -25,9 +25,14 @@ FROM sweeps, json_each(config, '$.models') ORDER BY ALL
 """
 
 
+def own_names(asked: str, aliases: Collection[str] = ()) -> frozenset[str | None]:
+    """The names under which the model that was asked for answers; None: the server names none."""
+    return frozenset({None, asked, *aliases})
+
+
 def is_other_model(asked: str, served: str | None, aliases: Collection[str] = ()) -> bool:
     """Whether it is another model's answer: by neither the id asked for nor an alias of it."""
-    return served is not None and served != asked and served not in aliases
+    return served not in own_names(asked, aliases)
 
 
 def others_among(pairs: Iterable[Pair], aliases: Iterable[Pair]) -> list[Pair]:

@@ -55,9 +55,10 @@ from merge_runner.records import (
     ChatRequest,
     Slot,
     Usage,
+    is_scripted,
     says_scripted,
 )
-from merge_runner.served_model import is_other_model
+from merge_runner.served_model import own_names
 
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
@@ -99,6 +100,7 @@ class LlmClient:
     meter: Meter = field(default_factory=Meter)
     driver: str = field(init=False)
     _wire: WireFormat = field(init=False)
+    _own_names: frozenset[str | None] = field(init=False)
     _money: BudgetPort = field(init=False)
     _consequences: Consequences = field(init=False)
     _calls: dict[str, Call] = field(default_factory=dict)
@@ -108,6 +110,7 @@ class LlmClient:
         """Derive what every call needs."""
         self.driver = driver_name(self.name, self.endpoint)
         self._wire = FORMATS[self.entry.format]
+        self._own_names = own_names(self.entry.id, self.entry.aliases)
         self._money = self.budget or Unpaid(self.cache)
         provider = self.entry.provider
         self._consequences = Consequences(
@@ -146,10 +149,9 @@ class LlmClient:
                 reply = await asyncio.shield(call.task)
             if shared:
                 reply = replace(reply, earlier=len(reply.attempts))
+        self._count(reply)
         served = reply.attempts[-1].model_served
-        is_other = is_other_model(self.entry.id, served, self.entry.aliases)
-        self.meter.count_reply(reply, served if is_other else None)
-        if self.strict and is_other:
+        if self.strict and served not in self._own_names:
             raise ModelSwapped(
                 f"{self.driver}: {served} answered where {self.entry.id} was asked for, at "
                 f"{slot_text(slot)}; --strict-model stops the sweep. The reply is kept. To go on "
@@ -195,6 +197,16 @@ class LlmClient:
                 raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
             return None
         return None if recorded is None else self._read(recorded, len(recorded.attempts))
+
+    def _count(self, reply: ChatReply) -> None:
+        """Count an answer that a trial uses, and who gave it where it is another model."""
+        last, meter = reply.attempts[-1], self.meter
+        meter.calls_cached += reply.cached
+        meter.calls_live += not reply.cached
+        if last.model_served not in self._own_names:
+            meter.mismatches[f"{reply.request.model} -> {last.model_served}"] += 1
+        if reply.request.provider != "emulator":
+            meter.stand_ins += is_scripted(reply.request, last)
 
     def _read(self, recorded: CachedCall, earlier: int) -> ChatReply:
         last = recorded.attempts[-1]

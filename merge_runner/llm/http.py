@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import re
 import select
 import ssl
 import zlib
-from collections.abc import AsyncIterator, Awaitable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -23,7 +24,6 @@ from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, proxy_secre
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.http_outcome import ErrorReply, RawReply, TransportFailure
-from merge_runner.llm.masking import Mask
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
 if TYPE_CHECKING:
@@ -40,6 +40,11 @@ HEADERS = {
     "content-type": "application/json",
     "user-agent": "merge-runner",
 }
+MASK = "[key]"
+# So many characters of a secret in a row are masked, too. Wherever they begin in it, they contain
+# one of its pieces, each half as long.
+RUN = 12
+PIECE = RUN // 2
 T = TypeVar("T")
 
 
@@ -85,6 +90,35 @@ class Connections(aiohttp.TCPConnector):
             if not (handler.should_close or arrived.poll(0) or self._trust.one_each):
                 return connection
             connection.close()
+
+
+class Mask:
+    """Replaces secrets, and RUN characters of one in a row or more, in texts."""
+
+    def __init__(self, secrets: Iterable[str]) -> None:
+        # The longest first, since one may hold another.
+        self._pieces = {
+            secret: [secret[at : at + PIECE] for at in range(0, len(secret) - PIECE + 1, PIECE)]
+            for secret in sorted(secrets, key=len, reverse=True)
+        }
+
+    def __call__(self, text: str) -> str:
+        """The text without the secrets."""
+        for secret, pieces in self._pieces.items():
+            if any(piece in text for piece in pieces):
+                text = _without_runs(text.replace(secret, MASK), secret)
+        return text
+
+
+def _without_runs(text: str, secret: str) -> str:
+    runs = {re.escape(secret[at : at + RUN]) for at in range(len(secret) - RUN + 1)}
+    spans = sorted(match.span() for run in runs for match in re.finditer(run, text))
+    kept, done = [], 0
+    for begin, end in spans:
+        if begin >= done:
+            kept += [text[done:begin], MASK]
+        done = max(done, end)
+    return "".join([*kept, text[done:]])
 
 
 class HttpTransport:

@@ -6,7 +6,7 @@ import time
 from collections import Counter, deque
 from dataclasses import dataclass, field, fields, replace
 
-from merge_runner.records import Attempt, ChatReply, is_scripted
+from merge_runner.records import Attempt
 
 MINUTE_S = 60.0
 
@@ -41,17 +41,6 @@ class Meter:
             self.cost_usd += attempt.cost_usd
         else:
             self.cost_unknown += 1
-
-    def count_reply(self, reply: ChatReply, other_model: str | None) -> None:
-        """Count an answer that a trial uses, and who gave it where it is another model."""
-        if reply.cached:
-            self.calls_cached += 1
-        else:
-            self.calls_live += 1
-        if other_model is not None:
-            self.mismatches[f"{reply.request.model} -> {other_model}"] += 1
-        if reply.request.provider != "emulator":
-            self.stand_ins += is_scripted(reply.request, reply.attempts[-1])
 
     def add(self, other: Meter) -> None:
         """Add what another meter has counted."""
