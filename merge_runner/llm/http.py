@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
-PIECE = 2**18
+MOST_UNPACKED = 2**18  # bytes at a time
 HEADERS = {
     "accept": "*/*",
     "accept-encoding": "gzip",
@@ -143,7 +143,7 @@ class HttpTransport:
         # transport's own, and the number of the request.
         self._own = str(uuid4())[:24]
         self._ids = map("{:012x}".format, itertools.count(1))
-        self._connections = self._transport(connections)
+        self._connections: httpx.AsyncBaseTransport = self._transport(connections)
         self._urls: dict[str, httpx.URL] = {}
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
@@ -349,7 +349,7 @@ async def _unpacked(reply: httpx.Response) -> AsyncIterator[bytes]:
         packed = chunk
         while packed:
             try:
-                yield unpacking.decompress(packed, PIECE)
+                yield unpacking.decompress(packed, MOST_UNPACKED)
             except zlib.error as exc:
                 raise TransportFailure("connection_lost", f"the reply is no {encoding}") from exc
             packed = unpacking.unconsumed_tail
