@@ -293,9 +293,7 @@ class LlmClient:
                 await asyncio.sleep(seconds)
 
         try:
-            async for attempt in deadline.retries(sleep=sleep):
-                with attempt:
-                    return await self._attempt(call, deadline)
+            return await deadline.keep(partial(self._attempt, call, deadline), sleep=sleep)
         except (OutOfTime, RequestFailed) as exc:
             why, made = f"{exc} ({call.last_failure})", len(call.own_attempts)
             if isinstance(exc, OutOfTime) and not self.first.passed:
@@ -305,7 +303,6 @@ class LlmClient:
                     "the same command"
                 ) from exc
             raise call.failed(f"{self.name}: {why}, {made} attempts") from exc
-        raise AssertionError("unreachable: the loop returns or raises")
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; returns its answer, which is kept, or raises what follows from it."""

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
+KEPT_S = 5.0
 MOST_UNPACKED = 2**18  # bytes at a time
 HEADERS = {
     "accept": "*/*",
@@ -138,6 +139,7 @@ class HttpTransport:
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}
         self._mask = Mask(secret for secret in secrets if len(secret) >= SHORTEST_SECRET)
+        self._tells_slot = endpoint.is_emulator
         self._trust = Trust()
         # Each id is a UUID, as some servers demand (llama-cpp-python): a random part, this
         # transport's own, and the number of the request.
@@ -149,7 +151,7 @@ class HttpTransport:
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Post the hashed bytes; raises TransportFailure."""
         headers = request.headers
-        if self._endpoint.is_emulator:
+        if self._tells_slot:
             slot = canonical_json(request.slot.as_dict())
             headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
         body = request.body.encode()
@@ -287,9 +289,11 @@ class HttpTransport:
                 f"({exc.strerror or exc}): correct it or unset it"
             ) from exc
 
+        kept = {"limit": connections, "keepalive_timeout": KEPT_S, "ssl": trusted}
+
         def session() -> aiohttp.ClientSession:
             return aiohttp.ClientSession(
-                connector=Connections(self._trust, limit=connections, ssl=trusted),
+                connector=Connections(self._trust, **kept),
                 cookie_jar=aiohttp.DummyCookieJar(),  # one would tie independent samples together
             )
 

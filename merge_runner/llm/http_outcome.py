@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import TYPE_CHECKING, Literal, NoReturn, TypeVar
 from urllib.parse import urlsplit
 
 from merge_runner.config import PROVIDERS, ModelEntry
@@ -38,10 +38,11 @@ from merge_runner.llm.formats.base import (
 from merge_runner.llm.formats.delays import server_delay_s
 
 if TYPE_CHECKING:
-    from tenacity import AsyncRetrying, RetryCallState
+    from tenacity import RetryCallState
 
     from merge_runner.llm.call import Call
 
+T = TypeVar("T")
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
 NOTHING_READ = Reading("error")
 REGISTRY = "experiments/models.toml"
@@ -286,15 +287,23 @@ class Deadline:
         finally:
             self._used_s += loop.time() - began
 
-    def retries(
-        self, *, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep
-    ) -> AsyncRetrying:
-        """A loop of attempts, each a context, that goes on while they raise TryAgain.
+    async def keep(
+        self,
+        attempt: Callable[[], Awaitable[T]],
+        *,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+    ) -> T:
+        """Return what the first attempt brings that does not raise TryAgain.
 
-        The wait is the backoff, or longer where the server asks for it. Raises OutOfTime where it
-        would pass the deadline.
+        The wait before the next one is the backoff, or longer where the server asks for it. Raises
+        OutOfTime where it would pass the deadline.
         """
-        from tenacity import AsyncRetrying, retry_if_exception_type  # a replay needs none of it
+        try:
+            return await attempt()
+        except TryAgain as exc:
+            failed = [exc]
+        # Only now, since it costs time and memory that most calls need not spend.
+        from tenacity import AsyncRetrying, retry_if_exception_type
 
         def wait_s(state: RetryCallState) -> float:
             # The jitter lets calls that failed together, as when a server restarts, not return
@@ -306,15 +315,19 @@ class Deadline:
         def count_wait(state: RetryCallState) -> None:
             self._used_s += state.upcoming_sleep
 
-        # Looped over, since to wrap a function for each call would take twice the processor time.
-        return AsyncRetrying(
+        async for again in AsyncRetrying(
             retry=retry_if_exception_type(TryAgain),
             wait=wait_s,
             stop=lambda state: self._used_s + state.upcoming_sleep >= self._seconds,
             before_sleep=count_wait,
             sleep=sleep,
             retry_error_callback=self._give_up,
-        )
+        ):
+            with again:
+                if failed:
+                    raise failed.pop()
+                return await attempt()
+        raise AssertionError("unreachable: the loop returns or raises")
 
     def _give_up(self, state: RetryCallState) -> NoReturn:
         last = _failure(state)

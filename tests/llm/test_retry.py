@@ -47,12 +47,12 @@ class Call:
     async def run(self, deadline_s=600.0):
         deadline = Deadline(deadline_s)
 
-        async for context in deadline.retries(sleep=self.sleep):
-            with context:
-                turn = await self.take_turn()
-                with deadline.attempt() as seconds_left:
-                    return await self.attempt(turn, seconds_left)
-        raise AssertionError("unreachable: the loop returns or raises")
+        async def attempt():
+            turn = await self.take_turn()
+            with deadline.attempt() as seconds_left:
+                return await self.attempt(turn, seconds_left)
+
+        return await deadline.keep(attempt, sleep=self.sleep)
 
 
 @pytest.fixture
