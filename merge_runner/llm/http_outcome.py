@@ -411,10 +411,10 @@ class Consequences:
                 return EndpointRefused(f"{self.driver}: {self._advice(outcome)} ({message})")
         self.first.passed = self.first.known = True
         # Servers of some formats give an empty answer now and then.
+        if outcome.name != "empty" or not FORMATS[self.entry.format].retries_empty:
+            return None
         empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
-        retries = EMPTY_RETRIES if FORMATS[self.entry.format].retries_empty else 0
-        again = outcome.name == "empty" and empty <= retries
-        return TryAgain("empty answer") if again else None
+        return TryAgain("empty answer") if empty <= EMPTY_RETRIES else None
 
     def pause_s(self, call: Call, outcome: AttemptOutcome) -> float | None:
         """For how long all calls with the same key wait; None: they go on."""
