@@ -128,11 +128,17 @@ class HttpTransport:
     A reply of more than ``most_bytes`` is refused. Proxies are those of the environment; loopback
     never goes through one. Only our own emulator is told the slot. Each attempt has a random id; an
     answer that names another one is not taken. Once an answer was late, cut or came unasked, each
-    connection serves one request, unless the answers name their requests.
+    connection serves one request, unless the answers name their requests. A ``carrier`` takes the
+    requests in the place of connections.
     """
 
     def __init__(
-        self, endpoint: Endpoint, *, connections: int, most_bytes: int = MOST_BYTES
+        self,
+        endpoint: Endpoint,
+        *,
+        connections: int,
+        most_bytes: int = MOST_BYTES,
+        carrier: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._endpoint = endpoint
         self._most_bytes = most_bytes
@@ -145,7 +151,7 @@ class HttpTransport:
         # transport's own, and the number of the request.
         self._own = str(uuid4())[:24]
         self._ids = map("{:012x}".format, itertools.count(1))
-        self._connections: httpx.AsyncBaseTransport = self._transport(connections)
+        self._carrier = carrier or self._network(connections)
         self._urls: dict[str, httpx.URL] = {}
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
@@ -200,7 +206,7 @@ class HttpTransport:
 
     async def close(self) -> None:
         """Close all connections."""
-        await self._connections.aclose()
+        await self._carrier.aclose()
 
     async def _reply(
         self, method: str, path: str, headers: Mapping[str, str], body: bytes
@@ -210,7 +216,7 @@ class HttpTransport:
         sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
         sent |= dict.fromkeys(ID_HEADERS, own_id)
         sent["connection"] = "close" if self._trust.one_each else "keep-alive"
-        reply = await self._connections.handle_async_request(
+        reply = await self._carrier.handle_async_request(
             httpx.Request(method, self._url(path), headers=sent, content=body)
         )
         named = [part.strip() for h in ID_HEADERS for part in reply.headers.get(h, "").split(",")]
@@ -275,7 +281,7 @@ class HttpTransport:
             self._urls[path] = url
         return self._urls[path]
 
-    def _transport(self, connections: int) -> AiohttpTransport:
+    def _network(self, connections: int) -> AiohttpTransport:
         """The connections, by the proxies and certificates of the environment."""
         url = httpx.URL(self._endpoint.base_url)
         # An empty one where there is no TLS, since to load the certificates takes long.
