@@ -26,17 +26,17 @@ FROM sweeps, json_each(config, '$.models') ORDER BY ALL
 
 
 def own_names(asked: str, aliases: Collection[str] = ()) -> frozenset[str | None]:
-    """The names under which the model that was asked for answers; None: the server names none."""
+    """Return the names under which a model answers; None: the server names none."""
     return frozenset({None, asked, *aliases})
 
 
 def is_other_model(asked: str, served: str | None, aliases: Collection[str] = ()) -> bool:
-    """Whether it is another model's answer: by neither the id asked for nor an alias of it."""
+    """Return whether another model answered: neither the id asked for nor an alias of it."""
     return served not in own_names(asked, aliases)
 
 
 def others_among(pairs: Iterable[Pair], aliases: Iterable[Pair]) -> list[Pair]:
-    """Those pairs in which another model answered; ``aliases`` are pairs of an id and an alias."""
+    """Return the pairs in which another model answered; ``aliases`` pair ids with aliases."""
     declared: dict[str, set[str]] = {}
     for model, alias in aliases:
         declared.setdefault(model, set()).add(alias)
@@ -44,12 +44,12 @@ def others_among(pairs: Iterable[Pair], aliases: Iterable[Pair]) -> list[Pair]:
 
 
 def other_models(connection: duckdb.DuckDBPyConnection) -> list[Pair]:
-    """Those pairs of a database in which another model answered."""
+    """Return the pairs of a database in which another model answered."""
     pairs, aliases = (connection.execute(sql).fetchall() for sql in (PAIRS, ALIASES))
     return others_among(pairs, aliases)
 
 
 def sql_of(others: Iterable[Pair]) -> str:
-    """The condition, on a row of ``calls`` or ``attempts``, that another model answered."""
+    """Return the condition on a row of ``calls`` or ``attempts`` that another model answered."""
     listed = ", ".join(f"({quoted(asked)}, {quoted(served)})" for asked, served in others)
     return f"(model_requested, model_served) IN ({listed})" if listed else "false"

@@ -56,18 +56,18 @@ class Call:
 
     @property
     def own_attempts(self) -> list[Attempt]:
-        """Those of this run."""
+        """The attempts of this run."""
         return self.attempts[self.earlier :]
 
     @property
     def last_failure(self) -> str:
-        """Why the last attempt brought no answer."""
+        """The reason why the last attempt brought no answer."""
         last = self.attempts[-1]
         return last.error or last.outcome
 
     @contextmanager
     def asked_by_one(self) -> Iterator[None]:
-        """While this lasts, one more waits for the answer."""
+        """Count one more who waits for the answer while this lasts."""
         self.asking += 1
         try:
             yield
@@ -78,7 +78,7 @@ class Call:
     def waiting(
         self, what: str, until: datetime | None = None, *, idle: bool = False
     ) -> Iterator[Wait]:
-        """While this lasts, nothing of the call is in flight, so that it can be given up."""
+        """Mark the call as waiting, so that it can be given up: nothing of it is in flight."""
         if self.stopping:
             raise CallFailed("the sweep was stopped", self.request)
         self.wait = wait = Wait(f"{self.asked.driver}: {self.asked.slot}", what, until, idle)
@@ -95,10 +95,10 @@ class Call:
             self.task.cancel()
 
     def failed(self, why: str) -> CallFailed:
-        """The error of a call that ends without an answer."""
+        """Return the error of a call that ends without an answer."""
         return CallFailed(why, self.request, tuple(self.attempts), self.earlier)
 
 
 def slot_text(slot: Slot) -> str:
-    """A slot for a reader."""
+    """Format a slot for a reader."""
     return f"{slot.condition} rep {slot.repetition} {slot.side}, decision {slot.decision}"

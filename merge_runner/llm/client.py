@@ -123,7 +123,7 @@ class LlmClient:
         )
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
-        """The model's reply for a slot; lower ``order`` is served first.
+        """Return the model's reply for a slot; lower ``order`` is served first.
 
         Raises CallFailed, TrialSuspended or SweepStopped.
         """
@@ -169,27 +169,27 @@ class LlmClient:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def leave(self, order: int) -> None:
-        """The trial of this order has ended, and needs no more money."""
+        """Release the money of the trial of this order, which has ended."""
         self._money.leave(order)
 
     @property
     def in_flight_calls(self) -> int:
-        """How many calls are in flight or being saved."""
+        """Number of calls in flight or being saved."""
         return sum(call.wait is None for call in self._calls.values())
 
     @property
     def waits(self) -> list[Wait]:
-        """What the other calls wait for."""
+        """The waits of all other calls."""
         return [call.wait for call in self._calls.values() if call.wait is not None]
 
     @property
     def idle_askers(self) -> int:
-        """How many wait for calls that wait, themselves, for another's answer."""
+        """Number of trials that wait for calls that are blocked on another call."""
         calls = self._calls.values()
         return sum(call.asking for call in calls if call.wait is not None and call.wait.idle)
 
     def _known(self, request: ChatRequest) -> ChatReply | None:
-        """The recorded reply; a damaged one is None, and in a replay raises CallFailed."""
+        """Return the recorded reply; a damaged one is None, and in a replay raises CallFailed."""
         try:
             recorded = self.cache.get(request.key)
         except RecordingError as exc:
@@ -305,7 +305,7 @@ class LlmClient:
             raise call.failed(f"{self.name}: {why}, {made} attempts") from exc
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
-        """Make one attempt; returns its answer, which is kept, or raises what follows from it."""
+        """Make one attempt; return its answer, which is kept, or raise what follows from it."""
         if self.batches is not None and (call.open or self._goes_in_batch(call)):
             return await self._attempt_in_batch(call, self.batches)
         async with AsyncExitStack() as stack:
@@ -335,7 +335,7 @@ class LlmClient:
     async def _send(
         self, call: Call, seconds_left: float
     ) -> tuple[AttemptOutcome, RawReply | None, Attempt]:
-        """Send the request once: what came of it, the reply, and the attempt for the record."""
+        """Send the request once; return its outcome, the reply, and the attempt for the record."""
         assert self.transport is not None, "a sealed client asks nothing"
         number, timeout_s = len(call.attempts) + 1, min(self.entry.timeout_s, seconds_left)
         try:
@@ -356,7 +356,7 @@ class LlmClient:
         raw: RawReply | None,
         record: Attempt,
     ) -> ChatReply:
-        """Keep what an attempt brought: its answer, or why there is none, which is raised."""
+        """Keep an attempt and return its answer, or raise why there is none."""
         call.attempts.append(record)
         self.meter.count_attempt(record)
         self._tell_overrun(call, paid.aside_usd)
@@ -403,7 +403,7 @@ class LlmClient:
         )
 
     def _cost_usd(self, raw: RawReply, usage: Usage, worst: Usage) -> float | None:
-        """What a reply cost, by its usage, which an error may have too; None if nobody knows.
+        """Return the cost of a reply by its usage, which an error may have too; None: unknown.
 
         Output beyond the cap is charged even where the server does not say what was read.
         """
@@ -418,7 +418,7 @@ class LlmClient:
         return None if charged else 0.0
 
     def _goes_in_batch(self, call: Call) -> bool:
-        """Whether the next attempt at a call goes with the next round."""
+        """Return whether the next attempt at a call goes with the next round."""
         if self.batches is None or not self.batches.rounds.submits or call.singly:
             return False
         return sum(attempt.batch_id is not None for attempt in call.own_attempts) < MOST_LINES
@@ -445,7 +445,7 @@ class LlmClient:
     def _line_record(
         self, call: Call, end: LineEnd, price_factor: float
     ) -> tuple[Attempt, AttemptOutcome]:
-        """What came of a line: the attempt as it is recorded, and what it means."""
+        """Return the attempt of a line as it is recorded, and its outcome."""
         number = len(call.attempts) + 1
         if end.raw is None:
             free = self.entry.price == "free" or not end.unclear

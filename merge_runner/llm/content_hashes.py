@@ -24,12 +24,12 @@ _CANONICAL = json.JSONEncoder(
 
 
 def canonical_json(value: object) -> str:
-    """The one spelling of a JSON value: sorted keys, no spaces; NaN raises ValueError."""
+    """Return the one spelling of a JSON value: sorted keys, no spaces; NaN raises ValueError."""
     return _CANONICAL.encode(value)
 
 
 def spec_hash(text: str) -> str:
-    """The short hash of the canonical JSON that defines a trial."""
+    """Return the short hash of the canonical JSON that defines a trial."""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -43,7 +43,7 @@ def make_request(
     body: dict[str, JsonValue],
     slot: Slot,
 ) -> ChatRequest:
-    """A request with its key; see ChatRequest."""
+    """Return a request with its key."""
     text = canonical_json(body)
     return ChatRequest(
         key=call_key(endpoint=endpoint, path=path, headers=headers, body=text, slot=slot),
@@ -58,7 +58,7 @@ def make_request(
 
 
 def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, slot: Slot) -> str:
-    """SHA-256 over the canonical JSON of all parts; ``body`` is canonical JSON already."""
+    """Return the SHA-256 of the canonical JSON of all parts; ``body`` is canonical already."""
     middle = between_body_and_slot(endpoint, path, tuple(headers.items()))
     text = f'{{"body":{body},{middle}{canonical_json(slot.as_dict())}}}'
     return hashlib.sha256(text.encode()).hexdigest()
@@ -66,7 +66,7 @@ def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, sl
 
 @cache
 def between_body_and_slot(endpoint: str, path: str, headers: tuple[tuple[str, str], ...]) -> str:
-    """The part of a key's text between body and slot: the same for all calls of a model.
+    """Return the text of a key between body and slot: the same for all calls of a model.
 
     "body" sorts before the other names and "slot" after them, so that the whole is canonical.
     """
@@ -75,13 +75,13 @@ def between_body_and_slot(endpoint: str, path: str, headers: tuple[tuple[str, st
 
 
 def without_prompt(body: str) -> str:
-    """A canonical body with an empty text in place of its longest one, which is the prompt."""
+    """Return a canonical body without its longest text, which is the prompt."""
     prompt = max(_texts(json.loads(body)), key=len, default="")
     return body.replace(canonical_json(prompt), '""')
 
 
 def manner(path: str, empty_body: str) -> str:
-    """The short hash of how a model is asked: of all that is sent but the prompt."""
+    """Return the short hash of all that is sent but the prompt."""
     return hashlib.sha256(f"{path} {empty_body}".encode()).hexdigest()[:16]
 
 

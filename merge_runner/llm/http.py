@@ -62,7 +62,7 @@ class Trust:
 
     @property
     def one_each(self) -> bool:
-        """Whether a connection serves one request alone, so that nothing late is taken."""
+        """True if a connection serves one request alone, so that nothing late is taken."""
         return self.doubted and not self.answers_named
 
 
@@ -75,7 +75,7 @@ class Connections(aiohttp.TCPConnector):
         self._used: WeakSet[ResponseHandler] = WeakSet()
 
     async def connect(self, *args: Any, **options: Any) -> Connection:  # noqa: ANN401
-        """A new connection, or one on which nothing has come since its last answer."""
+        """Return a new connection, or one on which nothing has come since its last answer."""
         while True:
             connection = await super().connect(*args, **options)
             handler, channel = connection.protocol, connection.transport
@@ -104,7 +104,7 @@ class Mask:
         }
 
     def __call__(self, text: str) -> str:
-        """The text without the secrets."""
+        """Return the text without the secrets."""
         for secret, pieces in self._pieces.items():
             if any(piece in text for piece in pieces):
                 text = _without_runs(text.replace(secret, MASK), secret)
@@ -211,7 +211,7 @@ class HttpTransport:
     async def _reply(
         self, method: str, path: str, headers: Mapping[str, str], body: bytes
     ) -> httpx.Response:
-        """The head of the reply to a request, whose body is still to be read."""
+        """Send a request; return the reply with its body unread."""
         own_id = self._own + next(self._ids)
         sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
         sent |= dict.fromkeys(ID_HEADERS, own_id)
@@ -254,7 +254,7 @@ class HttpTransport:
             raise self._failure(exc) from exc
 
     def _failure(self, error: Exception) -> TransportFailure:
-        """The failure that an error of the libraries is: whatever it is, there is no reply."""
+        """Return the TransportFailure for an error of the libraries."""
         # httpx reports refused, reset and cut connections alike; what aiohttp said is its cause.
         reason = self._mask(str(error)) or type(error).__name__
         cause = error.__cause__ or error
@@ -270,7 +270,7 @@ class HttpTransport:
         return TransportFailure("connection_lost", reason)
 
     def _url(self, path: str) -> httpx.URL:
-        """The URL of a path, which is never at another host: the key goes to the configured one."""
+        """Return the URL of a path at the configured host, which alone may get the key."""
         if path not in self._urls:
             try:
                 url = httpx.URL(self._endpoint.base_url + path)
@@ -282,7 +282,7 @@ class HttpTransport:
         return self._urls[path]
 
     def _network(self, connections: int) -> AiohttpTransport:
-        """The connections, by the proxies and certificates of the environment."""
+        """Return the connections, by the proxies and certificates of the environment."""
         url = httpx.URL(self._endpoint.base_url)
         # An empty one where there is no TLS, since to load the certificates takes long.
         trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -307,7 +307,7 @@ class HttpTransport:
 
 
 def _proxy(url: httpx.URL) -> httpx.Proxy | None:
-    """The proxy that the environment names for an endpoint."""
+    """Return the proxy that the environment names for an endpoint."""
     proxies = getproxies()
     named = proxies.get(url.scheme) or proxies.get("all")
     if named is None or url.host in LOOPBACK or proxy_bypass(url.netloc.decode()):
@@ -324,12 +324,12 @@ def _too_long(most_bytes: int) -> TransportFailure:
 
 
 def _refused(why: str) -> TransportFailure:
-    """The failure of a reply that is not taken, and not asked for again."""
+    """Return the failure of a reply that is not taken, and not asked for again."""
     return TransportFailure("reply_refused", f"the reply is refused: {why}", action="fail")
 
 
 def _decoded(body: bytes) -> str:
-    """Bytes as UTF-8, the encoding of JSON, whatever a header says."""
+    """Decode a body as UTF-8, the encoding of JSON, whatever a header says."""
     return body.decode("utf-8-sig", errors="replace")
 
 
@@ -339,13 +339,13 @@ async def _within(seconds: float, awaited: Awaitable[T]) -> T:
 
 
 async def _in_time(chunks: AsyncIterator[bytes], timeout_s: float) -> AsyncIterator[bytes]:
-    """The chunks; raises TimeoutError where one is late."""
+    """Yield the chunks; raises TimeoutError where one is late."""
     while (chunk := await _within(timeout_s, anext(chunks, None))) is not None:
         yield chunk
 
 
 async def _unpacked(reply: httpx.Response) -> AsyncIterator[bytes]:
-    """The pieces of a body without its encoding, which may unpack to a thousand times as much."""
+    """Yield the decompressed pieces of a body, which may be a thousand times as long."""
     encoding = reply.headers.get("content-encoding", "").strip().lower()
     if encoding in ("", "identity"):
         async for chunk in reply.aiter_raw():
@@ -372,7 +372,7 @@ async def _unpacked(reply: httpx.Response) -> AsyncIterator[bytes]:
 
 
 async def split_lines(chunks: AsyncIterator[bytes], most_bytes: int) -> AsyncIterator[bytes | None]:
-    """The lines of a body that comes in chunks, or None for one of more than ``most_bytes``.
+    """Yield the lines of a body, or None for one of more than ``most_bytes``.
 
     Their ends, which may be CRLF, are left out.
     """

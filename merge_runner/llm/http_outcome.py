@@ -166,7 +166,7 @@ class AttemptOutcome:
 
 
 def may_be_charged(raw: RawReply, provider: str | None) -> bool:
-    """Whether a reply that tells no usage may stand for work that is charged.
+    """Return whether a reply without usage may have been billed.
 
     A refusal before any work is not, nor an error in the documented form of the ``provider`` whose
     own host answered (None: another server). That of a gateway, or one for want of time, may
@@ -180,18 +180,18 @@ def may_be_charged(raw: RawReply, provider: str | None) -> bool:
 
 
 def is_web_page(raw: RawReply) -> bool:
-    """Whether a web site answers: no service of any format sends this as an answer."""
+    """Return whether a web site answers: no service of any format sends this as an answer."""
     return raw.body.lstrip("\ufeff \t\r\n")[:9].lower().startswith(("<!doctype", "<html"))
 
 
 def _in_its_form(provider: str, raw: RawReply) -> bool:
-    """Whether an error has the members that the provider documents for all of its own."""
+    """Return whether an error has the members that the provider documents for its own."""
     members = PROVIDERS[provider].error_members
     return bool(members) and members <= as_dict(as_dict(raw.first).get("error")).keys()
 
 
 def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
-    """What a reply means, by the rules of docs/reference/providers.md."""
+    """Classify a reply by the rules of docs/reference/providers.md."""
     if raw.status == 200:
         return _judge_success(raw, wire)
     outcome = judge_error(raw.error, wire)
@@ -213,7 +213,7 @@ def _judge_success(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
 
 
 def status_within(error: ServerError) -> int:
-    """The status that an error within a 200 stands for: 400 or 500 if nobody knows it."""
+    """Return the status that an error within a 200 stands for: 400 or 500 if nobody knows it."""
     if "rate_limit_exceeded" in error.names:
         return 429
     if error.names == {"server_error"}:
@@ -223,7 +223,7 @@ def status_within(error: ServerError) -> int:
 
 
 def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
-    """What an error means, whatever was asked for."""
+    """Classify an error, whatever was asked for."""
     # What a format knows of an error, else what a format knows that gateways pass on.
     told = filter(None, (each.meaning(error) for each in (wire, *PASSED_ON)))
     name: str = next(told, None) or STATUSES.get(error.status, "bad_request")
@@ -262,7 +262,7 @@ class OutOfTime(MergeRunnerError):
 
 
 def backoff_s(attempts: int) -> float:
-    """The wait after so many failed attempts, without jitter."""
+    """Return the wait in s after so many failed attempts, without jitter."""
     # The exponent is bounded: after a thousand attempts the power would fit in no float.
     return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
 
@@ -279,7 +279,7 @@ class Deadline:
 
     @contextmanager
     def attempt(self) -> Iterator[float]:
-        """The time within this counts; yields the seconds that are left for it."""
+        """Count the time within this; yields the seconds that are left for it."""
         loop = asyncio.get_running_loop()
         began = loop.time()
         try:
@@ -293,7 +293,7 @@ class Deadline:
         *,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> T:
-        """Return what the first attempt brings that does not raise TryAgain.
+        """Return the result of the first attempt that does not raise TryAgain.
 
         The wait before the next one is the backoff, or longer where the server asks for it. Raises
         OutOfTime where it would pass the deadline.
@@ -342,7 +342,7 @@ class Deadline:
 
 
 def _failure(state: RetryCallState) -> TryAgain:
-    """The error of the last attempt; tenacity calls these hooks after a TryAgain alone."""
+    """Return the error of the last attempt: tenacity calls its hooks after a TryAgain alone."""
     error = state.outcome.exception() if state.outcome else None
     assert isinstance(error, TryAgain)
     return error
@@ -369,7 +369,7 @@ class FirstCall:
         return not self.passed
 
     def give_turn(self) -> None:
-        """The call that went alone has ended, and another one may go."""
+        """Let another call go, after the one that went alone."""
         self._alone.release()
 
 
@@ -386,7 +386,7 @@ class Consequences:
     def error(
         self, call: Call, outcome: AttemptOutcome, raw: RawReply | None
     ) -> MergeRunnerError | None:
-        """What the last attempt at a call means for it; None: it is the answer."""
+        """Return the error that follows from a call's last attempt, None if it is an answer."""
         if not self.first.passed and (stop := self._end_of_run(call, outcome, raw)):
             return stop
         message = outcome.message or outcome.name
@@ -417,7 +417,7 @@ class Consequences:
         return TryAgain("empty answer") if empty <= EMPTY_RETRIES else None
 
     def pause_s(self, call: Call, outcome: AttemptOutcome) -> float | None:
-        """For how long all calls with the same key wait; None: they go on."""
+        """Return for how many s all calls to the endpoint wait; None: they go on."""
         if not outcome.pause or self._is_too_long(outcome):
             return None
         return outcome.delay_s or backoff_s(len(call.own_attempts))
@@ -428,7 +428,7 @@ class Consequences:
     def _end_of_run(
         self, call: Call, outcome: AttemptOutcome, raw: RawReply | None
     ) -> SweepStopped | None:
-        """The end of the run at its first call, where no other one would fare better."""
+        """Return the error that ends a run whose other calls would fare no better."""
         if raw is None:
             # A server that is just starting is waited for, but only for seconds.
             waited_s = asyncio.get_running_loop().time() - call.began_s
@@ -447,7 +447,7 @@ class Consequences:
         return EndpointRefused(f"{self.driver}: {why}")
 
     def _refusal(self, raw: RawReply, outcome: AttemptOutcome) -> str | None:
-        """Why no other call of a run would fare better, and what to set; None: one might."""
+        """Return why all calls of a run would fail, and what to set; None: they might not."""
         base_url = set_base_url(self.name, self.entry)
         if is_web_page(raw) and raw.status == 200:
             return f"a web page answers there, and no language model: {base_url}"
@@ -462,7 +462,7 @@ class Consequences:
         return f"the request is refused: look at {where} ({outcome.message})"
 
     def _named_parameter(self, raw: RawReply) -> str | None:
-        """The parameter that an error names."""
+        """Return the parameter that an error names."""
         error = as_dict(as_dict(raw.first).get("error"))
         said = f"{error.get('param')} {raw.error.message}"
         named = (f"parameters.{each}" for each in self.entry.parameters if each in said)
@@ -470,7 +470,7 @@ class Consequences:
         return next(named, "max_output_tokens" if is_cap else None)
 
     def _advice(self, outcome: AttemptOutcome) -> str:
-        """What to do where the endpoint refuses all calls."""
+        """Return what a user can do if the endpoint refuses all calls."""
         entry = self.entry
         if outcome.name == "not_allowed":
             key_envs = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
@@ -489,7 +489,7 @@ class Consequences:
 
 
 def if_nobody(name: str, entry: ModelEntry) -> str:
-    """What to do where nobody answers."""
+    """Return what a user can do if no server answers."""
     return (
         f"{PROVIDERS[entry.provider].if_nobody}, or {set_base_url(name, entry)}; then run the same "
         "command again"
@@ -497,7 +497,7 @@ def if_nobody(name: str, entry: ModelEntry) -> str:
 
 
 def set_base_url(name: str, entry: ModelEntry) -> str:
-    """What to do about the base URL of an entry, and where it is set."""
+    """Return how a user corrects the base URL of an entry."""
     provider = PROVIDERS[entry.provider]
     if entry.base_url is not None or provider.base_url_env is None:
         return f"correct `base_url` of [{name}] in {REGISTRY}"

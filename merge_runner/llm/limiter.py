@@ -135,7 +135,7 @@ class Limiter:
         return self._waiters[0] if self._waiters else None
 
     def _blocked_for(self, waiter: _Waiter, now: float) -> float:
-        """How long in s the head of the queue has to wait at least."""
+        """Return the least wait in s of the head of the queue."""
         while self._window and now - self._window[0].dispatched_at >= self._window_s:
             expired = self._window.popleft()
             expired.counts = False
@@ -147,7 +147,7 @@ class Limiter:
         return free_at - now
 
     async def _wait(self, seconds: float) -> None:
-        """Wait, or until a new waiter or a settlement changes what can be done."""
+        """Wait for a time, or until a new waiter or a settlement changes what can be done."""
         self._changed.clear()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):

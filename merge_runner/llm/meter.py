@@ -51,7 +51,7 @@ class Meter:
             setattr(self, each.name, getattr(self, each.name) + getattr(counted, each.name))
 
     def last_minute(self) -> tuple[int, int]:
-        """Requests and tokens of the last minute."""
+        """Return the requests and tokens of the last minute."""
         now = time.monotonic()
         while self.events and now - self.events[0][0] > MINUTE_S:
             self.events.popleft()

@@ -16,7 +16,7 @@ POLL_S = 0.5
 
 
 def listed_models(endpoint: Endpoint, *, patient: bool = False) -> list[str]:
-    """The ids of the models; raises TransportFailure, ``no_list`` where another thing answers.
+    """Return the ids of the models; raises TransportFailure, ``no_list`` if there is no list.
 
     A ``patient`` one waits some seconds for a server that is just starting.
     """
@@ -34,7 +34,7 @@ async def _listed(endpoint: Endpoint, patience_s: float) -> list[str]:
 
 
 async def _reply(transport: HttpTransport, patience_s: float) -> RawReply:
-    """The reply of whoever listens; connections that are refused are tried again."""
+    """Return the reply to ``GET /models``; refused connections are tried again."""
     began_s = asyncio.get_running_loop().time()
     while True:
         try:

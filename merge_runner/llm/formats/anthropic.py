@@ -40,7 +40,7 @@ class AnthropicMessages(WireFormat):
     headers = {"anthropic-version": VERSION}  # noqa: RUF012 # never changed
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
-        """One user message; ``max_tokens`` is required."""
+        """Return one user message; ``max_tokens`` is required."""
         return WireRequest(
             path=entry.path or "/v1/messages",
             body={
@@ -85,6 +85,6 @@ class AnthropicMessages(WireFormat):
         )
 
     def meaning(self, error: ServerError) -> Meaning | None:
-        """A spend limit, also where it is an invalid request."""
+        """Tell a spend limit, also from an invalid request."""
         spent = error.status == 400 and any(words in error.message for words in SPENT)
         return "quota_exhausted" if spent or error.names & QUOTA else None

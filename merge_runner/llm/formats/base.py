@@ -90,35 +90,35 @@ class WireFormat(ABC):
 
     @abstractmethod
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
-        """The request for a prompt."""
+        """Return the request for a prompt."""
 
     @abstractmethod
     def read(self, payload: dict[str, Any]) -> Reading:
         """Read a body of status 200; unknown keys and missing ones are normal."""
 
     def meaning(self, error: ServerError) -> Meaning | None:
-        """What an error means where that is not what its status says."""
+        """Return the meaning of an error whose status does not tell it."""
         return None
 
     def delay_s(self, error: ServerError) -> float | None:
-        """How long to wait by a member of the error; its words are read for every format."""
+        """Return the delay in s in a member of the error; its words are read for every format."""
         return None
 
 
 def plain(*names: str) -> dict[str, tuple[str, ...]]:
-    """Parameters that stand at the top, under their common names."""
+    """Return parameters that stand at the top, under their common names."""
     return {name: (name,) for name in names}
 
 
 def is_answer(payload: dict[str, Any], members: frozenset[str]) -> bool:
-    """Whether a body of status 200 has anything of an answer: an empty one has its frame."""
+    """Return whether a body of status 200 has a part of an answer, if only its frame."""
     return any(payload.get(name) not in (None, [], {}) for name in members)
 
 
 def outcome_of(
     text: str, *, failed: object = False, truncated: bool = False, refused: bool = False
 ) -> str:
-    """The outcome of an answer, from its text and what its finish reason means.
+    """Return the outcome of an answer, from its text and what its finish reason means.
 
     ``failed`` is what the body reports as an error, where it does.
     """
@@ -132,27 +132,27 @@ def outcome_of(
 
 
 def as_dict(value: object) -> dict[str, Any]:
-    """A JSON object, or an empty one where the server sent something else."""
+    """Return a JSON object, or an empty one for anything else."""
     return value if isinstance(value, dict) else {}
 
 
 def as_dicts(value: object) -> list[dict[str, Any]]:
-    """The objects of a JSON array, if it is one; anything else in it counts as an empty object."""
+    """Return the objects of a JSON array; anything else counts as an empty one."""
     return [as_dict(item) for item in value] if isinstance(value, list) else []
 
 
 def first_of(value: object) -> dict[str, Any]:
-    """The first object of a JSON array, or an empty one."""
+    """Return the first object of a JSON array, or an empty one."""
     return next(iter(as_dicts(value)), {})
 
 
 def joined(parts: Iterable[dict[str, Any]], member: str = "text") -> str:
-    """The text of all parts of an answer that have some."""
+    """Return the text of all parts of an answer that have some."""
     return "".join(as_text(part.get(member)) or "" for part in parts)
 
 
 def as_text(value: object) -> str | None:
-    """A JSON string, or None where the server sent something else.
+    """Return a JSON string, or None for anything else.
 
     JSON can spell half of a surrogate pair, which no file can hold: a "?" takes its place.
     """
@@ -162,14 +162,14 @@ def as_text(value: object) -> str | None:
 
 
 def as_count(value: object) -> int | None:
-    """A token count, or None where it is absent or cannot be one; some servers write 9.0."""
+    """Return a token count, or None for what cannot be one; some servers write 9.0."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     return value if type(value) is int and 0 <= value <= MOST_TOKENS else None
 
 
 def total(*counts: int | None) -> int | None:
-    """The sum of the counts that are there; None where none is."""
+    """Return the sum of the counts that are there; None if none is."""
     known = [count for count in counts if count is not None]
     return sum(known) if known else None
 

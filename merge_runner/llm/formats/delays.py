@@ -27,7 +27,7 @@ MOST_S = 366 * 86400.0
 def server_delay_s(
     error: ServerError, formats: Iterable[WireFormat], now: datetime | None = None
 ) -> float | None:
-    """The delay in s that a failed reply asks for, None where it says nothing usable.
+    """Return the delay in s that a failed reply asks for, None if it says nothing usable.
 
     Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), a member of the
     error that one of the ``formats`` knows, and "try again in 1.574s" or "retry after 5 minutes" in
@@ -58,7 +58,7 @@ def _longest(header: str, read: Callable[[str], float]) -> float | None:
 
 
 def _duration_s(text: str) -> float:
-    """Seconds of ``6m0s``, ``1h30m``, ``120ms`` or ``5 minutes``."""
+    """Return the seconds of ``6m0s``, ``1h30m``, ``120ms`` or ``5 minutes``."""
     parts = [(number, unit.lower()) for number, unit in _PARTS.findall(text)]
     return sum(
         float(number) * _UNIT_S["ms" if unit.startswith(("ms", "milli")) else unit[0]]

@@ -58,7 +58,7 @@ class GeminiGenerateContent(WireFormat):
     members = frozenset({"candidates", "promptFeedback", "usageMetadata"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
-        """One user turn; the cap covers thoughts and visible tokens."""
+        """Return one user turn; the cap covers thoughts and visible tokens."""
         return WireRequest(
             path=entry.path or f"/v1beta/models/{entry.id}:generateContent",
             body={
@@ -98,7 +98,7 @@ class GeminiGenerateContent(WireFormat):
         )
 
     def meaning(self, error: ServerError) -> Meaning | None:
-        """A quota per day, which waiting does not mend, has the words of one per minute."""
+        """Tell a quota per day, which has the words of one per minute and does not pass."""
         if error.status == 400 and "API_KEY_INVALID" in error.names:
             return "not_allowed"
         per_day = any(
@@ -109,7 +109,7 @@ class GeminiGenerateContent(WireFormat):
         return "quota_exhausted" if error.status == 429 and per_day else None
 
     def delay_s(self, error: ServerError) -> float | None:
-        """The RetryInfo among the details."""
+        """Read the RetryInfo among the details."""
         for detail in error.details:
             match = DURATION.fullmatch(as_text(detail.get("retryDelay")) or "")
             if match:

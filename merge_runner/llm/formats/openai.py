@@ -39,7 +39,7 @@ class OpenAI(WireFormat):
     """A format of OpenAI, with the errors of Azure, OpenRouter and LiteLLM."""
 
     def meaning(self, error: ServerError) -> Meaning | None:
-        """Filters, quotas, unknown models and what can never be sent."""
+        """Tell filters, quotas, unknown models and what can never be sent."""
         # Azure's content filter, and OpenRouter's moderation.
         if error.status == 400 and "content_filter" in error.names:
             return "refusal"
@@ -76,7 +76,7 @@ class OpenAIChat(OpenAI):
     members = frozenset({"choices"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
-        """One user message; the cap covers reasoning and visible tokens."""
+        """Return one user message; the cap covers reasoning and visible tokens."""
         return WireRequest(
             path=entry.path or "/chat/completions",
             body={
@@ -121,7 +121,7 @@ class OpenAIResponses(OpenAI):
     members = frozenset({"output", "status"})
 
     def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
-        """The prompt as the whole input; the cap covers reasoning and visible tokens."""
+        """Return the prompt as the whole input; the cap covers reasoning and visible tokens."""
         return WireRequest(
             path=entry.path or "/responses",
             body={
@@ -160,7 +160,7 @@ class OpenAIResponses(OpenAI):
 
 
 def _usage(payload: dict[str, Any], read: str, written: str) -> Usage:
-    """The usage of an answer, by the format's words for what was read and written."""
+    """Return the usage of an answer, by the format's words for what was read and written."""
     usage = as_dict(payload.get("usage"))
     read_details = as_dict(usage.get(f"{read}_tokens_details"))
     written_details = as_dict(usage.get(f"{written}_tokens_details"))
@@ -173,7 +173,7 @@ def _usage(payload: dict[str, Any], read: str, written: str) -> Usage:
 
 
 def _content(content: object) -> str:
-    """The text of a message, which some servers send as a list of parts."""
+    """Return the text of a message, which some servers send as a list of parts."""
     if isinstance(content, str):
         return content
     return joined(as_dicts(content))

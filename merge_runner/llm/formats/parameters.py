@@ -22,7 +22,7 @@ RANGES = {
 
 
 def known_parameters(entries: Iterable[ModelEntry]) -> set[str]:
-    """The parameters that some model takes, by common names."""
+    """Return the parameters that some model takes, by common names."""
     return {CAP, EFFORT}.union(
         *(form.parameters for form in FORMATS.values()),
         *(provider.parameters for provider in PROVIDERS.values()),
@@ -31,7 +31,7 @@ def known_parameters(entries: Iterable[ModelEntry]) -> set[str]:
 
 
 def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValue) -> ModelEntry:
-    """The entry ``name`` with a parameter set; raises UsageError where the model rejects it.
+    """Return the entry ``name`` with a parameter set; raises UsageError if the model rejects it.
 
     What is the provider's default already is not sent.
     """
@@ -80,7 +80,7 @@ def _with_effort(name: str, entry: ModelEntry, level: JsonValue) -> ModelEntry:
 def _set(
     values: dict[str, JsonValue], place: tuple[str, ...], level: JsonValue
 ) -> dict[str, JsonValue]:
-    """The values with one set at a place, a name within a name."""
+    """Return the values with one set at a place, a name within a name."""
     first, *rest = place
     if not rest:
         return {**values, first: level}
