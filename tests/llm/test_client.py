@@ -262,23 +262,6 @@ async def test_two_entries_of_one_model_that_ask_the_same_make_one_call(make):
     assert replies[0].text == replies[1].text
 
 
-@in_virtual_time
-async def test_an_exhausted_quota_stops_at_once(make, cache):
-    client = make(error(429, "the account is empty", "insufficient_quota"))
-    with pytest.raises(QuotaExhausted, match=r"my-model.*the account is empty"):
-        await client.ask("prompt", slot())
-    assert len(client.transport.sent) == 1
-    assert list(cache.entries()) == []
-
-
-@in_virtual_time
-async def test_a_refused_key_stops_at_once(make):
-    client = make(error(401, code="invalid_api_key"))
-    with pytest.raises(EndpointRefused, match=r"my-model.*key"):
-        await client.ask("prompt", slot())
-    assert len(client.transport.sent) == 1
-
-
 @pytest.mark.parametrize("shutdown", [None, "2026-12-11"])
 @in_virtual_time
 async def test_an_unknown_model_stops_at_once_and_its_shutdown_is_named(make, shutdown):
@@ -311,14 +294,6 @@ async def test_at_its_deadline_a_call_fails_with_all_that_was_tried(make):
     assert client.transport.times[-1] <= 20
     for sent_at, timeout in zip(client.transport.times, client.transport.timeouts, strict=True):
         assert timeout == pytest.approx(min(9, 20 - sent_at))
-
-
-@in_virtual_time
-async def test_the_wait_for_a_turn_does_not_count_against_the_deadline(make):
-    client = make(answer(), limiter=Limiter(tpm=150), deadline_s=5)
-    client.transport.replies = [answer(usage=None)]
-    await asyncio.gather(*(client.ask("prompt", slot(n)) for n in range(1, 4)))
-    assert client.transport.times == [0, 60, 120]
 
 
 @pytest.mark.parametrize(
@@ -363,21 +338,6 @@ async def test_an_empty_answer_of_gemini_is_asked_at_most_twice_again(
     assert reply.outcome == expected[-1]
     assert len(client.transport.sent) == len(expected)
     assert cache.get(reply.request.key).attempts == reply.attempts
-
-
-@pytest.mark.parametrize(
-    ("wire", "body"),
-    [
-        ("openai-chat", {"choices": [{"message": {"content": ""}, "finish_reason": "stop"}]}),
-        ("openai-responses", {"status": "completed", "output": []}),
-        ("anthropic", {"content": [], "stop_reason": "end_turn"}),
-    ],
-)
-@in_virtual_time
-async def test_an_empty_answer_of_others_is_not_asked_again(make, wire, body):
-    client = make(raw(body), format=wire)
-    assert (await client.ask("prompt", slot())).outcome == "empty"
-    assert len(client.transport.sent) == 1
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
 from datetime import UTC, datetime
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import read_error
@@ -172,12 +170,3 @@ def test_a_date_that_has_passed_is_no_delay():
 )
 def test_nothing_usable_is_none(payload):
     assert delay(payload=payload) is None
-
-
-@settings(deadline=None)
-@given(st.text(), st.text("0123456789.hms"))
-def test_no_text_makes_it_raise(text, digits):
-    for each in (text, digits):
-        for name in ("retry-after-ms", "retry-after"):
-            found = delay({name: each}, message(f"try again in {each}"))
-            assert found is None or found > 0

@@ -156,18 +156,6 @@ async def test_any_other_error_passes_through_at_once(make_call, error):
     assert call.sleeps == []
 
 
-async def test_an_error_while_waiting_for_a_turn_passes_through_without_an_attempt(make_call):
-    call = make_call("never asked")
-
-    async def no_turn():
-        raise CallFailed("the sweep was stopped", None)
-
-    call.take_turn = no_turn
-    with pytest.raises(CallFailed):
-        await call.run()
-    assert call.attempts == []
-
-
 async def test_a_wait_that_the_deadline_does_not_allow_is_told(make_call):
     call = make_call(TryAgain("HTTP 503: come back later", 3600.0))
     with pytest.raises(OutOfTime, match="asks to wait 3600 s, longer than a call"):
