@@ -445,10 +445,10 @@ def endpoint_url(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
     return normalised_url(entry.base_url or provider.base_url)
 
 
-def rehearsal_endpoint(entry: ModelEntry, emulator_url: str) -> Endpoint:
+def rehearsal_endpoint(entry: ModelEntry) -> Endpoint:
     """The emulator, in the place of an entry's provider: without a key."""
     path = urlsplit(PROVIDERS.require(entry.provider).base_url).path
-    return Endpoint(entry.provider, REHEARSAL, emulator_url + path, {})
+    return Endpoint(entry.provider, REHEARSAL, "http://127.0.0.1" + path, {})
 
 
 def is_own_host(provider: str, identity: str) -> bool:

@@ -41,7 +41,7 @@ from merge_runner.cli.options import (
 )
 from merge_runner.cli.output import print_out, say
 from merge_runner.cli.playing import check_money_and_replay, play
-from merge_runner.cli.stand_in import emulator_options, faults_of
+from merge_runner.cli.stand_in import faults_of
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 
@@ -149,8 +149,7 @@ def sweep(
         max_cost_usd=max_cost,
         replay=replay,
         recordings=recording or (),
-        emulator_options=emulator_options(fault_rate, faults, seed),
-        faults_identity=faults_of(fault_rate, faults, seed).identity,
+        faults=faults_of(fault_rate, faults, seed),
         strict_model=strict_model,
         keep_going=keep_going,
         quiet=quiet,

@@ -127,7 +127,7 @@ def marked(body: dict[str, Any]) -> dict[str, Any]:
     return {**body, SCRIPTED_FIELD: True}
 
 
-def dumps(body: dict[str, Any]) -> bytes:
+def dumps(body: object) -> bytes:
     """A body as it is sent."""
     return json.dumps(body, ensure_ascii=False).encode()
 

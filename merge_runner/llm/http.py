@@ -53,8 +53,9 @@ class StrictClient(HttpxAiohttpClient):
         return self._strict(super()._init_proxy_transport(*args, **options))
 
     def _strict(self, transport: httpx.AsyncBaseTransport) -> httpx.AsyncBaseTransport:
-        """The same transport with a session of our own."""
-        assert isinstance(transport, AiohttpTransport)
+        """The same transport with a session of our own; one that was given stays as it is."""
+        if not isinstance(transport, AiohttpTransport):
+            return transport
         limits, ssl_context = transport.limits, transport.ssl_context
 
         def session() -> aiohttp.ClientSession:
@@ -75,11 +76,17 @@ class HttpTransport:
 
     A reply of more than ``most_bytes`` is refused. Proxies are those that httpx reads from the
     environment; loopback never goes through one. Only our own emulator is told the slot. Each
-    attempt has a random id; an answer that names another one is not taken.
+    attempt has a random id; an answer that names another one is not taken. A ``carrier`` takes the
+    requests in the place of connections.
     """
 
     def __init__(
-        self, endpoint: Endpoint, *, connections: int, most_bytes: int = MOST_BYTES
+        self,
+        endpoint: Endpoint,
+        *,
+        connections: int,
+        most_bytes: int = MOST_BYTES,
+        carrier: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._endpoint = endpoint
         self._most_bytes = most_bytes
@@ -91,7 +98,7 @@ class HttpTransport:
         # transport's own, and the number of the request.
         self._own = str(uuid4())[:24]
         self._ids = map("{:012x}".format, itertools.count(1))
-        self._client = _client(endpoint.base_url, connections, self._trust)
+        self._client = _client(endpoint.base_url, connections, self._trust, carrier)
         self._headers = {
             **self._client.headers,
             "accept-encoding": ENCODING,
@@ -248,7 +255,9 @@ async def _in_time(chunks: AsyncIterator[bytes], timeout_s: float) -> AsyncItera
         yield chunk
 
 
-def _client(base_url: str, connections: int, trust: Trust) -> StrictClient:
+def _client(
+    base_url: str, connections: int, trust: Trust, carrier: httpx.AsyncBaseTransport | None
+) -> StrictClient:
     """A client with the proxies and certificates of the environment; raises UsageError."""
     url = httpx.URL(base_url)
     by_loopback = url.host in LOOPBACK
@@ -265,6 +274,7 @@ def _client(base_url: str, connections: int, trust: Trust) -> StrictClient:
     try:
         return StrictClient(
             trust,
+            transport=carrier,
             verify=trusted,
             trust_env=not by_loopback,  # the proxies, since the certificates are given
             limits=httpx.Limits(max_connections=connections, max_keepalive_connections=connections),

@@ -559,9 +559,7 @@ async def test_the_models_are_listed(emulator):
 
 async def test_it_announces_its_url_serves_and_closes_its_port_when_cancelled(driving_prompt):
     announced = asyncio.get_running_loop().create_future()
-    serving = asyncio.create_task(
-        run(0, FaultPlan(), announce=announced.set_result, until_stdin_closes=False)
-    )
+    serving = asyncio.create_task(run(0, FaultPlan(), announce=announced.set_result))
     async with asyncio.timeout(10):
         url = await announced
         status, _, _ = await ask(url, "openai-chat", driving_prompt)
