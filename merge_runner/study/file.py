@@ -77,11 +77,17 @@ class AddedText(RoadTexts):
             raise ValueError("before or after, not both")
         return self
 
+    @property
+    def texts(self) -> RoadTexts:
+        """Its templates where it is no registered block."""
+        if self.text is None:
+            return self
+        return RoadTexts(merge=self.text, straight=self.text)
+
 
 class StudyPrompt(Frozen):
-    """A prompt that a study makes from another one: ``removes`` blocks of it first, and so on.
+    """A prompt that a study makes from another one: it removes, replaces and adds, in this order.
 
-    ``order`` names blocks of the prompt in the order in which they are to stand, all of them.
     Tables show the ``title``.
     """
 
@@ -91,7 +97,6 @@ class StudyPrompt(Frozen):
     remove: tuple[str, ...] = ()
     replace: dict[str, Annotated[RoadTexts, BeforeValidator(_texts)]] = Field(default_factory=dict)
     add: tuple[AddedText, ...] = ()
-    order: tuple[str, ...] = ()
     title: str = ""
 
 
