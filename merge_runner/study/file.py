@@ -50,7 +50,7 @@ def _for_every_prompt(value: object) -> object:
 class RoadTexts(Frozen):
     """The templates of a paragraph before and after the merge point; where one is left out, none.
 
-    What they may name in braces: ``prompts.blocks.Fields``.
+    What they may name in braces: ``prompts.fields``.
     """
 
     merge: str | None = None

@@ -9,7 +9,8 @@ import pytest
 from pydantic import BaseModel
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.prompts.blocks import BLOCKS, NAMES, VARIANTS, Variant
+from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
+from merge_runner.prompts.fields import FIELDS
 from merge_runner.prompts.render import render_prompt
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.unsent import unsent
@@ -87,7 +88,7 @@ def test_every_key_is_explained_and_shown_in_an_example():
 
 def test_all_fields_and_blocks_of_a_prompt_are_named():
     (fields,) = re.findall(r"<!-- fields -->(.*?)<!-- end -->", PAGE, re.DOTALL)
-    assert re.findall(r"`(\w+)`", fields) == [*NAMES]
+    assert re.findall(r"`(\w+)`", fields) == [*FIELDS]
     for block in BLOCKS:
         assert f"`{block}`" in PAGE
 
