@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from pydantic import (
@@ -67,13 +67,9 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class Frozen(BaseModel):
-    """A configuration object: frozen, and an unknown key is an error.
-
-    ``nested`` says by key which objects it holds, also in lists and tables of them.
-    """
+    """A configuration object: frozen, and an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {}
 
 
 def whole_steps(name: str, seconds: float, step_s: float) -> int:
@@ -148,10 +144,6 @@ class ScenarioConfig(Frozen):
     ``prompt_rate_hz`` is a language model's, and that of a program without a rate of its own.
     ``perception_left`` and ``perception_right`` say what the driver of each side perceives.
     """
-
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {
-        f"perception_{side}": Perception for side in SIDES
-    }
 
     horizon_s: Positive = 4.0
     step_s: Positive = 0.2
@@ -266,8 +258,6 @@ class ModelEntry(Frozen):
     reply longer than ``max_reply_mb`` (unpacked) is refused. ``batch`` is the batch mode: the
     ``provider``'s, ``none``, or one on the terms of another server that speaks the format.
     """
-
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {"price": Price, "batch": BatchTerms}
 
     provider: str
     format: str
@@ -428,11 +418,15 @@ def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.e
     base_url = endpoint_url(entry, env)
     if key is not None and len(key) >= SHORTEST_SECRET and key.lower() in base_url.lower():
         raise UsageError(f"the base URL of {name} holds its key: take it out, since URLs are shown")
+    headers: dict[str, str] = {}
+    if key is not None:
+        auth = entry.auth or provider.auth
+        headers = {"authorization": f"Bearer {key}"} if auth == "bearer" else {auth: key}
     return Endpoint(
         provider=entry.provider,
         identity=endpoint_identity(entry, env),
         base_url=base_url,
-        auth_headers=_auth_headers(entry.auth or provider.auth, key),
+        auth_headers=headers,
     )
 
 
@@ -619,11 +613,6 @@ def state_folder(env: Mapping[str, str] = os.environ) -> Path:
     raise UsageError("HOME names no folder: set it, or XDG_STATE_HOME")
 
 
-def running_emulator_url(env: Mapping[str, str] = os.environ) -> str | None:
-    """The URL of an emulator that already runs (EMULATOR_BASE_URL), or None."""
-    return env.get("EMULATOR_BASE_URL") or None
-
-
 def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
     """The variables of this environment that say where the entries' providers are reached."""
     variables = {PROVIDERS.require(entry.provider).base_url_env for entry in entries.values()}
@@ -669,12 +658,6 @@ def url_origin(url: str) -> str:
     return f"{parts.scheme}://{parts.netloc}"
 
 
-def _auth_headers(scheme: str, key: str | None) -> dict[str, str]:
-    if key is None:
-        return {}
-    return {"authorization": f"Bearer {key}"} if scheme == "bearer" else {scheme: key}
-
-
 def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
     lines = []
     for error in exc.errors():
@@ -682,9 +665,17 @@ def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
         if error["type"] == "extra_forbidden":
             owner = model
             for part in error["loc"][:-1]:
-                owner = getattr(owner, "nested", {}).get(part, owner)
+                field = owner.model_fields.get(str(part))
+                owner = (field and model_in(field.annotation)) or owner
             lines.append(str(unknown_name("key", place, owner.model_fields)))
         else:
             text = error["msg"].removeprefix("Value error, ")
             lines.append(f"{place}: {text}" if place else text)
     return lines
+
+
+def model_in(annotation: object) -> type[BaseModel] | None:
+    """The model that a field holds, also in a list or a table of them."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(model_in, get_args(annotation))), None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
@@ -14,7 +15,6 @@ from merge_runner.config import (
     check_network,
     rehearsal_endpoint,
     resolve_endpoint,
-    running_emulator_url,
     with_base_urls,
 )
 from merge_runner.emulator.faults import FaultPlan
@@ -126,7 +126,8 @@ def endpoint_plan(plan: Plan, options: Options, known: frozenset[str]) -> Endpoi
     if plan.is_rehearsal:
         emulator: FaultPlan | None = behaviour(plan)
     else:
-        emulator = options.faults if emulated and running_emulator_url() is None else None
+        runs = bool(os.environ.get("EMULATOR_BASE_URL"))  # and is the one to ask
+        emulator = options.faults if emulated and not runs else None
     return EndpointPlan(base_urls(plan.entries), emulator, options.strict_model, known)
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from merge_runner.config import (
     MOST_REPETITIONS,
@@ -91,8 +90,6 @@ class StudyPrompt(Frozen):
     Tables show the ``title``.
     """
 
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {"replace": RoadTexts, "add": AddedText}
-
     based_on: str = BASELINE
     remove: tuple[str, ...] = ()
     replace: dict[str, Annotated[RoadTexts, BeforeValidator(_texts)]] = Field(default_factory=dict)
@@ -161,16 +158,6 @@ class StudyFile(Frozen):
     drivers are played both ways round. ``perception`` holds by name what the levels of the factors
     perception, perception_left and perception_right stand for.
     """
-
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {
-        "conditions": StudyCondition,
-        "scenario": ScenarioConfig,
-        "prompts": StudyPrompt,
-        "drivers": StudyDriver,
-        "perception": Perception,
-        "budget": BudgetTerms,
-        "plugins": Plugins,
-    }
 
     description: str = ""
     models: tuple[str, ...] = ()

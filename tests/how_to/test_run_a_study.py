@@ -8,7 +8,7 @@ import tomllib
 import pytest
 from pydantic import BaseModel
 
-from merge_runner.config import ScenarioConfig
+from merge_runner.config import ScenarioConfig, model_in
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
 from merge_runner.prompts.fields import FIELDS
 from merge_runner.prompts.render import render_prompt
@@ -25,8 +25,9 @@ EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n+```toml\n(.*?)^```", PAGE, re.DOTALL
 def keys(model: type[BaseModel]):
     """The keys of a table of the file, and of those within it but the scenario's."""
     yield from model.model_fields
-    for inner in getattr(model, "nested", {}).values():
-        if inner is not ScenarioConfig:
+    for field in model.model_fields.values():
+        inner = model_in(field.annotation)
+        if inner is not None and inner is not ScenarioConfig:
             yield from keys(inner)
 
 
