@@ -35,10 +35,8 @@ from merge_runner.text_safety import one_line
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
-LONGEST_URL, LONGEST_HOST = 2000, 253
 # A shorter key is a dummy, and may occur in any text.
 SHORTEST_SECRET = 8
-_HOST = re.compile(r"[a-z0-9_-]{1,63}(\.[a-z0-9_-]{1,63})*\.?", re.I)
 UNNAMED = "default"
 # What stands for the emulator where it takes the place of a provider.
 REHEARSAL = "rehearsal://localhost"
@@ -522,14 +520,11 @@ def normalised_url(url: str, named: str = "base_url") -> str:
     Raises UsageError, which shows nothing of it: a key may have been pasted there. It is told apart
     by what it is ``named``.
     """
-    url = url.strip()
-    if not url.lower().startswith(("http://", "https://")):
-        raise UsageError(f"{named} is no base URL: it must begin with http:// or https://")
-    parts = _address(url)
+    parts = _http_url(url.strip())
     if parts is None:
         raise UsageError(
-            f"{named} is no base URL: there can be no such host or port, or it has a space or "
-            "characters that are not ASCII (write a name of other letters as xn--...)"
+            f"{named} is no base URL: it must begin with http:// or https:// and name a host that "
+            "there can be, without spaces (write other letters than ASCII as xn--...)"
         )
     if "@" in parts.netloc or parts.query or parts.fragment:
         raise UsageError(
@@ -543,18 +538,18 @@ def normalised_url(url: str, named: str = "base_url") -> str:
     return f"{parts.scheme}://{host}{port}{parts.path.rstrip('/')}"
 
 
-def _address(url: str) -> SplitResult | None:
-    """The parts of a URL, or None where no host can be reached at it."""
-    if len(url) > LONGEST_URL or not (url.isascii() and url.isprintable()) or " " in url:
+def _http_url(url: str) -> SplitResult | None:
+    """The parts of a URL, or None where no host can be reached at it by HTTP."""
+    if not (url.isascii() and url.isprintable()) or " " in url:
         return None
     try:
         parts = urlsplit(url)
         name = parts.hostname or ""
         if ":" in name or re.fullmatch(r"\d+(\.\d+){3}", name):
-            is_host = "%" not in str(ipaddress.ip_address(name))
-        else:
-            is_host = len(name) <= LONGEST_HOST and bool(_HOST.fullmatch(name))
-        return parts if is_host and parts.port != 0 else None
+            ipaddress.ip_address(name)
+        name.encode("idna")  # raises where a label is empty or too long
+        is_host = parts.port != 0 and re.fullmatch(r"[\w.:-]+", name)
+        return parts if is_host and parts.scheme in ("http", "https") else None
     except ValueError:
         return None
 
@@ -562,27 +557,21 @@ def _address(url: str) -> SplitResult | None:
 def check_network(base_url: str, env: Mapping[str, str] = os.environ) -> None:
     """Raise UsageError where a variable keeps an endpoint from being reached.
 
-    Calls to loopback never go through a proxy, so the proxy variables do not matter there.
+    Calls to loopback never go through a proxy, so the proxy variables do not matter there. Their
+    values are not shown: they may hold a password.
     """
-    if urlsplit(base_url).hostname not in LOOPBACK:
-        for variable, value in env.items():
-            if variable.lower() in PROXY_VARIABLES and value:
-                _check_proxy(variable, value)
+    by_proxy = urlsplit(base_url).hostname not in LOOPBACK
+    for variable, value in env.items():
+        if not (by_proxy and value and variable.lower() in PROXY_VARIABLES):
+            continue
+        if _http_url(value if "://" in value else f"http://{value}") is None:
+            raise UsageError(
+                f"{variable} is no URL of an HTTP proxy: set it to http://HOST:PORT or unset it; a "
+                "SOCKS proxy needs an HTTP proxy before it (privoxy, for one)"
+            )
     folders = env.get("SSL_CERT_DIR", "")
     if folders and not any(Path(folder).is_dir() for folder in folders.split(":")):
         raise UsageError("SSL_CERT_DIR names no folder that exists: correct it or unset it")
-
-
-def _check_proxy(variable: str, value: str) -> None:
-    """The value is not shown: it may have a password."""
-    scheme, separator, _ = value.partition("://")
-    if separator and scheme.isalnum() and scheme.lower() not in ("http", "https"):
-        raise UsageError(
-            f"{variable} names a {scheme[:20]}:// proxy, and only http:// and https:// ones can be "
-            "used: unset it, or put one of these (privoxy, for one) before a SOCKS proxy"
-        )
-    if _address(value if separator else f"http://{value}") is None:
-        raise UsageError(f"{variable} is no URL of a proxy: set it to http://HOST:PORT or unset it")
 
 
 def proxy_secrets(env: Mapping[str, str] = os.environ) -> Iterator[str]:
