@@ -28,7 +28,7 @@ from aiohttp import web
 from benchmarks.cases import Bench, Figures
 from benchmarks.processes import PROJECT, RUNNER
 from merge_runner.emulator.faults import FaultPlan, transient_faults
-from merge_runner.emulator.server import HOST, Emulator
+from merge_runner.emulator.server import HOST, application
 from merge_runner.llm.content_hashes import call_key
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot
 from merge_runner.results.store import results_digest
@@ -101,7 +101,7 @@ class Process:
 @asynccontextmanager
 async def serving(watch: Watch, faults: FaultPlan) -> AsyncIterator[str]:
     """The emulator, watched; gives its base URL."""
-    app = Emulator(faults).app
+    app = application(faults)
     app.middlewares.append(watch.middle)
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
     await runner.setup()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from pydantic import (
@@ -35,10 +35,8 @@ from merge_runner.text_safety import one_line
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
-LONGEST_URL, LONGEST_HOST = 2000, 253
 # A shorter key is a dummy, and may occur in any text.
 SHORTEST_SECRET = 8
-_HOST = re.compile(r"[a-z0-9_-]{1,63}(\.[a-z0-9_-]{1,63})*\.?", re.I)
 UNNAMED = "default"
 # What stands for the emulator where it takes the place of a provider.
 REHEARSAL = "rehearsal://localhost"
@@ -67,13 +65,9 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class Frozen(BaseModel):
-    """A configuration object: frozen, and an unknown key is an error.
-
-    ``nested`` says by key which objects it holds, also in lists and tables of them.
-    """
+    """A configuration object: frozen, and an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {}
 
 
 def whole_steps(name: str, seconds: float, step_s: float) -> int:
@@ -148,10 +142,6 @@ class ScenarioConfig(Frozen):
     ``prompt_rate_hz`` is a language model's, and that of a program without a rate of its own.
     ``perception_left`` and ``perception_right`` say what the driver of each side perceives.
     """
-
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {
-        f"perception_{side}": Perception for side in SIDES
-    }
 
     horizon_s: Positive = 4.0
     step_s: Positive = 0.2
@@ -266,8 +256,6 @@ class ModelEntry(Frozen):
     reply longer than ``max_reply_mb`` (unpacked) is refused. ``batch`` is the batch mode: the
     ``provider``'s, ``none``, or one on the terms of another server that speaks the format.
     """
-
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {"price": Price, "batch": BatchTerms}
 
     provider: str
     format: str
@@ -428,11 +416,15 @@ def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.e
     base_url = endpoint_url(entry, env)
     if key is not None and len(key) >= SHORTEST_SECRET and key.lower() in base_url.lower():
         raise UsageError(f"the base URL of {name} holds its key: take it out, since URLs are shown")
+    headers: dict[str, str] = {}
+    if key is not None:
+        auth = entry.auth or provider.auth
+        headers = {"authorization": f"Bearer {key}"} if auth == "bearer" else {auth: key}
     return Endpoint(
         provider=entry.provider,
         identity=endpoint_identity(entry, env),
         base_url=base_url,
-        auth_headers=_auth_headers(entry.auth or provider.auth, key),
+        auth_headers=headers,
     )
 
 
@@ -445,10 +437,10 @@ def endpoint_url(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
     return normalised_url(entry.base_url or provider.base_url)
 
 
-def rehearsal_endpoint(entry: ModelEntry, emulator_url: str) -> Endpoint:
+def rehearsal_endpoint(entry: ModelEntry) -> Endpoint:
     """The emulator, in the place of an entry's provider: without a key."""
     path = urlsplit(PROVIDERS.require(entry.provider).base_url).path
-    return Endpoint(entry.provider, REHEARSAL, emulator_url + path, {})
+    return Endpoint(entry.provider, REHEARSAL, "http://127.0.0.1" + path, {})
 
 
 def is_own_host(provider: str, identity: str) -> bool:
@@ -528,14 +520,11 @@ def normalised_url(url: str, named: str = "base_url") -> str:
     Raises UsageError, which shows nothing of it: a key may have been pasted there. It is told apart
     by what it is ``named``.
     """
-    url = url.strip()
-    if not url.lower().startswith(("http://", "https://")):
-        raise UsageError(f"{named} is no base URL: it must begin with http:// or https://")
-    parts = _address(url)
+    parts = _http_url(url.strip())
     if parts is None:
         raise UsageError(
-            f"{named} is no base URL: there can be no such host or port, or it has a space or "
-            "characters that are not ASCII (write a name of other letters as xn--...)"
+            f"{named} is no base URL: it must begin with http:// or https:// and name a host that "
+            "there can be, without spaces (write other letters than ASCII as xn--...)"
         )
     if "@" in parts.netloc or parts.query or parts.fragment:
         raise UsageError(
@@ -549,18 +538,18 @@ def normalised_url(url: str, named: str = "base_url") -> str:
     return f"{parts.scheme}://{host}{port}{parts.path.rstrip('/')}"
 
 
-def _address(url: str) -> SplitResult | None:
-    """The parts of a URL, or None where no host can be reached at it."""
-    if len(url) > LONGEST_URL or not (url.isascii() and url.isprintable()) or " " in url:
+def _http_url(url: str) -> SplitResult | None:
+    """The parts of a URL, or None where no host can be reached at it by HTTP."""
+    if not (url.isascii() and url.isprintable()) or " " in url:
         return None
     try:
         parts = urlsplit(url)
         name = parts.hostname or ""
         if ":" in name or re.fullmatch(r"\d+(\.\d+){3}", name):
-            is_host = "%" not in str(ipaddress.ip_address(name))
-        else:
-            is_host = len(name) <= LONGEST_HOST and bool(_HOST.fullmatch(name))
-        return parts if is_host and parts.port != 0 else None
+            ipaddress.ip_address(name)
+        name.encode("idna")  # raises where a label is empty or too long
+        is_host = parts.port != 0 and re.fullmatch(r"[\w.:-]+", name)
+        return parts if is_host and parts.scheme in ("http", "https") else None
     except ValueError:
         return None
 
@@ -568,27 +557,21 @@ def _address(url: str) -> SplitResult | None:
 def check_network(base_url: str, env: Mapping[str, str] = os.environ) -> None:
     """Raise UsageError where a variable keeps an endpoint from being reached.
 
-    Calls to loopback never go through a proxy, so the proxy variables do not matter there.
+    Calls to loopback never go through a proxy, so the proxy variables do not matter there. Their
+    values are not shown: they may hold a password.
     """
-    if urlsplit(base_url).hostname not in LOOPBACK:
-        for variable, value in env.items():
-            if variable.lower() in PROXY_VARIABLES and value:
-                _check_proxy(variable, value)
+    by_proxy = urlsplit(base_url).hostname not in LOOPBACK
+    for variable, value in env.items():
+        if not (by_proxy and value and variable.lower() in PROXY_VARIABLES):
+            continue
+        if _http_url(value if "://" in value else f"http://{value}") is None:
+            raise UsageError(
+                f"{variable} is no URL of an HTTP proxy: set it to http://HOST:PORT or unset it; a "
+                "SOCKS proxy needs an HTTP proxy before it (privoxy, for one)"
+            )
     folders = env.get("SSL_CERT_DIR", "")
     if folders and not any(Path(folder).is_dir() for folder in folders.split(":")):
         raise UsageError("SSL_CERT_DIR names no folder that exists: correct it or unset it")
-
-
-def _check_proxy(variable: str, value: str) -> None:
-    """The value is not shown: it may have a password."""
-    scheme, separator, _ = value.partition("://")
-    if separator and scheme.isalnum() and scheme.lower() not in ("http", "https"):
-        raise UsageError(
-            f"{variable} names a {scheme[:20]}:// proxy, and only http:// and https:// ones can be "
-            "used: unset it, or put one of these (privoxy, for one) before a SOCKS proxy"
-        )
-    if _address(value if separator else f"http://{value}") is None:
-        raise UsageError(f"{variable} is no URL of a proxy: set it to http://HOST:PORT or unset it")
 
 
 def proxy_secrets(env: Mapping[str, str] = os.environ) -> Iterator[str]:
@@ -617,11 +600,6 @@ def state_folder(env: Mapping[str, str] = os.environ) -> Path:
         if folder.is_absolute():
             return folder / below / "merge-runner"
     raise UsageError("HOME names no folder: set it, or XDG_STATE_HOME")
-
-
-def running_emulator_url(env: Mapping[str, str] = os.environ) -> str | None:
-    """The URL of an emulator that already runs (EMULATOR_BASE_URL), or None."""
-    return env.get("EMULATOR_BASE_URL") or None
 
 
 def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
@@ -669,12 +647,6 @@ def url_origin(url: str) -> str:
     return f"{parts.scheme}://{parts.netloc}"
 
 
-def _auth_headers(scheme: str, key: str | None) -> dict[str, str]:
-    if key is None:
-        return {}
-    return {"authorization": f"Bearer {key}"} if scheme == "bearer" else {scheme: key}
-
-
 def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
     lines = []
     for error in exc.errors():
@@ -682,9 +654,17 @@ def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
         if error["type"] == "extra_forbidden":
             owner = model
             for part in error["loc"][:-1]:
-                owner = getattr(owner, "nested", {}).get(part, owner)
+                field = owner.model_fields.get(str(part))
+                owner = (field and model_in(field.annotation)) or owner
             lines.append(str(unknown_name("key", place, owner.model_fields)))
         else:
             text = error["msg"].removeprefix("Value error, ")
             lines.append(f"{place}: {text}" if place else text)
     return lines
+
+
+def model_in(annotation: object) -> type[BaseModel] | None:
+    """The model that a field holds, also in a list or a table of them."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(model_in, get_args(annotation))), None)

@@ -50,7 +50,7 @@ def zygote(shared):
 @pytest.fixture(scope="session")
 def emulator_url(zygote, tmp_path_factory):
     """An emulator without faults, for all tests that need no other."""
-    command = ("emulate", "--port", 0, "--until-stdin-closes")
+    command = ("emulate", "--port", 0)
     folder = tmp_path_factory.mktemp("emulator")
     with zygote.serving(command, cwd=folder, env=environment()) as url:
         yield url.strip() + "/v1"
@@ -60,7 +60,7 @@ def emulator_url(zygote, tmp_path_factory):
 def merge_runner(tmp_path, zygote, emulator_url):
     """Runs ``merge-runner`` in an empty folder, beside an emulator.
 
-    With ``EMULATOR_BASE_URL=""``, or with faults, a sweep starts an emulator of its own. ``fork``
+    With ``EMULATOR_BASE_URL=""``, or with faults, a sweep has an emulator of its own. ``fork``
     returns once it has begun, to be signalled; ``start`` does so with a process of its own
     command line and imports.
     """

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from aiohttp import web
 
-from merge_runner.emulator.server import HOST, Emulator
+from merge_runner.emulator.server import HOST, application
 from merge_runner.llm.trial_costs import TrialCalls, TrialCosts
 from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 from merge_runner.registry import GROUP
@@ -113,7 +113,7 @@ async def watched(middle: Middle | None = None, faults=None, *, honest: bool = T
         seen.headers.append({name.lower(): value for name, value in request.headers.items()})
         return await (middle(request, handler) if middle else handler(request))
 
-    app = Emulator(faults).app
+    app = application(faults)
     app.middlewares.append(watch)
     if not honest:
         app.on_response_prepare.clear()

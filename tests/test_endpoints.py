@@ -12,7 +12,6 @@ from merge_runner.config import (
     key_status,
     normalised_url,
     resolve_endpoint,
-    running_emulator_url,
 )
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
@@ -220,14 +219,6 @@ def test_an_unknown_provider_is_an_error_that_names_the_known_ones():
     with pytest.raises(UsageError) as caught:
         resolve_endpoint("m", entry("opnai"), {})
     assert all(name in str(caught.value) for name in ["opnai", *PROVIDERS])
-
-
-@pytest.mark.parametrize(
-    ("env", "url"),
-    [({}, None), ({"EMULATOR_BASE_URL": ""}, None), ({"EMULATOR_BASE_URL": "u"}, "u")],
-)
-def test_a_running_emulator_is_found_by_its_variable(env, url):
-    assert running_emulator_url(env) == url
 
 
 def test_the_registry_that_we_ship_is_valid():

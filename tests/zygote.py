@@ -115,23 +115,25 @@ class Zygote:
 
     @contextmanager
     def serving(self, arguments, *, cwd, env) -> Iterator[str]:
-        """Runs a server until its standard input closes; gives the first line that it writes."""
+        """Runs a server; gives the first line that it writes."""
         ours, theirs = socket.socketpair()
         with theirs:
-            link = self._request(arguments, cwd, env, theirs, theirs, stdin=theirs)
+            link = self._request(arguments, cwd, env, theirs, theirs)
         with link:
+            pid = int(link.recv(DIGITS, socket.MSG_WAITALL))
             with ours, ours.makefile() as said:
                 yield said.readline()
-            link.recv(2 * DIGITS, socket.MSG_WAITALL)  # until it has ended
+            os.kill(pid, signal.SIGTERM)
+            link.recv(DIGITS)  # once it has ended
 
-    def _request(self, arguments, cwd, env, out, err, *, module="", stdin=None) -> socket.socket:
+    def _request(self, arguments, cwd, env, out, err, *, module="") -> socket.socket:
         with open(os.devnull) as nothing:
             return asked(
                 self._address,
                 list(map(str, arguments)),
                 cwd=str(cwd),
                 env=env,
-                streams=[file.fileno() for file in (stdin or nothing, out, err)],
+                streams=[file.fileno() for file in (nothing, out, err)],
                 module=module,
             )
 

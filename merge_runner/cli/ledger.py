@@ -8,10 +8,7 @@ from typing import Annotated
 
 import typer
 
-from merge_runner.cli.options import (
-    CacheOption,
-    JsonOption,
-)
+from merge_runner.cli.options import CacheOption, JsonOption
 from merge_runner.cli.output import agree, print_out
 from merge_runner.paths import DEFAULT_CACHE
 

@@ -36,8 +36,6 @@ DbOption = Annotated[
         help="The results database; that of a study's file lies beside it.",
     ),
 ]
-
-
 CacheOption = Annotated[
     Path,
     typer.Option(
@@ -56,12 +54,6 @@ def _drivers() -> list[str]:
     return [*load_models(), *PROGRAMS]
 
 
-def _studies() -> list[str]:
-    from merge_runner.study.file import study_files
-
-    return sorted(study_files())
-
-
 ModelOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -72,8 +64,6 @@ ModelOption = Annotated[
         "Else those of the study's file, or the emulator.",
     ),
 ]
-
-
 OnlyOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -83,106 +73,19 @@ OnlyOption = Annotated[
         "than once.",
     ),
 ]
-
-
-MirrorOption = Annotated[
-    bool,
-    typer.Option(
-        "--mirror", help="Also play two different drivers with their sides changed, as LEFT+RIGHT."
-    ),
-]
 RepsOption = Annotated[
     int | None,
     typer.Option("--reps", metavar="N", help="Repetitions per condition, for every variant."),
 ]
-
-
 ConditionsOption = Annotated[
     str | None,
     typer.Option("--conditions", metavar="A,B", help="Conditions, separated by commas."),
 ]
-
-
 VariantsOption = Annotated[
     str | None,
     typer.Option("--variants", metavar="A,B", help="Prompt variants, separated by commas."),
 ]
-
-
-SampleSetOption = Annotated[
-    int,
-    typer.Option("--sample-set", metavar="N", help="Another number draws a fresh set of samples."),
-]
-
-
-InFlightOption = Annotated[
-    int, typer.Option("--in-flight", metavar="N", help="Trials at once, over all workers.", min=1)
-]
-
-
-RpmOption = Annotated[
-    int | None, typer.Option("--rpm", metavar="N", help="Requests a minute.", min=1)
-]
-
-
-TpmOption = Annotated[
-    int | None, typer.Option("--tpm", metavar="N", help="Tokens a minute.", min=1)
-]
-
-
-MaxCostOption = Annotated[
-    float | None,
-    typer.Option(
-        "--max-cost", metavar="USD", help="Never spend more on this, over all its runs.", min=0
-    ),
-]
-
-
-BatchOption = Annotated[
-    bool,
-    typer.Option(
-        "--batch",
-        help="Ask in the provider's batches, one decision of all trials a round, at a lower price.",
-    ),
-]
-
-
-StrictModelOption = Annotated[
-    bool, typer.Option("--strict-model", help="Stop when another model answers.")
-]
-
-
-KeepGoingOption = Annotated[
-    bool,
-    typer.Option("--keep-going", help="Go on with a model that gives no valid decision."),
-]
-
-
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only estimate.")]
-
-
-YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask before spending.")]
-
-
-ReplayOption = Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")]
-
-
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-
-
-QuietOption = Annotated[bool, typer.Option("--quiet", help="Show no progress.")]
-
-
-StudiesArgument = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="NAME...",
-        autocompletion=_studies,
-        help="experiments/NAME.toml, or a path. Several are played one after the other.",
-    ),
-]
-
-
 TrustOption = Annotated[
     bool,
     typer.Option(
@@ -190,8 +93,6 @@ TrustOption = Annotated[
         help="Run the study's code and send keys where its models.toml says, unasked.",
     ),
 ]
-
-
 StudyOption = Annotated[
     str | None,
     typer.Option(
@@ -199,24 +100,6 @@ StudyOption = Annotated[
         metavar="FILE",
         help="A study's file: tables, figures and reports are of its trials alone, its plug-ins "
         "run, and its prompts, conditions, drivers and metrics are known.",
-    ),
-]
-
-
-RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
-
-
-ImportedFile = Annotated[
-    Path, typer.Argument(metavar="FILE", help="A recording (.parquet), or a cache folder.")
-]
-
-
-RecordingOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--recording",
-        metavar="FILE",
-        help="Also replay from this file, without importing it; may be repeated.",
     ),
 ]
 

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from merge_runner.cli.options import (
-    CacheOption,
-    DbOption,
-    ImportedFile,
-    RecordingFile,
-)
+from merge_runner.cli.options import CacheOption, DbOption
 from merge_runner.cli.output import print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+
+RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
 
 recording_app = typer.Typer(
     help="Portable recordings: one Parquet file that anyone can replay.", no_args_is_help=True
@@ -50,7 +48,12 @@ def recording_export(
 
 
 @recording_app.command("import")
-def recording_import(file: ImportedFile, cache: CacheOption = DEFAULT_CACHE) -> None:
+def recording_import(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A recording (.parquet), or a cache folder.")
+    ],
+    cache: CacheOption = DEFAULT_CACHE,
+) -> None:
     """Verify a recording or a cache folder, and add it to the cache."""
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.cache_import import import_folder

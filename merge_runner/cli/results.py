@@ -13,13 +13,7 @@ from typing import Annotated
 
 import typer
 
-from merge_runner.cli.options import (
-    DbOption,
-    JsonOption,
-    StudyOption,
-    TrustOption,
-    use_study,
-)
+from merge_runner.cli.options import DbOption, JsonOption, StudyOption, TrustOption, use_study
 from merge_runner.cli.output import agree, print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB

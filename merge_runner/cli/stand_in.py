@@ -29,7 +29,6 @@ def emulate(
         float | None,
         typer.Option(metavar="S", help="Seconds until a batch has its results.", min=0),
     ] = None,
-    until_stdin_closes: Annotated[bool, typer.Option(hidden=True)] = False,
 ) -> None:
     """Serve the emulator on 127.0.0.1, and print its base URL."""
     import asyncio
@@ -40,14 +39,7 @@ def emulate(
     if batch_delay is not None:
         batch = plan.batch.model_copy(update={"delay_s": batch_delay})
         plan = plan.model_copy(update={"batch": batch})
-    asyncio.run(
-        run(
-            port,
-            plan,
-            announce=print_out,
-            until_stdin_closes=until_stdin_closes,
-        )
-    )
+    asyncio.run(run(port, plan, announce=print_out))
 
 
 def faults_of(fault_rate: float, faults: Path | None, seed: int) -> FaultPlan:
@@ -59,10 +51,3 @@ def faults_of(fault_rate: float, faults: Path | None, seed: int) -> FaultPlan:
     if fault_rate or seed:
         raise UsageError("--faults names a file that holds the rates and the seed: give it alone")
     return load_faults(faults)
-
-
-def emulator_options(fault_rate: float, faults: Path | None, seed: int) -> list[str]:
-    """The same as options of ``emulate``."""
-    if faults is not None:
-        return ["--faults", str(faults.resolve())]
-    return ["--fault-rate", str(fault_rate), "--seed", str(seed)]

@@ -12,36 +12,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from merge_runner.cli.options import (
-    BatchOption,
     CacheOption,
     ConditionsOption,
     DbOption,
-    DryRunOption,
-    InFlightOption,
     JsonOption,
-    KeepGoingOption,
-    MaxCostOption,
-    MirrorOption,
     ModelOption,
     OnlyOption,
-    QuietOption,
-    RecordingOption,
-    ReplayOption,
     RepsOption,
-    RpmOption,
-    SampleSetOption,
-    StrictModelOption,
-    StudiesArgument,
-    TpmOption,
     TrustOption,
     VariantsOption,
-    YesOption,
     levels,
     listed,
 )
 from merge_runner.cli.output import print_out, say
 from merge_runner.cli.playing import check_money_and_replay, play
-from merge_runner.cli.stand_in import emulator_options, faults_of
+from merge_runner.cli.stand_in import faults_of
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 
@@ -63,8 +48,21 @@ def init(
     print_out(f"go on: cd {shlex.quote(str(folder))} && merge-runner sweep study.toml")
 
 
+def _studies() -> list[str]:
+    from merge_runner.study.file import study_files
+
+    return sorted(study_files())
+
+
 def sweep(
-    studies: StudiesArgument,
+    studies: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="NAME...",
+            autocompletion=_studies,
+            help="experiments/NAME.toml, or a path. Several are played one after the other.",
+        ),
+    ],
     first: Annotated[
         bool,
         typer.Option("--first", help="Only the first decision of both sides, without the trial."),
@@ -72,7 +70,6 @@ def sweep(
     grid: Annotated[
         str | None,
         typer.Option(
-            "--grid",
             metavar="GRID",
             help="With --first, in the place of the study's conditions: "
             "h=FROM:TO:STEP,dv=FROM:TO:STEP, projected headways in m and relative velocities in "
@@ -81,32 +78,55 @@ def sweep(
     ] = None,
     model: ModelOption = None,
     only: OnlyOption = None,
-    mirror: MirrorOption = False,
+    mirror: Annotated[
+        bool,
+        typer.Option(
+            "--mirror",
+            help="Also play two different drivers with their sides changed, as LEFT+RIGHT.",
+        ),
+    ] = False,
     reps: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
-    sample_set: SampleSetOption = 0,
+    sample_set: Annotated[
+        int, typer.Option(metavar="N", help="Another number draws a fresh set of samples.")
+    ] = 0,
     order_seed: Annotated[
-        int, typer.Option("--order-seed", metavar="N", help="Another number draws another order.")
+        int, typer.Option(metavar="N", help="Another number draws another order.")
     ] = 0,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
-    in_flight: InFlightOption = 200,
-    rpm: RpmOption = None,
-    tpm: TpmOption = None,
-    max_cost: MaxCostOption = None,
+    in_flight: Annotated[
+        int, typer.Option(metavar="N", help="Trials at once, over all workers.", min=1)
+    ] = 200,
+    rpm: Annotated[int | None, typer.Option(metavar="N", help="Requests a minute.", min=1)] = None,
+    tpm: Annotated[int | None, typer.Option(metavar="N", help="Tokens a minute.", min=1)] = None,
+    max_cost: Annotated[
+        float | None,
+        typer.Option(metavar="USD", help="Never spend more on this, over all its runs.", min=0),
+    ] = None,
     dask: Annotated[
         str | None,
         typer.Option(
-            "--dask",
             metavar="CLUSTER",
             help="Play on a Dask cluster: local:N, a scheduler's address, or its file.",
         ),
     ] = None,
-    batch: BatchOption = False,
-    strict_model: StrictModelOption = False,
-    keep_going: KeepGoingOption = False,
-    dry_run: DryRunOption = False,
+    batch: Annotated[
+        bool,
+        typer.Option(
+            "--batch",
+            help="Ask in the provider's batches, one decision of all trials a round, at a lower "
+            "price.",
+        ),
+    ] = False,
+    strict_model: Annotated[
+        bool, typer.Option("--strict-model", help="Stop when another model answers.")
+    ] = False,
+    keep_going: Annotated[
+        bool, typer.Option("--keep-going", help="Go on with a model that gives no valid decision.")
+    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only estimate.")] = False,
     rehearse: Annotated[
         bool,
         typer.Option(
@@ -114,10 +134,16 @@ def sweep(
             help="The emulator answers in the model's place, ten times as fast: no key, no cost.",
         ),
     ] = False,
-    yes: YesOption = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before spending.")] = False,
     trust: TrustOption = False,
-    replay: ReplayOption = False,
-    recording: RecordingOption = None,
+    replay: Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")] = False,
+    recording: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also replay from this file, without importing it; may be repeated.",
+        ),
+    ] = None,
     fault_rate: Annotated[
         float,
         typer.Option(metavar="P", help="Emulator only: share of attempts with a transient fault."),
@@ -126,7 +152,7 @@ def sweep(
         Path | None, typer.Option(metavar="FILE", help="Emulator only: a file of faults.")
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", help="Emulator only: seed of the faults.")] = 0,
-    quiet: QuietOption = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of one or more sweeps that are not stored yet."""
@@ -149,8 +175,7 @@ def sweep(
         max_cost_usd=max_cost,
         replay=replay,
         recordings=recording or (),
-        emulator_options=emulator_options(fault_rate, faults, seed),
-        faults_identity=faults_of(fault_rate, faults, seed).identity,
+        faults=faults_of(fault_rate, faults, seed),
         strict_model=strict_model,
         keep_going=keep_going,
         quiet=quiet,

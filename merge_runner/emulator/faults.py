@@ -9,12 +9,11 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    ValidationError,
     model_validator,
 )
 
 from merge_runner.chance import draw, draw_between
-from merge_runner.config import read_toml
+from merge_runner.config import read_toml, validated
 from merge_runner.errors import UsageError
 
 Fault = Literal[
@@ -133,14 +132,4 @@ def transient_faults(rate: float, seed: int) -> FaultPlan:
 
 def load_faults(path: Path) -> FaultPlan:
     """A fault plan from a TOML file; raises UsageError."""
-    try:
-        return FaultPlan.model_validate(read_toml(path))
-    except ValidationError as exc:
-        first = exc.errors()[0]
-        place = [str(part) for part in first["loc"] if part != "[key]"]
-        wrong = first["msg"].removeprefix("Value error, ")
-        tables = {"rates": FAULTS, "batch": tuple(BatchPlan.model_fields)}
-        valid = tables.get(place[0] if place else "", tuple(FaultPlan.model_fields))
-        raise UsageError(
-            f"{path}: {'.'.join(place) or 'rates'}: {wrong}; valid: {', '.join(valid)}"
-        ) from exc
+    return validated(FaultPlan, read_toml(path), str(path))

@@ -58,7 +58,7 @@ class ServedFormat(ABC):
     """A wire format from the server's side."""
 
     path: ClassVar[str]
-    """Where requests go, as a route of aiohttp."""
+    """Where requests go, as a regular expression."""
 
     error_names: ClassVar[dict[int, str]]
     """What the provider calls an error, by its status."""
@@ -196,7 +196,7 @@ class _Responses(_OpenAI):
 
 
 class _Gemini(ServedFormat):
-    path = r"/{version:v1\w*}/models/{model}:generateContent"
+    path = r"/(?P<version>v1\w*)/models/(?P<model>[^/]+?):generateContent"
     error_names: ClassVar = {
         400: "INVALID_ARGUMENT",
         404: "NOT_FOUND",

@@ -9,50 +9,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from string import Formatter
-from typing import TypedDict
+from typing import get_args
 
 from merge_runner.errors import UsageError
-from merge_runner.prompts.state_lines import LINES
+from merge_runner.prompts.fields import FIELDS
 from merge_runner.records import Road
 from merge_runner.registry import Registry
 
 OUTPUT_FORMAT = "C5"
 SITUATION, TABLE = "C0", "state.table"  # the second stands in place of the first
-
-
-class Fields(TypedDict):
-    """What a template may name in braces beside ``state_lines``, as it is written in the prompt.
-
-    Numbers have two decimals, in m, s, m/s and m/s^2, or in the unit of their name; lists are
-    those of Python. What is about the other car is "not seen" while that is so, and without the
-    unit that a template has behind it.
-    """
-
-    vehicle_length: str
-    own_speed: str
-    other_speed: str
-    own_speed_kmh: str
-    other_speed_kmh: str
-    own_speed_mph: str
-    other_speed_mph: str
-    relative_speed: str  # own minus other
-    relative_distance: str  # how far the other car is ahead, negative if it is behind
-    distance_to_merge: str  # before the merge point alone
-    own_accelerations: str
-    other_speeds: str
-    remaining_plan: str
-    memory_s: str
-    horizon_s: str
-    step_s: str
-    prompt_interval_s: str
-    plan_actions: str
-    max_acceleration: str
-
-
-NAMES = (*Fields.__annotations__, *LINES)
-"""All that a template may name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +39,9 @@ class Block:
     before: str | None = OUTPUT_FORMAT
 
     def __post_init__(self) -> None:
-        for road, fields in (
-            ("merge", NAMES),
-            ("straight", [name for name in NAMES if name != "distance_to_merge"]),
-        ):
-            for name in named(getattr(self, road) or ""):
+        for road in get_args(Road):
+            fields = [name for name in FIELDS if (road, name) != ("straight", "distance_to_merge")]
+            for name in named(self.template(road) or ""):
                 if name not in fields:
                     raise UsageError(
                         f"the block {self.meaning!r} names {{{name}}} on the road {road}; valid: "
@@ -197,20 +161,19 @@ acceleration of {max_acceleration} m/s^2 and -1 for a deceleration of {max_accel
 Write the list in a Python code block that holds nothing but the list."""
 
 BLOCKS = Registry[Block]("prompt block")
-_of_paper = partial(Block, in_baseline=True, before=None)
-BLOCKS.register(
-    SITUATION, _of_paper("situation", _listed(_APPROACHING, _BEFORE), _listed(_MERGED, _AFTER))
-)
-BLOCKS.register("C1", _of_paper("history", _HISTORY, _HISTORY))
-BLOCKS.register("C2", _of_paper("previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN))
-BLOCKS.register("C3.safety", _of_paper("avoid a collision", _SAFETY, _SAFETY))
-BLOCKS.register("C3.human", _of_paper("drive like a human", _HUMAN, _HUMAN))
-BLOCKS.register("C3.distance", _of_paper("keep a distance", _DISTANCE, _DISTANCE))
-BLOCKS.register("C3.reassess", _of_paper("reassess", _REASSESS, _REASSESS))
-BLOCKS.register("C4", _of_paper("tactical decision", _TACTICAL, None))
-BLOCKS.register(OUTPUT_FORMAT, _of_paper("output format", _SCHEMA, _SCHEMA))
+for _name, _meaning, _merge, _straight in (
+    (SITUATION, "situation", _listed(_APPROACHING, _BEFORE), _listed(_MERGED, _AFTER)),
+    ("C1", "history", _HISTORY, _HISTORY),
+    ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
+    ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
+    ("C3.human", "drive like a human", _HUMAN, _HUMAN),
+    ("C3.distance", "keep a distance", _DISTANCE, _DISTANCE),
+    ("C3.reassess", "reassess", _REASSESS, _REASSESS),
+    ("C4", "tactical decision", _TACTICAL, None),
+    (OUTPUT_FORMAT, "output format", _SCHEMA, _SCHEMA),
+):
+    BLOCKS.register(_name, Block(_meaning, _merge, _straight, in_baseline=True, before=None))
 
-_of_state = partial(Block, before="C1")
 _HEADWAY = """\
 Projected headway (which car is ahead when the first of you reaches the merge point at present \
 speeds): {projected_headway}"""
@@ -223,13 +186,16 @@ _FASTER = "Relative speed: {relative_speed_in_words}"
 _KMH = "In km/h: your speed is {own_speed_kmh}, the speed of the other car {other_speed_kmh}"
 _MPH = "In mph: your speed is {own_speed_mph}, the speed of the other car {other_speed_mph}"
 _TABLES = _tabled(_APPROACHING, _BEFORE), _tabled(_MERGED, _AFTER)
-BLOCKS.register("state.projected_headway", _of_state("projected headway", _HEADWAY, None))
-BLOCKS.register("state.time_to_merge", _of_state("times to the merge point", _TIMES, None))
-BLOCKS.register("state.time_gap", _of_state("time gap", _GAP, _GAP))
-BLOCKS.register("state.relative_speed", _of_state("relative speed in words", _FASTER, _FASTER))
-BLOCKS.register("state.kmh", _of_state("speeds in km/h", _KMH, _KMH))
-BLOCKS.register("state.mph", _of_state("speeds in mph", _MPH, _MPH))
-BLOCKS.register(TABLE, _of_state("situation as a table, in place of C0", *_TABLES))
+for _name, _meaning, _merge, _straight in (
+    ("state.projected_headway", "projected headway", _HEADWAY, None),
+    ("state.time_to_merge", "times to the merge point", _TIMES, None),
+    ("state.time_gap", "time gap", _GAP, _GAP),
+    ("state.relative_speed", "relative speed in words", _FASTER, _FASTER),
+    ("state.kmh", "speeds in km/h", _KMH, _KMH),
+    ("state.mph", "speeds in mph", _MPH, _MPH),
+    (TABLE, "situation as a table, in place of C0", *_TABLES),
+):
+    BLOCKS.register(_name, Block(_meaning, _merge, _straight, before="C1"))
 
 VARIANTS = Registry[Variant]("variant")
 VARIANTS.register("baseline", Variant(title="Baseline"))

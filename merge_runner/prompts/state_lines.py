@@ -94,4 +94,4 @@ LINES: Mapping[str, Callable[[Observation], str]] = {
     "time_gap": time_gap,
     "relative_speed_in_words": relative_speed,
 }
-"""What templates may name beside ``blocks.Fields``."""
+"""The fields of templates that are words."""

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 
 from merge_runner.config import (
-    REHEARSAL,
     Endpoint,
     ModelEntry,
     base_urls,
     check_network,
     rehearsal_endpoint,
     resolve_endpoint,
-    running_emulator_url,
     with_base_urls,
 )
-from merge_runner.emulator.process import emulator_process
+from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.batches import Batches
 from merge_runner.llm.batch.journal import Journal
@@ -35,7 +34,7 @@ from merge_runner.llm.prices import is_known
 from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan, most_prompts
-from merge_runner.run.rehearsal import SPEED, write_behaviour
+from merge_runner.run.rehearsal import SPEED, behaviour
 
 # For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
@@ -45,12 +44,14 @@ SPARE_FILES = 64
 class EndpointPlan:
     """How the endpoints of a sweep are asked; ``urls`` maps variables to base URLs.
 
-    ``known`` names the models whose endpoint has ever given an answer in its format, ``passed``
+    ``emulator`` says how the emulator of this process behaves, None where none is needed. ``known``
+    names the models whose endpoint has ever given an answer in its format, ``passed``
     those where it has done so in this run. With ``strict``, an answer from another model than the
     one requested stops the run.
     """
 
     urls: Mapping[str, str]
+    emulator: FaultPlan | None = None
     strict: bool = False
     known: frozenset[str] = frozenset()
     passed: frozenset[str] = frozenset()
@@ -118,22 +119,15 @@ def open_services(
     return LocalServices(limiters=limiters, budget=budget)
 
 
-async def start_endpoints(plan: Plan, options: Options, stack: AsyncExitStack) -> dict[str, str]:
-    """The variables of base URLs that lead to the endpoints of a plan's models.
-
-    Starts the emulator where one needs it; closing ``stack`` stops it.
-    """
-    urls = base_urls(plan.entries)
+def endpoint_plan(plan: Plan, options: Options, known: frozenset[str]) -> EndpointPlan:
+    """Return how the endpoints of a plan's models are asked; see EndpointPlan for ``known``."""
     emulated = any(entry.provider == "emulator" for entry in plan.entries.values())
     if plan.is_rehearsal:
-        behaviour = options.db.with_name("faults.toml")
-        write_behaviour(plan, behaviour)
-        process = emulator_process(["--faults", str(behaviour)])
-        urls[REHEARSAL] = await stack.enter_async_context(process)
-    elif emulated and running_emulator_url() is None:
-        url = await stack.enter_async_context(emulator_process(options.emulator_options))
-        urls |= {"EMULATOR_BASE_URL": f"{url}/v1"}
-    return urls
+        emulator: FaultPlan | None = behaviour(plan)
+    else:
+        runs = bool(os.environ.get("EMULATOR_BASE_URL"))  # and is the one to ask
+        emulator = options.faults if emulated and not runs else None
+    return EndpointPlan(base_urls(plan.entries), emulator, options.strict_model, known)
 
 
 def live_clients(
@@ -154,6 +148,11 @@ def live_clients(
     from merge_runner.llm.http import HttpTransport
 
     _allow_open_files(connections + SPARE_FILES)
+    in_process = None
+    if endpoint_plan.emulator is not None:
+        from merge_runner.emulator.handler import Emulator, InProcess
+
+        in_process = InProcess(Emulator(endpoint_plan.emulator))
     transports: dict[str, HttpTransport] = {}
     clients = {}
     for name, entry in plan.entries.items():
@@ -162,7 +161,10 @@ def live_clients(
             endpoint = _endpoint(plan, name, endpoint_plan.urls)
             check_network(endpoint.base_url)
             transports[model] = HttpTransport(
-                endpoint, connections=connections, most_bytes=int(entry.max_reply_mb * 1e6)
+                endpoint,
+                connections=connections,
+                most_bytes=int(entry.max_reply_mb * 1e6),
+                carrier=in_process if endpoint.is_emulator else None,
             )
             stack.push_async_callback(transports[model].close)
             if rounds is not None and batch_terms(entry) is not None:
@@ -189,7 +191,7 @@ def live_clients(
 
 def _endpoint(plan: Plan, name: str, urls: Mapping[str, str]) -> Endpoint:
     if plan.is_rehearsal:
-        return rehearsal_endpoint(plan.entries[name], urls[REHEARSAL])
+        return rehearsal_endpoint(plan.entries[name])
     return resolve_endpoint(name, plan.entries[name], with_base_urls(urls))
 
 

@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +21,7 @@ from merge_runner.config import (
 )
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, HumanTrials, Program
+from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
@@ -68,10 +69,9 @@ class Options:
     ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
     those of other sweeps.
     ``dask`` names the cluster that plays the trials; if None, this process plays them.
-    ``faults_identity`` keeps the answers of an emulator that was told to misbehave apart from those
-    of the usual one. A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that
-    is to ``keep_going`` asks a model on that gives no valid decision. In a ``batch`` run all
-    trials ask together, at a lower price.
+    ``faults`` are those of the emulator. A ``dry_run`` sends nothing, a ``quiet`` run shows no
+    progress, and one that is to ``keep_going`` asks a model on that gives no valid decision. In a
+    ``batch`` run all trials ask together, at a lower price.
     """
 
     db: Path
@@ -83,8 +83,7 @@ class Options:
     ledgers: Sequence[str] = ()
     replay: bool = False
     recordings: Sequence[Path] = ()
-    emulator_options: Sequence[str] = ()
-    faults_identity: str = ""
+    faults: FaultPlan = field(default_factory=FaultPlan)
     strict_model: bool = False
     keep_going: bool = False
     quiet: bool = False

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from merge_runner.config import PROVIDERS, REHEARSAL, ModelEntry, endpoint_identity
+from merge_runner.emulator.faults import BatchPlan, Fault, FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.models import load_models
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
@@ -18,22 +19,14 @@ from merge_runner.run.plan import Options, Plan
 
 SPEED = 10
 FOLDER = Path("results/rehearsal")
-BEHAVIOUR = """\
-# How the emulator answers in the model's place (docs/reference/emulator.md).
-latency_s = {latency_s}
-output_tokens = {output_tokens}
-delay_s = 1.0
-
-[rates]
-rate_limit = 0.01
-server_error = 0.005
-overloaded = 0.005
-malformed = 0.005
-
-[batch]
-delay_s = {batch_s}
-failed = 0.005
-"""
+# A share of attempts and of lines of a batch in which something goes wrong, as with providers.
+RATES: dict[Fault, float] = {
+    "rate_limit": 0.01,
+    "server_error": 0.005,
+    "overloaded": 0.005,
+    "malformed": 0.005,
+}
+FAILED_LINES = 0.005
 
 
 def rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]:
@@ -59,16 +52,17 @@ def rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]:
     return plan, replace(options, db=folder / "merge.duckdb", cache=folder / "responses")
 
 
-def write_behaviour(plan: Plan, file: Path) -> None:
-    """Write how the emulator answers in the place of a plan's one model."""
+def behaviour(plan: Plan) -> FaultPlan:
+    """Return how the emulator answers in the place of a plan's one model."""
     entry = next(iter(plan.entries.values()))  # the others differ in parameters alone
-    behaviour = BEHAVIOUR.format(
-        latency_s=entry.typical_latency_s / SPEED,
-        batch_s=2 * entry.typical_latency_s / SPEED,
+    latency_s = entry.typical_latency_s / SPEED
+    return FaultPlan(
+        rates=RATES,
+        latency_s=latency_s,
+        delay_s=1.0,
         output_tokens=entry.typical_output_tokens,
+        batch=BatchPlan(delay_s=2 * latency_s, failed=FAILED_LINES),
     )
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(behaviour, encoding="utf-8")
 
 
 def _can_be_rehearsed(entry: ModelEntry) -> bool:

@@ -38,13 +38,12 @@ from merge_runner.results.recording import Spilled
 from merge_runner.results.rows import factor_rows
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
-    EndpointPlan,
     check_batches,
+    endpoint_plan,
     live_clients,
     open_rounds,
     open_services,
     sealed_clients,
-    start_endpoints,
 )
 from merge_runner.run.estimate import Estimate, Todo, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
@@ -354,18 +353,17 @@ class Sweep:
             in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
             return LocalRunner(plan, clients, in_flight)
         services = open_services(plan, options, self._cache, self._ledger, self._measured())
-        urls = await start_endpoints(plan, options, stack)
         known = frozenset(
             name
             for name, entry in plan.entries.items()
             if plan.endpoints[name] in self._cache.stats(entry.id).totals
         )
-        endpoint_plan = EndpointPlan(urls, options.strict_model, known)
+        endpoints = endpoint_plan(plan, options, known)
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
         if options.dask is None:
             clients = live_clients(
                 plan,
-                endpoint_plan,
+                endpoints,
                 self._cache,
                 services.limiters,
                 services.budget,
@@ -386,7 +384,7 @@ class Sweep:
         from merge_runner.run.cluster.coordinator import Coordinator  # imports Dask
 
         return await stack.enter_async_context(
-            Coordinator(client, plan, endpoint_plan, self._cache, services, options.in_flight)
+            Coordinator(client, plan, endpoints, self._cache, services, options.in_flight)
         )
 
     async def _play(self, runner: TrialRunner, flusher: Flusher, outcome: Outcome) -> None:
@@ -567,7 +565,7 @@ class Sweep:
         """The endpoint's identity: in a replay, the one under which the model is recorded."""
         entry, configured = plan.entries[name], plan.endpoints[name]
         if entry.provider == "emulator":
-            configured += self._options.faults_identity
+            configured += self._options.faults.identity
         if not self._options.replay:
             return configured
         recorded = self._cache.recorded_endpoints(entry.id)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import product
-from operator import itemgetter
 
 from pydantic import JsonValue
 
@@ -101,15 +101,22 @@ def cross(
     factors = {name: levels for name, levels in file.factors.items() if name != PROMPT}
     if PROMPT in file.factors or len(repetitions) > 1:
         factors[PROMPT] = tuple(repetitions)
-    axes = {MODEL: tuple(models), **factors}
     _check_names(file, registry)
-    _check_axes(file, axes, only)
-    axes = {name: _reference_first(file, name, levels) for name, levels in axes.items()}
+    axes = {MODEL: _by_text(file, MODEL, models)}
+    axes |= {name: _by_text(file, name, levels) for name, levels in factors.items()}
+    _check_levels(axes, only)
+    # What is left out may be a model or a prompt that is not asked for today.
+    known = {**axes, PROMPT: VARIANTS, MODEL: {*axes[MODEL], *file.models}}
+    skip = [{name: _texts(wanted) for name, wanted in row.items()} for row in file.skip]
+    for row in skip:
+        _check_levels(known, row)
+    _check_levels(known, {name: [level_text(level)] for name, level in file.reference.items()})
     varying = [name for name, levels in axes.items() if len(levels) > 1]
-    axes = {name: _wanted(levels, only.get(name)) for name, levels in axes.items()}
-    _check_size(axes, file.skip, repetitions, conditions)
+    for name, texts in only.items():
+        axes[name] = {text: level for text, level in axes[name].items() if text in texts}
+    _check_size(axes, skip, repetitions, conditions)
     arms = []
-    for prompt, levels in _crossings(axes, file.skip, repetitions):
+    for prompt, levels in _crossings(axes, skip, repetitions):
         try:
             arm = _arm(file, levels, prompt, repetitions, registry, varying)
         except UsageError as exc:
@@ -136,7 +143,7 @@ def listed_levels(
     """
     axes = {MODEL: [*models], **file.factors, PROMPT: [*file_prompts(file), *prompts]}
     return {
-        name: list(dict.fromkeys(map(level_text, _reference_first(file, name, levels))))
+        name: _reference_first(file, name, dict.fromkeys(map(level_text, levels)))
         for name, levels in axes.items()
     }
 
@@ -148,53 +155,78 @@ def file_prompts(file: StudyFile) -> list[str]:
     return levels or named or [BASELINE] * (EVERY_PROMPT in file.repetitions)
 
 
-def _reference_first(
-    file: StudyFile, factor: str, levels: Iterable[JsonValue]
-) -> tuple[JsonValue, ...]:
+def _reference_first(file: StudyFile, factor: str, texts: Iterable[str]) -> list[str]:
     if factor not in file.reference:
-        return tuple(levels)
+        return list(texts)
     reference = level_text(file.reference[factor])
-    return tuple(sorted(levels, key=lambda level: level_text(level) != reference))
+    return sorted(texts, key=lambda text: text != reference)
 
 
-def _wanted(levels: Sequence[JsonValue], only: Sequence[str] | None) -> tuple[JsonValue, ...]:
-    return tuple(level for level in levels if only is None or level_text(level) in only)
+def _by_text(file: StudyFile, factor: str, levels: Iterable[JsonValue]) -> dict[str, JsonValue]:
+    """The levels of a factor by their texts; raises UsageError for none, or one twice."""
+    by_text: dict[str, JsonValue] = {}
+    numbers: dict[str, str] = {}
+    for level in levels:
+        number = int(level) if isinstance(level, float) and level.is_integer() else level
+        text = level_text(level)
+        twin = numbers.setdefault(level_text(number), text)
+        if twin != text or text in by_text:
+            raise UsageError(
+                f"the factor {factor} needs each of its levels once: {twin} and {text} are the same"
+            )
+        by_text[text] = level
+    if not by_text:
+        raise UsageError(f"the factor {factor} needs levels")
+    return {text: by_text[text] for text in _reference_first(file, factor, by_text)}
+
+
+def _texts(wanted: JsonValue) -> set[str]:
+    """The levels that a row of ``skip`` names."""
+    return set(map(level_text, wanted if isinstance(wanted, list) else [wanted]))
+
+
+def _check_levels(
+    axes: Mapping[str, Collection[str]], named: Mapping[str, Collection[str]]
+) -> None:
+    """Raise UsageError for a factor, or a level of it, that there is not."""
+    for name, texts in named.items():
+        levels = require(axes, "factor", name)
+        for text in texts:
+            require(dict.fromkeys(levels), f"level of {name}", text)
 
 
 def _crossings(
-    axes: Mapping[str, Sequence[JsonValue]], skip: Sequence[Levels], repetitions: Mapping[str, int]
+    axes: Mapping[str, Mapping[str, JsonValue]],
+    skip: Sequence[Mapping[str, Collection[str]]],
+    repetitions: Mapping[str, int],
 ) -> Iterator[tuple[str, Levels]]:
     """Each crossing that is to be played: its prompt and its levels."""
     for chosen in product(*axes.values()):
-        levels = dict(zip(axes, chosen, strict=True))
-        prompt = str(levels.get(PROMPT, next(iter(repetitions))))
-        if not _is_left_out({PROMPT: prompt, **levels}, skip):
-            yield prompt, levels
+        texts = {PROMPT: next(iter(repetitions)), **dict(zip(axes, chosen, strict=True))}
+        if not any(all(texts[name] in wanted for name, wanted in row.items()) for row in skip):
+            yield texts[PROMPT], {name: axes[name][texts[name]] for name in axes}
 
 
 def _check_size(
-    axes: Mapping[str, Sequence[JsonValue]],
-    skip: Sequence[Levels],
+    axes: Mapping[str, Mapping[str, JsonValue]],
+    skip: Sequence[Mapping[str, Collection[str]]],
     repetitions: Mapping[str, int],
     conditions: int,
 ) -> None:
     """Raise UsageError where these are more trials than can be played."""
-    prompts = [str(prompt) for prompt in axes.get(PROMPT, [*repetitions][:1])]
-    others = [(len(levels), name) for name, levels in axes.items() if name != PROMPT]
-    of_a_prompt = math.prod(n for n, _ in others)
-    trials = conditions * of_a_prompt * sum(repetitions[prompt] for prompt in prompts)
-    if skip and of_a_prompt * len(prompts) <= MOST_TRIALS:  # few enough to go through
+    sizes = Counter({f"levels of {name}": len(levels) for name, levels in axes.items()})
+    crossings = math.prod(sizes.values())
+    sizes.update({"conditions": conditions, "repetitions": max(repetitions.values())})
+    trials = math.prod(sizes.values())
+    if crossings <= MOST_TRIALS:  # few enough to go through
         trials = conditions * sum(repetitions[p] for p, _ in _crossings(axes, skip, repetitions))
-    if trials <= MOST_TRIALS:
-        return
-    sizes = [(n, f"levels of {name}") for n, name in [*others, (len(prompts), PROMPT)]]
-    sizes += [(conditions, "conditions"), (max(repetitions.values()), "repetitions")]
-    sizes.sort(key=itemgetter(0), reverse=True)
-    raise UsageError(
-        f"{' x '.join(f'{n:,} {what}' for n, what in sizes if n > 1)} make {trials:,} trials, and "
-        f"at most {MOST_TRIALS:,} can be played: leave out {sizes[0][1]}, in the file or by "
-        "--only, --conditions or --reps"
-    )
+    if trials > MOST_TRIALS:
+        large = [(f"{n:,} {what}", what) for what, n in sizes.most_common() if n > 1]
+        raise UsageError(
+            f"{' x '.join(size for size, _ in large)} make {trials:,} trials, and at most "
+            f"{MOST_TRIALS:,} can be played: leave out {large[0][1]}, in the file or by --only, "
+            "--conditions or --reps"
+        )
 
 
 def chosen_models(file: StudyFile, models: Sequence[str]) -> tuple[str, ...]:
@@ -415,52 +447,3 @@ def _perception(file: StudyFile, factor: str, level: str) -> dict[str, JsonValue
     known = {PERFECT_ONE: PERFECT, **file.perception}
     hint = f"define another one as [{PERCEPTION}.NAME]"
     return require(known, f"level of the factor {factor}:", level, hint).model_dump()
-
-
-def _check_axes(
-    file: StudyFile, axes: Mapping[str, Sequence[JsonValue]], only: Mapping[str, Sequence[str]]
-) -> None:
-    """Raise UsageError for levels that are not there, or there twice, and for names of none."""
-    for name, levels in axes.items():
-        if not levels:
-            raise UsageError(f"the factor {name} needs levels")
-        known: dict[str, JsonValue] = {}
-        for level in levels:
-            value = int(level) if isinstance(level, float) and level.is_integer() else level
-            if (text := level_text(value)) in known:
-                raise UsageError(
-                    f"the factor {name} needs each of its levels once: {level_text(known[text])} "
-                    f"and {level_text(level)} are the same"
-                )
-            known[text] = level
-    for name, wanted in only.items():
-        for text in wanted:
-            _check_level(axes, name, text)
-    # What is left out may be a model or a prompt that is not asked for today.
-    whole = {**axes, PROMPT: tuple(VARIANTS), MODEL: (*axes[MODEL], *file.models)}
-    for row in file.skip:
-        for name, text in _pairs(row):
-            _check_level(whole, name, text)
-    for name, level in file.reference.items():
-        _check_level(whole, name, level_text(level))
-
-
-def _check_level(axes: Mapping[str, Sequence[JsonValue]], name: str, text: str) -> None:
-    levels = require(axes, "factor", name)
-    require({level_text(each): each for each in levels}, f"level of {name}", text)
-
-
-def _pairs(row: Levels) -> Iterator[tuple[str, str]]:
-    for name, wanted in row.items():
-        for level in wanted if isinstance(wanted, list) else [wanted]:
-            yield name, level_text(level)
-
-
-def _is_left_out(levels: Levels, skip: Iterable[Levels]) -> bool:
-    texts = {name: level_text(level) for name, level in levels.items()}
-
-    def fits(row: Levels) -> bool:
-        named = list(_pairs(row))
-        return all((name, texts[name]) in named for name in row)
-
-    return any(map(fits, skip))

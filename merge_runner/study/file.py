@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from merge_runner.config import (
     MOST_REPETITIONS,
@@ -50,7 +49,7 @@ def _for_every_prompt(value: object) -> object:
 class RoadTexts(Frozen):
     """The templates of a paragraph before and after the merge point; where one is left out, none.
 
-    What they may name in braces: ``prompts.blocks.Fields``.
+    What they may name in braces: ``prompts.fields``.
     """
 
     merge: str | None = None
@@ -77,21 +76,24 @@ class AddedText(RoadTexts):
             raise ValueError("before or after, not both")
         return self
 
+    @property
+    def texts(self) -> RoadTexts:
+        """Its templates where it is no registered block."""
+        if self.text is None:
+            return self
+        return RoadTexts(merge=self.text, straight=self.text)
+
 
 class StudyPrompt(Frozen):
-    """A prompt that a study makes from another one: ``removes`` blocks of it first, and so on.
+    """A prompt that a study makes from another one: it removes, replaces and adds, in this order.
 
-    ``order`` names blocks of the prompt in the order in which they are to stand, all of them.
     Tables show the ``title``.
     """
-
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {"replace": RoadTexts, "add": AddedText}
 
     based_on: str = BASELINE
     remove: tuple[str, ...] = ()
     replace: dict[str, Annotated[RoadTexts, BeforeValidator(_texts)]] = Field(default_factory=dict)
     add: tuple[AddedText, ...] = ()
-    order: tuple[str, ...] = ()
     title: str = ""
 
 
@@ -156,16 +158,6 @@ class StudyFile(Frozen):
     drivers are played both ways round. ``perception`` holds by name what the levels of the factors
     perception, perception_left and perception_right stand for.
     """
-
-    nested: ClassVar[Mapping[str, type[BaseModel]]] = {
-        "conditions": StudyCondition,
-        "scenario": ScenarioConfig,
-        "prompts": StudyPrompt,
-        "drivers": StudyDriver,
-        "perception": Perception,
-        "budget": BudgetTerms,
-        "plugins": Plugins,
-    }
 
     description: str = ""
     models: tuple[str, ...] = ()

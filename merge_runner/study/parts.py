@@ -178,13 +178,12 @@ def _program(name: str, driver: StudyDriver) -> Program:
 
 def _variant(name: str, prompt: StudyPrompt) -> Variant:
     """The variant that a prompt of a study is; raises UsageError."""
-    blocks = dict(blocks_of(prompt.based_on))
-    before = dict(blocks)
-    for each in (*prompt.remove, *prompt.replace):
-        _known(name, each, blocks)
+    before = blocks_of(prompt.based_on)
     for each in prompt.remove:
-        del blocks[each]
+        _known(name, each, before)
+    blocks = {each: block for each, block in before.items() if each not in prompt.remove}
     for each, texts in prompt.replace.items():
+        _known(name, each, blocks)
         blocks[each] = replace(blocks[each], merge=texts.merge, straight=texts.straight)
     for number, added in enumerate(prompt.add, 1):
         blocks = _with_added(name, blocks, number, added)
@@ -193,8 +192,6 @@ def _variant(name: str, prompt: StudyPrompt) -> Variant:
             f"the prompt {name} says the situation twice, in {SITUATION} and in {TABLE}: write "
             f'remove = ["{SITUATION}"]'
         )
-    if prompt.order:
-        blocks = _ordered(name, blocks, prompt.order)
     return Variant(
         removes=frozenset(each for each, block in before.items() if blocks.get(each) != block),
         adds=frozenset(each for each, block in blocks.items() if before.get(each) != block),
@@ -207,13 +204,12 @@ def _with_added(
     prompt: str, blocks: Mapping[str, Block], number: int, added: AddedText
 ) -> dict[str, Block]:
     """The blocks with an added one in its place; raises UsageError."""
-    name = added.block or f"{prompt}.{number}"
     if added.block is not None:
+        name = added.block
         block = BLOCKS.require(name, f"the prompt {prompt} adds it")
     else:
-        merge = added.text if added.merge is None else added.merge
-        straight = added.text if added.straight is None else added.straight
-        block = Block(f"added by {prompt}", merge, straight, before=None)
+        name, texts = f"{prompt}.{number}", added.texts
+        block = Block(f"added by {prompt}", texts.merge, texts.straight, before=None)
     if name in blocks:
         raise UsageError(f"the prompt {prompt} adds the block {name!r}, which it has already")
     anchor = added.before or added.after or _own_place(block, blocks)
@@ -221,9 +217,10 @@ def _with_added(
         _known(prompt, anchor, blocks)
     names = list(blocks)
     place = len(names) if anchor is None else names.index(anchor) + (added.after is not None)
-    follower = names[place] if place < len(names) else LAST
-    whole = list(blocks.items())
-    return dict([*whole[:place], (name, replace(block, before=follower)), *whole[place:]])
+    # Where it stands is a part of its hash.
+    block = replace(block, before=[*names, LAST][place])
+    names.insert(place, name)
+    return {each: blocks.get(each, block) for each in names}
 
 
 def _own_place(block: Block, blocks: Mapping[str, Block]) -> str | None:
@@ -231,22 +228,6 @@ def _own_place(block: Block, blocks: Mapping[str, Block]) -> str | None:
     paper = [name for name, each in BLOCKS.items() if each.before is None]
     later = paper[paper.index(block.before) :] if block.before in paper else []
     return next((name for name in later if name in blocks), None)
-
-
-def _ordered(prompt: str, blocks: Mapping[str, Block], order: Iterable[str]) -> dict[str, Block]:
-    """The blocks in another order, of which each says what it stands before."""
-    names = list(order)
-    for name in names:
-        _known(prompt, name, blocks)
-    if sorted(names) != sorted(blocks):
-        raise UsageError(
-            f"the order of the prompt {prompt} names each of its blocks once: {', '.join(blocks)}"
-        )
-    followers = [*names[1:], LAST]
-    return {
-        name: replace(blocks[name], before=follower)
-        for name, follower in zip(names, followers, strict=True)
-    }
 
 
 def _known(prompt: str, block: str, blocks: Mapping[str, Block]) -> None:

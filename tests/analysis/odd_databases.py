@@ -6,6 +6,7 @@ they say.
 
 from __future__ import annotations
 
+import atexit
 import os
 import random
 import subprocess
@@ -209,11 +210,11 @@ def replayed(db: Path, model: str) -> None:
 def _emulator() -> str:
     """The URL of an emulator, which ends with this process."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "merge_runner", "emulate", "--port", "0", "--until-stdin-closes"],
-        stdin=subprocess.PIPE,
+        [sys.executable, "-m", "merge_runner", "emulate", "--port", "0"],
         stdout=subprocess.PIPE,
         text=True,
     )
+    atexit.register(process.terminate)
     assert process.stdout is not None
     return process.stdout.readline().strip()
 

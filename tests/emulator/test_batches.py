@@ -10,10 +10,10 @@ import pytest
 from merge_runner.emulator.batches import Batches
 from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.emulator.formats import CHAT
-from merge_runner.emulator.process import emulator_process
 from merge_runner.emulator.replies import Asked, Replies
 from merge_runner.errors import UsageError
 from merge_runner.records import SLOT_HEADER
+from tests.harness import environment
 
 
 class Clock:
@@ -137,14 +137,13 @@ async def test_a_file_has_an_id_that_no_other_has_had(emulator):
         assert await upload() not in (first, second)
 
 
-async def test_the_command_says_how_long_batches_take(driving_prompt):
+async def test_the_command_says_how_long_batches_take(zygote, tmp_path, driving_prompt):
     body = {"model": "m", "messages": [{"role": "user", "content": driving_prompt}]}
     requests = {"requests": [{"custom_id": "k", "params": body}]}
-    async with (
-        emulator_process(["--batch-delay", "3600"]) as url,
-        aiohttp.ClientSession(url) as session,
-    ):
-        async with session.post("/v1/messages/batches", json=requests) as reply:
-            created = await reply.json()
-        async with session.get(f"/v1/messages/batches/{created['id']}") as reply:
-            assert (await reply.json())["processing_status"] == "in_progress"
+    command = ("emulate", "--port", 0, "--batch-delay", 3600)
+    with zygote.serving(command, cwd=tmp_path, env=environment()) as url:
+        async with aiohttp.ClientSession(url.strip()) as session:
+            async with session.post("/v1/messages/batches", json=requests) as reply:
+                created = await reply.json()
+            async with session.get(f"/v1/messages/batches/{created['id']}") as reply:
+                assert (await reply.json())["processing_status"] == "in_progress"

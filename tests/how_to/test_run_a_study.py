@@ -8,8 +8,9 @@ import tomllib
 import pytest
 from pydantic import BaseModel
 
-from merge_runner.config import ScenarioConfig
-from merge_runner.prompts.blocks import BLOCKS, NAMES, VARIANTS, Variant
+from merge_runner.config import ScenarioConfig, model_in
+from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
+from merge_runner.prompts.fields import FIELDS
 from merge_runner.prompts.render import render_prompt
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.unsent import unsent
@@ -24,8 +25,9 @@ EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n+```toml\n(.*?)^```", PAGE, re.DOTALL
 def keys(model: type[BaseModel]):
     """The keys of a table of the file, and of those within it but the scenario's."""
     yield from model.model_fields
-    for inner in getattr(model, "nested", {}).values():
-        if inner is not ScenarioConfig:
+    for field in model.model_fields.values():
+        inner = model_in(field.annotation)
+        if inner is not None and inner is not ScenarioConfig:
             yield from keys(inner)
 
 
@@ -87,7 +89,7 @@ def test_every_key_is_explained_and_shown_in_an_example():
 
 def test_all_fields_and_blocks_of_a_prompt_are_named():
     (fields,) = re.findall(r"<!-- fields -->(.*?)<!-- end -->", PAGE, re.DOTALL)
-    assert re.findall(r"`(\w+)`", fields) == [*NAMES]
+    assert re.findall(r"`(\w+)`", fields) == [*FIELDS]
     for block in BLOCKS:
         assert f"`{block}`" in PAGE
 

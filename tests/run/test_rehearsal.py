@@ -90,7 +90,6 @@ async def test_the_rehearsal_of_a_study_lies_beside_its_file(merge_runner, tmp_p
     assert {path.name for path in (tmp_path / "mine/results/rehearsal").iterdir()} >= {
         "merge.duckdb",
         "responses",
-        "faults.toml",
     }
     assert not (tmp_path / "results").exists()
 

@@ -259,11 +259,14 @@ async def test_a_bad_certificate_ends_a_sweep_at_once_and_nothing_is_sent(
     [
         ({"SSL_CERT_FILE": "/nowhere.pem"}, "SSL_CERT_FILE names cannot be read (No such file"),
         ({"SSL_CERT_DIR": "/nowhere"}, "SSL_CERT_DIR names no folder that exists"),
-        ({"HTTPS_PROXY": "ftp://proxy.invalid"}, "HTTPS_PROXY names a ftp:// proxy, and only http"),
-        ({"ALL_PROXY": f"socks5://u:{KEY}@proxy.invalid"}, "ALL_PROXY names a socks5:// proxy"),
-        ({"https_proxy": "http://[::1"}, "https_proxy is no URL of a proxy"),
+        ({"HTTPS_PROXY": "ftp://proxy.invalid"}, "HTTPS_PROXY is no URL of an HTTP proxy"),
+        (
+            {"ALL_PROXY": f"socks5://u:{KEY}@proxy.invalid"},
+            "a SOCKS proxy needs an HTTP proxy before it",
+        ),
+        ({"https_proxy": "http://[::1"}, "https_proxy is no URL of an HTTP proxy"),
         ({"OPENAI_BASE_URL": "https://a..b/v1"}, "OPENAI_BASE_URL is no base URL"),
-        ({"OPENAI_BASE_URL": f"https://{'a' * 300}/v1"}, "is no base URL: there can be no such"),
+        ({"OPENAI_BASE_URL": f"https://{'a' * 300}/v1"}, "OPENAI_BASE_URL is no base URL"),
     ],
     ids=lambda value: str(value)[:40],
 )

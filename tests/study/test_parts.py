@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
 from merge_runner.config import ScenarioConfig
@@ -110,23 +108,21 @@ def test_an_edited_prompt_is_another_spec_at_once(plan_of):
     assert "You are late." not in prompt("taxi")
 
 
-def test_blocks_are_removed_replaced_and_reordered(plan_of):
-    names = list(blocks_of("A2"))
-    order = [name for name in (names[0], *reversed(names[1:])) if name != "C3.safety"]
+def test_blocks_are_removed_replaced_and_moved(plan_of):
     plan_of(
-        '[factors]\nprompt = ["other"]\n[prompts.other]\nbased_on = "A2"\nremove = ["C3.safety"]\n'
-        'replace = { "C3.human" = "Drive like a robot." }\n'
-        f"order = {json.dumps(order)}\n"
+        '[factors]\nprompt = ["other"]\n[prompts.other]\nbased_on = "A2"\n'
+        'remove = ["C3.safety", "C4"]\nreplace = { "C3.human" = "Drive like a robot." }\n'
+        'add = [{ after = "C0", block = "C4" }]\n'
     )
-    assert list(blocks_of("other")) == order
+    rest = [name for name in blocks_of("A2") if name not in ("C0", "C3.safety", "C4")]
+    assert list(blocks_of("other")) == ["C0", "C4", *rest]
     assert "Drive like a robot." in prompt("other")
 
 
-def test_the_order_of_a_prompt_is_in_its_hash(plan_of):
-    names = list(blocks_of("baseline"))
-    swapped = [*names[:2], names[3], names[2], *names[4:]]
+def test_the_place_of_a_block_is_in_the_hash_of_its_prompt(plan_of):
     plan_of(
-        f'[factors]\nprompt = ["other"]\n[prompts.other]\norder = {json.dumps(swapped)}\n',
+        '[factors]\nprompt = ["other"]\n[prompts.other]\nremove = ["C4"]\n'
+        'add = [{ after = "C0", block = "C4" }]\n'
     )
     assert block_digests("other") != block_digests("baseline")
 
@@ -204,7 +200,11 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
         (persona().replace("C3.human", "C9"), None, "names the block 'C9'; those that it has: C0"),
         (persona().replace("C3.human", "A"), None, "the prompt taxi names the block 'A'"),
         ('[prompts.baseline]\nremove = ["C2"]\n', None, "there is a variant 'baseline' already"),
-        ('[prompts.x]\norder = ["C0"]\n', None, "names each of its blocks once: C0, C1"),
+        (
+            '[prompts.x]\nremove = ["C2"]\nreplace = { C2 = "x" }\n',
+            None,
+            "the prompt x names the block 'C2' (which another prompt has)",
+        ),
         (
             '[prompts.x]\nadd = [{ after = "C0" }]\n',
             None,

@@ -12,7 +12,7 @@ from aiohttp import web
 
 from merge_runner.chance import draw
 from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.server import HOST, Emulator
+from merge_runner.emulator.server import HOST, application
 from merge_runner.records import SCRIPTED_FIELD
 from tests.emulator.scenarios import SCENARIOS
 from tests.emulator.scenarios.base import Scene
@@ -87,7 +87,7 @@ def _told_now(scene):
 @asynccontextmanager
 async def playing(plan, *middlewares):
     """Serve an emulator on loopback that plays a plan; yields its URL."""
-    app = Emulator(plan).app
+    app = application(plan)
     app.middlewares.extend((*middlewares, play))
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.01)
     await runner.setup()
