@@ -23,8 +23,8 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.batches import Batches
 from merge_runner.llm.batch.lines import LineEnd
-from merge_runner.llm.budget import Unpaid
-from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid, UnpaidAttempt
+from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Call, Wait, slot_text
 from merge_runner.llm.consequences import Consequences
 from merge_runner.llm.content_hashes import make_request
@@ -39,16 +39,10 @@ from merge_runner.llm.http_outcome import (
     may_be_charged,
 )
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
+from merge_runner.llm.limiter import Limiter, Settle
 from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import cost_usd
 from merge_runner.llm.retry import Deadline, OutOfTime, RequestFailed, retries
-from merge_runner.llm.shared_services import (
-    AttemptPort,
-    BudgetPort,
-    CachePort,
-    RateLimitPort,
-    Settle,
-)
 from merge_runner.llm.transport import Transport, TransportFailure
 from merge_runner.llm.verify import reply_object
 from merge_runner.records import (
@@ -86,10 +80,10 @@ class LlmClient:
     name: str
     entry: ModelEntry
     endpoint: str
-    cache: CachePort
+    cache: ResponseCache
     transport: Transport
-    limiter: RateLimitPort
-    budget: BudgetPort | None = None
+    limiter: Limiter
+    budget: Budget | None = None
     sealed: bool = False
     strict: bool = False
     model: str = ""
@@ -298,7 +292,11 @@ class LlmClient:
             return await self._concluded(call, paid, outcome, raw)
 
     async def _concluded(
-        self, call: Call, paid: AttemptPort, outcome: AttemptOutcome, raw: RawReply | None
+        self,
+        call: Call,
+        paid: PaidAttempt | UnpaidAttempt,
+        outcome: AttemptOutcome,
+        raw: RawReply | None,
     ) -> ChatReply:
         """Keep what an attempt brought: its answer, or why there is none, which is raised."""
         self._tell_overrun(call, paid.aside_usd)
@@ -355,12 +353,14 @@ class LlmClient:
         return replace(record, batch_id=end.batch_id), outcome
 
     @asynccontextmanager
-    async def _permitted(self, call: Call) -> AsyncIterator[tuple[AttemptPort, Settle]]:
+    async def _permitted(
+        self, call: Call
+    ) -> AsyncIterator[tuple[PaidAttempt | UnpaidAttempt, Settle]]:
         """What an attempt needs before it is sent: its money, then its turn."""
         # A turn must be used as soon as it is given, or the limits do not hold.
         async with AsyncExitStack() as stack:
             with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid = await stack.enter_async_context(
+                paid: PaidAttempt | UnpaidAttempt = await stack.enter_async_context(
                     self._money.attempt(call.order, call.request.key, call.asked)
                 )
             with call.waiting("for a turn under the rate limits"):
@@ -416,7 +416,7 @@ class LlmClient:
         )
 
     @property
-    def _money(self) -> BudgetPort:
+    def _money(self) -> Budget | Unpaid:
         return self.budget or Unpaid(self.cache)
 
     @property

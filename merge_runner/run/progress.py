@@ -33,7 +33,8 @@ from merge_runner.text_safety import printable
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from merge_runner.run.local_runner import TrialRunner
+    from merge_runner.run.dask_tasks import DaskTasks
+    from merge_runner.run.local_runner import LocalRunner
 
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
@@ -56,7 +57,7 @@ class Progress:
 
     plan: Plan
     planned: Counter[Cell]
-    runner: TrialRunner
+    runner: LocalRunner | DaskTasks
     ledger: Ledger
     stored: Counter[Cell] = field(default_factory=Counter)
     cap_usd: float | None = None

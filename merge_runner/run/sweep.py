@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
 from itertools import takewhile
+from typing import TYPE_CHECKING
 
 from merge_runner.audit import Audit, audit_sweep
 from merge_runner.config import ModelEntry
 from merge_runner.errors import (
     MergeRunnerError,
     NoValidDecision,
-    ProviderDown,
     ReplayMiss,
     StoreError,
     TrialSuspended,
@@ -42,25 +42,25 @@ from merge_runner.run.clients import (
     check_batches,
     live_clients,
     open_rounds,
-    open_services,
     sealed_clients,
     start_endpoints,
 )
 from merge_runner.run.estimate import Estimate, Todo, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, MOST_HELD, Flusher
-from merge_runner.run.local_runner import LocalRunner, TrialRunner
+from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
 from merge_runner.signals import on_interrupt
 
+if TYPE_CHECKING:
+    from merge_runner.run.dask_tasks import DaskTasks
+
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
 SHOWN = 5
-# More than bad luck explains, since nothing is answered between them; few enough to stop early.
-FAILURES_IN_A_ROW = 10
 FROM_PROGRAMS = 16
 
 
@@ -130,8 +130,6 @@ class Sweep:
         self._misses: list[Miss] = []
         self._ledger = Ledger(self._cache, plan.ledger)
         self._options = options = self._less_what_is_spent(options)
-        # Keyed by model and its number of answered calls, so that an answer starts a new count.
-        self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
         self._suspended: TrialSuspended | None = None
         self._rounds: Rounds | None = None
         self._progress = Progress(
@@ -345,7 +343,7 @@ class Sweep:
         )
         return sweep_id
 
-    async def _runner(self, stack: AsyncExitStack) -> TrialRunner:
+    async def _runner(self, stack: AsyncExitStack) -> LocalRunner | DaskTasks:
         """What plays the trials: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if not self._is_live:
@@ -353,46 +351,36 @@ class Sweep:
             # Recorded replies come at once: more trials in flight would only wait for each other.
             in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
             return LocalRunner(plan, clients, in_flight)
-        services = open_services(plan, options, self._cache, self._ledger, self._measured())
         urls = await start_endpoints(plan, options, stack)
         known = frozenset(
             name
             for name, entry in plan.entries.items()
             if plan.endpoints[name] in self._cache.stats(entry.id).totals
         )
-        endpoint_plan = EndpointPlan(urls, options.strict_model, known)
+        endpoint_plan = EndpointPlan(urls, known, self._measured())
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
-        if options.dask is None:
-            clients = live_clients(
-                plan,
-                endpoint_plan,
-                self._cache,
-                services.limiters,
-                services.budget,
-                connections=options.connections,
-                stack=stack,
-                rounds=rounds,
-            )
-            if rounds is not None:
-                stack.push_async_callback(rounds.close)
-                self._progress.batches = rounds.standing
-            # A trial that waits for a round takes up nobody's time.
-            in_flight = len(self._todo) if options.batch else options.in_flight
-            first = self._first_decisions(one_by_one=rounds is None)
-            return LocalRunner(plan, clients, in_flight, first)
-        from merge_runner.run.cluster.connect import connected
+        first = self._first_decisions(one_by_one=rounds is None)
+        if options.dask is not None:
+            from merge_runner.run.dask_cluster import connected
 
-        client = await stack.enter_async_context(connected(options.dask))
-        from merge_runner.run.cluster.coordinator import Coordinator  # imports Dask
+            client = await stack.enter_async_context(connected(options.dask))
+            from merge_runner.run.dask_tasks import DaskTasks  # imports Dask
 
-        return await stack.enter_async_context(
-            Coordinator(client, plan, endpoint_plan, self._cache, services, options.in_flight)
+            return DaskTasks(client, plan, options, endpoint_plan, self._cache, self._ledger, first)
+        clients = live_clients(
+            plan, options, endpoint_plan, self._cache, self._ledger, stack=stack, rounds=rounds
         )
+        if rounds is not None:
+            stack.push_async_callback(rounds.close)
+            self._progress.batches = rounds.standing
+        # A trial that waits for a round takes up nobody's time.
+        in_flight = len(self._todo) if options.batch else options.in_flight
+        return LocalRunner(plan, clients, in_flight, first)
 
-    async def _play(self, runner: TrialRunner, flusher: Flusher, outcome: Outcome) -> None:
+    async def _play(
+        self, runner: LocalRunner | DaskTasks, flusher: Flusher, outcome: Outcome
+    ) -> None:
         """Run the trials until all have ended, or the sweep is stopped or interrupted."""
-        # No worker of a cluster has all of them.
-        first = None if isinstance(runner, LocalRunner) else self._first_decisions()
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             if isinstance(record, TrialSuspended):
@@ -402,9 +390,6 @@ class Sweep:
             self._progress.by_cell[spec.cell][record.status] += 1
             self._misses += _misses(spec, record)
             flusher.add(record)
-            self._watch_for_outage(record, runner)
-            if first is not None:
-                self._count(record, first)
 
         # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
         work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
@@ -412,10 +397,7 @@ class Sweep:
 
         def interrupted() -> None:
             work.cancel()  # before anything is written: the terminal may be closed
-            self._say(
-                f"Stopping: {runner.in_flight_calls} calls in flight are saved first; "
-                "Ctrl-C again drops them."
-            )
+            self._say(f"Stopping: {runner.unsaved} are saved first; Ctrl-C again drops them.")
 
         beside = []
         if self._rounds is not None and isinstance(runner, LocalRunner):
@@ -508,28 +490,6 @@ class Sweep:
         except (StoreError, UsageError) as exc:
             outcome.fail(exc.exit_code, str(exc))
 
-    def _watch_for_outage(self, record: TrialRecord, runner: TrialRunner) -> None:
-        """Stop when trials keep failing for one model that answers no call in between."""
-        if self._options.replay:
-            return
-        asked = self._arms[record.spec.arm].asked
-        for name in {asked[failed.side] for failed in record.failed_calls}:
-            since = name, runner.answers(name)
-            self._failures_in_a_row[since] += 1
-            failed = self._failures_in_a_row[since]
-            if failed >= FAILURES_IN_A_ROW:
-                raise ProviderDown(
-                    f"the last {failed} trials with {name} failed and no call was answered "
-                    f"in between ({record.error}): the rest is not tried. When the service answers "
-                    "again, run the same command to go on"
-                )
-
-    def _count(self, record: TrialRecord, first: FirstDecisions) -> None:
-        asked = self._arms[record.spec.arm].asked
-        for row in record.decisions:
-            if asked[row.side] in self._plan.entries:
-                first.count(asked[row.side], row.decision)
-
     def _first_decisions(self, *, one_by_one: bool = False) -> FirstDecisions:
         """The first decisions of the models, with those that are stored already."""
         if self._options.keep_going:
@@ -592,7 +552,7 @@ def _differing(trials: Mapping[str, Sequence[str]]) -> str:
     return "; ".join(f"{trial_id} ({', '.join(columns)})" for trial_id, columns in shown)
 
 
-async def _drained(runner: TrialRunner, work: asyncio.Task[None]) -> None:
+async def _drained(runner: LocalRunner | DaskTasks, work: asyncio.Task[None]) -> None:
     """Once the work has ended, however it did, save the calls that are in flight."""
     await asyncio.wait([work])
     await runner.drain()
