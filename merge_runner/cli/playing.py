@@ -121,9 +121,7 @@ def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
 
 
 def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
-    from dataclasses import asdict, astuple
-
-    from merge_runner.results.query_output import write_table
+    from dataclasses import asdict
 
     if as_json:
         print_out(json.dumps(asdict(expected)))
@@ -152,12 +150,4 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         )
     if expected.trials_within_cap is not None:
         print_out(f"cap     buys about {expected.trials_within_cap} trials")
-    if len(expected.cells) > 1:
-        headings = ["cell", "trials", "calls", "tokens in", "tokens out"]
-        headings += [f"{what}{singly}" for what in ("USD", "minutes")]
-        write_table(
-            [*headings, "trials within the cap"],
-            [tuple("" if v is None else v for v in astuple(c)) for c in expected.cells],
-            sys.stdout,
-        )
     print_out("Nothing was sent.")
