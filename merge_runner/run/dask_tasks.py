@@ -224,8 +224,6 @@ async def _cancel(work: asyncio.Task[None], stopping: threading.Event) -> None:
 class DaskTasks:
     """Plays trials on the workers of a cluster: one task for each of their threads at a time."""
 
-    playing = None
-
     def __init__(
         self,
         client: Client,

@@ -15,7 +15,7 @@ from merge_runner.errors import ProviderDown, TrialSuspended
 from merge_runner.llm.call import Wait
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
-from merge_runner.records import SIDES, Cell, ChatReply, Slot, TrialRecord, TrialSpec
+from merge_runner.records import SIDES, ChatReply, Slot, TrialRecord, TrialSpec
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.plan import Plan
 from merge_runner.run.scheduler import Gate, run_bounded
@@ -38,14 +38,17 @@ FAILURES_IN_A_ROW = 10
 
 @dataclass
 class LocalRunner:
-    """Plays at most ``in_flight`` trials at once; ``asking`` counts the open questions of each."""
+    """Plays at most ``in_flight`` trials at once, of which so many are ``running``.
+
+    ``asking`` counts the open questions of each trial.
+    """
 
     plan: Plan
     clients: Mapping[str, LlmClient]
     in_flight: int
     first: FirstDecisions = field(default_factory=FirstDecisions)
     gate: Gate = field(default_factory=Gate)
-    playing: Counter[Cell] = field(default_factory=Counter)
+    running: int = 0
     asking: Counter[int] = field(default_factory=Counter)
     workers: None = None
     # Keyed by model and its number of answered calls, so that an answer starts a new count.
@@ -69,11 +72,6 @@ class LocalRunner:
     def _sealed(self) -> frozenset[str]:
         """The models whose answers are there, or nowhere."""
         return frozenset(name for name, client in self.clients.items() if client.sealed)
-
-    @property
-    def running(self) -> int:
-        """How many trials are being played."""
-        return self.playing.total()
 
     @property
     def meters(self) -> Mapping[str, Meter]:
@@ -147,14 +145,14 @@ class LocalRunner:
         drivers = {
             side: self.drivers[arm.asked[side]].make(arm.scenario, spec, side) for side in SIDES
         }
-        self.playing[spec.cell] += 1
+        self.running += 1
         try:
             recorded = all(name in self._sealed for name in arm.asked.values())
             return spec, await play_trial(spec, arm.scenario, drivers, in_turn=recorded)
         except TrialSuspended as exc:
             return spec, exc
         finally:
-            self.playing[spec.cell] -= 1
+            self.running -= 1
             for client in self.clients.values():
                 client.leave(spec.order)
 

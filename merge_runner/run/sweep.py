@@ -134,8 +134,8 @@ class Sweep:
         self._rounds: Rounds | None = None
         self._progress = Progress(
             plan=plan,
-            planned=Counter(spec.cell for spec in specs.values()),
-            stored=Counter(specs[key].cell for key in self._stored),
+            planned=len(specs),
+            stored=len(self._stored),
             runner=LocalRunner(plan, {}, in_flight=0),  # nobody plays yet
             ledger=self._ledger,
             cap_usd=options.max_cost_usd,
@@ -245,16 +245,16 @@ class Sweep:
                     outcome.fail(exc.exit_code, str(exc))
         for meter in runner.meters.values():
             outcome.meter.add(meter)
-        ways = self._progress.ways
-        outcome.suspended = ways["suspended"]
+        counts = self._progress.outcome_counts
+        outcome.suspended = counts["suspended"]
         if self._suspended:
             outcome.fail(
                 TrialSuspended.exit_code,
                 f"{outcome.suspended} trials wait for money: {self._suspended}. Their "
                 f"replies are kept: raise {self._plan.capped_by} and run the same command again",
             )
-        if ways["failed"] and not self._misses:
-            outcome.fail(1, f"{ways['failed']} trials failed")
+        if counts["failed"] and not self._misses:
+            outcome.fail(1, f"{counts['failed']} trials failed")
         return outcome
 
     async def estimate(self) -> Estimate:
@@ -384,10 +384,10 @@ class Sweep:
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             if isinstance(record, TrialSuspended):
-                self._progress.by_cell[spec.cell]["suspended"] += 1
+                self._progress.outcome_counts["suspended"] += 1
                 self._suspended = record
                 return
-            self._progress.by_cell[spec.cell][record.status] += 1
+            self._progress.outcome_counts[record.status] += 1
             self._misses += _misses(spec, record)
             flusher.add(record)
 
