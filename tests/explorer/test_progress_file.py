@@ -15,8 +15,8 @@ from merge_runner.results.progress_file import ProgressFile, clear_dead, read_st
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.progress import Progress
-from merge_runner.run.sweep import Sweep
 from tests.gate import HANGS_S
+from tests.harness import run_sweep
 
 NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
 LEDGER = SimpleNamespace(spending=Spending())
@@ -64,7 +64,7 @@ async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, m
     said = []
     monkeypatch.setattr(ProgressFile, "write", lambda _, standing: said.append(standing))
     plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0", "L_4_0"])
-    await Sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print).run()
+    await run_sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print)
     first, last = said[0], said[-1]
     assert (first.doing, last.doing) == ("playing", "checking")
     assert (first.trials, first.ended, last.ended, last.failed) == (4, 0, 4, 0)
