@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -379,12 +378,6 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
             "FROM decisions",
             "",
         )[0]
-        attempts = rows(
-            f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
-            "if(outcome = 'ok', coalesce(failure, outcome), outcome), model, provider, "
-            "count(*) FILTER (scripted), count(*) FROM attempts LEFT JOIN specs USING (spec_hash)",
-            "GROUP BY ALL ORDER BY ALL",
-        )
         asked = rows("SELECT 1 FROM trials", "WHERE source = 'seat' LIMIT 1")
         return SweepFacts(
             outcomes=rows(
@@ -399,7 +392,12 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 "FROM trials JOIN trial_levels USING (trial_id, spec_hash)",
                 "GROUP BY ALL ORDER BY ALL",
             ),
-            ledger=_ledger(attempts),
+            ledger=rows(
+                f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
+                "if(outcome = 'ok', coalesce(failure, outcome), outcome), count(*) FROM attempts "
+                "LEFT JOIN specs USING (spec_hash)",
+                "GROUP BY ALL ORDER BY ALL",
+            ),
             failed=rows(
                 "SELECT trial_id, error FROM trials", "WHERE status = 'failed' ORDER BY ALL"
             ),
@@ -408,7 +406,12 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 f"WHERE http_status = 200 AND {sql_of(other_models(connection))} "
                 "GROUP BY ALL ORDER BY ALL",
             ),
-            stand_ins=_stand_ins(attempts),
+            stand_ins=rows(
+                f"SELECT {DRIVER}, model, provider, count(*) FILTER (scripted), count(*) "  # noqa: S608 # constants
+                "FROM attempts LEFT JOIN specs USING (spec_hash)",
+                "WHERE fate IN ('driven', 'fallback') "
+                "GROUP BY ALL HAVING bool_or(scripted) ORDER BY ALL",
+            ),
             first_looks=asked
             and rows(
                 "SELECT driver, variant, model, side, velocity_mps, count(*), "  # noqa: S608 # constants
@@ -421,25 +424,6 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
             invalid=decisions[1],
             fallbacks=decisions[2],
         )
-
-
-def _ledger(attempts: Iterable[Row]) -> list[tuple[str, str, str, str, int]]:
-    """How many attempts a driver made with a prompt, by what became of them; see SweepFacts."""
-    counts: Counter[tuple[str, str, str, str]] = Counter()
-    for driver, variant, fate, outcome, *_, count in attempts:
-        counts[driver, variant, fate, outcome] += count
-    return [(*group, count) for group, count in counts.items()]
-
-
-def _stand_ins(attempts: Iterable[Row]) -> list[tuple[str, str, str, int, int]]:
-    """Who answered in whose name, of the answers that were driven; see SweepFacts."""
-    scripted: Counter[tuple[str, str, str]] = Counter()
-    answers: Counter[tuple[str, str, str]] = Counter()
-    for driver, _, fate, _, model, provider, by_stand_ins, count in attempts:
-        if fate in ("driven", "fallback"):
-            scripted[driver, model, provider] += by_stand_ins
-            answers[driver, model, provider] += count
-    return [(*who, count, answers[who]) for who, count in sorted(scripted.items()) if count]
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:
