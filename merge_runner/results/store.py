@@ -341,9 +341,9 @@ class SweepFacts:
     ``ledger`` (driver, variant, fate, outcome, attempts) as the view ``attempts`` names them,
     ``failed`` (trial_id, error), ``others`` (model requested, model served, answers) where another
     model answered, and ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
-    scripted stand-in answered. Where drivers were only asked, ``first_looks`` holds (driver,
-    variant, model that was asked, or program, side, own relative velocity in m/s, answers, invalid
-    ones, those with a tactical word, those with M, mean first action of valid ones in m/s^2).
+    scripted stand-in answered. Where drivers were only asked, ``first_looks`` says what was done
+    first by driver, variant, model that was asked, or program, side and own relative velocity; the
+    share of M is that among answers with a tactical word.
     """
 
     outcomes: list[tuple[str, str, str, str | None, bool, int]]
@@ -352,7 +352,7 @@ class SweepFacts:
     failed: list[tuple[str, str]]
     others: list[tuple[str, str, int]]
     stand_ins: list[tuple[str, str, str, int, int]]
-    first_looks: list[tuple[str, str, str, str, float, int, int, int, int, float | None]]
+    first_looks: list[dict[str, Any]]
     decisions: int
     invalid: int
     fallbacks: int
@@ -412,18 +412,25 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 "WHERE fate IN ('driven', 'fallback') "
                 "GROUP BY ALL HAVING bool_or(scripted) ORDER BY ALL",
             ),
-            first_looks=asked
-            and rows(
-                "SELECT driver, variant, model, side, velocity_mps, count(*), "  # noqa: S608 # constants
-                "count(*) FILTER (NOT valid), count(tactical), count(*) FILTER (tactical = 'M'), "
-                f"avg(action_mps2) FILTER (valid) FROM ({FIRST_LOOKS}) "
-                "JOIN trial_drivers USING (trial_id, spec_hash)",
-                "GROUP BY ALL ORDER BY ALL",
-            ),
+            first_looks=_first_looks(connection, sweep_id) if asked else [],
             decisions=decisions[0],
             invalid=decisions[1],
             fallbacks=decisions[2],
         )
+
+
+def _first_looks(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> list[dict[str, Any]]:
+    sql = f"""
+        SELECT driver, variant, model, side, velocity_mps AS relative_velocity_mps,
+            count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,
+            count(tactical) AS with_a_word,
+            count(*) FILTER (tactical = 'M') / nullif(count(tactical), 0) AS share_m,
+            avg(action_mps2) FILTER (valid) AS first_action_mps2
+        FROM ({FIRST_LOOKS}) JOIN trial_drivers USING (trial_id, spec_hash)
+        SEMI JOIN (FROM sweep_trials WHERE sweep_id = ?) USING (trial_id, spec_hash)
+        GROUP BY ALL ORDER BY ALL
+    """  # noqa: S608 # constants
+    return list(by_name(connection.execute(sql, [sweep_id])))
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:
