@@ -22,6 +22,7 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from distributed import Client, Future, Worker, get_worker
 from distributed.scheduler import KilledWorker
@@ -287,9 +288,10 @@ class DaskTasks:
     async def drain(self) -> None:
         """Stop the workers, and keep what their tasks have brought."""
         self._groups.clear()
-        with contextlib.suppress(OSError, TimeoutError, MergeRunnerError):
+        with contextlib.suppress(OSError):  # a timeout among them
             async with asyncio.timeout(GOODBYE_S):
                 await self._client.run(stop, self._run, on_error="ignore")
+        with contextlib.suppress(ClusterFailed):
             while self._tasks:
                 await self._look()
                 with contextlib.suppress(MergeRunnerError):  # the first error is told already
@@ -300,10 +302,13 @@ class DaskTasks:
         """Find out which workers there are; raises UsageError for one with another program."""
         try:
             self._threads = dict(await self._client.nthreads())
-            new = [address for address in self._threads if address not in self._ids]
-            told = await self._client.run(introduce, workers=new, on_error="return") if new else {}
         except OSError as exc:
             raise ClusterFailed(SCHEDULER_GONE) from exc
+        told: dict[str, Any] = {}
+        if new := [address for address in self._threads if address not in self._ids]:
+            with contextlib.suppress(OSError):  # one that hangs is asked again
+                async with asyncio.timeout(GOODBYE_S):
+                    told = await self._client.run(introduce, workers=new, on_error="return")
         for address, answer in told.items():
             if isinstance(answer, (ImportError, AttributeError)):
                 raise UsageError(
