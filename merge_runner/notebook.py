@@ -11,13 +11,12 @@ import asyncio
 import sys
 import threading
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypedDict, TypeVar, Unpack
 
-from merge_runner.config import resolve_endpoint
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.program_seat import Parameter, ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, Program
@@ -29,8 +28,7 @@ from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
 from merge_runner.run.recorded_plan import replayed
 from merge_runner.run.seat import first_situations, grid_conditions
-from merge_runner.run.sweep import Sweep
-from merge_runner.run.unsent import unsent
+from merge_runner.run.sweep import Sweep, open_sweep, unsent
 from merge_runner.study.crossing import level_text
 from merge_runner.text_safety import printable
 
@@ -233,7 +231,8 @@ class Study:
             plan, options, notes = replayed(plan, options, whole=whole)
             for note in notes:
                 _say(note)
-            return await _played(Sweep(plan, options, say=_say), options)
+            async with open_sweep(plan, options, say=_say) as prepared:
+                return await _played(prepared, options)
 
     dry_run, run = sync(adry_run), sync(arun)
     seat_first, replay = sync(aseat_first), sync(areplay)
@@ -241,7 +240,7 @@ class Study:
     async def _run(self, plan: Plan, *, yes: bool, **how: Unpack[RunOptions]) -> StudyOutcome:
         """Play what is not stored yet of a plan; ``yes`` lets it spend money."""
         options = self._options(plan, **how)
-        with closing(Sweep(plan, options, say=_say)) as prepared:
+        async with open_sweep(plan, options, say=_say) as prepared:
             if prepared.trials_to_play:
                 await _check(plan, prepared, may_spend=yes)
             return await _played(prepared, options)
@@ -266,9 +265,7 @@ def _alone() -> Iterator[None]:
 
 
 async def _check(plan: Plan, prepared: Sweep, *, may_spend: bool) -> None:
-    """Raise UsageError where a key is missing, or where money is spent without leave."""
-    for name, entry in plan.entries.items():
-        resolve_endpoint(name, entry)
+    """Raise UsageError where money is spent without leave."""
     if may_spend or all(entry.price == "free" for entry in plan.entries.values()):
         return
     expected = await prepared.estimate()

@@ -18,6 +18,8 @@ from merge_runner.emulator.server import HOST, application
 from merge_runner.llm.trial_costs import TrialCalls, TrialCosts
 from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 from merge_runner.registry import GROUP
+from merge_runner.run.plan import Options, Plan
+from merge_runner.run.sweep import Outcome, open_sweep
 
 PROJECT = Path(__file__).parent.parent
 PROGRAM = Path(sys.executable).with_name("merge-runner")
@@ -67,6 +69,12 @@ def environment(**changes: str) -> dict[str, str]:
     # Compiled modules are kept, or each of the many starts would compile them anew.
     kept.pop("PYTHONDONTWRITEBYTECODE", None)
     return {**kept, **changes}
+
+
+async def run_sweep(plan: Plan, options: Options, *, say: Callable[[str], None]) -> Outcome:
+    """Play a plan in this process."""
+    async with open_sweep(plan, options, say=say) as sweep:
+        return await sweep.run()
 
 
 def each(usd: float, model: str = "m") -> TrialCosts:

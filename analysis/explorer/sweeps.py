@@ -183,14 +183,14 @@ class ListedSweep:
     def ended(self) -> int:
         """How many of its trials have an outcome."""
         if self.live:
-            return sum(cell.ended for cell in self.live.cells)
+            return self.live.ended
         return int(self.row["trials"] - self.row["failed"])
 
     @property
     def failed(self) -> int:
         """How many of its trials ended without one."""
         if self.live:
-            return sum(cell.failed for cell in self.live.cells)
+            return self.live.failed
         return int(self.row["failed"])
 
     @property
@@ -217,10 +217,9 @@ class ListedSweep:
 
 @dataclass(frozen=True, slots=True)
 class VariantCondition:
-    """Trials of one variant, or arm, and condition; ``running`` is None where nobody knows.
+    """Stored trials of one variant, or arm, and condition, of those that were planned.
 
-    ``decisions`` and ``invalid`` are those of stored trials; ``state`` is the filter of the
-    variant's or arm's trials.
+    ``state`` is the filter of the variant's or arm's trials.
     """
 
     variant: str
@@ -228,8 +227,6 @@ class VariantCondition:
     planned: int = 0
     ended: int = 0
     failed: int = 0
-    running: int | None = 0
-    suspended: int = 0
     decisions: int = 0
     invalid: int = 0
     state: dict[str, str] = field(default_factory=dict)
@@ -354,18 +351,15 @@ def cells_of(entry: ListedSweep, stored: list[Row]) -> dict[tuple[str, str], Var
     arms = {arm.key: arm for arm in entry.config.arms}
     states = {arm.label: arm.state for arm in arms.values()}
     found = {(_label(row, arms), row["condition"]): row for row in stored}
-    told = {(cell.variant, cell.condition): cell for cell in entry.live.cells} if entry.live else {}
     cells = {}
     for key in planned | found:
-        row, now = found.get(key, {}), told.get(key)
+        row = found.get(key, {})
         cells[key] = VariantCondition(
             variant=key[0],
             condition=key[1],
             planned=planned.get(key, 0),
-            ended=now.ended if now else row.get("ended", 0),
-            failed=now.failed if now else row.get("failed", 0),
-            running=now.running if now else 0,
-            suspended=now.suspended if now else 0,
+            ended=row.get("ended", 0),
+            failed=row.get("failed", 0),
             decisions=row.get("decisions", 0),
             invalid=row.get("invalid", 0),
             state=states.get(key[0], {"variant": key[0]}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -52,7 +53,7 @@ def power(
     from analysis.table_format import TableFormat
     from analysis.tables.formats import render
     from merge_runner.run.plan import Options, make_plan
-    from merge_runner.run.unsent import of_all
+    from merge_runner.run.sweep import of_all
 
     plan = make_plan(
         study,
@@ -63,7 +64,7 @@ def power(
         only=levels(only or (), "--only"),
         trust=trust,
     )
-    expected = of_all(plan, Options(db=Path(db), cache=Path(cache)), say=say)
+    expected = asyncio.run(of_all(plan, Options(db=Path(db), cache=Path(cache)), say=say))
     found = chances(plan, expected, simulations=sims, seed=seed)
     if as_json:
         print_out(json.dumps(asdict(found), ensure_ascii=False))

@@ -17,7 +17,7 @@ from merge_runner.errors import UsageError
 if TYPE_CHECKING:
     from merge_runner.run.estimate import Estimate
     from merge_runner.run.plan import Options, Plan
-    from merge_runner.run.sweep import Sweep
+    from merge_runner.run.sweep import Outcome
 
 
 def check_money_and_replay(
@@ -40,7 +40,7 @@ def play(
     import asyncio
 
     from merge_runner.llm.models import shutdown_notes
-    from merge_runner.run.unsent import unsent
+    from merge_runner.run.sweep import unsent
 
     for note in plan.notes():
         say(note)
@@ -65,14 +65,16 @@ def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> int:
     import asyncio
 
     from merge_runner.run import summary
-    from merge_runner.run.sweep import INTERRUPTED, Sweep
+    from merge_runner.run.sweep import INTERRUPTED, open_sweep
 
-    prepared = Sweep(plan, options, say=say)
-    expected = None
-    if not options.replay and prepared.trials_to_play:
-        expected = _confirm(plan, prepared, yes=yes)
+    expected = None if options.replay else _confirm(plan, options, yes=yes)
+
+    async def run() -> Outcome:
+        async with open_sweep(plan, options, say=say) as sweep:
+            return await sweep.run()
+
     try:
-        outcome = asyncio.run(prepared.run())
+        outcome = asyncio.run(run())
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
         return INTERRUPTED
@@ -87,18 +89,21 @@ def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> int:
     return outcome.exit_code
 
 
-def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
-    """Check the keys, say what a live run of a paid model will cost, and ask once."""
+def _confirm(plan: Plan, options: Options, *, yes: bool) -> Estimate | None:
+    """Say what a live run of a paid model will cost, and ask once; None where there is no cost."""
     import asyncio
 
     from merge_runner.config import resolve_endpoint
+    from merge_runner.run.sweep import unsent
 
-    for name, entry in plan.entries.items():
-        if not plan.is_rehearsal:
-            resolve_endpoint(name, entry)
     if all(entry.price == "free" for entry in plan.entries.values()):
         return None
-    expected = asyncio.run(prepared.estimate())
+    expected = asyncio.run(unsent(plan, options, say=say))
+    if not expected.trials:
+        return None
+    if not plan.is_rehearsal:
+        for name, entry in plan.entries.items():
+            resolve_endpoint(name, entry)  # raises where its key is missing
     cost = "an unknown price" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
     takes = f"{cost}, {expected.minutes} minutes or more"
     if (batch := expected.batch) is not None:
@@ -121,9 +126,7 @@ def _confirm(plan: Plan, prepared: Sweep, *, yes: bool) -> Estimate | None:
 
 
 def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
-    from dataclasses import asdict, astuple
-
-    from merge_runner.results.query_output import write_table
+    from dataclasses import asdict
 
     if as_json:
         print_out(json.dumps(asdict(expected)))
@@ -152,12 +155,4 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         )
     if expected.trials_within_cap is not None:
         print_out(f"cap     buys about {expected.trials_within_cap} trials")
-    if len(expected.cells) > 1:
-        headings = ["cell", "trials", "calls", "tokens in", "tokens out"]
-        headings += [f"{what}{singly}" for what in ("USD", "minutes")]
-        write_table(
-            [*headings, "trials within the cap"],
-            [tuple("" if v is None else v for v in astuple(c)) for c in expected.cells],
-            sys.stdout,
-        )
     print_out("Nothing was sent.")

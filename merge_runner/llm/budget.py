@@ -27,9 +27,8 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger, Spending
-from merge_runner.llm.shared_services import CachePort
 from merge_runner.llm.trial_costs import TrialCosts
 from merge_runner.records import Attempt
 
@@ -166,13 +165,6 @@ class Budget:
         self._left.add(trial)
         if self._begun.pop(trial, None) is not None:
             self._tell()
-
-    def readmit(self, trials: Iterable[int]) -> None:
-        """The worker that played these trials is gone, and they may be admitted anew."""
-        for trial in trials:
-            self._begun.pop(trial, None)
-            self._left.discard(trial)
-        self._tell()
 
     @asynccontextmanager
     async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[PaidAttempt]:
@@ -352,7 +344,7 @@ async def _told(place: _Place) -> float:
 class Unpaid:
     """The budget of a model that costs nothing: only replies and attempts are kept."""
 
-    cache: CachePort
+    cache: ResponseCache
 
     async def admit(self, trial: int) -> None:
         """Every trial may begin."""
@@ -380,7 +372,7 @@ class Unpaid:
 class UnpaidAttempt:
     """One attempt that costs nothing; see PaidAttempt."""
 
-    cache: CachePort
+    cache: ResponseCache
     key: str
     aside_usd: float = 0.0
 

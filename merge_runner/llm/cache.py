@@ -254,6 +254,20 @@ class ResponseCache:
         text = self.read(_UNANSWERED + key)
         return () if text is None else _attempts(text)
 
+    def all_unanswered(self) -> dict[str, tuple[Attempt, ...]]:
+        """The attempts at all calls without an answer, by call key."""
+        keys = (name.removeprefix(_UNANSWERED) for name in self.names(_UNANSWERED))
+        return {key: self.unanswered(key) for key in keys}
+
+    def keep_all(
+        self, entries: Iterable[CachedCall], unanswered: Mapping[str, tuple[Attempt, ...]]
+    ) -> None:
+        """An operation: keep entries, and the attempts at calls that have no answer yet."""
+        for entry in entries:
+            self._keep(entry)
+        for key, attempts in unanswered.items():
+            self.keep_unanswered(key, attempts)
+
     def keep_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """An operation: keep the attempts at a call that has no answer yet."""
         self._store.set(_UNANSWERED + key, _behind_checksum(ATTEMPTS.dump_json(attempts).decode()))

@@ -24,8 +24,8 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.batches import Batches
 from merge_runner.llm.batch.lines import LineEnd
-from merge_runner.llm.budget import Unpaid
-from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid, UnpaidAttempt
+from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Call, Wait, slot_text
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
@@ -44,9 +44,9 @@ from merge_runner.llm.http_outcome import (
     may_be_charged,
 )
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked
+from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import cost_usd
-from merge_runner.llm.shared_services import AttemptPort, BudgetPort, CachePort, RateLimitPort
 from merge_runner.llm.verify import reply_object
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -88,10 +88,10 @@ class LlmClient:
     name: str
     entry: ModelEntry
     endpoint: str
-    cache: CachePort
+    cache: ResponseCache
     transport: HttpTransport | None
-    limiter: RateLimitPort
-    budget: BudgetPort | None = None
+    limiter: Limiter
+    budget: Budget | None = None
     sealed: bool = False
     strict: bool = False
     model: str = ""
@@ -101,7 +101,7 @@ class LlmClient:
     driver: str = field(init=False)
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
-    _money: BudgetPort = field(init=False)
+    _money: Budget | Unpaid = field(init=False)
     _consequences: Consequences = field(init=False)
     _calls: dict[str, Call] = field(default_factory=dict)
     _stopping: bool = False
@@ -310,7 +310,7 @@ class LlmClient:
             return await self._attempt_in_batch(call, self.batches)
         async with AsyncExitStack() as stack:
             with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid = await stack.enter_async_context(
+                paid: PaidAttempt | UnpaidAttempt = await stack.enter_async_context(
                     self._money.attempt(call.order, call.request.key, call.asked)
                 )
             # A turn must be used as soon as it is given, or the limits do not hold.
@@ -351,7 +351,7 @@ class LlmClient:
     async def _concluded(
         self,
         call: Call,
-        paid: AttemptPort,
+        paid: PaidAttempt | UnpaidAttempt,
         outcome: AttemptOutcome,
         raw: RawReply | None,
         record: Attempt,

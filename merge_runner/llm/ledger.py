@@ -8,7 +8,7 @@ case until a user releases it, and stands in the call's list of attempts with an
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
@@ -199,11 +199,43 @@ class Ledger:
             entry, lambda: self._settle(key, entry.attempts, worst_usd, asked)
         )
 
+    def reserve_share(self, name: str, asked: Asked) -> None:
+        """An operation: reserve a task's share of the cap, as if it were one attempt."""
+        spending = self.read()
+        spending.reserved_usd += asked.honest_usd
+        spending.open_attempts += 1
+        self._write(spending)
+        self._write_open(name, [SetAside(asked.honest_usd, asked, _now())])
+
+    def settle_share(
+        self, name: str, task: Spending, opened: Mapping[str, Sequence[SetAside]]
+    ) -> None:
+        """An operation: put what a task has spent, and has open, in the place of its share."""
+        spending = self.read()
+        share = self._opened(name)  # none where a user has released it
+        spending.spent_usd += task.spent_usd
+        spending.reserved_usd += task.reserved_usd - sum(each.usd for each in share)
+        spending.open_attempts += task.open_attempts - len(share)
+        if not spending.open_attempts:
+            spending.reserved_usd = 0.0  # what is left is rounding
+        spending.overrun_usd += task.overrun_usd
+        for driver, ratio in task.overruns.items():
+            spending.overruns[driver] = max(ratio, spending.times(driver))
+        self._write(spending)
+        self._write_open(name, [])
+        for key, attempts in opened.items():
+            self._write_open(key, [*self._opened(key), *attempts])
+
+    def opened(self) -> dict[str, list[SetAside]]:
+        """The attempts without a known cost, by call key."""
+        keys = (name.removeprefix(self._open) for name in self._cache.names(self._open))
+        return {key: self._opened(key) for key in keys}
+
     def reasons(self) -> list[Reason]:
         """Why something is set aside, the largest sum first."""
         found: dict[tuple[str, str], Reason] = {}
-        for name in self._cache.names(self._open):
-            for one in self._opened(name.removeprefix(self._open)):
+        for attempts_of_call in self.opened().values():
+            for one in attempts_of_call:
                 driver = one.asked.driver
                 found.setdefault((driver, one.outcome), Reason(driver, one.outcome)).add(one)
         spending = self.read()

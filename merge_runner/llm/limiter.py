@@ -13,14 +13,16 @@ import asyncio
 import contextlib
 import heapq
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
 from asyncio_throttle.throttler import Throttler
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.shared_services import Settle
 
+# Replaces the estimate with which a request was let through by the tokens that it used.
+Settle = Callable[[int], None]
 WINDOW_S = 60.0
 BURST_S = 0.5
 CLOCK_STEP_S, POLL_S = 1e-6, 1e-3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from concurrent.futures import ThreadPoolExecutor
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.formats.base import as_dict, as_dicts, as_text
@@ -15,20 +14,14 @@ TIMEOUT_S = 60.0
 POLL_S = 0.5
 
 
-def listed_models(endpoint: Endpoint, *, patient: bool = False) -> list[str]:
+async def listed_models(endpoint: Endpoint, *, patient: bool = False) -> list[str]:
     """Return the ids of the models; raises TransportFailure, ``no_list`` if there is no list.
 
     A ``patient`` one waits some seconds for a server that is just starting.
     """
-    # In a thread of its own, since the caller may be in an event loop.
-    with ThreadPoolExecutor(1) as thread:
-        return thread.submit(asyncio.run, _listed(endpoint, NOBODY_S if patient else 0.0)).result()
-
-
-async def _listed(endpoint: Endpoint, patience_s: float) -> list[str]:
     transport = HttpTransport(endpoint, connections=1)
     try:
-        return _ids(await _reply(transport, patience_s))
+        return _ids(await _reply(transport, NOBODY_S if patient else 0.0))
     finally:
         await transport.close()
 

@@ -29,33 +29,10 @@ MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 @dataclass(frozen=True, slots=True)
-class CellStanding:
-    """Trials of one prompt variant and condition: planned, stored before this run, and this run's.
-
-    ``suspended`` ones wait for money. ``running`` is None where only the workers know.
-    """
-
-    variant: str
-    condition: str
-    planned: NonNegativeInt
-    stored: NonNegativeInt = 0
-    running: NonNegativeInt | None = None
-    finished: NonNegativeInt = 0
-    collided: NonNegativeInt = 0
-    timeout: NonNegativeInt = 0
-    failed: NonNegativeInt = 0
-    suspended: NonNegativeInt = 0
-
-    @property
-    def ended(self) -> int:
-        """Trials with an outcome, from all runs."""
-        return self.stored + self.finished + self.collided + self.timeout
-
-
-@dataclass(frozen=True, slots=True)
 class Standing:
     """Where a sweep stands. ``committed_usd`` counts against ``cap_usd``, over all runs.
 
+    ``ended`` trials have an outcome, those that were ``stored_before`` this run among them.
     ``waiting`` says what its calls wait for, ``warnings`` what its user should know. ``left_s`` is
     the estimated time left, None while there is no estimate.
     """
@@ -72,7 +49,8 @@ class Standing:
     stored_before: NonNegativeInt
     running: NonNegativeInt
     workers: NonNegativeInt | None
-    cells: tuple[CellStanding, ...]
+    ended: NonNegativeInt
+    failed: NonNegativeInt
     calls_live: NonNegativeInt
     calls_cached: NonNegativeInt
     cost_usd: float

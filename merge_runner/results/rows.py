@@ -6,13 +6,16 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import fields
 from datetime import datetime
+from operator import attrgetter
 from typing import Any
 
 from merge_runner.records import (
     Attempt,
     ChatRequest,
     Observation,
+    StateRow,
     TrialRecord,
     TrialSpec,
     is_scripted,
@@ -20,6 +23,8 @@ from merge_runner.records import (
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 Row = tuple[Any, ...]
+# The fields of a state are its columns; dataclasses.astuple would copy each value.
+_state = attrgetter(*(field.name for field in fields(StateRow)))
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
 
@@ -69,15 +74,7 @@ def state_rows(record: TrialRecord) -> Iterator[Row]:
     """Rows of ``states``."""
     key = (record.spec.trial_id, record.spec.spec_hash)
     for row in record.states:
-        yield (
-            *key,
-            row.step,
-            row.time_s,
-            row.side,
-            row.position_m,
-            row.velocity_mps,
-            row.acceleration_mps2,
-        )
+        yield (*key, *_state(row))
 
 
 def decision_rows(record: TrialRecord) -> Iterator[Row]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -342,9 +341,9 @@ class SweepFacts:
     ``ledger`` (driver, variant, fate, outcome, attempts) as the view ``attempts`` names them,
     ``failed`` (trial_id, error), ``others`` (model requested, model served, answers) where another
     model answered, and ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
-    scripted stand-in answered. Where drivers were only asked, ``first_looks`` holds (driver,
-    variant, model that was asked, or program, side, own relative velocity in m/s, answers, invalid
-    ones, those with a tactical word, those with M, mean first action of valid ones in m/s^2).
+    scripted stand-in answered. Where drivers were only asked, ``first_looks`` says what was done
+    first by driver, variant, model that was asked, or program, side and own relative velocity; the
+    share of M is that among answers with a tactical word.
     """
 
     outcomes: list[tuple[str, str, str, str | None, bool, int]]
@@ -353,7 +352,7 @@ class SweepFacts:
     failed: list[tuple[str, str]]
     others: list[tuple[str, str, int]]
     stand_ins: list[tuple[str, str, str, int, int]]
-    first_looks: list[tuple[str, str, str, str, float, int, int, int, int, float | None]]
+    first_looks: list[dict[str, Any]]
     decisions: int
     invalid: int
     fallbacks: int
@@ -379,12 +378,6 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
             "FROM decisions",
             "",
         )[0]
-        attempts = rows(
-            f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
-            "if(outcome = 'ok', coalesce(failure, outcome), outcome), model, provider, "
-            "count(*) FILTER (scripted), count(*) FROM attempts LEFT JOIN specs USING (spec_hash)",
-            "GROUP BY ALL ORDER BY ALL",
-        )
         asked = rows("SELECT 1 FROM trials", "WHERE source = 'seat' LIMIT 1")
         return SweepFacts(
             outcomes=rows(
@@ -399,7 +392,12 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 "FROM trials JOIN trial_levels USING (trial_id, spec_hash)",
                 "GROUP BY ALL ORDER BY ALL",
             ),
-            ledger=_ledger(attempts),
+            ledger=rows(
+                f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
+                "if(outcome = 'ok', coalesce(failure, outcome), outcome), count(*) FROM attempts "
+                "LEFT JOIN specs USING (spec_hash)",
+                "GROUP BY ALL ORDER BY ALL",
+            ),
             failed=rows(
                 "SELECT trial_id, error FROM trials", "WHERE status = 'failed' ORDER BY ALL"
             ),
@@ -408,38 +406,31 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 f"WHERE http_status = 200 AND {sql_of(other_models(connection))} "
                 "GROUP BY ALL ORDER BY ALL",
             ),
-            stand_ins=_stand_ins(attempts),
-            first_looks=asked
-            and rows(
-                "SELECT driver, variant, model, side, velocity_mps, count(*), "  # noqa: S608 # constants
-                "count(*) FILTER (NOT valid), count(tactical), count(*) FILTER (tactical = 'M'), "
-                f"avg(action_mps2) FILTER (valid) FROM ({FIRST_LOOKS}) "
-                "JOIN trial_drivers USING (trial_id, spec_hash)",
-                "GROUP BY ALL ORDER BY ALL",
+            stand_ins=rows(
+                f"SELECT {DRIVER}, model, provider, count(*) FILTER (scripted), count(*) "  # noqa: S608 # constants
+                "FROM attempts LEFT JOIN specs USING (spec_hash)",
+                "WHERE fate IN ('driven', 'fallback') "
+                "GROUP BY ALL HAVING bool_or(scripted) ORDER BY ALL",
             ),
+            first_looks=_first_looks(connection, sweep_id) if asked else [],
             decisions=decisions[0],
             invalid=decisions[1],
             fallbacks=decisions[2],
         )
 
 
-def _ledger(attempts: Iterable[Row]) -> list[tuple[str, str, str, str, int]]:
-    """How many attempts a driver made with a prompt, by what became of them; see SweepFacts."""
-    counts: Counter[tuple[str, str, str, str]] = Counter()
-    for driver, variant, fate, outcome, *_, count in attempts:
-        counts[driver, variant, fate, outcome] += count
-    return [(*group, count) for group, count in counts.items()]
-
-
-def _stand_ins(attempts: Iterable[Row]) -> list[tuple[str, str, str, int, int]]:
-    """Who answered in whose name, of the answers that were driven; see SweepFacts."""
-    scripted: Counter[tuple[str, str, str]] = Counter()
-    answers: Counter[tuple[str, str, str]] = Counter()
-    for driver, _, fate, _, model, provider, by_stand_ins, count in attempts:
-        if fate in ("driven", "fallback"):
-            scripted[driver, model, provider] += by_stand_ins
-            answers[driver, model, provider] += count
-    return [(*who, count, answers[who]) for who, count in sorted(scripted.items()) if count]
+def _first_looks(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> list[dict[str, Any]]:
+    sql = f"""
+        SELECT driver, variant, model, side, velocity_mps AS relative_velocity_mps,
+            count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,
+            count(tactical) AS with_a_word,
+            count(*) FILTER (tactical = 'M') / nullif(count(tactical), 0) AS share_m,
+            avg(action_mps2) FILTER (valid) AS first_action_mps2
+        FROM ({FIRST_LOOKS}) JOIN trial_drivers USING (trial_id, spec_hash)
+        SEMI JOIN (FROM sweep_trials WHERE sweep_id = ?) USING (trial_id, spec_hash)
+        GROUP BY ALL ORDER BY ALL
+    """  # noqa: S608 # constants
+    return list(by_name(connection.execute(sql, [sweep_id])))
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:

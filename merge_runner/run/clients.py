@@ -31,7 +31,6 @@ from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import is_known
-from merge_runner.llm.shared_services import BudgetPort, CachePort, RateLimitPort
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan, most_prompts
 from merge_runner.run.rehearsal import SPEED, behaviour
@@ -45,24 +44,14 @@ class EndpointPlan:
     """How the endpoints of a sweep are asked; ``urls`` maps variables to base URLs.
 
     ``emulator`` says how the emulator of this process behaves, None where none is needed. ``known``
-    names the models whose endpoint has ever given an answer in its format, ``passed``
-    those where it has done so in this run. With ``strict``, an answer from another model than the
-    one requested stops the run.
+    names the models whose endpoint has ever given an answer in its format, and ``measured`` is what
+    the cache knows about each model's answers to similar requests.
     """
 
     urls: Mapping[str, str]
-    emulator: FaultPlan | None = None
-    strict: bool = False
-    known: frozenset[str] = frozenset()
-    passed: frozenset[str] = frozenset()
-
-
-@dataclass(frozen=True, slots=True)
-class LocalServices:
-    """What the clients of a run share: the rate limiter of each model, and the budget."""
-
-    limiters: Mapping[str, Limiter]
-    budget: Budget
+    emulator: FaultPlan | None
+    known: frozenset[str]
+    measured: Mapping[str, CallTotals]
 
 
 def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
@@ -81,18 +70,55 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     }
 
 
-def open_services(
+def _limiters(plan: Plan, options: Options, share: float) -> dict[str, Limiter]:
+    """The rate limiter of each entry, with a share of its model's limits."""
+    # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
+    pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
+    # An account's limits are those of a model, with whatever parameters it is asked.
+    by_model: dict[str, Limiter] = {}
+    for name, entry in plan.entries.items():
+        if plan.registered[name] not in by_model:
+            rpm, tpm = (limit and max(1, int(limit * share)) for limit in options.rates(entry))
+            by_model[plan.registered[name]] = Limiter(
+                rpm=rpm,
+                tpm=tpm,
+                pause=pauses[plan.endpoints[name]],
+                window_s=WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S,
+            )
+    return {name: by_model[plan.registered[name]] for name in plan.entries}
+
+
+def endpoint_plan(
+    plan: Plan, options: Options, known: frozenset[str], measured: Mapping[str, CallTotals]
+) -> EndpointPlan:
+    """Return how the endpoints of a plan's models are asked; see EndpointPlan for the last two."""
+    emulated = any(entry.provider == "emulator" for entry in plan.entries.values())
+    if plan.is_rehearsal:
+        emulator: FaultPlan | None = behaviour(plan)
+    else:
+        runs = bool(os.environ.get("EMULATOR_BASE_URL"))  # and is the one to ask
+        emulator = options.faults if emulated and not runs else None
+    return EndpointPlan(base_urls(plan.entries), emulator, known, measured)
+
+
+def live_clients(
     plan: Plan,
     options: Options,
+    endpoint_plan: EndpointPlan,
     cache: ResponseCache,
     ledger: Ledger,
-    measured: Mapping[str, CallTotals],
-) -> LocalServices:
-    """The services of a run.
+    *,
+    stack: AsyncExitStack,
+    rounds: Rounds | None = None,
+    share: float = 1.0,
+) -> dict[str, LlmClient]:
+    """Clients with connections, closed with ``stack``, and a share of the rate limits.
 
-    ``measured`` is what the cache knows about each model's earlier answers to similar requests.
-    Raises UsageError where a cap could not be enforced.
+    ``rounds`` are those of this run, which get the batch modes of its models. Raises UsageError
+    where a key is missing, or a cap could not be enforced.
     """
+    from merge_runner.llm.http import HttpTransport
+
     for name, entry in plan.entries.items():
         if options.max_cost_usd is not None and not is_known(entry):
             raise UsageError(
@@ -101,53 +127,10 @@ def open_services(
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
-    # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
-    pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
-    # An account's limits are those of a model, with whatever parameters it is asked.
-    by_model: dict[str, Limiter] = {}
-    limiters = {}
-    for name, entry in plan.entries.items():
-        model = plan.registered[name]
-        if model not in by_model:
-            rpm, tpm = options.rates(entry)
-            window_s = WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S
-            pause = pauses[plan.endpoints[name]]
-            by_model[model] = Limiter(rpm=rpm, tpm=tpm, pause=pause, window_s=window_s)
-        limiters[name] = by_model[model]
-    costs = trial_costs(plan, measured, batch=options.batch)
+    costs = trial_costs(plan, endpoint_plan.measured, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
-    return LocalServices(limiters=limiters, budget=budget)
-
-
-def endpoint_plan(plan: Plan, options: Options, known: frozenset[str]) -> EndpointPlan:
-    """Return how the endpoints of a plan's models are asked; see EndpointPlan for ``known``."""
-    emulated = any(entry.provider == "emulator" for entry in plan.entries.values())
-    if plan.is_rehearsal:
-        emulator: FaultPlan | None = behaviour(plan)
-    else:
-        runs = bool(os.environ.get("EMULATOR_BASE_URL"))  # and is the one to ask
-        emulator = options.faults if emulated and not runs else None
-    return EndpointPlan(base_urls(plan.entries), emulator, options.strict_model, known)
-
-
-def live_clients(
-    plan: Plan,
-    endpoint_plan: EndpointPlan,
-    cache: CachePort,
-    limiters: Mapping[str, RateLimitPort],
-    budget: BudgetPort,
-    *,
-    connections: int,
-    stack: AsyncExitStack,
-    rounds: Rounds | None = None,
-) -> dict[str, LlmClient]:
-    """Clients with connections, closed with ``stack``. Raises UsageError where a key is missing.
-
-    ``rounds`` are those of this run, which get the batch modes of its models.
-    """
-    from merge_runner.llm.http import HttpTransport
-
-    _allow_open_files(connections + SPARE_FILES)
+    limiters = _limiters(plan, options, share)
+    _allow_open_files(options.connections + SPARE_FILES)
     in_process = None
     if endpoint_plan.emulator is not None:
         from merge_runner.emulator.handler import Emulator, InProcess
@@ -162,7 +145,7 @@ def live_clients(
             check_network(endpoint.base_url)
             transports[model] = HttpTransport(
                 endpoint,
-                connections=connections,
+                connections=options.connections,
                 most_bytes=int(entry.max_reply_mb * 1e6),
                 carrier=in_process if endpoint.is_emulator else None,
             )
@@ -177,14 +160,14 @@ def live_clients(
             transport=transports[model],
             limiter=limiters[name],
             budget=None if entry.price == "free" else budget,
-            strict=endpoint_plan.strict,
+            strict=options.strict_model,
             model=model,
             first=FirstCall(
                 # A round is asked at once: no call of it waits for another one's answer.
-                passed=name in endpoint_plan.passed or (rounds is not None and rounds.submits),
+                passed=rounds is not None and rounds.submits,
                 known=name in endpoint_plan.known,
             ),
-            batches=_batches(model, entry, cache, budget, rounds),
+            batches=_batches(model, entry, budget, cache, rounds),
         )
     return clients
 
@@ -196,11 +179,11 @@ def _endpoint(plan: Plan, name: str, urls: Mapping[str, str]) -> Endpoint:
 
 
 def _batches(
-    model: str, entry: ModelEntry, cache: CachePort, budget: BudgetPort, rounds: Rounds | None
+    model: str, entry: ModelEntry, budget: Budget, cache: ResponseCache, rounds: Rounds | None
 ) -> Batches | None:
-    """The batches in which a model is asked; None where it has none, and on a cluster."""
+    """The batches in which a model is asked; None where it has none."""
     terms = batch_terms(entry)
-    if rounds is None or terms is None or not isinstance(budget, Budget):
+    if rounds is None or terms is None:
         return None
     money = Unpaid(cache) if entry.price == "free" else budget
     return Batches(rounds, model, budget.ledger.scope, money, terms.price_factor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
@@ -27,31 +27,13 @@ PROMPT_MARGIN = 1.25
 
 @dataclass(frozen=True, slots=True)
 class Todo:
-    """What a cell has yet to do: trials that are neither stored nor recorded, and their calls.
+    """What an arm has yet to do: trials that are neither stored nor recorded, and their calls.
 
     ``calls`` is roughly how many each model has yet to answer.
     """
 
     trials: int
     calls: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class CellEstimate:
-    """The part of one cell: trials, calls, tokens, USD (None: unknown) and minutes if alone.
-
-    ``trials_within_cap`` is how many of the trials the money that is left buys, if it is spread
-    evenly over what all cells have yet to do.
-    """
-
-    cell: str
-    trials: int
-    calls: int
-    input_tokens: int
-    output_tokens: int
-    cost_usd: float | None
-    minutes: float
-    trials_within_cap: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,30 +67,23 @@ class Estimate:
     free: bool
     measured: tuple[str, ...]
     trials_within_cap: int | None
-    cells: tuple[CellEstimate, ...]
     batch: BatchEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Calls:
-    """How many calls a model of the registry has yet to answer in one cell, and what one takes.
+    """How many calls a model of the registry has yet to answer in one arm, and what one takes.
 
     A run pays a ``part`` of their price: less than all of it in batches.
     """
 
+    arm: str
     model: str
     entry: ModelEntry
     number: int
-    each: _PerCall
+    usage: Usage
+    latency_s: float
     part: float
-
-    @property
-    def usage(self) -> Usage:
-        return self.each.usage
-
-    @property
-    def latency_s(self) -> float:
-        return self.each.latency_s
 
     @property
     def cost_usd(self) -> float | None:
@@ -120,14 +95,6 @@ class _Calls:
     def paid_usd(self) -> float | None:
         """What the run pays for them."""
         return None if self.cost_usd is None else self.cost_usd * self.part
-
-
-@dataclass(frozen=True, slots=True)
-class _PerCall:
-    """The tokens of a call and its latency in s, as measured or as listed in the registry."""
-
-    usage: Usage
-    latency_s: float
 
 
 def estimate(
@@ -144,38 +111,33 @@ def estimate(
     endpoint, ``spending`` what counts against the caps already.
     """
     arms = plan.by_label()
-    calls = {
-        label: _calls(plan, arms[label], cell.calls, facts, batch=options.batch)
-        for label, cell in todo.items()
-    }
-    whole = [made for cell in calls.values() for made in cell]
-    shares = {
-        label: _share_within(options.max_cost_usd, spending, cell, whole)
-        for label, cell in calls.items()
-    }
-    cells = tuple(
-        CellEstimate(
+    calls = [
+        _Calls(
             label,
-            cell.trials,
-            *_sums(calls[label]),
-            minutes=_minutes(options, cell.trials, calls[label]),
-            trials_within_cap=_within({label: shares[label]}, todo),
+            plan.registered[name],
+            entry,
+            round(each.calls[name]),
+            *_per_call(plan, arms[label], entry, facts[name]),
+            price_factor(entry) if options.batch else 1.0,
         )
-        for label, cell in todo.items()
-    )
-    trials = sum(cell.trials for cell in todo.values())
+        for label, each in todo.items()
+        for name, entry in arms[label].entries.items()
+    ]
+    trials = sum(each.trials for each in todo.values())
     return Estimate(
         plan.driver,
         trials,
-        *_sums(whole),
-        minutes=_minutes(options, trials, whole),
+        calls=sum(each.number for each in calls),
+        input_tokens=sum(each.number * (each.usage.input_tokens or 0) for each in calls),
+        output_tokens=sum(each.number * (each.usage.output_tokens or 0) for each in calls),
+        cost_usd=_rounded_sum(each.cost_usd for each in calls),
+        minutes=_minutes(options, trials, calls),
         free=all(entry.price == "free" for entry in plan.entries.values()),
         measured=tuple(
             driver_name(name, plan.endpoints[name]) for name in plan.entries if facts[name].measured
         ),
-        trials_within_cap=_within(shares, todo),
-        cells=cells,
-        batch=_in_batches(plan, whole) if options.batch else None,
+        trials_within_cap=_within(options.max_cost_usd, spending, todo, calls),
+        batch=_in_batches(plan, calls) if options.batch else None,
     )
 
 
@@ -186,69 +148,29 @@ def price_factor(entry: ModelEntry) -> float:
 
 
 def _in_batches(plan: Plan, calls: Sequence[_Calls]) -> BatchEstimate:
-    costs = [each.paid_usd for each in calls]
-    known = [cost for cost in costs if cost is not None]
     return BatchEstimate(
-        cost_usd=round(sum(known), 2) if len(known) == len(costs) else None,
+        cost_usd=_rounded_sum(each.paid_usd for each in calls),
         rounds=max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0),
         most_rounds=max(map(most_prompts, plan.arms), default=0),
     )
 
 
-def _calls(
-    plan: Plan,
-    arm: Arm,
-    calls: Mapping[str, float],
-    facts: Mapping[str, CallTotals],
-    *,
-    batch: bool,
-) -> list[_Calls]:
-    return [
-        _Calls(
-            plan.registered[name],
-            entry,
-            round(calls[name]),
-            _per_call(plan, arm, entry, facts[name]),
-            price_factor(entry) if batch else 1.0,
-        )
-        for name, entry in arm.entries.items()
-    ]
+def _rounded_sum(costs: Iterable[float | None]) -> float | None:
+    """The sum to a cent; None where a price is unknown."""
+    known = list(costs)
+    return None if None in known else round(sum(cost or 0.0 for cost in known), 2)
 
 
-def _sums(calls: Sequence[_Calls]) -> tuple[int, int, int, float | None]:
-    """The sums of calls, input tokens, output tokens and USD."""
-    costs = [each.cost_usd for each in calls]
-    known = [cost for cost in costs if cost is not None]
-    return (
-        sum(each.number for each in calls),
-        sum(each.number * (each.usage.input_tokens or 0) for each in calls),
-        sum(each.number * (each.usage.output_tokens or 0) for each in calls),
-        round(sum(known), 2) if len(known) == len(costs) else None,
-    )
-
-
-def _share_within(
-    cap_usd: float | None, spending: Spending, calls: Sequence[_Calls], whole: Sequence[_Calls]
-) -> float | None:
-    """Return the part of a cell's calls that the money left buys; None without a cap or a price.
-
-    The money is spread evenly over what the ``whole`` run costs.
-    """
-    if cap_usd is None or any(each.cost_usd is None for each in whole):
+def _within(
+    cap_usd: float | None, spending: Spending, todo: Mapping[str, Todo], calls: Sequence[_Calls]
+) -> int | None:
+    """How many trials the money left buys, spread evenly; None without a cap or a price."""
+    if cap_usd is None or any(each.cost_usd is None for each in calls):
         return None
-    if not _usd(calls):
-        return 1.0
-    return max(0.0, min(1.0, (cap_usd - spending.committed_usd) / _usd(whole)))
-
-
-def _usd(calls: Sequence[_Calls]) -> float:
-    return sum(each.paid_usd or 0.0 for each in calls)
-
-
-def _within(shares: Mapping[str, float | None], todo: Mapping[str, Todo]) -> int | None:
-    """How many trials of cells the money left buys, each cell by its part."""
-    known = [todo[label].trials * share for label, share in shares.items() if share is not None]
-    return int(sum(known)) if known and len(known) == len(shares) else None
+    usd = sum(each.paid_usd or 0.0 for each in calls)
+    paid = {each.arm for each in calls if each.paid_usd}
+    share = max(0.0, min(1.0, (cap_usd - spending.committed_usd) / usd)) if usd else 1.0
+    return int(sum(t.trials * (share if label in paid else 1.0) for label, t in todo.items()))
 
 
 def _minutes(options: Options, trials: int, calls: Sequence[_Calls]) -> float:
@@ -308,14 +230,14 @@ def _measured_usage(totals: CallTotals) -> Usage:
     )
 
 
-def _per_call(plan: Plan, arm: Arm, entry: ModelEntry, facts: CallTotals) -> _PerCall:
+def _per_call(plan: Plan, arm: Arm, entry: ModelEntry, facts: CallTotals) -> tuple[Usage, float]:
+    """The tokens of a call and its latency in s, as measured or as listed in the registry."""
     if facts.measured:
-        latency_s = facts.mean_latency_s or entry.typical_latency_s
-        return _PerCall(_measured_usage(facts), latency_s)
+        return _measured_usage(facts), facts.mean_latency_s or entry.typical_latency_s
     # English has about 4 bytes a token.
     prompt_tokens = len(typical_prompt(plan, arm).encode()) // 4
     usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
-    return _PerCall(usage, entry.typical_latency_s)
+    return usage, entry.typical_latency_s
 
 
 def _limited_s(options: Options, calls: _Calls) -> float:

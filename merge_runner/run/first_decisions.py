@@ -84,6 +84,12 @@ class FirstDecisions:
         self._add_invalid(model, 1, decision.failure, text)
         self._check(model)
 
+    def for_a_task(self) -> FirstDecisions:
+        """Those of another process, which knows which models have decided validly."""
+        first = FirstDecisions(self._most_invalid, one_by_one=self._one_by_one)
+        first._valid |= self._valid  # of this class
+        return first
+
     def add_stored(
         self, model: str, valid: int, invalid: int, failure: str | None, text: str | None
     ) -> None:

@@ -7,16 +7,15 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Protocol
 
 from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import TrialSuspended
+from merge_runner.errors import ProviderDown, TrialSuspended
 from merge_runner.llm.call import Wait
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
-from merge_runner.records import SIDES, Cell, ChatReply, Slot, TrialRecord, TrialSpec
+from merge_runner.records import SIDES, ChatReply, Slot, TrialRecord, TrialSpec
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.plan import Plan
 from merge_runner.run.scheduler import Gate, run_bounded
@@ -33,64 +32,27 @@ async def no_wait() -> None:
     """A Room without limits."""
 
 
-class TrialRunner(Protocol):
-    """What plays the trials of a sweep: this process, or workers in a cluster."""
-
-    @property
-    def meters(self) -> Mapping[str, Meter]:
-        """What each model's calls came to, over all workers."""
-        ...
-
-    @property
-    def running(self) -> int:
-        """How many trials are being played."""
-        ...
-
-    @property
-    def playing(self) -> Mapping[Cell, int] | None:
-        """How many trials of each cell are being played; None: only the workers know."""
-        ...
-
-    @property
-    def in_flight_calls(self) -> int:
-        """How many calls are in flight or being saved."""
-        ...
-
-    @property
-    def waits(self) -> Sequence[Wait]:
-        """What the other calls wait for."""
-        ...
-
-    @property
-    def workers(self) -> int | None:
-        """How many workers play; None: this process does."""
-        ...
-
-    def answers(self, name: str) -> int:
-        """How many calls of this run a model has answered."""
-        ...
-
-    async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
-        """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
-        ...
-
-    async def drain(self) -> None:
-        """Let calls in flight end and be saved, and drop those that still wait for a turn."""
-        ...
+# More than bad luck explains, since nothing is answered between them; few enough to stop early.
+FAILURES_IN_A_ROW = 10
 
 
 @dataclass
 class LocalRunner:
-    """Plays at most ``in_flight`` trials at once; ``asking`` counts the open questions of each."""
+    """Plays at most ``in_flight`` trials at once, of which so many are ``running``.
+
+    ``asking`` counts the open questions of each trial.
+    """
 
     plan: Plan
     clients: Mapping[str, LlmClient]
     in_flight: int
     first: FirstDecisions = field(default_factory=FirstDecisions)
     gate: Gate = field(default_factory=Gate)
-    playing: Counter[Cell] = field(default_factory=Counter)
+    running: int = 0
     asking: Counter[int] = field(default_factory=Counter)
     workers: None = None
+    # Keyed by model and its number of answered calls, so that an answer starts a new count.
+    _failures_in_a_row: Counter[tuple[str, int]] = field(default_factory=Counter)
 
     @cached_property
     def arms(self) -> Mapping[str, Arm]:
@@ -110,11 +72,6 @@ class LocalRunner:
     def _sealed(self) -> frozenset[str]:
         """The models whose answers are there, or nowhere."""
         return frozenset(name for name, client in self.clients.items() if client.sealed)
-
-    @property
-    def running(self) -> int:
-        """How many trials are being played."""
-        return self.playing.total()
 
     @property
     def meters(self) -> Mapping[str, Meter]:
@@ -137,20 +94,41 @@ class LocalRunner:
         idle = sum(client.idle_askers for client in self.clients.values())
         return self.running == len(self.asking) and self.asking.total() == idle
 
-    def answers(self, name: str) -> int:
-        """How many live replies a model's trials have used."""
-        return self.clients[name].meter.calls_live
+    @property
+    def unsaved(self) -> str:
+        """What Ctrl-C waits for, in words."""
+        return f"{self.in_flight_calls} calls in flight"
 
     async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room = no_wait) -> None:
-        """See TrialRunner."""
+        """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
+
+        def done(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+            ended(spec, record)
+            if isinstance(record, TrialRecord):
+                self._watch_for_outage(record)
+
         await run_bounded(
             (partial(self._trial, spec, room) for spec in specs),
             in_flight=self.in_flight,
-            on_done=lambda done: ended(*done),
+            on_done=lambda result: done(*result),
         )
 
+    def _watch_for_outage(self, record: TrialRecord) -> None:
+        """Stop when trials keep failing for one model that answers no call in between."""
+        asked = self.arms[record.spec.arm].asked
+        for name in {asked[failed.side] for failed in record.failed_calls} - self._sealed:
+            since = name, self.clients[name].meter.calls_live
+            self._failures_in_a_row[since] += 1
+            failed = self._failures_in_a_row[since]
+            if failed >= FAILURES_IN_A_ROW:
+                raise ProviderDown(
+                    f"the last {failed} trials with {name} failed and no call was answered "
+                    f"in between ({record.error}): the rest is not tried. When the service answers "
+                    "again, run the same command to go on"
+                )
+
     async def drain(self) -> None:
-        """See TrialRunner."""
+        """Let calls in flight end and be saved, and drop those that still wait for a turn."""
         await asyncio.gather(*(client.drain() for client in self.clients.values()))
 
     async def _trial(
@@ -167,14 +145,14 @@ class LocalRunner:
         drivers = {
             side: self.drivers[arm.asked[side]].make(arm.scenario, spec, side) for side in SIDES
         }
-        self.playing[spec.cell] += 1
+        self.running += 1
         try:
             recorded = all(name in self._sealed for name in arm.asked.values())
             return spec, await play_trial(spec, arm.scenario, drivers, in_turn=recorded)
         except TrialSuspended as exc:
             return spec, exc
         finally:
-            self.playing[spec.cell] -= 1
+            self.running -= 1
             for client in self.clients.values():
                 client.leave(spec.order)
 

@@ -11,7 +11,6 @@ from merge_runner.config import (
     ModelEntry,
     check_network,
     driver_name,
-    model_id,
     resolve_endpoint,
 )
 from merge_runner.errors import ProviderDown, UsageError
@@ -20,16 +19,6 @@ from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody
 
 # What Ollama adds to a name that has no tag.
 USUAL_TAG = ":latest"
-
-
-def with_names(
-    entries: Mapping[str, ModelEntry], find: Callable[[str, ModelEntry], str]
-) -> dict[str, ModelEntry]:
-    """The entries by name, those without an ``id`` with the one that is found."""
-    return {
-        name: entry.model_copy(update={"id": model_id(entry) or find(name, entry)})
-        for name, entry in entries.items()
-    }
 
 
 def recorded_name(name: str, entry: ModelEntry, *, cache: ResponseCache, strict: bool) -> str:
@@ -46,12 +35,12 @@ def recorded_name(name: str, entry: ModelEntry, *, cache: ResponseCache, strict:
     return recorded[0] if len(recorded) == 1 else UNNAMED
 
 
-def served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
+async def served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
     """The one model that a server lists; raises ProviderDown where nobody listens, UsageError."""
     endpoint = resolve_endpoint(name, entry)
     driver = driver_name(name, endpoint.identity)
     try:
-        listed = _listed(endpoint, patient=True)
+        listed = await _listed(endpoint, patient=True)
     except TransportFailure as exc:
         if exc.outcome == "no_connection":
             raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
@@ -65,7 +54,7 @@ def served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> 
     return listed[0]
 
 
-def check_served(entries: Mapping[str, ModelEntry]) -> None:
+async def check_served(entries: Mapping[str, ModelEntry]) -> None:
     """Raise UsageError where a server lists its models and not the one that is to be asked.
 
     A server that lists nothing, or does not answer, is judged by the first call.
@@ -75,7 +64,7 @@ def check_served(entries: Mapping[str, ModelEntry]) -> None:
             continue
         endpoint = resolve_endpoint(name, entry)
         try:
-            listed = _listed(endpoint)
+            listed = await _listed(endpoint)
         except TransportFailure:
             continue
         if entry.id not in listed and entry.id + USUAL_TAG not in listed:
@@ -85,11 +74,11 @@ def check_served(entries: Mapping[str, ModelEntry]) -> None:
             )
 
 
-def _listed(endpoint: Endpoint, *, patient: bool = False) -> list[str]:
+async def _listed(endpoint: Endpoint, *, patient: bool = False) -> list[str]:
     from merge_runner.llm.model_list import listed_models  # imports httpx, which no replay needs
 
     check_network(endpoint.base_url)
-    return listed_models(endpoint, patient=patient)
+    return await listed_models(endpoint, patient=patient)
 
 
 def _choose(name: str, entry: ModelEntry) -> str:

@@ -96,6 +96,11 @@ class Options:
         """How many connections a model may need: both drivers of a trial may ask at once."""
         return 2 * self.in_flight
 
+    @property
+    def sends_nothing(self) -> bool:
+        """Whether no model may be asked."""
+        return self.replay or self.dry_run
+
     def rates(self, entry: ModelEntry) -> tuple[int | None, int | None]:
         """The requests and tokens a minute that a model may get; None: no limit."""
         return self.rpm or entry.rpm, self.tpm or entry.tpm

@@ -7,22 +7,19 @@ import errno
 import os
 import sys
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib import import_module
 from typing import TYPE_CHECKING, Literal
 
 from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.meter import Meter
-from merge_runner.records import Cell
 from merge_runner.results.progress_file import (
     EVERY_S,
     MACHINE,
-    CellStanding,
     ProgressFile,
     Standing,
     clear_dead,
@@ -33,11 +30,11 @@ from merge_runner.text_safety import printable
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from merge_runner.run.local_runner import TrialRunner
+    from merge_runner.run.dask_tasks import DaskTasks
+    from merge_runner.run.local_runner import LocalRunner
 
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
-CELL_EVERY_S = 0.5
 PULSE_S = 0.05
 NOTES_SHOWN = 10
 REASONS_SHOWN = 3
@@ -48,19 +45,18 @@ CLOSE_IT = "you may close this: the same command goes on"
 class Progress:
     """Where a sweep stands; ``runner`` plays its trials.
 
-    ``planned`` and ``stored`` count trials by prompt variant and condition: all of them, and those
-    that were stored before this run. ``by_cell`` counts how the trials of this run ended: with a
-    Status, or ``suspended`` until there is more money. ``worst_stall_s`` is the longest delay of
-    the event loop.
+    ``planned`` is the number of all trials, ``stored`` of those that were stored before this run.
+    ``outcome_counts`` counts how the trials of this run ended: with a Status, or ``suspended``
+    until there is more money. ``worst_stall_s`` is the longest delay of the event loop.
     """
 
     plan: Plan
-    planned: Counter[Cell]
-    runner: TrialRunner
+    planned: int
+    runner: LocalRunner | DaskTasks
     ledger: Ledger
-    stored: Counter[Cell] = field(default_factory=Counter)
+    stored: int = 0
     cap_usd: float | None = None
-    by_cell: defaultdict[Cell, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    outcome_counts: Counter[str] = field(default_factory=Counter)
     started: float = field(default_factory=time.monotonic)
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
     worst_stall_s: float = 0.0
@@ -75,20 +71,14 @@ class Progress:
         return f"{self.plan.name}: {self.plan.driver}{stand_in}"
 
     @property
-    def ways(self) -> Counter[str]:
-        """How the trials of this run ended so far, and how many are suspended."""
-        return sum(self.by_cell.values(), Counter[str]())
-
-    @property
     def total(self) -> int:
         """How many trials this run has to play."""
-        return self.planned.total() - self.stored.total()
+        return self.planned - self.stored
 
     @property
     def ended(self) -> int:
         """How many trials of this run have ended, in whatever way."""
-        ways = self.ways
-        return ways.total() - ways["suspended"]
+        return self.outcome_counts.total() - self.outcome_counts["suspended"]
 
     def fields(self) -> list[tuple[str, str]]:
         """Name and text of every figure that is shown."""
@@ -98,13 +88,12 @@ class Progress:
         left_s = self._left_s()
         left = "" if left_s is None else f", about {left_s:.0f} s left"
         window = min(60.0, max(elapsed, 1.0)) / 60
-        stored = self.stored.total()
-        before = f" (+{stored} stored before)" if stored else ""
+        before = f" (+{self.stored} stored before)" if self.stored else ""
         running = f"{self.runner.running} running{self._on()}"
         return [
             *(("WARNING", text) for text in self._warnings()),
             ("trials", f"{self.ended}/{self.total} ended{before}, {running}"),
-            ("failed", str(self.ways["failed"])),
+            ("failed", str(self.outcome_counts["failed"])),
             ("calls", f"{self._calls_live} live, {self._calls_cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
             ("cost", f"{self._cost_usd:.2f} USD{self._in_the_end()}{self._spent()}"),
@@ -124,11 +113,12 @@ class Progress:
             started_at=self.began_at,
             updated_at=datetime.now(UTC),
             doing=self.doing,
-            trials=self.planned.total(),
-            stored_before=self.stored.total(),
+            trials=self.planned,
+            stored_before=self.stored,
             running=self.runner.running,
             workers=self.runner.workers,
-            cells=tuple(map(self._cell, self.planned)),
+            ended=self.stored + self.ended - self.outcome_counts["failed"],
+            failed=self.outcome_counts["failed"],
             calls_live=self._calls_live,
             calls_cached=self._calls_cached,
             cost_usd=self._cost_usd,
@@ -180,21 +170,6 @@ class Progress:
         more = [f"{len(texts) - REASONS_SHOWN} others"] * (len(texts) > REASONS_SHOWN)
         shown = texts[:REASONS_SHOWN] + more
         return [*shown, CLOSE_IT] if shown else []
-
-    def _cell(self, cell: Cell) -> CellStanding:
-        playing = self.runner.playing
-        ways = self.by_cell[cell]
-        return CellStanding(
-            *cell,
-            planned=self.planned[cell],
-            stored=self.stored[cell],
-            running=None if playing is None else playing.get(cell, 0),
-            finished=ways["finished"],
-            collided=ways["collided"],
-            timeout=ways["timeout"],
-            failed=ways["failed"],
-            suspended=ways["suspended"],
-        )
 
     def _warnings(self) -> list[str]:
         others = sum((meter.mismatches for meter in self.meters), Counter[str]())
@@ -256,11 +231,11 @@ async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncItera
 
 @asynccontextmanager
 async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[None]:
-    """Show the progress on stderr or in a notebook while the body runs, and at its end.
+    """Show the progress on stderr while the body runs, and at its end.
 
     ``quiet``: only the clients' messages.
     """
-    show = _show_live if sys.stderr.isatty() else _show_in_cell if in_cell() else _show_plain
+    show = _show_live if sys.stderr.isatty() else _show_plain
     if quiet:
         show = _show_notes
     stop = asyncio.Event()
@@ -307,24 +282,6 @@ async def _show_live(progress: Progress, stop: asyncio.Event) -> None:
         for note in _notes(progress):
             console.print(Text(note))
         live.update(_table(progress), refresh=True)
-
-
-def in_cell() -> bool:
-    """Whether a notebook's cell is running."""
-    ipython = sys.modules.get("IPython")
-    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
-
-
-async def _show_in_cell(progress: Progress, stop: asyncio.Event) -> None:
-    """One line below the cell, which is replaced by the next one also in a notebook's file."""
-    display = import_module("IPython.display").display
-    shown = display({"text/plain": ""}, raw=True, display_id=True)
-    ended = False
-    while not ended:
-        ended = await _stopped(stop, CELL_EVERY_S)
-        for note in _notes(progress):
-            _say(note)
-        shown.update({"text/plain": printable(_line(progress))}, raw=True)
 
 
 async def _show_plain(progress: Progress, stop: asyncio.Event) -> None:

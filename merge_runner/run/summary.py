@@ -80,7 +80,7 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
             for (factor, level), counts in (_by_level(facts) if facts else {}).items()
         ],
         "outcomes_without_fallbacks": (_named(_counts(facts, FELL_BACK)[False,]) if facts else {}),
-        **({"first_looks": list(_first_looks(facts))} if plan.seat else {}),
+        **({"first_looks": facts.first_looks if facts else []} if plan.seat else {}),
     }
 
 
@@ -189,32 +189,9 @@ def _table(plan: Plan, facts: SweepFacts) -> Iterator[str]:
             yield _row(level, _named(by_level[factor, level]).values(), width)
 
 
-def _first_looks(facts: SweepFacts | None) -> Iterator[dict[str, Any]]:
-    """What was done first, by driver, prompt, model, side and own relative velocity.
-
-    The share of M is that among answers with a tactical word.
-    """
-    for row in facts.first_looks if facts else ():
-        driver, variant, model, side, velocity_mps, asked, invalid, words, merging, action_mps2 = (
-            row
-        )
-        yield {
-            "driver": driver,
-            "variant": variant,
-            "model": model,
-            "side": side,
-            "relative_velocity_mps": velocity_mps,
-            "asked": asked,
-            "invalid": invalid,
-            "with_a_word": words,
-            "share_m": merging / words if words else None,
-            "first_action_mps2": action_mps2,
-        }
-
-
 def _asked(facts: SweepFacts) -> Iterator[str]:
-    """The same as a table for each driver and prompt, for each of the two that met."""
-    looks = list(_first_looks(facts))
+    """What was done first, as a table for each driver and prompt, for each of the two that met."""
+    looks = facts.first_looks
     models = {(look["driver"], look["model"]) for look in looks}
     met = Counter(driver for driver, _ in models)
     for (driver, variant, model), rows in groupby(

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AsyncExitStack
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
 from itertools import takewhile
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from merge_runner.audit import Audit, audit_sweep
-from merge_runner.config import ModelEntry
+from merge_runner.config import ModelEntry, model_id, resolve_endpoint
 from merge_runner.errors import (
     MergeRunnerError,
     NoValidDecision,
-    ProviderDown,
     ReplayMiss,
     StoreError,
     TrialSuspended,
@@ -42,24 +44,24 @@ from merge_runner.run.clients import (
     endpoint_plan,
     live_clients,
     open_rounds,
-    open_services,
     sealed_clients,
 )
 from merge_runner.run.estimate import Estimate, Todo, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, MOST_HELD, Flusher
-from merge_runner.run.local_runner import LocalRunner, TrialRunner
-from merge_runner.run.model_names import check_served, recorded_name, served_name, with_names
+from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.model_names import check_served, recorded_name, served_name
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
 from merge_runner.signals import on_interrupt
 
+if TYPE_CHECKING:
+    from merge_runner.run.dask_tasks import DaskTasks
+
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
 SHOWN = 5
-# More than bad luck explains, since nothing is answered between them; few enough to stop early.
-FAILURES_IN_A_ROW = 10
 FROM_PROGRAMS = 16
 
 
@@ -100,69 +102,37 @@ class Outcome:
 
 
 class Sweep:
-    """One run of a plan.
+    """One run of a plan (see ``open_sweep``), which plays the trials ``todo``."""
 
-    Making it opens the cache, and the database unless it is a replay; it asks a server of one's
-    own what its model is called, locks the models that a live run is to ask, and does nothing else.
-    """
-
-    def __init__(self, plan: Plan, options: Options, *, say: Callable[[str], None]) -> None:
-        """Find out what is missing; ``say`` shows a line to the user. Raises UsageError."""
-        check_batches(plan, options)
+    def __init__(
+        self,
+        plan: Plan,
+        options: Options,
+        cache: ResponseCache,
+        stored: list[TrialSpec],
+        todo: list[TrialSpec],
+        *,
+        say: Callable[[str], None],
+    ) -> None:
+        self._plan = plan
         self._options = options
+        self._cache = cache
+        self._stored = stored
+        self._todo = todo
         self._say = say
-        recorded = partial(Spilled, options.recordings) if options.recordings else None
-        self._cache = ResponseCache(options.cache, overlay=recorded)
-        plan = plan.with_entries(self._named(plan.entries))
-        endpoints = {name: self._endpoint(plan, name) for name in plan.entries}
-        self._plan = plan = replace(plan, endpoints=endpoints)
         self._arms = plan.by_label()
-        specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
-        # A replay derives everything from the recorded replies alone, so it plays every trial.
-        with unreadable_is_usage():
-            ended = set() if options.replay else self._store.ended_trials(specs)
-        self._stored = [key for key in specs if key in ended]
-        self._stored_specs = [specs[key] for key in self._stored]
-        self._todo = [spec for key, spec in specs.items() if key not in ended]
-        if self._todo and not (self._is_silent or options.dask):  # workers may see other servers
-            check_served(plan.entries)
         self._misses: list[Miss] = []
-        self._ledger = Ledger(self._cache, plan.ledger)
-        self._options = options = self._less_what_is_spent(options)
-        # Keyed by model and its number of answered calls, so that an answer starts a new count.
-        self._failures_in_a_row: Counter[tuple[str, int]] = Counter()
+        self._ledger = Ledger(cache, plan.ledger)
         self._suspended: TrialSuspended | None = None
         self._rounds: Rounds | None = None
         self._progress = Progress(
             plan=plan,
-            planned=Counter(spec.cell for spec in specs.values()),
-            stored=Counter(specs[key].cell for key in self._stored),
+            planned=len(stored) + len(todo),
+            stored=len(stored),
             runner=LocalRunner(plan, {}, in_flight=0),  # nobody plays yet
             ledger=self._ledger,
             cap_usd=options.max_cost_usd,
         )
-        if self._is_live:
-            entries = plan.entries.items()
-            self._cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in entries})
-
-    def _less_what_is_spent(self, options: Options) -> Options:
-        """The options with a cap that is lower by what other ledgers under it hold.
-
-        They are those of sweeps that share the cap, and others of this study: it was run before its
-        file had a budget, or has none any more.
-        """
-        own, name = self._plan.ledger, self._plan.study.name
-        others = [
-            scope
-            for scope in scopes(self._cache)
-            if (scope.startswith(f"{name}/") if own == name else scope == name)
-            or (scope in options.ledgers and scope != own)
-        ]
-        spent_usd = sum(Ledger(self._cache, scope).read().committed_usd for scope in others)
-        if options.max_cost_usd is None or not spent_usd or self._is_silent:
-            return options
-        self._say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
-        return replace(options, max_cost_usd=max(0.0, options.max_cost_usd - spent_usd))
 
     @property
     def trials_to_play(self) -> int:
@@ -214,14 +184,12 @@ class Sweep:
         outcome.messages.append(
             f"nothing of this replay is recorded, and nothing is stored: {held}"
         )
-        self._cache.close()
         return outcome
 
     async def _run(self, sweep_id: str) -> Outcome:
         """Play what is missing and store it."""
         outcome = Outcome(self._plan, sweep_id, len(self._stored))
         async with AsyncExitStack() as stack:
-            stack.callback(self._cache.close)
             runner = await self._runner(stack)
             self._progress.runner = runner
             batch = BATCH_OF_REPLAY if self._options.replay else BATCH
@@ -246,16 +214,16 @@ class Sweep:
                     outcome.fail(exc.exit_code, str(exc))
         for meter in runner.meters.values():
             outcome.meter.add(meter)
-        ways = self._progress.ways
-        outcome.suspended = ways["suspended"]
+        counts = self._progress.outcome_counts
+        outcome.suspended = counts["suspended"]
         if self._suspended:
             outcome.fail(
                 TrialSuspended.exit_code,
                 f"{outcome.suspended} trials wait for money: {self._suspended}. Their "
                 f"replies are kept: raise {self._plan.capped_by} and run the same command again",
             )
-        if ways["failed"] and not self._misses:
-            outcome.fail(1, f"{ways['failed']} trials failed")
+        if counts["failed"] and not self._misses:
+            outcome.fail(1, f"{counts['failed']} trials failed")
         return outcome
 
     async def estimate(self) -> Estimate:
@@ -308,10 +276,6 @@ class Sweep:
             facts[name] = self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
         return facts
 
-    def close(self) -> None:
-        """Close what was opened, if the sweep is not run after all."""
-        self._cache.close()
-
     def _explain(self, misses: list[Miss], outcome: Outcome) -> None:
         if not misses:
             return
@@ -339,70 +303,57 @@ class Sweep:
                 versions=canonical_json(versions()),
             ),
             self._plan.specs(),
-            self._stored,
-            [row for spec in self._stored_specs for row in factor_rows(spec)],
+            [(spec.trial_id, spec.spec_hash) for spec in self._stored],
+            [row for spec in self._stored for row in factor_rows(spec)],
         )
         return sweep_id
 
-    async def _runner(self, stack: AsyncExitStack) -> TrialRunner:
+    async def _runner(self, stack: AsyncExitStack) -> LocalRunner | DaskTasks:
         """What plays the trials: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
-        if not self._is_live:
+        if options.sends_nothing or not plan.entries:
             clients = sealed_clients(plan, self._cache)
             # Recorded replies come at once: more trials in flight would only wait for each other.
             in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
             return LocalRunner(plan, clients, in_flight)
-        services = open_services(plan, options, self._cache, self._ledger, self._measured())
         known = frozenset(
             name
             for name, entry in plan.entries.items()
             if plan.endpoints[name] in self._cache.stats(entry.id).totals
         )
-        endpoints = endpoint_plan(plan, options, known)
+        endpoints = endpoint_plan(plan, options, known, self._measured())
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
-        if options.dask is None:
-            clients = live_clients(
-                plan,
-                endpoints,
-                self._cache,
-                services.limiters,
-                services.budget,
-                connections=options.connections,
-                stack=stack,
-                rounds=rounds,
-            )
-            if rounds is not None:
-                stack.push_async_callback(rounds.close)
-                self._progress.batches = rounds.standing
-            # A trial that waits for a round takes up nobody's time.
-            in_flight = len(self._todo) if options.batch else options.in_flight
-            first = self._first_decisions(one_by_one=rounds is None)
-            return LocalRunner(plan, clients, in_flight, first)
-        from merge_runner.run.cluster.connect import connected
+        first = self._first_decisions(one_by_one=rounds is None)
+        if options.dask is not None:
+            from merge_runner.run.dask_cluster import connected
 
-        client = await stack.enter_async_context(connected(options.dask))
-        from merge_runner.run.cluster.coordinator import Coordinator  # imports Dask
+            client = await stack.enter_async_context(connected(options.dask))
+            from merge_runner.run.dask_tasks import DaskTasks  # imports Dask
 
-        return await stack.enter_async_context(
-            Coordinator(client, plan, endpoints, self._cache, services, options.in_flight)
+            return DaskTasks(client, plan, options, endpoints, self._cache, self._ledger, first)
+        clients = live_clients(
+            plan, options, endpoints, self._cache, self._ledger, stack=stack, rounds=rounds
         )
+        if rounds is not None:
+            stack.push_async_callback(rounds.close)
+            self._progress.batches = rounds.standing
+        # A trial that waits for a round takes up nobody's time.
+        in_flight = len(self._todo) if options.batch else options.in_flight
+        return LocalRunner(plan, clients, in_flight, first)
 
-    async def _play(self, runner: TrialRunner, flusher: Flusher, outcome: Outcome) -> None:
+    async def _play(
+        self, runner: LocalRunner | DaskTasks, flusher: Flusher, outcome: Outcome
+    ) -> None:
         """Run the trials until all have ended, or the sweep is stopped or interrupted."""
-        # No worker of a cluster has all of them.
-        first = None if isinstance(runner, LocalRunner) else self._first_decisions()
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             if isinstance(record, TrialSuspended):
-                self._progress.by_cell[spec.cell]["suspended"] += 1
+                self._progress.outcome_counts["suspended"] += 1
                 self._suspended = record
                 return
-            self._progress.by_cell[spec.cell][record.status] += 1
+            self._progress.outcome_counts[record.status] += 1
             self._misses += _misses(spec, record)
             flusher.add(record)
-            self._watch_for_outage(record, runner)
-            if first is not None:
-                self._count(record, first)
 
         # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
         work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
@@ -410,10 +361,7 @@ class Sweep:
 
         def interrupted() -> None:
             work.cancel()  # before anything is written: the terminal may be closed
-            self._say(
-                f"Stopping: {runner.in_flight_calls} calls in flight are saved first; "
-                "Ctrl-C again drops them."
-            )
+            self._say(f"Stopping: {runner.unsaved} are saved first; Ctrl-C again drops them.")
 
         beside = []
         if self._rounds is not None and isinstance(runner, LocalRunner):
@@ -491,9 +439,9 @@ class Sweep:
                 finished=outcome.exit_code == 0,
                 derive=False,  # these trials have just been driven
             )
-            if not (outcome.exit_code or self._is_silent or self._options.keep_going):
+            if not (outcome.exit_code or self._options.sends_nothing or self._options.keep_going):
                 stored = FirstDecisions()
-                self._add_stored(stored, [*self._stored_specs, *self._todo])
+                self._add_stored(stored, [*self._stored, *self._todo])
                 for line in stored.without_a_valid_one():
                     outcome.fail(NoValidDecision.exit_code, line)
             # Answers from another model are reported elsewhere; only --strict-model stops for them.
@@ -506,34 +454,12 @@ class Sweep:
         except (StoreError, UsageError) as exc:
             outcome.fail(exc.exit_code, str(exc))
 
-    def _watch_for_outage(self, record: TrialRecord, runner: TrialRunner) -> None:
-        """Stop when trials keep failing for one model that answers no call in between."""
-        if self._options.replay:
-            return
-        asked = self._arms[record.spec.arm].asked
-        for name in {asked[failed.side] for failed in record.failed_calls}:
-            since = name, runner.answers(name)
-            self._failures_in_a_row[since] += 1
-            failed = self._failures_in_a_row[since]
-            if failed >= FAILURES_IN_A_ROW:
-                raise ProviderDown(
-                    f"the last {failed} trials with {name} failed and no call was answered "
-                    f"in between ({record.error}): the rest is not tried. When the service answers "
-                    "again, run the same command to go on"
-                )
-
-    def _count(self, record: TrialRecord, first: FirstDecisions) -> None:
-        asked = self._arms[record.spec.arm].asked
-        for row in record.decisions:
-            if asked[row.side] in self._plan.entries:
-                first.count(asked[row.side], row.decision)
-
     def _first_decisions(self, *, one_by_one: bool = False) -> FirstDecisions:
         """The first decisions of the models, with those that are stored already."""
         if self._options.keep_going:
             return FirstDecisions()
         first = FirstDecisions(MOST_INVALID, one_by_one=one_by_one)
-        self._add_stored(first, self._stored_specs)
+        self._add_stored(first, self._stored)
         return first
 
     def _add_stored(self, first: FirstDecisions, specs: Iterable[TrialSpec]) -> None:
@@ -544,39 +470,121 @@ class Sweep:
             if model in self._plan.entries:
                 first.add_stored(model, valid, invalid, failure, rationale)
 
-    @property
-    def _is_live(self) -> bool:
-        """Whether there are trials to play for which a model may be asked."""
-        return bool(self._todo and self._plan.entries) and not self._is_silent
 
-    @property
-    def _is_silent(self) -> bool:
-        """Whether nothing may be sent."""
-        return self._options.replay or self._options.dry_run
+@asynccontextmanager
+async def open_sweep(
+    plan: Plan, options: Options, *, say: Callable[[str], None]
+) -> AsyncIterator[Sweep]:
+    """Open the cache, and the database unless it is a replay, and find out what is missing.
 
-    def _named(self, entries: Mapping[str, ModelEntry]) -> dict[str, ModelEntry]:
-        """The entries, each with its model's name: as told, as recorded, or as its server says."""
-        if self._is_silent:
-            recorded = partial(recorded_name, cache=self._cache, strict=self._options.replay)
-            return with_names(entries, recorded)
-        return with_names(entries, partial(served_name, say=self._say))
+    Asks a server of one's own what its model is called, and locks the models that a live run is to
+    ask. ``say`` shows a line to the user. Raises UsageError.
+    """
+    check_batches(plan, options)
+    recorded = partial(Spilled, options.recordings) if options.recordings else None
+    with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
+        plan = plan.with_entries(await _named(plan.entries, options, cache, say))
+        endpoints = {name: _endpoint(plan, name, options, cache) for name in plan.entries}
+        plan = replace(plan, endpoints=endpoints)
+        specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
+        # A replay derives everything from the recorded replies alone, so it plays every trial.
+        with unreadable_is_usage():
+            ended = set() if options.replay else Store(options.db).ended_trials(specs)
+        todo = [spec for key, spec in specs.items() if key not in ended]
+        if todo and not options.sends_nothing:
+            if not plan.is_rehearsal:
+                for name, entry in plan.entries.items():
+                    resolve_endpoint(name, entry)  # raises where its key is missing
+            if options.dask is None:  # workers may see other servers
+                await check_served(plan.entries)
+            options = _less_what_is_spent(plan, options, cache, say)
+            entries = plan.entries.items()
+            cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in entries})
+        stored = [spec for key, spec in specs.items() if key in ended]
+        yield Sweep(plan, options, cache, stored, todo, say=say)
 
-    def _endpoint(self, plan: Plan, name: str) -> str:
-        """The endpoint's identity: in a replay, the one under which the model is recorded."""
-        entry, configured = plan.entries[name], plan.endpoints[name]
-        if entry.provider == "emulator":
-            configured += self._options.faults.identity
-        if not self._options.replay:
-            return configured
-        recorded = self._cache.recorded_endpoints(entry.id)
-        if configured in recorded or not recorded:
-            return configured
-        if len(recorded) > 1:
-            raise UsageError(
-                f"replies of {name} are recorded from several endpoints: {', '.join(recorded)}. "
-                "Set the base URL variable of its provider to the one to replay."
-            )
-        return recorded[0]
+
+async def _named(
+    entries: Mapping[str, ModelEntry],
+    options: Options,
+    cache: ResponseCache,
+    say: Callable[[str], None],
+) -> dict[str, ModelEntry]:
+    """The entries, each with its model's name: as told, as recorded, or as its server says."""
+    named = {}
+    for name, entry in entries.items():
+        found = model_id(entry)
+        if not found and options.sends_nothing:
+            found = recorded_name(name, entry, cache=cache, strict=options.replay)
+        elif not found:
+            found = await served_name(name, entry, say=say)
+        named[name] = entry.model_copy(update={"id": found})
+    return named
+
+
+def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
+    """The endpoint's identity: in a replay, the one under which the model is recorded."""
+    entry, configured = plan.entries[name], plan.endpoints[name]
+    if entry.provider == "emulator":
+        configured += options.faults.identity
+    if not options.replay:
+        return configured
+    recorded = cache.recorded_endpoints(entry.id)
+    if configured in recorded or not recorded:
+        return configured
+    if len(recorded) > 1:
+        raise UsageError(
+            f"replies of {name} are recorded from several endpoints: {', '.join(recorded)}. "
+            "Set the base URL variable of its provider to the one to replay."
+        )
+    return recorded[0]
+
+
+def _less_what_is_spent(
+    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
+) -> Options:
+    """The options with a cap that is lower by what other ledgers under it hold.
+
+    They are those of sweeps that share the cap, and others of this study: it was run before its
+    file had a budget, or has none any more.
+    """
+    own, name = plan.ledger, plan.study.name
+    others = [
+        scope
+        for scope in scopes(cache)
+        if (scope.startswith(f"{name}/") if own == name else scope == name)
+        or (scope in options.ledgers and scope != own)
+    ]
+    spent_usd = sum(Ledger(cache, scope).read().committed_usd for scope in others)
+    if options.max_cost_usd is None or not spent_usd:
+        return options
+    say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
+    return replace(options, max_cost_usd=max(0.0, options.max_cost_usd - spent_usd))
+
+
+async def unsent(plan: Plan, options: Options, *, say: Callable[[str], None]) -> Estimate:
+    """What is neither stored nor recorded yet; makes no database or cache that is not there."""
+    async with _open_unchanged(plan, options, say) as prepared:
+        return await prepared.estimate()
+
+
+async def of_all(plan: Plan, options: Options, *, say: Callable[[str], None]) -> Estimate:
+    """What the whole plan takes, as if nothing were stored or recorded; makes nothing either."""
+    async with _open_unchanged(plan, options, say) as prepared:
+        return prepared.estimate_of_all()
+
+
+@asynccontextmanager
+async def _open_unchanged(
+    plan: Plan, options: Options, say: Callable[[str], None]
+) -> AsyncIterator[Sweep]:
+    with tempfile.TemporaryDirectory() as folder:
+        db = options.db if options.db.is_file() else Path(folder) / "none.duckdb"
+        recorded = (options.cache / "cache.db").is_file()
+        cache = options.cache if recorded else Path(folder) / "responses"
+        options = replace(options, db=db, cache=cache, dry_run=True)
+        async with open_sweep(plan, options, say=say) as sweep:
+            yield sweep
 
 
 def _misses(spec: TrialSpec, record: TrialRecord) -> list[Miss]:
@@ -590,7 +598,7 @@ def _differing(trials: Mapping[str, Sequence[str]]) -> str:
     return "; ".join(f"{trial_id} ({', '.join(columns)})" for trial_id, columns in shown)
 
 
-async def _drained(runner: TrialRunner, work: asyncio.Task[None]) -> None:
+async def _drained(runner: LocalRunner | DaskTasks, work: asyncio.Task[None]) -> None:
     """Once the work has ended, however it did, save the calls that are in flight."""
     await asyncio.wait([work])
     await runner.drain()

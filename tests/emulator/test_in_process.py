@@ -13,7 +13,7 @@ from merge_runner.config import ModelEntry, resolve_endpoint
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.emulator.handler import Emulator, InProcess
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.transport import TransportFailure
+from merge_runner.llm.http_outcome import TransportFailure
 
 ENTRY = ModelEntry(provider="emulator", format="openai-chat", id="m", max_output_tokens=1)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections import Counter
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
@@ -16,8 +15,8 @@ from merge_runner.results.progress_file import ProgressFile, clear_dead, read_st
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.progress import Progress
-from merge_runner.run.sweep import Sweep
 from tests.gate import HANGS_S
+from tests.harness import run_sweep
 
 NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
 LEDGER = SimpleNamespace(spending=Spending())
@@ -26,8 +25,7 @@ SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm
 
 def standing(sweep_id="s", **changes):
     plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0"])
-    planned = Counter({("baseline", "N_0_0"): 2})
-    plain = Progress(plan, planned, LocalRunner(plan, {}, 0), LEDGER).standing(sweep_id)
+    plain = Progress(plan, 2, LocalRunner(plan, {}, 0), LEDGER).standing(sweep_id)
     return replace(plain, **changes)
 
 
@@ -56,29 +54,20 @@ async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_
         await process.communicate()
     assert found.pid == process.pid
     assert (found.trials, found.running) == (4, 4)
-    assert {(c.variant, c.condition): (c.planned, c.running) for c in found.cells} == {
-        ("baseline", "N_0_0"): (2, 2),
-        ("baseline", "L_4_0"): (2, 2),
-    }
     assert str(tmp_path) not in text
     assert (alive, read_standing(db, found.sweep_id).alive) == (True, False)
     assert (await merge_runner("sweep", "baseline", "--model", "constant", "--db", db)).code == 0
     assert not path.parent.exists()
 
 
-async def test_the_last_word_of_a_sweep_is_that_it_checks_what_each_cell_came_to(
-    tmp_path, monkeypatch
-):
+async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, monkeypatch):
     said = []
     monkeypatch.setattr(ProgressFile, "write", lambda _, standing: said.append(standing))
     plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0", "L_4_0"])
-    await Sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print).run()
+    await run_sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print)
     first, last = said[0], said[-1]
     assert (first.doing, last.doing) == ("playing", "checking")
-    assert [(c.condition, c.ended, c.failed) for c in first.cells] == [
-        (c.condition, 0, 0) for c in last.cells
-    ]
-    assert [(c.planned, c.collided, c.ended) for c in last.cells] == [(2, 2, 2)] * 2
+    assert (first.trials, first.ended, last.ended, last.failed) == (4, 0, 4, 0)
 
 
 @pytest.mark.parametrize(
@@ -163,15 +152,9 @@ def test_a_file_that_is_none_of_ours_says_nothing(tmp_path, text):
     assert read_standing(tmp_path / "m.duckdb", "s") is None
 
 
-def test_trials_are_told_cell_by_cell():
-    cells = [("baseline", "N_0_0"), ("A1", "N_0_0")]
+def test_what_was_stored_before_has_ended_and_what_failed_has_not():
     plan = make_plan("baseline", "constant")
-    runner = LocalRunner(plan, {}, 1)
-    runner.playing[cells[1]] += 1
-    progress = Progress(plan, Counter(dict.fromkeys(cells, 3)), runner, LEDGER)
-    progress.stored[cells[0]] = 1
-    progress.by_cell[cells[0]].update(collided=1, failed=1, suspended=1)
-    first, second = progress.standing("s").cells
-    assert (first.ended, first.failed, first.suspended, first.running) == (2, 1, 1, 0)
-    assert (second.ended, second.running) == (0, 1)
-    assert progress.ended == 2
+    progress = Progress(plan, 3, LocalRunner(plan, {}, 1), LEDGER, stored=1)
+    progress.outcome_counts.update(collided=1, failed=1, suspended=1)
+    standing = progress.standing("s")
+    assert (standing.ended, standing.failed, progress.ended) == (2, 1, 2)

@@ -13,7 +13,7 @@ from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
 from merge_runner.prompts.fields import FIELDS
 from merge_runner.prompts.render import render_prompt
 from merge_runner.run.plan import Options, make_plan
-from merge_runner.run.unsent import unsent
+from merge_runner.run.sweep import unsent
 from merge_runner.study.file import StudyFile
 from tests.harness import PROJECT
 from tests.prompts.test_render import FIRST

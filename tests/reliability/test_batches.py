@@ -18,8 +18,7 @@ from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.seat import first_situations
-from merge_runner.run.sweep import Sweep
-from tests.harness import FAST, PROJECT, watched
+from tests.harness import FAST, PROJECT, run_sweep, watched
 
 KILLS = 20
 TWO = ("--conditions", "L_4_0,N_0_0", "--reps", 1)
@@ -222,7 +221,7 @@ async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly
         monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
         first = first_situations(make_plan("baseline", "emulator", repetitions=1))
         options = Options(tmp_path / "m.duckdb", tmp_path / "c", batch=True)
-        outcome = await Sweep(first, options, say=said.append).run()
+        outcome = await run_sweep(first, options, say=said.append)
         batched, alone = await answered(server)
     assert outcome.exit_code == 0, outcome.messages
     assert any("is cancelled: what it has answered is taken, the rest" in line for line in said)

@@ -18,9 +18,8 @@ from merge_runner.records import SLOT_HEADER
 from merge_runner.results.database import SCHEMA_VERSION
 from merge_runner.results.store import Store, results_digest
 from merge_runner.run.plan import Options, make_plan
-from merge_runner.run.sweep import Sweep
 from tests.gate import HANGS_S, Gate
-from tests.harness import FAST, watched
+from tests.harness import FAST, run_sweep, watched
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--json")
 NOTEBOOK = """
@@ -246,7 +245,7 @@ async def test_what_was_dropped_is_played_again_and_failed_trials_are_kept_as_th
     async with watched(fails) as server:
         monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
         plan = make_plan("baseline", driver, repetitions=1)
-        held = await Sweep(plan, Options(tmp_path / "held", tmp_path / "c"), say=say).run()
+        held = await run_sweep(plan, Options(tmp_path / "held", tmp_path / "c"), say=say)
         asked = server.requests
     failed = driver != "constant"
     assert any("trials that are not stored yet are played again" in line for line in said)
@@ -258,7 +257,7 @@ async def test_what_was_dropped_is_played_again_and_failed_trials_are_kept_as_th
     assert held.meter.calls_live == asked - failed
     assert results_digest(tmp_path / "held")[1] == 11
     replay = Options(tmp_path / "new", tmp_path / "c", replay=True)
-    again = await Sweep(plan, replay, say=said.append).run()
+    again = await run_sweep(plan, replay, say=said.append)
     if not failed:
         assert again.exit_code == 0
         assert results_digest(tmp_path / "held") == results_digest(tmp_path / "new")

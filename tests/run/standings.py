@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from types import SimpleNamespace
 
 from merge_runner.llm.ledger import Spending
 from merge_runner.run.plan import make_plan
 from merge_runner.run.progress import Progress
 
-CELL = ("baseline", "N_0_0")
 LEDGER = SimpleNamespace(spending=Spending(spent_usd=4.0, reserved_usd=0.25))
 
 
 def runner(*meters, running=0, waits=()):
     """Plays nothing, and has counted this."""
     named = {str(number): meter for number, meter in enumerate(meters)}
-    return SimpleNamespace(meters=named, waits=waits, running=running, playing={}, workers=None)
+    return SimpleNamespace(meters=named, waits=waits, running=running, workers=None)
 
 
-def progress(runner, planned=None, **changes):
+def progress(runner, planned=10, **changes):
     """Of ten trials where nothing else is said, so that about 210 calls are expected."""
     plan = make_plan("baseline", "emulator")
-    return Progress(plan, Counter(planned or {CELL: 10}), runner, LEDGER, **changes)
+    return Progress(plan, planned, runner, LEDGER, **changes)

@@ -6,7 +6,7 @@ import time
 
 from merge_runner.llm.meter import Meter
 from merge_runner.records import Attempt, Usage
-from tests.run.standings import CELL, progress, runner
+from tests.run.standings import progress, runner
 
 
 def test_every_figure_is_that_of_the_meters():
@@ -15,9 +15,9 @@ def test_every_figure_is_that_of_the_meters():
     meters[1].count_attempt(Attempt(1, "timeout"))
     meters[1].mismatches["o3 -> gpt-4o"] = 2
     shown = progress(runner(*meters, running=5), cap_usd=20, started=time.monotonic() - 60)
-    shown.planned[CELL] += 7
-    shown.stored[CELL] += 7
-    shown.by_cell[CELL].update(finished=2, failed=1, suspended=1)
+    shown.planned += 7
+    shown.stored += 7
+    shown.outcome_counts.update(finished=2, failed=1, suspended=1)
     fields = dict(shown.fields())
     assert fields["trials"] == "3/10 ended (+7 stored before), 5 running"
     assert fields["failed"] == "1"

@@ -75,13 +75,9 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
 
 def bar(cell: VariantCondition) -> list[tuple[str, float, float]]:
     """(what, from, width) of a bar of 100 units for the planned trials of a cell."""
-    whole = max(cell.planned, cell.ended + cell.failed + (cell.running or 0), 1)
+    whole = max(cell.planned, cell.ended + cell.failed, 1)
     parts, begin = [], 0.0
-    for name, count in (
-        ("ended", cell.ended),
-        ("failed", cell.failed),
-        ("running", cell.running or 0),
-    ):
+    for name, count in (("ended", cell.ended), ("failed", cell.failed)):
         width = 100 * count / whole
         if count:
             parts.append((name, round(begin, 2), round(width, 2)))
@@ -92,15 +88,12 @@ def bar(cell: VariantCondition) -> list[tuple[str, float, float]]:
 def _total(variant: str, cells: list[VariantCondition | None]) -> VariantCondition:
     """One variant over all conditions."""
     there = [cell for cell in cells if cell is not None]
-    running = [cell.running for cell in there]
     return VariantCondition(
         variant,
         "",
         planned=sum(cell.planned for cell in there),
         ended=sum(cell.ended for cell in there),
         failed=sum(cell.failed for cell in there),
-        running=None if None in running else sum(count or 0 for count in running),
-        suspended=sum(cell.suspended for cell in there),
         decisions=sum(cell.decisions for cell in there),
         invalid=sum(cell.invalid for cell in there),
         state=there[0].state,

@@ -22,9 +22,8 @@ if TYPE_CHECKING:
 
 CONNECT_TIMEOUT_S = 10
 SCHEMES = ("tcp", "tls")
-WORKER = "merge_runner.run.cluster.worker"
 # What a worker imports, and a process from which all are forked imports once.
-SHARED = ["distributed", WORKER, "merge_runner.llm.http"]
+SHARED = ["distributed", "merge_runner.run.dask_tasks", "merge_runner.llm.http"]
 VALID = (
     "valid: local:N (N workers on this machine), the address of a scheduler "
     "(tcp://HOST:PORT, tls://HOST:PORT), or its scheduler file (PATH.json)"
@@ -69,15 +68,18 @@ async def _local_cluster(workers: int) -> AsyncIterator[object]:
     from distributed import LocalCluster
 
     _choose_how_workers_start()
-    # None leaves the method chosen above: given "forkserver", it has it import pandas.
-    with dask.config.set({"distributed.worker.multiprocessing-method": None}):
+    settings = {
+        # None leaves the method chosen above: given "forkserver", it has it import pandas.
+        "distributed.worker.multiprocessing-method": None,
+        "distributed.admin.large-graph-warning-threshold": "1GB",
+    }
+    with dask.config.set(settings):
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
             processes=True,
             dashboard_address=None,
             silence_logs=logging.CRITICAL,
-            preload=[WORKER],  # also in workers that replace lost ones
             asynchronous=True,
         )
         with _for_children():

@@ -1,0 +1,413 @@
+"""A sweep on a Dask cluster is the same sweep, whatever dies; what hinders it is told in one line.
+
+Its workers share nothing, so that a lost one's trials are asked again as a whole.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from functools import partial
+
+import psutil
+import pytest
+from aiohttp import web
+
+from merge_runner.emulator.faults import FaultPlan
+from merge_runner.errors import UsageError
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.ledger import Asked, Ledger, SetAside, Spending
+from merge_runner.registry import Catalogue, in_use, use
+from merge_runner.run.dask_cluster import connected
+from merge_runner.run.dask_tasks import use_study
+from merge_runner.signals import FROM_TERMINAL
+from merge_runner.study.file import read_study
+from tests.gate import HANGS_S, Gate
+from tests.harness import FAST, PROJECT, environment, watched
+from tests.llm.test_limiter import fullest_window
+from tests.zygote import Zygote
+
+SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
+# Six trials of 19 calls each.
+SIX = ("sweep", "baseline", "--reps", 2, "--conditions", "L_4_0,N_0_0,R_-4_8", "--json")
+ON_TWO = (*SIX, "--in-flight", 4, "--dask", "local:2")
+PAID = ("--model", "o3", "--yes", *FAST)
+
+
+@pytest.fixture(scope="session")
+def zygote(shared):
+    """What the program is forked from; here it has imported Dask too."""
+    with Zygote(shared / "zygote-dask", "merge_runner.run.dask_tasks") as forking:
+        yield forking
+
+
+@pytest.fixture
+def started(zygote, tmp_path):
+    """Starts a sweep on a cluster; what is left of it is killed in the end."""
+    families: list[psutil.Process] = []
+
+    async def start(*arguments, **env):
+        process = await zygote.start(arguments, cwd=tmp_path, env=environment(**env))
+        families.append(psutil.Process(process.pid))
+        return process
+
+    yield start
+    for parent in families:
+        if parent.is_running():
+            for process in (*parent.children(recursive=True), parent):
+                process.kill()
+
+
+def workers_of(pid: int) -> list[psutil.Process]:
+    """The workers that a coordinator has started: what is forked from a process of its own."""
+    children = psutil.Process(pid).children()
+    servers = [child for child in children if "forkserver" in " ".join(child.cmdline())]
+    return [worker for server in servers for worker in server.children()]
+
+
+def held_from(gate: Gate, worker: psutil.Process) -> set[str]:
+    """The slots that wait for an answer on a worker's connections."""
+    ports = {c.laddr.port for c in worker.net_connections("tcp")}
+    return {slot for slot, port in gate.held.items() if port in ports}
+
+
+def repetition_of(slot: str) -> tuple[str, int]:
+    told = json.loads(slot)
+    return told["condition"], told["repetition"]
+
+
+async def all_held(gate: Gate, trials: int) -> None:
+    """Wait until so many trials are held, and nothing more is asked."""
+    async with asyncio.timeout(HANGS_S):
+        before = -1
+        while len(set(map(repetition_of, gate.held))) < trials or before != len(gate.asked):
+            before = len(gate.asked)
+            await asyncio.sleep(0.5)
+
+
+async def ended(process) -> tuple[int, str, str]:
+    """How a sweep ended, of which no process may be left."""
+    family = psutil.Process(process.pid).children(recursive=True)
+    async with asyncio.timeout(HANGS_S):
+        out, err = await process.communicate()
+    _, alive = psutil.wait_procs(family, timeout=HANGS_S)
+    assert not alive
+    return process.returncode, out.decode(), err.decode()
+
+
+def test_threads_of_a_worker_play_by_one_catalogue():
+    study = read_study("baseline")
+    use(Catalogue())
+    with ThreadPoolExecutor() as threads:
+        used = list(threads.map(lambda _: (use_study(study), in_use())[1], range(8)))
+    assert len({id(catalogue) for catalogue in used}) == 1
+    assert used[0].text == study.text
+
+
+@pytest.mark.slow
+async def test_three_workers_come_to_the_results_of_one_process(merge_runner):
+    sweep = ("sweep", "baseline", "--reps", 2, "--json")
+    async with watched(faults=FaultPlan(latency_s=0.02)) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--in-flight", 12, "--dask", "local:3", **env)
+        assert run.code == 0, run.err
+        assert "on 3 workers" in run.err
+        assert set(server.asked.values()) == {1}
+        assert run.summary["calls"] == {"live": server.requests, "cached": 0}
+        again = await merge_runner(*sweep, "--db", "again", **env)
+        assert again.summary["calls"]["live"] == 0, "all is recorded"
+        assert run.summary["calls"]["live"] == server.requests
+    one = await merge_runner(*sweep, "--db", "one", "--cache", "new")
+    assert one.code == 0, one.err
+    digest = (await merge_runner("digest")).out
+    assert digest == (await merge_runner("digest", "--db", "one")).out
+    assert "22 trials" in digest
+
+
+@pytest.mark.parametrize(
+    ("where", "says"),
+    [
+        ("local:0", "valid: local:N"),
+        ("local:x", "valid: local:N"),
+        ("local", "valid: local:N"),
+        ("", "valid: local:N"),
+        ("http://host:1", "valid: local:N"),
+        ("tcp://host", "valid: local:N"),
+        ("none.json", "there is no scheduler file none.json"),
+    ],
+)
+async def test_a_word_that_names_no_cluster_is_refused(where, says):
+    with pytest.raises(UsageError, match=says):
+        async with connected(where):
+            pass
+
+
+async def test_a_word_that_names_no_cluster_is_told_in_one_line(merge_runner):
+    run = await merge_runner(*SMALL, "--dask", "local:0")
+    assert run.code == 2
+    assert "valid: local:N" in run.err
+    assert len(run.err.splitlines()) == 1
+
+
+@pytest.mark.long
+async def test_where_no_scheduler_listens_it_says_so_soon(merge_runner):
+    async with asyncio.timeout(HANGS_S):
+        run = await merge_runner(*SMALL, "--dask", "127.0.0.1:1")
+    assert run.code == 2
+    assert run.err.startswith("error: no Dask scheduler answers at 127.0.0.1:1 within 10 s")
+    assert len(run.err.splitlines()) == 1
+
+
+async def test_a_replay_needs_no_cluster(merge_runner):
+    run = await merge_runner(*SMALL, "--replay", "--dask", "local:2")
+    assert run.code == 2
+    assert "a replay needs no cluster" in run.err
+
+
+@pytest.mark.slow
+async def test_without_the_extra_it_says_what_to_install(merge_runner, tmp_path, emulator_url):
+    (tmp_path / "distributed.py").write_text("raise ModuleNotFoundError('no distributed')")
+    process = await merge_runner.start(
+        *SMALL, "--dask", "local:2", PYTHONPATH=str(tmp_path), EMULATOR_BASE_URL=emulator_url
+    )
+    _, err = await process.communicate()
+    assert process.returncode == 2
+    assert err.decode() == (
+        "error: --dask needs the package distributed: pip install distributed\n"
+    )
+
+
+@pytest.mark.long
+async def test_what_stops_a_sweep_stops_it_at_all_workers_in_one_line(merge_runner):
+    async def middle(request, handler):
+        if server.requests > 12:
+            body = {"error": {"code": "insufficient_quota", "message": "nothing left"}}
+            return web.json_response(body, status=429)
+        return await handler(request)
+
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(
+            *SMALL, "--conditions", "L_4_0,N_0_0", "--model", "o3", "--yes", "--dask", "local:2",
+            **env,
+        )  # fmt: skip
+    assert run.code == 3
+    assert "quota is exhausted" in run.err
+    assert "Traceback" not in run.err
+
+
+@pytest.fixture
+async def scheduler(tmp_path, zygote):
+    """A scheduler of its own; called, it adds a worker."""
+    file = tmp_path / "scheduler.json"
+    to = ("--scheduler-file", file, "--no-dashboard")
+    processes = []
+
+    async def start(*arguments, **changes):
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "distributed.cli.dask_worker", *arguments, *map(str, to),
+            cwd=tmp_path, env=environment(**changes),
+            stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
+        )  # fmt: skip
+        processes.append(psutil.Process(process.pid))
+
+    start.process = await zygote.start(
+        ("--port", "0", "--host", "127.0.0.1", *to),
+        cwd=tmp_path, env=environment(), module="distributed.cli.dask_scheduler",
+    )  # fmt: skip
+    processes.append(psutil.Process(start.process.pid))
+    while not file.exists():
+        await asyncio.sleep(0.1)
+    start.file = file
+    yield start
+    for parent in filter(psutil.Process.is_running, processes):
+        for process in (*parent.children(recursive=True), parent):
+            process.kill()
+
+
+@pytest.mark.slow
+async def test_workers_of_another_scheduler_play_with_their_own_keys(merge_runner, scheduler):
+    async with watched() as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        sweep = (*SMALL, "--model", "o3", "--yes", "--dask", scheduler.file)
+        await scheduler("--no-nanny")
+        run = await merge_runner(*sweep, **env)
+        assert run.code == 2
+        assert "o3 needs a key: set OPENAI_API_KEY" in run.err
+        assert "(told by the worker tcp://127.0.0.1:" in run.err
+        assert server.requests == 0
+    assert "Traceback" not in run.err
+
+
+@pytest.mark.slow
+async def test_a_worker_with_other_source_is_refused(merge_runner, scheduler, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(PROJECT / "merge_runner", other / "merge_runner")
+    with (other / "merge_runner/errors.py").open("a") as file:
+        file.write("# another one\n")
+    await scheduler("--no-nanny", PYTHONPATH=str(other))
+    run = await merge_runner(*SMALL, "--dask", scheduler.file)
+    assert run.code == 2
+    assert "install the same one for all" in run.err
+    assert "Traceback" not in run.err
+
+
+@pytest.mark.long
+async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, scheduler):
+    async def middle(request, handler):
+        if server.requests == 10:
+            scheduler.process.kill()
+        return await handler(request)
+
+    await scheduler("--no-nanny")
+    async with watched(middle, FaultPlan(latency_s=0.2)) as server:
+        url = f"{server.url}/v1"
+        run = await merge_runner(*SMALL, "--dask", scheduler.file, EMULATOR_BASE_URL=url)
+        assert run.code == 1
+        assert "error: the Dask scheduler is gone" in run.err
+        assert "Traceback" not in run.err
+        again = await merge_runner(*SMALL, EMULATOR_BASE_URL=url)
+    assert again.code == 0, again.err
+
+
+@pytest.mark.slow
+async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(merge_runner, started):
+    gate = Gate(40)
+    async with watched(gate.middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await started(*ON_TWO, **env)
+        await all_held(gate, trials=4)
+        victim = next(w for w in workers_of(process.pid) if held_from(gate, w))
+        lost = set(map(repetition_of, held_from(gate, victim)))
+        victim.kill()
+        await process.said("is lost: its ")
+        gate.open()
+        code, out, err = await ended(process)
+        assert code == 0, err
+        summary = json.loads(out)
+        again = set(map(repetition_of, gate.asked_again))
+        assert lost <= again
+        assert len(again) <= 3, "trials of the other worker are asked again, too"
+        assert summary["trials"]["finished"] + summary["trials"]["collided"] == 6
+        requests = server.requests
+        plain = await merge_runner(*SIX, "--db", "plain", **env)
+        assert (plain.code, server.requests) == (0, requests), "a reply is not kept"
+    digests = {(await merge_runner("digest", *db)).out for db in ((), ("--db", "plain"))}
+    assert len(digests) == 1
+
+
+def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
+    with closing(ResponseCache(tmp_path)) as cache:
+        ledger = Ledger(cache, "baseline")
+        for name in ("lost", "kept"):
+            asked = Asked("Dask worker tcp://1", "L_4_0", 5.0)
+            cache.run_now([partial(ledger.reserve_share, name, asked)])
+        assert (ledger.read().reserved_usd, ledger.read().open_attempts) == (10, 2)
+        unclear = SetAside(0.5, Asked("o3", "N_0_0"), "", "read_timeout")
+        spent = Spending(1.5, 0.5, 1, overrun_usd=0.25, overruns={"o3": 2.0})
+        cache.run_now([partial(ledger.settle_share, "kept", spent, {"a key": [unclear]})])
+        spending = Ledger(cache, "baseline").read()
+        assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (1.5, 5.5, 2)
+        assert spending.overruns == {"o3": 2.0}
+        assert [reason.driver for reason in ledger.reasons()] == ["Dask worker tcp://1", "o3"]
+
+
+@pytest.mark.long
+async def test_a_coordinator_that_is_killed_takes_its_workers_along(merge_runner, started):
+    gate = Gate(40)
+    async with watched(gate.middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await started(*ON_TWO, **env)
+        await all_held(gate, trials=4)
+        family = psutil.Process(process.pid).children(recursive=True)
+        process.kill()
+        await process.wait()
+        _, alive = psutil.wait_procs(family, timeout=HANGS_S)
+        assert not alive
+        gate.open()
+        run = await merge_runner(*SIX, **env)
+    assert run.code == 0, run.err
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", FROM_TERMINAL)
+async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, number):
+    gate = Gate(40)
+    async with watched(gate.middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await started(*ON_TWO, **env)
+        await all_held(gate, trials=4)
+        process.send_signal(number)
+        for worker in workers_of(process.pid):
+            worker.send_signal(number)  # as a terminal does
+        await process.said("are saved first")
+        await asyncio.sleep(1)
+        gate.open()
+        code, _, err = await ended(process)
+        assert code == 130, err
+        assert "the replies of 2 tasks are saved first" in err
+        assert "Traceback" not in err
+        run = await merge_runner(*ON_TWO, **env)
+    assert run.code == 0, run.err
+    assert not gate.asked_again
+    assert len(set(gate.asked)) == 114
+
+
+@pytest.mark.long
+async def test_requests_and_tokens_a_minute_hold_over_all_workers(merge_runner):
+    times, tokens = [], []
+
+    async def middle(request, handler):
+        times.append(time.monotonic())
+        reply = await handler(request)
+        usage = json.loads(reply.body)["usage"]
+        tokens.append(usage["prompt_tokens"] + usage["completion_tokens"])
+        return reply
+
+    async with watched(middle) as server:
+        run = await merge_runner(
+            *SIX, "--in-flight", 3, "--dask", "local:3", "--rpm", 600, "--tpm", 10**6,
+            EMULATOR_BASE_URL=f"{server.url}/v1",
+        )  # fmt: skip
+    assert run.code == 0, run.err
+    # Half a second's worth goes at a time at each worker, and may come a little late; one limiter
+    # of 600 for each would let three times as many through.
+    assert fullest_window(times, [1] * len(times), length=1.0) <= 1.5 * 10 + 3
+    assert sum(tokens) <= 10**6
+
+
+@pytest.mark.long
+async def test_the_cost_cap_holds_over_all_workers_and_a_higher_one_goes_on(merge_runner, tmp_path):
+    # Trials end after 12 s at the latest, so that none can cost more than 3.4 USD.
+    shutil.copytree(PROJECT / "experiments", tmp_path / "experiments")
+    short = "[repetitions]\nbaseline = 10\n[scenario]\ntimeout_s = 12\n"
+    (tmp_path / "experiments/baseline.toml").write_text(short)
+    cap, usd = 3.7, 0.0
+
+    async def middle(request, handler):
+        nonlocal usd
+        reply = await handler(request)
+        usage = json.loads(reply.body)["usage"]
+        usd += (2 * usage["prompt_tokens"] + 8 * usage["completion_tokens"]) / 1e6
+        return reply
+
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        sweep = (*SIX, "--reps", 18, *PAID)
+        run = await merge_runner(*sweep, "--dask", "local:3", "--max-cost", cap, **env)
+        assert run.code == 3, run.err
+        assert 0 < usd <= cap
+        assert run.summary["cost_usd"] == pytest.approx(usd)
+        assert run.summary["sweep_cost_usd"] == pytest.approx(usd)
+        assert run.summary["trials"]["suspended"] > 0
+        done = await merge_runner(*sweep, "--max-cost", 50, **env)
+        assert done.code == 0, done.err
+        calls = await merge_runner("sql", "select count(*) from calls", "--format", "csv")
+        assert int(calls.out.split()[1]) == server.requests, "nothing was paid for twice"
+    assert done.summary["sweep_cost_usd"] == pytest.approx(usd)
+    assert done.summary["set_aside_usd"] == 0
