@@ -295,8 +295,11 @@ def _arm(
         pace_of(scenario, program.in_spec(name))
     parameters = {name: level for name, level in levels.items() if _is_parameter(name)}
     changed = set(both_sides(str(levels[MODEL])).values())
-    if not changed & {*registry}:
-        _refuse_parameters(str(levels[MODEL]), parameters)
+    refused = [name for name, level in parameters.items() if level != DEFAULT]
+    if refused and not changed & {*registry}:
+        raise UsageError(
+            f"{levels[MODEL]} is a program and takes no {refused[0]}, only {DEFAULT!r}"
+        )
     entries: dict[str, ModelEntry] = {}
     asked = {}
     for side, name in sides.items():
@@ -412,12 +415,6 @@ def _entry(
             changed.append(f"{parameter}={level_text(level)}")
         entry = with_it
     return " ".join([name, *changed]), entry
-
-
-def _refuse_parameters(program: str, parameters: Levels) -> None:
-    for parameter, level in parameters.items():
-        if level != DEFAULT:
-            raise UsageError(f"{program} is a program and takes no {parameter}, only {DEFAULT!r}")
 
 
 def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
