@@ -23,7 +23,6 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.batch.batches import Batches
-from merge_runner.llm.batch.lines import LineEnd
 from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid, UnpaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Call, Wait, slot_text
@@ -341,12 +340,10 @@ class LlmClient:
         try:
             raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
         except TransportFailure as exc:
-            free = self.entry.price == "free" or not exc.sent
-            cost = 0.0 if free else None
-            record = Attempt(number, exc.outcome, error=str(exc), cost_usd=cost)
-            return AttemptOutcome(exc.action, exc.outcome, str(exc)), None, record
+            outcome = AttemptOutcome(exc.action, exc.outcome, str(exc))
+            return outcome, None, self._record(call, outcome, None, charged=exc.sent)
         outcome = judge(raw, self._wire)
-        return outcome, raw, self._record(number, raw, outcome, call.worst)
+        return outcome, raw, self._record(call, outcome, raw)
 
     async def _concluded(
         self,
@@ -388,7 +385,14 @@ class LlmClient:
             f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
         )
 
-    def _record(self, number: int, raw: RawReply, outcome: AttemptOutcome, worst: Usage) -> Attempt:
+    def _record(
+        self, call: Call, outcome: AttemptOutcome, raw: RawReply | None, *, charged: bool = True
+    ) -> Attempt:
+        """Return an attempt as it is recorded; without a reply it may have been ``charged``."""
+        number = len(call.attempts) + 1
+        if raw is None:
+            cost = None if charged and self.entry.price != "free" else 0.0
+            return Attempt(number, outcome.name, error=outcome.message, cost_usd=cost)
         return Attempt(
             number=number,
             outcome=outcome.name,
@@ -398,7 +402,7 @@ class LlmClient:
             usage=outcome.reading.usage,
             reply=raw.body,
             error=outcome.message,
-            cost_usd=self._cost_usd(raw, outcome.reading.usage, worst),
+            cost_usd=self._cost_usd(raw, outcome.reading.usage, call.worst),
             scripted=SCRIPTED_HEADER in raw.headers or says_scripted(raw.body),
         )
 
@@ -429,8 +433,19 @@ class LlmClient:
         async with batches.attempt(call, opened) as (paid, line):
             with call.waiting(f"for batches of {batches.model}", idle=True):
                 end = await batches.rounds.ask(line)
-            record, outcome = self._line_record(call, end, batches.price_factor)
-            record = replace(record, started_at=batches.rounds.submitted_at(line))
+            outcome = AttemptOutcome("retry", end.outcome, end.message)
+            if end.raw is not None:  # no limit of single calls is meant, and no call waits for one
+                outcome = replace(judge(end.raw, self._wire), pause=False, delay_s=None)
+            record = self._record(call, outcome, end.raw, charged=end.unclear)
+            usd = record.cost_usd
+            if end.raw is not None and end.raw.status != 200 and record.usage == Usage():
+                usd = 0.0  # no line that failed is charged
+            record = replace(
+                record,
+                started_at=batches.rounds.submitted_at(line),
+                cost_usd=None if usd is None else usd * batches.price_factor,
+                batch_id=end.batch_id,
+            )
             call.singly |= end.singly
             try:
                 if end.error is None:
@@ -441,22 +456,3 @@ class LlmClient:
                 raise end.error
             finally:
                 batches.rounds.ended(line)
-
-    def _line_record(
-        self, call: Call, end: LineEnd, price_factor: float
-    ) -> tuple[Attempt, AttemptOutcome]:
-        """Return the attempt of a line as it is recorded, and its outcome."""
-        number = len(call.attempts) + 1
-        if end.raw is None:
-            free = self.entry.price == "free" or not end.unclear
-            outcome = AttemptOutcome("retry", end.outcome, end.message)
-            record = Attempt(number, end.outcome, error=end.message, cost_usd=0.0 if free else None)
-        else:
-            # No limit of single calls is meant, and no call waits for one.
-            outcome = replace(judge(end.raw, self._wire), pause=False, delay_s=None)
-            record = self._record(number, end.raw, outcome, call.worst)
-            usd = record.cost_usd
-            if end.raw.status != 200 and record.usage == Usage():
-                usd = 0.0  # no line that failed is charged
-            record = replace(record, cost_usd=None if usd is None else usd * price_factor)
-        return replace(record, batch_id=end.batch_id), outcome

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import time
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.formats.base import as_dict, as_dicts, as_text
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.http_outcome import NOBODY_S, RawReply, TransportFailure
+from merge_runner.llm.http_outcome import NOBODY_S, TransportFailure
 
 # A server that answers one call at a time may be busy with one.
 TIMEOUT_S = 60.0
@@ -20,26 +21,20 @@ async def listed_models(endpoint: Endpoint, *, patient: bool = False) -> list[st
     A ``patient`` one waits some seconds for a server that is just starting.
     """
     transport = HttpTransport(endpoint, connections=1)
+    began_s = time.monotonic()
     try:
-        return _ids(await _reply(transport, NOBODY_S if patient else 0.0))
+        while True:
+            try:
+                raw = await transport.ask("GET", "/models", {}, timeout_s=TIMEOUT_S)
+                break
+            except TransportFailure as exc:
+                if exc.outcome != "no_connection" or time.monotonic() - began_s >= (
+                    NOBODY_S if patient else 0.0
+                ):
+                    raise
+            await asyncio.sleep(POLL_S)
     finally:
         await transport.close()
-
-
-async def _reply(transport: HttpTransport, patience_s: float) -> RawReply:
-    """Return the reply to ``GET /models``; refused connections are tried again."""
-    began_s = asyncio.get_running_loop().time()
-    while True:
-        try:
-            return await transport.ask("GET", "/models", {}, timeout_s=TIMEOUT_S)
-        except TransportFailure as exc:
-            waited_s = asyncio.get_running_loop().time() - began_s
-            if exc.outcome != "no_connection" or waited_s >= patience_s:
-                raise
-        await asyncio.sleep(POLL_S)
-
-
-def _ids(raw: RawReply) -> list[str]:
     payload = as_dict(raw.payload)
     if raw.status != 200 or "data" not in payload:
         raise TransportFailure("no_list", f"HTTP {raw.status}: {raw.error.message or 'no list'}")
