@@ -72,11 +72,11 @@ class SweepConfig(_Facts):
     model: str
     models: dict[str, ModelFacts]
     endpoints: dict[str, str]
-    scenario: dict[str, JsonValue]
+    scenario: dict[str, JsonValue] = {}
     repetitions: dict[str, int]
     conditions: tuple[str, ...]
     sample_set: int
-    prompt_blocks: dict[str, dict[str, str]]
+    prompt_blocks: dict[str, dict[str, str]] = {}
     seat: str = ""
     study: StudyFacts | None = None
     stored_arms: tuple[ArmFacts, ...] = Field(default=(), alias="arms")
@@ -198,7 +198,7 @@ class Spec:
             yield "sample set"
         # Programs read no prompt, so that their specs hold none.
         blocks = config.prompt_blocks.get(arm.variant)
-        if config.asks(arm) and self.content.get("prompt_blocks") != blocks:
+        if blocks and config.asks(arm) and self.content.get("prompt_blocks") != blocks:
             yield "prompt blocks"
         for side in SIDES:
             name = arm.asked[side]

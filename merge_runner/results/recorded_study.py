@@ -2,48 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, field_validator
 
 from merge_runner.llm.cache import CachedCall
 from merge_runner.results.recording import opened, read_provenance, readable, sweeps_of
 from merge_runner.text_safety import one_line
 
 
-class _Arm(BaseModel):
-    """What is read of an arm of a study."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    label: str
-
-
-class _Config(BaseModel):
-    """What is read of a sweep's configuration."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    model: str
-    repetitions: dict[str, int]
-    conditions: tuple[str, ...]
-    sample_set: int
-    mirror: bool = False
-    arms: tuple[_Arm, ...] = ()
-    seat: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedSweep:
+class RecordedSweep(BaseModel):
     """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition.
 
-    ``arms`` has the labels of the arms of a study, and is empty for a plain sweep. ``mirror`` says
-    that two different drivers were played both ways round. ``seat`` is ``first`` where only the
-    first situations were asked.
+    It is read from the configuration of any version that wrote a recording. ``arms`` has the
+    labels of the arms of a study; recordings of plain sweeps may have none. ``mirror`` says that
+    two different drivers were played both ways round. ``seat`` is ``first`` where only the first
+    situations were asked.
     """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
 
     name: str
     model: str
@@ -53,6 +33,13 @@ class RecordedSweep:
     arms: frozenset[str] = frozenset()
     seat: str = ""
     mirror: bool = False
+
+    @field_validator("arms", mode="before")
+    @classmethod
+    def _labels(cls, stored: object) -> object:
+        if not isinstance(stored, list):
+            return stored
+        return [arm.get("label") if isinstance(arm, dict) else arm for arm in stored]
 
     def __str__(self) -> str:
         """As a part of a sentence."""
@@ -86,23 +73,14 @@ def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
         there = _conditions_and_repetitions(file)
         for row in sweeps_of(read_provenance(file)):
             try:
-                config = _Config.model_validate_json(row.get("config", ""))
-            except ValidationError:
+                sweep = RecordedSweep(**{**json.loads(row["config"]), "name": row.get("name", "")})
+            except (KeyError, TypeError, ValueError, RecursionError):
                 continue
-            conditions = [one for one in config.conditions if one in there]
-            most = max((there[one] for one in conditions), default=0)
-            found.append(
-                RecordedSweep(
-                    name=row.get("name", ""),
-                    model=config.model,
-                    repetitions={v: min(n, most) for v, n in config.repetitions.items()},
-                    conditions=tuple(conditions),
-                    sample_set=config.sample_set,
-                    arms=frozenset(arm.label for arm in config.arms),
-                    seat=config.seat,
-                    mirror=config.mirror,
-                )
-            )
+            conditions = tuple(name for name in sweep.conditions if name in there)
+            most = max((there[name] for name in conditions), default=0)
+            repetitions = {v: min(n, most) for v, n in sweep.repetitions.items()}
+            changes = {"conditions": conditions, "repetitions": repetitions}
+            found.append(sweep.model_copy(update=changes))
     return found
 
 
@@ -126,7 +104,14 @@ def _joined(one: RecordedSweep, other: RecordedSweep) -> RecordedSweep:
     conditions = tuple(dict.fromkeys([*one.conditions, *other.conditions]))
     arms = one.arms | other.arms
     mirror = one.mirror or other.mirror
-    return replace(one, repetitions=repetitions, conditions=conditions, arms=arms, mirror=mirror)
+    return one.model_copy(
+        update={
+            "repetitions": repetitions,
+            "conditions": conditions,
+            "arms": arms,
+            "mirror": mirror,
+        }
+    )
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:

@@ -116,7 +116,7 @@ class Sweep:
         self._cache = ResponseCache(options.cache, overlay=recorded)
         plan = plan.with_entries(self._named(plan.entries))
         endpoints = {name: self._endpoint(plan, name) for name in plan.entries}
-        self._plan = plan = replace(plan, endpoints=endpoints)
+        self._plan = plan = plan.model_copy(update={"endpoints": endpoints})
         self._arms = plan.by_label()
         specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
@@ -328,7 +328,7 @@ class Sweep:
         """Add the sweep to the database, with the trials that are stored already."""
         started_at = datetime.now(UTC).replace(tzinfo=None)
         sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
-        config = {**self._plan.config(), "max_cost_usd": self._options.max_cost_usd}
+        config = {**self._plan.model_dump(mode="json"), "max_cost_usd": self._options.max_cost_usd}
         store.begin_sweep(
             SweepRow(
                 sweep_id=sweep_id,
