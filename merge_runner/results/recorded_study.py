@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, field_validator
+from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
 from merge_runner.llm.cache import CachedCall
 from merge_runner.results.recording import opened, read_provenance, readable, sweeps_of
@@ -20,7 +21,8 @@ class RecordedSweep(BaseModel):
     It is read from the configuration of any version that wrote a recording. ``arms`` has the
     labels of the arms of a study; recordings of plain sweeps may have none. ``mirror`` says that
     two different drivers were played both ways round. ``seat`` is ``first`` where only the first
-    situations were asked.
+    situations were asked. It has ``ended`` where all its trials did, and ``begins_late`` where a
+    driver may take control after the other.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -33,6 +35,9 @@ class RecordedSweep(BaseModel):
     arms: frozenset[str] = frozenset()
     seat: str = ""
     mirror: bool = False
+    models: dict[str, JsonValue] = {}
+    ended: bool = False
+    begins_late: bool = False
 
     @field_validator("arms", mode="before")
     @classmethod
@@ -62,6 +67,25 @@ class RecordedSweep(BaseModel):
         words += [word for file in files for word in ("--recording", str(file))]
         return one_line(shlex.join(words))
 
+    def arms_of(self, repetition: int) -> int:
+        """Return how many prompts may ask for a decision of a repetition."""
+        variants = sum(repetition <= most for most in self.repetitions.values())
+        return max(variants, len(self.arms))
+
+
+def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
+    """Return the sweeps as a recording says itself, without those whose configuration is odd."""
+    sweeps = []
+    for row in sweeps_of(provenance):
+        with suppress(KeyError, TypeError, ValueError, RecursionError):
+            told = {
+                "name": row.get("name", ""),
+                "ended": "ended_at" in row and row.get("exit_code", "0") == "0",
+                "begins_late": '"own_exit"' in row["config"],
+            }
+            sweeps.append(RecordedSweep(**{**json.loads(row["config"]), **told}))
+    return sweeps
+
 
 def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
     """The sweeps in recordings, less the repetitions and conditions of which no call is there.
@@ -71,11 +95,7 @@ def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
     found = []
     for file in files:
         there = _conditions_and_repetitions(file)
-        for row in sweeps_of(read_provenance(file)):
-            try:
-                sweep = RecordedSweep(**{**json.loads(row["config"]), "name": row.get("name", "")})
-            except (KeyError, TypeError, ValueError, RecursionError):
-                continue
+        for sweep in described_sweeps(read_provenance(file)):
             conditions = tuple(name for name in sweep.conditions if name in there)
             most = max((there[name] for name in conditions), default=0)
             repetitions = {v: min(n, most) for v, n in sweep.repetitions.items()}

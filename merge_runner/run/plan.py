@@ -349,7 +349,7 @@ class Plan(BaseModel):
         )
         return [
             TrialSpec(
-                trial_id=self._trial_id(arm, condition, repetition),
+                trial_id=self.trial_id_of(arm, condition, repetition),
                 spec_hash=hashes[arm.label, condition],
                 source="seat" if self.seat else "llm" if arm.entries else "driver",
                 model_left=arm.sides["left"],
@@ -366,7 +366,8 @@ class Plan(BaseModel):
             for order, (repetition, arm, condition) in enumerate(cells)
         ]
 
-    def _trial_id(self, arm: Arm, condition: str, repetition: int) -> str:
+    def trial_id_of(self, arm: Arm, condition: str, repetition: int) -> str:
+        """The id of a trial of an arm."""
         seat = "seat/" if self.seat else ""
         set_ = f"/set{self.sample_set}" if self.sample_set else ""
         # The prompt and the opponent stand in it already.

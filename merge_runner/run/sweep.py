@@ -12,7 +12,8 @@ from datetime import UTC, datetime
 from functools import cached_property, partial
 from itertools import takewhile
 
-from merge_runner.audit import Audit, audit_sweep
+from merge_runner.audit.checks import audit_sweep
+from merge_runner.audit.findings import Audit
 from merge_runner.config import ModelEntry
 from merge_runner.errors import (
     MergeRunnerError,
@@ -490,8 +491,8 @@ class Sweep:
             outcome.audit = audit_sweep(
                 self._options.db,
                 outcome.sweep_id,
+                [(spec.trial_id, spec.spec_hash) for spec in self._plan.trial_specs()],
                 finished=outcome.exit_code == 0,
-                derive=False,  # these trials have just been driven
             )
             if not (outcome.exit_code or self._is_silent or self._options.keep_going):
                 stored = FirstDecisions()

@@ -275,4 +275,4 @@ def test_an_audit_derives_a_studys_prompts_and_conditions_without_its_file_but_r
     assert alone["audits"][0]["counts"]["derived anew"] == 36
     assert "'sleepy', which is no driver here" in " ".join(alone["audits"][0]["notes"])
     named = json.loads(played.run("audit", "--json", "--study", "mine.toml", "--trust").out)
-    assert not any("not derived" in note for note in named["audits"][0]["notes"])
+    assert not any("not replayed" in note for note in named["audits"][0]["notes"])
