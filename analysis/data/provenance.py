@@ -14,7 +14,7 @@ import pandas as pd
 
 from analysis.data.load import ANSWERED, load_each, load_specs, rows
 from analysis.data.study import Group, Study, of_group
-from merge_runner.audit.replies import answers_alike
+from merge_runner.audit.checks import answers_alike, make_views
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.results.database import read_database
@@ -81,8 +81,7 @@ WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
 # Trials that are looked through for answers that repeat each other, of a driver at a time.
 OF_DRIVER = """
 CREATE OR REPLACE TEMP TABLE audited AS
-SELECT trial_id, spec_hash, model_left, model_right
-FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
+SELECT trial_id, spec_hash FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE driver = ? AND NOT scripted
 """
 DRIVERS = """
@@ -227,6 +226,7 @@ def _switched(spec: Mapping[str, Any]) -> str:
 
 def _alike(db: Path) -> dict[str, int]:
     with read_database(db) as connection:
+        make_views(connection)
         found = {}
         for (driver,) in connection.execute(DRIVERS).fetchall():
             connection.execute(OF_DRIVER, [driver])

@@ -15,7 +15,7 @@ from merge_runner.study.crossing import MODEL, PROMPT
 KEYS = ["trial_id", "spec_hash"]
 # The newest run comes first: the order of its levels counts.
 SWEEPS = """
-SELECT sweep_id, name, config->>'$.seat' AS seat, config->'$.levels' AS levels
+SELECT sweep_id, name, nullif(config->>'$.seat', '') AS seat, config->'$.levels' AS levels
 FROM sweeps ORDER BY started_at DESC, sweep_id
 """
 DESCRIPTIONS = """

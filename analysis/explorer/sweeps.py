@@ -11,7 +11,6 @@ from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
 from analysis.explorer.catalogue import FACTOR, Catalogue, Filter
 from analysis.explorer.reading import Row
-from merge_runner.audit.expected import ArmFacts, ModelFacts
 from merge_runner.config import both_sides, pair_name
 from merge_runner.drivers.registry import EMULATOR, stand_in
 from merge_runner.results.progress_file import Standing, read_standing
@@ -55,9 +54,27 @@ ARM = ("model_left", "model_right", "variant", "levels")
 ArmKey = tuple[str, str, str, tuple[str, ...]]
 
 
-class Arm(ArmFacts):
-    """An arm of a study's factors, by its ``label`` on the page."""
+class Model(BaseModel):
+    """What a sweep says of one of its models."""
 
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    id: str
+    provider: str
+    note: str = ""
+
+
+class Arm(BaseModel):
+    """What a sweep says of an arm of its study; ``asked`` are keys of the sweep's models."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    model: str
+    variant: str
+    repetitions: int
+    sides: dict[str, str]
+    asked: dict[str, str]
+    factors: dict[str, str] = {}
     label: str
 
     @property
@@ -86,7 +103,7 @@ class Config(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     model: str = ""
-    models: dict[str, ModelFacts] = {}
+    models: dict[str, Model] = {}
     endpoints: dict[str, str] = {}
     repetitions: dict[str, int] = {}
     conditions: tuple[str, ...] = ()

@@ -80,13 +80,8 @@ def audit(
     as_json: JsonOption = False,
 ) -> None:
     """Check that each trial is there and follows from its replies."""
-    from merge_runner.audit import (
-        NOT_DERIVED,
-        audit_cache,
-        audit_database,
-        audit_recording,
-        audit_sweep,
-    )
+    from merge_runner.audit.recordings import audit_recording
+    from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 
     use_study(study, trust=trust)
     skipped: list[str] = []
@@ -95,20 +90,19 @@ def audit(
             raise UsageError("--recording is checked by itself: without --sweep and --cache")
         audits = [audit_recording(recording)]
     else:
-        audits = audit_database(db) if sweep_id is None else [audit_sweep(db, sweep_id)]
-        skipped = list(NOT_DERIVED)
+        audits = audit_database(db, sweep_id, cache)
+        skipped = list(NOT_REPLAYED)
         if cache is not None:
-            audits.append(audit_cache(db, cache, sweep_id))
             skipped = [name for name in skipped if name == "calls.cached" or "calls" not in name]
     ok = all(found.ok for found in audits)
     if as_json:
-        whole = {"ok": ok, "not_derived": skipped, "audits": [found.as_dict() for found in audits]}
+        whole = {"ok": ok, "not_replayed": skipped, "audits": [found.as_dict() for found in audits]}
         print_out(json.dumps(whole, ensure_ascii=False))
     else:
         for line in chain.from_iterable(found.lines() for found in audits):
             print_out(line)
         if skipped:
-            print_out(f"not checked, since neither replies nor specs tell it: {', '.join(skipped)}")
+            print_out(f"not checked, since no replay tells it: {', '.join(skipped)}")
     sys.exit(0 if ok else 1)
 
 

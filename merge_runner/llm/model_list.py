@@ -21,16 +21,14 @@ async def listed_models(endpoint: Endpoint, *, patient: bool = False) -> list[st
     A ``patient`` one waits some seconds for a server that is just starting.
     """
     transport = HttpTransport(endpoint, connections=1)
-    began_s = time.monotonic()
+    patience_s, began_s = NOBODY_S if patient else 0.0, time.monotonic()
     try:
         while True:
             try:
                 raw = await transport.ask("GET", "/models", {}, timeout_s=TIMEOUT_S)
                 break
             except TransportFailure as exc:
-                if exc.outcome != "no_connection" or time.monotonic() - began_s >= (
-                    NOBODY_S if patient else 0.0
-                ):
+                if exc.outcome != "no_connection" or time.monotonic() - began_s >= patience_s:
                     raise
             await asyncio.sleep(POLL_S)
     finally:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import duckdb
 
@@ -16,10 +16,8 @@ TrialKey = tuple[str, str]
 
 Span = tuple[int, int]
 """The first and the last row number."""
-Spans = dict[str, Span]
-Read = TypeVar("Read")
-BATCH = 16
-"""Trials at once: their replies are in memory together."""
+AT_ONCE = 16
+"""Trials whose rows are in memory together, without their long texts."""
 
 _OF_THESE = (
     "SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)"
@@ -121,15 +119,11 @@ def stored_rows(
     table: str,
     keys: Sequence[TrialKey],
     span: Span | None = None,
-    columns: str | None = None,
 ) -> Stored:
-    """The rows of these trials: the given columns, or all, with hashes in place of long texts.
-
-    The columns must include those that identify a row.
-    """
-    hashed = LONG.get(table, ()) if columns is None else ()
+    """The rows of these trials, with hashes in place of long texts."""
+    hashed = LONG.get(table, ())
     hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in hashed)
-    columns = columns or (f"* REPLACE ({hashes})" if hashes else "*")
+    columns = f"* REPLACE ({hashes})" if hashes else "*"
     result = rows_of_trials(connection, columns, table, keys, span)
     names = tuple(column[0] for column in result.description or ())
     trial_id, spec_hash = names.index("trial_id"), names.index("spec_hash")
@@ -165,41 +159,23 @@ def rows_of_trials(
     )
 
 
-def in_batches(
-    connection: duckdb.DuckDBPyConnection,
-    keys: Iterable[TrialKey],
-    tables: Collection[str],
-    read: Callable[[list[TrialKey], Spans], Read],
-) -> Iterator[Read]:
-    """What ``read`` returns for batches of trials, given where the rows of each table lie.
+def in_order(
+    connection: duckdb.DuckDBPyConnection, keys: Iterable[TrialKey]
+) -> Iterator[tuple[list[TrialKey], dict[str, Span]]]:
+    """Yield trials, a few at once, and the span of their rows in each table.
 
-    Where a batch does not fit into the database's memory, smaller ones are read.
+    They come in the order in which they are stored, so that they are one stretch of each table.
     """
-    where = {table: _spans(connection, table) for table in tables}
+    where = {table: _spans(connection, table) for table in PLACES}
     nowhere = (0, -1)
-    # In the order in which they are stored, so that a batch is one stretch of each table.
     ordered = sorted(keys, key=lambda key: [spans.get(key, nowhere) for spans in where.values()])
-    first, size = 0, BATCH
-    while batch := ordered[first : first + size]:
-        found = {
-            table: [spans[key] for key in batch if key in spans] or [nowhere]
-            for table, spans in where.items()
-        }
-        try:
-            made = read(
-                batch,
-                {
-                    t: (min(a for a, _ in spans), max(b for _, b in spans))
-                    for t, spans in found.items()
-                },
-            )
-        except duckdb.OutOfMemoryException:
-            if size == 1:
-                raise
-            size //= 2
-        else:
-            first += size
-            yield made
+    for first in range(0, len(ordered), AT_ONCE):
+        some = ordered[first : first + AT_ONCE]
+        stretches = {}
+        for table, spans in where.items():
+            there = [spans[key] for key in some if key in spans] or [nowhere]
+            stretches[table] = (min(a for a, _ in there), max(b for _, b in there))
+        yield some, stretches
 
 
 def _spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, Span]:

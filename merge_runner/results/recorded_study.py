@@ -2,48 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
 from merge_runner.llm.cache import CachedCall
 from merge_runner.results.recording import opened, read_provenance, readable, sweeps_of
 from merge_runner.text_safety import one_line
 
 
-class _Arm(BaseModel):
-    """What is read of an arm of a study."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    label: str
-
-
-class _Config(BaseModel):
-    """What is read of a sweep's configuration."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-    model: str
-    repetitions: dict[str, int]
-    conditions: tuple[str, ...]
-    sample_set: int
-    mirror: bool = False
-    arms: tuple[_Arm, ...] = ()
-    seat: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedSweep:
+class RecordedSweep(BaseModel):
     """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition.
 
-    ``arms`` has the labels of the arms of a study, and is empty for a plain sweep. ``mirror`` says
-    that two different drivers were played both ways round. ``seat`` is ``first`` where only the
-    first situations were asked.
+    It is read from the configuration of any version that wrote a recording. ``arms`` has the
+    labels of the arms of a study; recordings of plain sweeps may have none. ``mirror`` says that
+    two different drivers were played both ways round. ``seat`` is ``first`` where only the first
+    situations were asked. It has ``ended`` where all its trials did, and ``begins_late`` where a
+    driver may take control after the other.
     """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
 
     name: str
     model: str
@@ -53,6 +35,16 @@ class RecordedSweep:
     arms: frozenset[str] = frozenset()
     seat: str = ""
     mirror: bool = False
+    models: dict[str, JsonValue] = {}
+    ended: bool = False
+    begins_late: bool = False
+
+    @field_validator("arms", mode="before")
+    @classmethod
+    def _labels(cls, stored: object) -> object:
+        if not isinstance(stored, list):
+            return stored
+        return [arm.get("label") if isinstance(arm, dict) else arm for arm in stored]
 
     def __str__(self) -> str:
         """As a part of a sentence."""
@@ -75,6 +67,25 @@ class RecordedSweep:
         words += [word for file in files for word in ("--recording", str(file))]
         return one_line(shlex.join(words))
 
+    def arms_of(self, repetition: int) -> int:
+        """Return how many prompts may ask for a decision of a repetition."""
+        variants = sum(repetition <= most for most in self.repetitions.values())
+        return max(variants, len(self.arms))
+
+
+def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
+    """Return the sweeps as a recording says itself, without those whose configuration is odd."""
+    sweeps = []
+    for row in sweeps_of(provenance):
+        with suppress(KeyError, TypeError, ValueError, RecursionError):
+            told = {
+                "name": row.get("name", ""),
+                "ended": "ended_at" in row and row.get("exit_code", "0") == "0",
+                "begins_late": '"own_exit"' in row["config"],
+            }
+            sweeps.append(RecordedSweep(**{**json.loads(row["config"]), **told}))
+    return sweeps
+
 
 def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
     """The sweeps in recordings, less the repetitions and conditions of which no call is there.
@@ -84,25 +95,12 @@ def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
     found = []
     for file in files:
         there = _conditions_and_repetitions(file)
-        for row in sweeps_of(read_provenance(file)):
-            try:
-                config = _Config.model_validate_json(row.get("config", ""))
-            except ValidationError:
-                continue
-            conditions = [one for one in config.conditions if one in there]
-            most = max((there[one] for one in conditions), default=0)
-            found.append(
-                RecordedSweep(
-                    name=row.get("name", ""),
-                    model=config.model,
-                    repetitions={v: min(n, most) for v, n in config.repetitions.items()},
-                    conditions=tuple(conditions),
-                    sample_set=config.sample_set,
-                    arms=frozenset(arm.label for arm in config.arms),
-                    seat=config.seat,
-                    mirror=config.mirror,
-                )
-            )
+        for sweep in described_sweeps(read_provenance(file)):
+            conditions = tuple(name for name in sweep.conditions if name in there)
+            most = max((there[name] for name in conditions), default=0)
+            repetitions = {v: min(n, most) for v, n in sweep.repetitions.items()}
+            changes = {"conditions": conditions, "repetitions": repetitions}
+            found.append(sweep.model_copy(update=changes))
     return found
 
 
@@ -126,7 +124,14 @@ def _joined(one: RecordedSweep, other: RecordedSweep) -> RecordedSweep:
     conditions = tuple(dict.fromkeys([*one.conditions, *other.conditions]))
     arms = one.arms | other.arms
     mirror = one.mirror or other.mirror
-    return replace(one, repetitions=repetitions, conditions=conditions, arms=arms, mirror=mirror)
+    return one.model_copy(
+        update={
+            "repetitions": repetitions,
+            "conditions": conditions,
+            "arms": arms,
+            "mirror": mirror,
+        }
+    )
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:

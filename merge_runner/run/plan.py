@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import math
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    computed_field,
+    field_serializer,
+    model_validator,
+)
 
 from merge_runner.config import (
     MOST_REPETITIONS,
@@ -106,21 +118,35 @@ class Options:
         return self.rpm or entry.rpm, self.tpm or entry.tpm
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+def _stored_study(study: StudySource) -> dict[str, object]:
+    return {"name": study.name, "text": study.text, "plugins": study.plugins}
+
+
+def _study_of(stored: object) -> object:
+    """Return a stored study as it was read; it has no path any more."""
+    if not isinstance(stored, dict):
+        return stored
+    file = StudyFile.model_validate(tomllib.loads(stored["text"]))
+    return StudySource(file=file, path=Path(f"{stored['name']}.toml"), **stored)
+
+
+class Plan(BaseModel):
     """A sweep before it runs: the arms of its study, each played in all conditions.
 
-    ``entries`` are the language models of all arms by what an arm's ``asked`` calls them, and
-    ``endpoints`` the identities of their endpoints (see ``config.Endpoint``). ``mirror``: its
-    pairs are played both ways round whatever its file says. ``seat`` is ``first`` where only the
-    first situations are asked (see ``run.seat``), and empty in a sweep.
+    The column ``sweeps.config`` holds it as JSON, from which it is read again. ``entries`` are the
+    language models of all arms by what an arm's ``asked`` calls them, and ``endpoints`` the
+    identities of their endpoints (see ``config.Endpoint``). ``mirror``: its pairs are played both
+    ways round whatever its file says. ``seat`` is ``first`` where only the first situations are
+    asked (see ``run.seat``), and empty in a sweep.
     """
 
+    model_config = ConfigDict(frozen=True, serialize_by_alias=True)
+
     name: str
-    study: StudySource
-    models: tuple[str, ...]
+    study: Annotated[StudySource, BeforeValidator(_study_of), PlainSerializer(_stored_study)]
+    drivers: tuple[str, ...]
     arms: tuple[Arm, ...]
-    entries: dict[str, ModelEntry]
+    entries: dict[str, ModelEntry] = Field(serialization_alias="models")
     endpoints: dict[str, str]
     conditions: tuple[str, ...]
     sample_set: int
@@ -128,10 +154,28 @@ class Plan:
     seat: Literal["", "first"] = ""
     mirror: bool = False
 
+    @model_validator(mode="before")
+    @classmethod
+    def _give_arms_their_entries(cls, stored: Any) -> Any:  # noqa: ANN401 # anything that is stored
+        """Read a stored plan, where an arm names its models and holds none."""
+        if not isinstance(stored, dict) or "models" not in stored:
+            return stored
+        entries = stored["models"]
+        arms = [
+            {**arm, "entries": {n: entries[n] for n in arm["asked"].values() if n in entries}}
+            for arm in stored["arms"]
+        ]
+        return {**stored, "entries": entries, "arms": arms}
+
+    @field_serializer("arms")
+    def _arms_without_entries(self, arms: tuple[Arm, ...]) -> list[dict[str, object]]:
+        return [asdict(replace(arm, entries={})) for arm in arms]
+
+    @computed_field  # type: ignore[prop-decorator] # https://github.com/python/mypy/issues/14461
     @property
     def model(self) -> str:
         """Who drives but for opponents, as ids of sweeps say, with a comma between models."""
-        pairs = (both_sides(model).values() for model in self.models)
+        pairs = (both_sides(name).values() for name in self.drivers)
         return ",".join("+".join(dict.fromkeys(pair)) for pair in pairs)
 
     @property
@@ -156,16 +200,24 @@ class Plan:
         """The first arm's."""
         return self.arms[0].scenario
 
+    @computed_field  # type: ignore[prop-decorator] # as above
     @property
     def repetitions(self) -> dict[str, int]:
         """Prompt variant to repetitions."""
         return {arm.variant: arm.repetitions for arm in self.arms}
 
+    @computed_field  # type: ignore[prop-decorator] # as above
     @property
     def levels(self) -> dict[str, list[str]]:
         """The levels of each factor of its file, a factor's reference first."""
         models = (arm.model_level for arm in self.arms)
         return listed_levels(self.study.file, models, self.repetitions)
+
+    @computed_field  # type: ignore[prop-decorator] # as above
+    @property
+    def description(self) -> str:
+        """What the study's file says of it."""
+        return self.study.file.description
 
     @property
     def trials(self) -> int:
@@ -253,7 +305,7 @@ class Plan:
         arms = (
             replace(arm, entries={name: entries[name] for name in arm.entries}) for arm in self.arms
         )
-        return replace(self, arms=tuple(arms), entries=entries)
+        return self.model_copy(update={"arms": tuple(arms), "entries": entries})
 
     def specs(self) -> dict[str, str]:
         """Spec hash to the canonical JSON that it covers."""
@@ -301,7 +353,7 @@ class Plan:
         )
         return [
             TrialSpec(
-                trial_id=self._trial_id(arm, condition, repetition),
+                trial_id=self.trial_id_of(arm, condition, repetition),
                 spec_hash=hashes[arm.label, condition],
                 source="seat" if self.seat else "llm" if arm.entries else "driver",
                 model_left=arm.sides["left"],
@@ -318,48 +370,8 @@ class Plan:
             for order, (repetition, arm, condition) in enumerate(cells)
         ]
 
-    def config(self) -> dict[str, object]:
-        """The sweep's configuration for its row in the database."""
-        entries = {name: entry.model_dump(mode="json") for name, entry in self.entries.items()}
-        prompt_blocks = {variant: block_digests(variant) for variant in self.repetitions}
-        file = self.study.file
-        mirrored = len(self.arms) > len(self.repetitions)
-        many = bool(file.factors) or len(self.models) > 1 or mirrored
-        config: dict[str, object] = {
-            "model": self.model,
-            "models": entries,
-            "endpoints": self.endpoints,
-            "scenario": (file.scenario if many else self.scenario).model_dump(),
-            "repetitions": self.repetitions,
-            "conditions": list(self.conditions),
-            "sample_set": self.sample_set,
-            "order_seed": self.order_seed,
-            "prompt_blocks": prompt_blocks,
-            "levels": self.levels,
-            **({"description": file.description} if file.description else {}),
-            **({"seat": self.seat} if self.seat else {}),
-        }
-        if self.mirror:
-            config["mirror"] = True
-        if many:
-            config["arms"] = [
-                {
-                    "label": arm.label,
-                    "model": arm.model,
-                    "sides": arm.sides,
-                    "asked": arm.asked,
-                    "variant": arm.variant,
-                    "repetitions": arm.repetitions,
-                    "scenario": arm.scenario.model_dump(),
-                    "factors": arm.factors,
-                }
-                for arm in self.arms
-            ]
-        if self.study.is_own:
-            config["study"] = {"text": self.study.text, "plugins": self.study.plugins}
-        return config
-
-    def _trial_id(self, arm: Arm, condition: str, repetition: int) -> str:
+    def trial_id_of(self, arm: Arm, condition: str, repetition: int) -> str:
+        """The id of a trial of an arm."""
         seat = "seat/" if self.seat else ""
         set_ = f"/set{self.sample_set}" if self.sample_set else ""
         # The prompt and the opponent stand in it already.
@@ -440,7 +452,7 @@ def make_plan(
     return Plan(
         name=study.name,
         study=study,
-        models=drivers,
+        drivers=drivers,
         arms=tuple(arms),
         entries=entries,
         endpoints={name: endpoint_identity(entry) for name, entry in entries.items()},

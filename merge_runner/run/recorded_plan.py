@@ -73,7 +73,7 @@ def as_recorded(plan: Plan, recordings: Sequence[Path]) -> tuple[Plan, str]:
     conditions = tuple(one for one in plan.conditions if one in held.conditions)
     if not arms or not conditions:
         return plan, ""
-    part = replace(plan, arms=arms, conditions=conditions)
+    part = plan.model_copy(update={"arms": arms, "conditions": conditions})
     if part.trials == plan.trials:
         return plan, ""
     variants = ", ".join(f"{wanted} x {variant}" for variant, wanted in part.repetitions.items())

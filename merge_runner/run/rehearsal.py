@@ -47,7 +47,7 @@ def rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]:
         raise UsageError(
             f"--rehearse takes one model at its provider's own address: --model with one of {valid}"
         )
-    plan = replace(plan, endpoints=dict.fromkeys(plan.entries, REHEARSAL))
+    plan = plan.model_copy(update={"endpoints": dict.fromkeys(plan.entries, REHEARSAL)})
     folder = home / FOLDER
     return plan, replace(options, db=folder / "merge.duckdb", cache=folder / "responses")
 

@@ -40,7 +40,8 @@ def first_situations(plan: Plan) -> Plan:
     arms = tuple(replace(arm, scenario=_one_decision(arm.scenario)) for arm in plan.arms)
     for arm, condition in product(arms, plan.conditions):
         _check(arm.scenario, condition)
-    return replace(plan, name=f"{plan.study.name}-first", arms=arms, seat="first")
+    changes = {"name": f"{plan.study.name}-first", "arms": arms, "seat": "first"}
+    return plan.model_copy(update=changes)
 
 
 def _one_decision(scenario: ScenarioConfig) -> ScenarioConfig:

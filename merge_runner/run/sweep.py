@@ -15,7 +15,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from merge_runner.audit import Audit, audit_sweep
+from merge_runner.audit.checks import audit_sweep
+from merge_runner.audit.findings import Audit
 from merge_runner.config import ModelEntry, model_id, resolve_endpoint
 from merge_runner.errors import (
     MergeRunnerError,
@@ -291,7 +292,7 @@ class Sweep:
         """Add the sweep to the database, with the trials that are stored already."""
         started_at = datetime.now(UTC).replace(tzinfo=None)
         sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
-        config = {**self._plan.config(), "max_cost_usd": self._options.max_cost_usd}
+        config = {**self._plan.model_dump(mode="json"), "max_cost_usd": self._options.max_cost_usd}
         store.begin_sweep(
             SweepRow(
                 sweep_id=sweep_id,
@@ -436,8 +437,8 @@ class Sweep:
             outcome.audit = audit_sweep(
                 self._options.db,
                 outcome.sweep_id,
+                [(spec.trial_id, spec.spec_hash) for spec in self._plan.trial_specs()],
                 finished=outcome.exit_code == 0,
-                derive=False,  # these trials have just been driven
             )
             if not (outcome.exit_code or self._options.sends_nothing or self._options.keep_going):
                 stored = FirstDecisions()
@@ -485,7 +486,7 @@ async def open_sweep(
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
         plan = plan.with_entries(await _named(plan.entries, options, cache, say))
         endpoints = {name: _endpoint(plan, name, options, cache) for name in plan.entries}
-        plan = replace(plan, endpoints=endpoints)
+        plan = plan.model_copy(update={"endpoints": endpoints})
         specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
         with unreadable_is_usage():

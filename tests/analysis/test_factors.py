@@ -267,12 +267,12 @@ def test_a_metric_of_the_studys_plug_in_is_shown_only_where_the_study_is_named(p
 
 
 @pytest.mark.slow
-def test_an_audit_derives_a_studys_prompts_and_conditions_without_its_file_but_runs_no_plug_in(
+def test_an_audit_replays_a_studys_prompts_and_conditions_without_its_file_but_runs_no_plug_in(
     played,
 ):
     alone = json.loads(played.run("audit", "--json").out)
     assert alone["ok"]
-    assert alone["audits"][0]["counts"]["derived anew"] == 36
-    assert "'sleepy', which is no driver here" in " ".join(alone["audits"][0]["notes"])
+    assert alone["audits"][0]["counts"]["replayed"] == 24
+    assert "unknown driver 'sleepy'" in " ".join(alone["audits"][0]["notes"])
     named = json.loads(played.run("audit", "--json", "--study", "mine.toml", "--trust").out)
-    assert not any("not derived" in note for note in named["audits"][0]["notes"])
+    assert not any("not replayed" in note for note in named["audits"][0]["notes"])

@@ -1,4 +1,4 @@
-"""One changed value of any stored column is found, or the audit says that it is not derived."""
+"""One changed value of any stored column is found, or the audit says that no replay gives it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from merge_runner.audit import NOT_DERIVED, audit_cache, audit_database, audit_recording
+from merge_runner.audit.recordings import audit_recording
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.recording import export_recording
+from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 from tests.harness import PROJECT, as_a_model, watched
 
 FAULTS = """
@@ -68,8 +69,7 @@ def change(db: Path, *statements: str) -> None:
 
 
 def findings(db: Path, cache: Path | None = None) -> list:
-    audits = [*audit_database(db), *([audit_cache(db, cache)] if cache else [])]
-    return [finding for audit in audits for finding in audit.findings]
+    return [finding for audit in audit_database(db, cache=cache) for finding in audit.findings]
 
 
 def columns() -> list[tuple[str, str, str]]:
@@ -102,7 +102,7 @@ def test_what_is_changed_is_bad_and_good_answers_a_retry_and_a_program(made):
         assert ask("SELECT count(*) FROM calls WHERE outcome = 'rate_limited'") > 0
         assert ask(f"SELECT valid FROM decisions WHERE {ROWS['decisions']}")
     (audit, _) = audit_database(db)
-    assert audit.counts["derived anew"] == 1
+    assert audit.counts["replayed"] == 1
     (note,) = audit.notes
     assert "emulator+constant/baseline: not judged: 2 of the 9 decisions" in note
 
@@ -112,10 +112,10 @@ def test_what_is_changed_is_bad_and_good_answers_a_retry_and_a_program(made):
 def test_one_changed_value_of_a_column_is_a_finding(db, made, table, column, kind):
     change(db, altered(table, column, kind))
     found = findings(db)
-    if f"{table}.{column}" not in NOT_DERIVED:
+    if f"{table}.{column}" not in NOT_REPLAYED:
         assert found
         return
-    assert not found, "it is derived: take it from the list"
+    assert not found, "a replay gives it: take it from the list"
     with_cache = findings(db, made / "cache/responses")
     assert bool(with_cache) == (table == "calls" and column != "cached")
 
@@ -128,12 +128,12 @@ def test_a_format_that_there_is_not_is_a_finding_and_switches_nothing_off_in_sil
 
 
 @pytest.mark.slow
-def test_what_is_not_derived_is_listed_in_the_docs_and_by_the_command(made, prepare):
+def test_what_is_not_replayed_is_listed_in_the_docs_and_by_the_command(made, prepare):
     page = (PROJECT / "docs/reference/audit.md").read_text()
     known = {f"{table}.{column}" for table, column, _ in COLUMNS}
-    assert set(NOT_DERIVED) <= known
+    assert set(NOT_REPLAYED) <= known
     listed = prepare(made, "audit").out.splitlines()[-1]
-    for name in NOT_DERIVED:
+    for name in NOT_REPLAYED:
         assert f"`{name}`" in page
         assert name in listed
     with_cache = prepare(made, "audit", "--cache", "cache/responses").out.splitlines()[-1]
@@ -154,7 +154,7 @@ def test_what_is_not_derived_is_listed_in_the_docs_and_by_the_command(made, prep
 )
 def test_a_column_that_is_changed_throughout_is_one_finding_a_trial(db, statement, says):
     change(db, statement)
-    (finding,) = (f for f in findings(db) if f.kind == "derived")
+    (finding,) = (f for f in findings(db) if f.kind == "replay")
     assert says in finding.text
     assert "more in the trial" in finding.text
     assert finding.trial == "emulator+constant/baseline/L_4_0/rep01"
@@ -168,37 +168,31 @@ def test_the_answers_of_two_calls_that_are_exchanged_are_found(db, made):
     """
     change(db, swap)
     found = findings(db)
-    assert {(f.kind, f.decision) for f in found} >= {("derived", 2)}
-    assert {f.decision for f in findings(db, made / "cache/responses") if f.kind == "cache"} == {
-        2,
-        5,
-    }
+    assert {(f.kind, f.decision) for f in found} >= {("exchanged", 2)}
+    assert 2 in {f.decision for f in findings(db, made / "cache/responses") if f.kind == "cache"}
 
 
 def test_an_answer_that_is_said_to_have_come_with_an_error_is_found(db):
     change(db, f"UPDATE calls SET http_status = 500 WHERE {ROWS['calls']}")
-    texts = [finding.text for finding in findings(db) if finding.kind == "derived"]
-    assert any("calls.outcome is ok, and server_error derived anew" in text for text in texts)
+    texts = [finding.text for finding in findings(db) if finding.kind == "replay"]
+    assert any("it cannot be replayed: left: HTTP 500" in text for text in texts)
 
 
-def test_a_program_that_is_another_one_by_now_is_said_and_only_driven(db, monkeypatch):
+def test_trials_of_another_program_are_a_note(db, monkeypatch):
     monkeypatch.setattr("merge_runner.drivers.registry.source_digest", lambda *_, **__: "edited")
     (audit, _) = audit_database(db)
     assert audit.findings == []
-    assert audit.notes[1:] == [
-        "not derived anew in 1 trials: the decisions of a program that is not as it was"
-    ]
-    change(db, "UPDATE states SET position_m = position_m + 1e-6 WHERE step = 3 AND side = 'right'")
-    assert findings(db)
+    assert audit.notes[-1] == (
+        "not replayed: 1 trials, since they were made by another version or other data: "
+        "right.source"
+    )
 
 
-def test_prompts_of_other_texts_are_said_and_the_rest_is_derived(db, monkeypatch):
-    monkeypatch.setattr("merge_runner.audit.derived.block_digests", lambda _: {"C0": "older"})
+def test_trials_of_other_prompts_are_a_note(db, monkeypatch):
+    monkeypatch.setattr("merge_runner.run.plan.block_digests", lambda _: {"C0": "older"})
     (audit, _) = audit_database(db)
     assert audit.findings == []
-    assert "the prompts, made of other texts than this version has" in audit.notes[1]
-    change(db, f"UPDATE decisions SET rationale = 'x' WHERE {ROWS['decisions']}")
-    assert findings(db)
+    assert "made by another version or other data: prompt_blocks" in audit.notes[-1]
 
 
 def test_a_difference_below_the_tolerance_is_none(db):
@@ -256,7 +250,7 @@ async def test_answers_that_were_exchanged_before_they_were_kept_are_found(
     export_recording(tmp_path / "swapped.parquet", cache, keys, {})
     cache.close()
     (finding, *_) = audit_recording(tmp_path / "swapped.parquet").findings
-    assert (finding.kind, finding.decision) == ("derived", 2)
+    assert (finding.kind, finding.decision) == ("exchanged", 2)
     # The trial goes another way after the first of them, so that it ends for want of a reply.
     await merge_runner(
         "replay", "baseline", "--model", "emulator+constant", *PART, "--cache", "swapped"

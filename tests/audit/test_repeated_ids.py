@@ -14,11 +14,6 @@ PLAN = f"M\n\nI keep my speed.\n\n{[0] * 20}"
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="2.3: equal answers under one id are faults, although a local server has 1,000 ids",
-)
 async def test_equal_answers_under_one_id_of_a_local_server_are_a_note(merge_runner):
     numbers = itertools.count()
 

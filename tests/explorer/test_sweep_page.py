@@ -18,8 +18,7 @@ from analysis.explorer.app import explorer
 from analysis.explorer.pages import sweep as page
 from analysis.explorer.pages.trials import filter_of
 from analysis.explorer.site import Site
-from analysis.explorer.sweeps import Config, ListedSweep, assessment_of, config_of
-from merge_runner.audit.expected import ModelFacts
+from analysis.explorer.sweeps import Config, ListedSweep, Model, assessment_of, config_of
 from merge_runner.results.progress_file import ProgressFile
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -249,7 +248,7 @@ def test_the_verdict_says_how_it_ended_and_what_to_type(code, ended, failed, kin
 
 def test_a_finished_sweep_that_another_model_answered_is_doubtful():
     row = {"sweep_id": "s", "name": "n", "exit_code": 0, "trials": 0, "failed": 0, "ended_at": END}
-    entry = ListedSweep(row, Config(models={"o3": ModelFacts(id="o3", provider="openai")}), None)
+    entry = ListedSweep(row, Config(models={"o3": Model(id="o3", provider="openai")}), None)
     assert assessment_of(entry, "", 7).kind == "doubtful"
 
 

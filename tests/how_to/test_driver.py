@@ -70,7 +70,7 @@ def test_a_driver_decides_at_its_own_rate_and_is_drawn_from_its_seed(study, play
 @pytest.mark.slow
 def test_it_is_in_every_command_that_reads(study, played):
     audit = study.run("audit", "--json", **played)
-    assert (audit.code, "not derived" in audit.out) == (0, False), audit.out
+    assert (audit.code, "not replayed" in audit.out) == (0, False), audit.out
     done = study.run("view", "--trials", "*", "--single", "trials.html", **played)
     assert done.code == 0, done.err
     tables = study.run("tables", "ablation-quantitative", "--format", "csv", **played)
@@ -85,7 +85,7 @@ def test_where_it_is_not_installed_the_rest_is_shown_and_checked(study, played):
     assert audit.code == 0
     notes = [note for one in json.loads(audit.out)["audits"] for note in one["notes"]]
     assert any(
-        "the decisions of 'impulsive', which is no driver here; valid: constant, " in note
+        "unknown driver 'impulsive'; valid: " in note
         and "(install the package that registers it, or name the study: --study FILE)" in note
         for note in notes
     ), notes
@@ -124,7 +124,7 @@ def test_a_study_gives_it_other_parameters_and_a_slower_clock(study, installed):
     assert interval == 1.0
     assert 0.5 < hardest <= 0.9
     audit = study.run("audit", "--db", "wild.duckdb", "--json", **installed)
-    assert (audit.code, "not derived" in audit.out) == (0, False), audit.out
+    assert (audit.code, "not replayed" in audit.out) == (0, False), audit.out
 
 
 def test_programs_are_listed_with_what_they_do(study, installed):

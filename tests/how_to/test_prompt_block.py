@@ -58,7 +58,7 @@ def test_it_is_in_every_command_that_reads(study, played):
     for command in (("audit",), ("view", "--export", "pages")):
         done = study.run(*command, **played)
         assert done.code == 0, f"{command}: {done.err}"
-        assert "not derived" not in done.out + done.err
+        assert "not replayed" not in done.out + done.err
     text = pages_of(study.folder / "pages")
     assert "with C6: warning of speed" in text
     assert "without C1: history and with C6: warning of speed" in text

@@ -11,10 +11,10 @@ import duckdb
 import psutil
 import pytest
 
-from merge_runner.audit import audit_database
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.recording import export_recording
+from merge_runner.run.stored_replay import audit_database
 from tests.analysis.studies import write_study, yielding
 from tests.harness import PROGRAM
 

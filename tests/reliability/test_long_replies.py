@@ -75,7 +75,7 @@ def command(folder, *arguments):
 def test_a_thousand_long_replies_are_audited_and_looked_up_in_the_cache(long):
     told = json.loads(command(long, "audit", "--cache", long / "cache", "--json"))
     assert told["ok"]
-    assert told["audits"][-1]["counts"]["calls"] > 1_000
+    assert told["audits"][0]["counts"]["calls"] > 1_000
 
 
 def test_a_thousand_long_replies_are_queried_in_every_format(long):

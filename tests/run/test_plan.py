@@ -59,7 +59,7 @@ def test_the_order_is_random_within_a_repetition_and_balanced_over_them():
     assert len(blocks) == max(plans[0].repetitions.values())
     # No block begins with the conditions of another one in the same order.
     assert len({tuple(cell[2] for cell in block[:11]) for block in blocks}) == len(blocks)
-    assert [plan.config()["order_seed"] for plan in plans] == [0, 0, 1]
+    assert [plan.model_dump(mode="json")["order_seed"] for plan in plans] == [0, 0, 1]
 
 
 def test_the_spec_hash_covers_what_determines_a_result_and_nothing_else(tmp_path):
@@ -69,7 +69,9 @@ def test_the_spec_hash_covers_what_determines_a_result_and_nothing_else(tmp_path
     assert hashes(make_plan("baseline", "emulator", conditions=["N_0_0"])) == {"baseline": base}
     changed = {
         hashes(make_plan("baseline", "emulator", sample_set=1))["baseline"],
-        hashes(replace(plan, endpoints={"emulator": "http://127.0.0.1:1/v1"}))["baseline"],
+        hashes(plan.model_copy(update={"endpoints": {"emulator": "http://127.0.0.1:1/v1"}}))[
+            "baseline"
+        ],
         hashes(make_plan("baseline", "emulator+constant"))["baseline"],
         hashes(make_plan("baseline", "constant+emulator"))["baseline"],
         *hashes(make_plan("baseline", "emulator", 1, variants=["A1", "A7"])).values(),

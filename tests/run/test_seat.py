@@ -312,7 +312,7 @@ def test_vehicles_that_collide_at_once_are_no_situation():
     wide = plan.arms[0].scenario.model_copy(update={"vehicle_length_m": 60.0})
     arms = (replace(plan.arms[0], scenario=wide),)
     with pytest.raises(UsageError, match="collide before both are driven"):
-        first_situations(replace(plan, arms=arms))
+        first_situations(plan.model_copy(update={"arms": arms}))
 
 
 @pytest.mark.slow

@@ -95,7 +95,7 @@ async def test_a_set_brings_its_parameters_and_single_ones_go_before_it(plan_of)
 def test_it_stands_in_pairs_and_in_the_sweep_with_its_study(plan_of):
     plan = plan_of(MINE, ["mine+emulator", "constant+mine"])
     assert [arm.sides["left"] for arm in plan.arms] == ["mine", "constant"]
-    assert "[drivers.mine]" in plan.config()["study"]["text"]
+    assert "[drivers.mine]" in plan.model_dump(mode="json")["study"]["text"]
 
 
 async def test_a_clock_holds_each_action(plan_of):
@@ -183,7 +183,7 @@ def test_a_world_is_as_fine_as_its_drivers_need_and_otherwise_as_it_was(plan_of)
 
 def test_what_a_sweep_stores_of_its_world_is_what_its_trials_are_played_in(plan_of):
     plan = plan_of("", "braking")
-    assert plan.config()["scenario"] == specs(plan)[0]["scenario"]
+    assert plan.model_dump(mode="json")["arms"][0]["scenario"] == specs(plan)[0]["scenario"]
 
 
 def test_a_step_that_is_given_and_does_not_fit_is_refused(plan_of):

@@ -90,7 +90,7 @@ async def test_a_foggy_study_that_is_killed_goes_on_and_replays_sealed_to_the_sa
     assert results_digest(foggy / "r") == results_digest(foggy / "results/merge.duckdb")
     assert query(foggy / "r", BESIDE) == query(foggy / "results/merge.duckdb", BESIDE)
     audit = await merge_runner("audit", "--db", "r")
-    assert (audit.code, "12 derived anew" in audit.out) == (0, True), audit.out
+    assert (audit.code, "12 replayed" in audit.out) == (0, True), audit.out
     assert "all holds" in audit.out
     with duckdb.connect(str(foggy / "r")) as connection:
         connection.execute("UPDATE decisions SET told_distance_m = told_distance_m + 0.01")

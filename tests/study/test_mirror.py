@@ -55,7 +55,10 @@ def test_to_mirror_changes_no_trial_that_was_played_without(plan_of):
 def test_a_pair_of_the_command_line_is_mirrored_too(plan_of):
     plan = plan_of("", "emulator+constant", mirror=True)
     assert seats(plan) == [("emulator", "constant", "left"), ("constant", "emulator", "right")]
-    assert [arm["label"] for arm in plan.config()["arms"]] == ["baseline", "baseline mirrored"]
+    assert [arm["label"] for arm in plan.model_dump(mode="json")["arms"]] == [
+        "baseline",
+        "baseline mirrored",
+    ]
 
 
 def test_a_pair_that_is_named_both_ways_is_played_once(plan_of):

@@ -161,7 +161,9 @@ def test_a_plug_in_beside_the_study_drives_and_an_edit_of_it_is_another_driver(p
         plan = plan_of(text, ["braking"], plugin=DRIVER.format(action=action))
         hashes.append(plan.trial_specs()[0].spec_hash)
     assert hashes[0] == hashes[1] != hashes[2]
-    assert plan.config()["study"]["plugins"] == {"mine.py": DRIVER.format(action=-0.2)}
+    assert plan.model_dump(mode="json")["study"]["plugins"] == {
+        "mine.py": DRIVER.format(action=-0.2)
+    }
 
 
 def test_an_edit_of_what_a_plug_in_imports_is_another_driver(tmp_path):

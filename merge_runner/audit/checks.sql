@@ -1,0 +1,316 @@
+-- What a replay cannot see, and what the states alone tell of a trial. The views read the tables of a
+-- database and these: the sweep that is audited, its trials as planned (with planned.known) and as
+-- stored, the trials that were audited before, and the pairs in which another model answered.
+CREATE OR REPLACE TEMP TABLE subject (sweep_id VARCHAR, finished BOOLEAN, known BOOLEAN);
+CREATE OR REPLACE TEMP TABLE planned (trial_id VARCHAR, spec_hash VARCHAR);
+CREATE OR REPLACE TEMP TABLE audited AS SELECT trial_id, spec_hash FROM trials LIMIT 0;
+CREATE OR REPLACE TEMP TABLE done AS FROM audited;
+CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
+
+-- The sweep's list of trials.
+
+CREATE OR REPLACE TEMP VIEW linked AS
+SELECT trial_id, spec_hash, count(*) AS links FROM sweep_trials SEMI JOIN subject USING (sweep_id)
+GROUP BY ALL;
+
+-- Another sweep may have gone on where this one stopped: what it has played is not missing.
+CREATE OR REPLACE TEMP VIEW unplayed AS
+SELECT trial_id, trials.status IS NOT NULL AS elsewhere
+FROM planned ANTI JOIN linked USING (trial_id)
+LEFT JOIN (
+    FROM trials SEMI JOIN sweep_trials USING (trial_id, spec_hash) WHERE status <> 'failed'
+) AS trials USING (trial_id, spec_hash);
+
+CREATE OR REPLACE TEMP VIEW list_findings AS
+SELECT 'missing' AS kind, trial_id, 'it was not played' AS text
+FROM unplayed WHERE NOT elsewhere AND (SELECT finished FROM subject)
+UNION ALL SELECT 'failed', trial_id, coalesce(error, 'it failed')
+FROM trials SEMI JOIN linked USING (trial_id, spec_hash)
+WHERE status = 'failed' AND (SELECT finished FROM subject)
+UNION ALL SELECT 'unplanned', trial_id, 'the plan of the sweep has no such trial'
+FROM linked ANTI JOIN planned USING (trial_id) WHERE (SELECT known FROM subject)
+UNION ALL SELECT 'unplanned', trial_id, format('the sweep lists it {} times', sum(links))
+FROM linked GROUP BY trial_id HAVING sum(links) > 1
+UNION ALL SELECT 'orphan', trial_id, 'the sweep lists it, and it is not among the trials'
+FROM linked ANTI JOIN trials USING (trial_id, spec_hash)
+UNION ALL SELECT 'config', NULL, 'its id is not made of its name, its drivers and its start'
+FROM sweeps SEMI JOIN subject USING (sweep_id)
+WHERE json_valid(config) AND sweep_id <> concat_ws(
+    '-', name, config->>'$.model', strftime(started_at, '%Y%m%dT%H%M%S%f'));
+
+-- Rows that belong to nothing, in the whole database; a spec's hash is that of its text.
+CREATE OR REPLACE TEMP VIEW orphans AS
+SELECT 'orphan' AS kind, trial_id, 'no sweep has this trial' AS text FROM trials
+ANTI JOIN sweep_trials USING (trial_id, spec_hash) WHERE source <> 'human'
+UNION ALL SELECT 'orphan', trial_id, 'its spec is not stored' FROM trials
+ANTI JOIN specs USING (spec_hash)
+UNION ALL SELECT 'orphan', trial_id, 'it is listed by a sweep that is not stored' FROM sweep_trials
+ANTI JOIN sweeps USING (sweep_id)
+UNION ALL SELECT 'orphan', trial_id, format('{} rows of {} belong to no trial', count(*), name)
+FROM (
+    SELECT 'states' AS name, trial_id, spec_hash FROM states
+    UNION ALL SELECT 'decisions', trial_id, spec_hash FROM decisions
+    UNION ALL SELECT 'calls', trial_id, spec_hash FROM calls
+    UNION ALL SELECT 'trial_factors', trial_id, spec_hash FROM trial_factors
+) ANTI JOIN trials USING (trial_id, spec_hash) GROUP BY name, trial_id
+UNION ALL SELECT 'spec', NULL, format('the spec stored as {} has another hash', spec_hash)
+FROM specs WHERE left(sha256(spec::VARCHAR), 16) <> spec_hash;
+
+-- What the states tell, by the inverse Y of the experiment: two branches of 100 m whose starts lie
+-- 25 m apart, and one lane of 50 m.
+
+CREATE OR REPLACE TEMP VIEW rules AS
+SELECT spec_hash, scenario->>'$.collision_rule' AS rule,
+    (scenario->>'$.vehicle_length_m')::DOUBLE AS length_m,
+    (scenario->>'$.vehicle_width_m')::DOUBLE AS width_m,
+    round((scenario->>'$.timeout_s')::DOUBLE / (scenario->>'$.step_s')::DOUBLE) AS timeout_steps
+FROM (SELECT spec_hash, if(json_valid(spec), spec->'$.scenario', NULL) AS scenario FROM specs);
+
+CREATE OR REPLACE TEMP VIEW traced AS
+WITH samples AS (
+    SELECT trial_id, spec_hash, step, max(time_s) AS time_s, count(*) AS vehicles,
+        max(position_m) FILTER (side = 'left') AS left_m,
+        max(position_m) FILTER (side = 'right') AS right_m
+    FROM states SEMI JOIN audited USING (trial_id, spec_hash) GROUP BY ALL
+), placed AS (
+    SELECT *, lag(left_m) OVER trial AS left_before_m, lag(right_m) OVER trial AS right_before_m,
+        sqrt(1 - 0.125 ** 2) AS cosine,
+        if(left_m > 100, 0, 0.125) AS left_x, if(left_m > 100, 1, cosine) AS left_y,
+        if(right_m > 100, 0, -0.125) AS right_x, if(right_m > 100, 1, cosine) AS right_y,
+        0.125 * (greatest(100 - left_m, 0) + greatest(100 - right_m, 0)) AS x,
+        right_m * right_y - left_m * left_y + if(right_m > 100, 100 * (cosine - 1), 0)
+            - if(left_m > 100, 100 * (cosine - 1), 0) AS y
+    FROM samples WINDOW trial AS (PARTITION BY trial_id, spec_hash ORDER BY step)
+), turned AS (
+    SELECT *, left_x * right_x + left_y * right_y AS along,
+        abs(left_x * right_y - left_y * right_x) AS across
+    FROM placed
+)
+-- How deep the vehicles are within each other; below 0 they are apart. Two boxes are apart where
+-- their shadows along or across either of them are.
+SELECT trial_id, spec_hash, step, time_s, vehicles, left_m, right_m, left_before_m, right_before_m,
+    length_m, timeout_steps, CASE rule
+        WHEN 'euclid2d' THEN length_m - sqrt(x ** 2 + y ** 2)
+        WHEN 'shared_lane'
+            THEN if(greatest(left_m, right_m) >= 100, length_m - abs(left_m - right_m), -1)
+        ELSE least(
+            (length_m * (1 + along) + width_m * across) / 2
+                - greatest(abs(x * left_x + y * left_y), abs(x * right_x + y * right_y)),
+            (width_m * (1 + along) + length_m * across) / 2
+                - greatest(abs(x * left_y - y * left_x), abs(x * right_y - y * right_x)))
+        END AS depth_m
+FROM turned JOIN rules USING (spec_hash);
+
+CREATE OR REPLACE TEMP VIEW driven AS
+SELECT trial_id, spec_hash, max(step) AS last_step, max(time_s) AS end_s,
+    count(*) FILTER (vehicles = 2 AND left_m IS NOT NULL AND right_m IS NOT NULL) AS samples,
+    max(greatest(left_m, right_m)) AS far_m, any_value(timeout_steps) AS timeout_steps,
+    min(step) FILTER (left_m >= 100) AS left_step, min(step) FILTER (right_m >= 100) AS right_step,
+    min(step) FILTER (depth_m > 1e-9) AS touch_step, arg_max(depth_m, step) AS last_depth_m,
+    -- Positions are linear within the step in which the first vehicle arrives.
+    arg_min(abs(left_before_m - right_before_m + least(
+            if(left_m >= 100, (100 - left_before_m) / (left_m - left_before_m), 1),
+            if(right_m >= 100, (100 - right_before_m) / (right_m - right_before_m), 1)
+        ) * (left_m - left_before_m - right_m + right_before_m)) - length_m, step)
+        FILTER (greatest(left_m, right_m) >= 100) AS gap_m
+FROM traced GROUP BY trial_id, spec_hash;
+
+CREATE OR REPLACE TEMP VIEW state_findings AS
+WITH judged AS (
+    SELECT trials.trial_id, if(status = 'finished', driven.gap_m, NULL) AS gap_m,
+        trial_metrics.gap_m AS view_gap_m, CASE
+        WHEN samples IS NULL THEN 'it has no states'
+        WHEN samples <> last_step + 1
+            THEN format('it has {} samples of both vehicles in {} steps', samples, last_step + 1)
+        WHEN abs(end_time_s - end_s) > 1e-6
+            THEN format('it ended after {} s, its states after {} s', end_time_s, end_s)
+        WHEN status = 'failed' AND error IS NULL THEN 'it failed and names no reason'
+        WHEN status = 'finished' AND far_m < 150
+            THEN 'it is finished, and nobody has reached the end of the track'
+        WHEN status IN ('timeout', 'failed') AND far_m >= 150
+            THEN format('it is {}, and a vehicle has reached the end of the track', status)
+        WHEN status = 'timeout' AND last_step <> timeout_steps
+            THEN format('its time was over after {} of {} steps', last_step, timeout_steps)
+        WHEN status IN ('collided', 'failed') AND merged_first IS NOT NULL
+            THEN format('it is {}, and has a first merger', status)
+        WHEN status IN ('collided', 'failed') OR left_step = right_step THEN NULL
+        WHEN merged_first IS DISTINCT FROM CASE
+                WHEN left_step < coalesce(right_step, left_step + 1) THEN 'left'
+                WHEN right_step IS NOT NULL THEN 'right' END
+            THEN 'another vehicle merged first by its states than by its row, or none'
+        END AS outcome, CASE
+        WHEN status = 'collided' AND last_depth_m < -1e-9
+            THEN 'it is collided, and its last states are apart'
+        WHEN touch_step < last_step OR (touch_step IS NOT NULL AND status <> 'collided')
+            THEN format('it is {} after {} steps, and its states collide after {}',
+                status, last_step, touch_step)
+        END AS collision
+    FROM trials SEMI JOIN audited USING (trial_id, spec_hash)
+    LEFT JOIN driven USING (trial_id, spec_hash)
+    LEFT JOIN trial_metrics USING (trial_id, spec_hash)
+)
+SELECT 'outcome' AS kind, trial_id, outcome AS text FROM judged WHERE outcome IS NOT NULL
+UNION ALL SELECT 'collision', trial_id, collision FROM judged WHERE collision IS NOT NULL
+UNION ALL SELECT 'gap', trial_id, format('it is {} m in trial_metrics, and by its states {} m',
+    coalesce(round(view_gap_m, 3)::VARCHAR, 'no'), coalesce(round(gap_m, 3)::VARCHAR, 'no'))
+FROM judged WHERE gap_m IS DISTINCT FROM view_gap_m
+    AND NOT coalesce(abs(view_gap_m - gap_m) <= 1e-6, false);
+
+-- The calls and their answers.
+
+CREATE OR REPLACE TEMP VIEW call_findings AS
+-- One finding for each pair of models, at its first answer.
+SELECT 'served' AS kind, arg_min(trial_id, (trial_id, decision, side)) AS trial_id,
+    arg_min(side, (trial_id, decision, side)) AS side,
+    arg_min(decision, (trial_id, decision, side)) AS decision,
+    format('{} -> {}: another model answered than was asked for ({} answers)',
+        model_requested, model_served, count(*)) AS text
+FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
+SEMI JOIN other_models USING (model_requested, model_served)
+WHERE http_status = 200 GROUP BY model_requested, model_served
+-- An empty answer may be asked for again; any other is the last attempt.
+UNION ALL SELECT 'attempt', trial_id, side, decision, text FROM (
+    SELECT trial_id, side, decision, CASE
+        WHEN list(attempt ORDER BY attempt) <> range(1, count(*) + 1)
+            THEN format('its attempts are numbered {}', list(attempt ORDER BY attempt)::VARCHAR)
+        WHEN min(attempt) FILTER (outcome IN ('ok', 'refusal', 'truncated')) < max(attempt)
+            THEN 'an answer was followed by another attempt' END AS text
+    FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
+    GROUP BY trial_id, spec_hash, side, decision, call_key
+) WHERE text IS NOT NULL
+-- The emulator says in each reply what it answers.
+UNION ALL SELECT 'exchanged', trial_id, side, decision,
+    'its reply is, as the server says in it, the answer to another request'
+FROM (
+    SELECT trial_id, calls.side, calls.decision, condition, rep, sample_set, request,
+        if(json_valid(reply), reply->'$.merge_runner_request', NULL) AS answered
+    FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
+    JOIN trials USING (trial_id, spec_hash)
+) WHERE answered->>'$.body_sha256' <> sha256(request::VARCHAR)
+    OR [answered->>'$.slot.condition', answered->>'$.slot.repetition', answered->>'$.slot.side',
+        answered->>'$.slot.decision', answered->>'$.slot.sample_set']
+        <> [condition, rep::VARCHAR, side, decision::VARCHAR, sample_set::VARCHAR]
+    AND json_type(answered, '$.slot') = 'OBJECT';
+
+-- A reply's id and a hash of its answer: what is beside it, such as a time, may differ in a copy. Ids
+-- are compared within an endpoint: two emulators give equal questions equal ids.
+CREATE OR REPLACE TEMP VIEW identified AS
+SELECT calls.trial_id, calls.spec_hash, calls.side, decision, call_key, provider, model_requested,
+    coalesce(json_extract_string(spec, '$.' || side || '.endpoint'), '') AS endpoint, reply_id,
+    hash(coalesce(reply->'$.choices', reply->'$.output', reply->'$.candidates', reply->'$.content',
+        reply)::VARCHAR) AS content
+FROM (
+    SELECT *, nullif(coalesce(reply->>'$.id', reply->>'$.responseId'), '') AS reply_id
+    FROM (
+        SELECT * REPLACE (if(json_valid(reply), reply, NULL) AS reply)
+        FROM calls WHERE http_status = 200
+    )
+) AS calls LEFT JOIN specs USING (spec_hash) WHERE reply_id IS NOT NULL;
+CREATE OR REPLACE TEMP TABLE reply_ids AS FROM identified LIMIT 0;
+
+-- Some servers draw ids out of a thousand, or have but one. An id that came with different answers
+-- proves nothing; neither does any other one of a server most of whose repeated ids are such, nor one
+-- of a server of one's own, whose ids nobody promises to be unique.
+CREATE OR REPLACE TEMP VIEW repeated_ids AS
+SELECT endpoint, model_requested, reply_id, same AND provider <> 'local'
+    AND count(*) FILTER (same) OVER server >= count(*) FILTER (NOT same) OVER server AS telling
+FROM (
+    SELECT endpoint, model_requested, reply_id, any_value(provider) AS provider,
+        min(content) = max(content) AS same
+    FROM reply_ids GROUP BY ALL HAVING min(call_key) <> max(call_key)
+) WINDOW server AS (PARTITION BY endpoint, model_requested);
+
+-- Two slots of one spec with one call, and two calls of any spec with one reply: a proxy that caches
+-- answers a repetition, or a fresh set of samples, with an old reply. Drivers of a study may ask the
+-- same in the same slot: that is no fault.
+CREATE OR REPLACE TEMP VIEW shared AS
+SELECT 'its call is also that of' AS text,
+    list(DISTINCT (trial_id, side, decision) ORDER BY (trial_id, side, decision)) AS places,
+    list(DISTINCT (trial_id, spec_hash)) AS trials
+FROM decisions JOIN trial_drivers USING (trial_id, spec_hash)
+WHERE call_key IS NOT NULL GROUP BY spec_hash, driver, call_key HAVING count(*) > 1
+UNION ALL SELECT 'its answer, with the provider''s id of it, is also that of',
+    list(place ORDER BY place), list(DISTINCT trial)
+FROM (
+    SELECT endpoint, model_requested, reply_id, min((trial_id, side, decision)) AS place,
+        arg_min((trial_id, spec_hash), (trial_id, side, decision)) AS trial
+    FROM reply_ids SEMI JOIN (FROM repeated_ids WHERE telling)
+        USING (endpoint, model_requested, reply_id)
+    GROUP BY endpoint, model_requested, reply_id, call_key
+) GROUP BY endpoint, model_requested, reply_id;
+
+CREATE OR REPLACE TEMP VIEW shared_findings AS
+SELECT 'shared' AS kind, places[1][1] AS trial_id, places[1][2] AS side, places[1][3] AS decision,
+    format('{} {}{}', text, array_to_string(
+        [format('{}, {}, decision {}', p[1], p[2], p[3]) FOR p IN places[2:4]], '; '),
+        if(len(places) > 4, format(' and {} more', len(places) - 4), '')) AS text
+FROM shared WHERE len(places) > 1
+    AND list_has_any(trials, (SELECT list((trial_id, spec_hash)) FROM audited))
+    AND NOT coalesce(list_has_any(trials, (SELECT list((trial_id, spec_hash)) FROM done)), false);
+
+CREATE OR REPLACE TEMP VIEW findings AS
+SELECT kind, trial_id, NULL AS side, NULL AS decision, text FROM list_findings
+UNION ALL SELECT kind, trial_id, NULL, NULL, text FROM state_findings
+UNION ALL FROM call_findings
+UNION ALL FROM shared_findings;
+
+-- What is no fault.
+
+CREATE OR REPLACE TEMP VIEW unclear_ids AS
+SELECT model_requested, endpoint, count(DISTINCT call_key) AS replies
+FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash)
+JOIN repeated_ids USING (endpoint, model_requested, reply_id)
+WHERE NOT telling GROUP BY ALL ORDER BY ALL;
+
+-- Of the answers to prompts that were asked before, how many are word for word like another. A model
+-- that samples never gives only answers that it has given before. A proxy that caches and gives each
+-- reply a new id does, and so does a model at temperature 0: in both cases they are no samples.
+CREATE OR REPLACE TEMP VIEW alike AS
+SELECT coalesce(sum(times - 1), 0)::BIGINT AS repeated,
+    coalesce(sum(times - different), 0)::BIGINT AS alike
+FROM (
+    SELECT count(*) AS times, count(DISTINCT answer) AS different
+    FROM (
+        SELECT DISTINCT ON (model_left, model_right, side, prompt_hash, call_key)
+            model_left, model_right, side, prompt_hash,
+            hash(coalesce(rationale, ''), plan) AS answer
+        FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)
+        JOIN trials USING (trial_id, spec_hash) WHERE valid AND call_key IS NOT NULL
+    ) GROUP BY model_left, model_right, side, prompt_hash
+);
+
+-- Trials that a sweep did not play, since earlier ones had, and identical requests of the same slot.
+CREATE OR REPLACE TEMP VIEW taken_over AS
+SELECT earlier.sweep_id, count(*) AS trials
+FROM linked JOIN (SELECT DISTINCT * FROM sweep_trials) AS links USING (trial_id, spec_hash)
+JOIN sweeps AS earlier USING (sweep_id)
+WHERE started_at < (SELECT started_at FROM sweeps SEMI JOIN subject USING (sweep_id))
+GROUP BY ALL ORDER BY ALL;
+
+CREATE OR REPLACE TEMP VIEW calls_in_common AS
+WITH used AS (
+    SELECT DISTINCT call_key, spec_hash, driver || '/' || variant AS name
+    FROM decisions JOIN trials USING (trial_id, spec_hash)
+    JOIN trial_drivers USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
+)
+SELECT if(a.name = b.name, format('{} ({})', a.name, a.spec_hash), a.name),
+    if(a.name = b.name, format('{} ({})', b.name, b.spec_hash), b.name),
+    count(DISTINCT call_key)
+FROM used AS a JOIN used AS b USING (call_key)
+WHERE (a.name, a.spec_hash) < (b.name, b.spec_hash)
+    AND (a.spec_hash IN (SELECT spec_hash FROM audited)
+        OR b.spec_hash IN (SELECT spec_hash FROM audited))
+GROUP BY a.name, a.spec_hash, b.name, b.spec_hash ORDER BY ALL;
+
+CREATE OR REPLACE TEMP VIEW counts AS
+FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, spec_hash)),
+    (SELECT count(*) FILTER (NOT elsewhere) AS missing FROM unplayed),
+    (SELECT count(*) AS failed FROM linked
+        SEMI JOIN (FROM trials WHERE status = 'failed') USING (trial_id, spec_hash)),
+    (SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid
+    FROM decisions SEMI JOIN audited USING (trial_id, spec_hash)),
+    (SELECT count(DISTINCT call_key) AS calls, count(*) AS attempts,
+        count(*) FILTER (scripted) AS "attempts answered by a scripted stand-in"
+    FROM calls SEMI JOIN audited USING (trial_id, spec_hash)),
+    (SELECT count(DISTINCT reply_id) AS "reply ids"
+    FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash));
