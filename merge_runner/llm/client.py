@@ -21,8 +21,7 @@ from merge_runner.errors import (
     RecordingError,
     SweepStopped,
 )
-from merge_runner.llm.batch.batches import Batches
-from merge_runner.llm.batch.lines import LineEnd
+from merge_runner.llm.batch.lines import Batches, LineEnd
 from merge_runner.llm.budget import Unpaid
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.call import Call, Wait, slot_text
@@ -327,13 +326,10 @@ class LlmClient:
             call.attempts.append(record)
             call.singly |= end.singly
             self.meter.count_attempt(record)
-            try:
-                if end.error is None:
-                    return await self._concluded(call, paid, outcome, end.raw)
-                await paid.settle(call.attempts)
-                raise end.error
-            finally:
-                batches.rounds.ended(line)
+            if end.error is None:
+                return await self._concluded(call, paid, outcome, end.raw)
+            await paid.settle(call.attempts)
+            raise end.error
 
     def _line_record(
         self, call: Call, end: LineEnd, price_factor: float

@@ -215,7 +215,7 @@ async def test_first_situations_take_one_batch(merge_runner, tmp_path):
 async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("merge_runner.llm.batch.following.ROUND_DEADLINE_S", 2.0)
+    monkeypatch.setattr("merge_runner.llm.batch.rounds.ROUND_DEADLINE_S", 2.0)
     said = []
     plan = BatchPlan(delay_s=1.0, slow=0.5, slow_factor=1000)
     async with watched(faults=FaultPlan(batch=plan)) as server:

@@ -81,20 +81,10 @@ async def test_results_in_any_order_need_no_single_call(play):
     assert (await play(with_results(lambda lines: lines[::-1])))[1] == 0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="4.1: a result that comes twice keeps another one from being read",
-)
 async def test_a_result_that_comes_twice_is_one_answer(play):
     assert (await play(with_results(lambda lines: [lines[0], *lines])))[1] == 0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="4.1: results of another batch keep the batch's own from being read",
-)
 async def test_results_of_another_batch_are_ignored_and_counted(play):
     def with_foreign(lines):
         foreign = [re.sub(rb'("custom_id"|"key"): "..', rb'\1: "zz', line) for line in lines]
@@ -105,18 +95,6 @@ async def test_results_of_another_batch_are_ignored_and_counted(play):
     assert re.search(rf"\b{LINES + 1}\b", run.err)
 
 
-GOES_BACK = pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="4.1: a state that goes back once has no results, and they are not asked for again",
-)
-
-
-@pytest.mark.parametrize(
-    "provider",
-    [pytest.param("openai", marks=GOES_BACK), "anthropic", pytest.param("gemini", marks=GOES_BACK)],
-    indirect=True,
-)
 async def test_a_batch_that_was_seen_to_end_has_ended(play):
     created, ended = {}, set()
 
