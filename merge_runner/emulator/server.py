@@ -11,8 +11,7 @@ from functools import partial
 
 from aiohttp import web
 
-from merge_runner.emulator.batch_routes import BatchRoutes
-from merge_runner.emulator.batches import Batches
+from merge_runner.emulator.batches import AnthropicMode, Batches, GeminiMode, OpenAIMode
 from merge_runner.emulator.faults import STATUS_FAULTS, FaultPlan
 from merge_runner.emulator.formats import SERVED, ServedFormat
 from merge_runner.emulator.replies import MODELS, Asked, Replies, dumps, marked
@@ -41,7 +40,9 @@ class Emulator:
             [
                 *(web.post(each.path, partial(self._serve, each)) for each in SERVED),
                 web.get("/v1/models", self._models),
-                *BatchRoutes(self._batches).routes(),
+                *OpenAIMode(self._batches).routes(),
+                *AnthropicMode(self._batches).routes(),
+                *GeminiMode(self._batches).routes(),
                 web.get("/emulator/answered", self._answered),
             ]
         )

@@ -123,23 +123,10 @@ async def test_openai_raises_its_errors_for_what_there_is_not_and_what_cannot_be
     async with openai_client(await emulator()) as client:
         with pytest.raises(NotFoundError):
             await client.batches.retrieve("batch_none")
-        with pytest.raises(BadRequestError, match="Line 1"):
+        with pytest.raises(BadRequestError, match="not valid"):
             await create_openai(client, b"no json\n")
         with pytest.raises(BadRequestError, match="unique"):
             await create_openai(client, openai_lines("a", count=1) * 2)
-
-
-async def test_openai_keeps_and_deletes_files(emulator):
-    from openai import NotFoundError
-
-    async with openai_client(await emulator()) as client:
-        file = await client.files.create(file=("in.jsonl", b"{}\n"), purpose="batch")
-        assert (file.bytes, file.purpose) == (3, "batch")
-        assert (await client.files.retrieve(file.id)).id == file.id
-        assert (await client.files.content(file.id)).content == b"{}\n"
-        assert (await client.files.delete(file.id)).deleted
-        with pytest.raises(NotFoundError):
-            await client.files.retrieve(file.id)
 
 
 def messages(prompt, count=3):
@@ -170,20 +157,12 @@ async def test_anthropic_creates_polls_and_reads_a_batch(emulator, driving_promp
     assert parse_reply(results[0].result.message.content[0].text, 20).plan
 
 
-async def test_anthropic_lists_its_batches_page_by_page_the_newest_first(emulator, driving_prompt):
-    async with anthropic_client(await emulator()) as client:
-        batches = client.messages.batches
-        created = [(await batches.create(requests=messages(driving_prompt))).id for _ in "abc"]
-        assert [batch.id async for batch in batches.list(limit=2)] == created[::-1]
-
-
 async def test_anthropic_cancels_a_batch(emulator, driving_prompt):
     async with anthropic_client(await emulator(NEVER)) as client:
         batches = client.messages.batches
         created = await batches.create(requests=messages(driving_prompt))
         cancelled = await batches.cancel(created.id)
         assert cancelled.processing_status == "canceling"
-        assert cancelled.cancel_initiated_at is not None
         ended = await batches.retrieve(created.id)
         assert (ended.processing_status, ended.request_counts.canceled) == ("ended", 3)
         results = [result async for result in await batches.results(created.id)]
@@ -214,75 +193,51 @@ async def test_anthropic_raises_its_errors(emulator, driving_prompt):
             await client.messages.batches.create(requests=messages("a", 1) * 2)
 
 
-def contents(prompt, count=3):
-    return [
-        {
-            "contents": [{"role": "user", "parts": [{"text": prompt}]}],
-            "metadata": {"key": f"line-{n}"},
-            "config": {"max_output_tokens": 1000 + n},
-        }
-        for n in range(count)
-    ]
-
-
-async def test_gemini_creates_polls_and_reads_an_inline_batch_in_order(emulator, driving_prompt):
-    async with gemini_client(await emulator(TWO_POLLS)).aio as client:
-        created = await client.batches.create(
-            model=MODEL, src=contents(driving_prompt), config={"display_name": "m1"}
-        )
-        assert (created.state.name, created.display_name) == ("JOB_STATE_PENDING", "m1")
-        states = [(await client.batches.get(name=created.name)).state.name for _ in range(3)]
-        assert states == ["JOB_STATE_PENDING", "JOB_STATE_RUNNING", "JOB_STATE_SUCCEEDED"]
-        batch = await client.batches.get(name=created.name)
-    responses = batch.dest.inlined_responses
-    assert [each.metadata["key"] for each in responses] == ["line-0", "line-1", "line-2"]
-    assert parse_reply(responses[0].response.text, 20).plan
-    assert batch.model == f"models/{MODEL}"
-
-
-async def test_gemini_creates_and_reads_a_batch_by_file(emulator, driving_prompt):
+async def create_gemini(client, prompt, count=3, name="m"):
     lines = [
         {
             "key": f"line-{n}",
-            "request": {"contents": [{"role": "user", "parts": [{"text": driving_prompt}]}]},
+            "request": {
+                "contents": [{"role": "user", "parts": [{"text": prompt}]}],
+                "generationConfig": {"maxOutputTokens": 1000 + n},
+            },
         }
-        for n in range(3)
+        for n in range(count)
     ]
     content = "".join(json.dumps(line) + "\n" for line in lines).encode()
-    async with gemini_client(await emulator()).aio as client:
-        file = await client.files.upload(
-            file=io.BytesIO(content), config={"mime_type": "application/jsonl"}
-        )
-        assert file.size_bytes == len(content)
-        created = await client.batches.create(
-            model=MODEL, src=file.name, config={"display_name": "m2"}
-        )
-        batch = await client.batches.get(name=created.name)
-        results = (await client.files.download(file=batch.dest.file_name)).decode().splitlines()
-    read = {line["key"]: line["response"] for line in map(json.loads, results)}
-    assert read.keys() == {"line-0", "line-1", "line-2"}
-    assert parse_reply(read["line-1"]["candidates"][0]["content"]["parts"][0]["text"], 20).plan
+    file = await client.files.upload(
+        file=io.BytesIO(content), config={"mime_type": "application/jsonl"}
+    )
+    return await client.batches.create(model=MODEL, src=file.name, config={"display_name": name})
+
+
+async def gemini_results(client, batch):
+    content = await client.files.download(file=batch.dest.file_name)
+    return [json.loads(line) for line in content.decode().splitlines()]
+
+
+async def test_gemini_creates_polls_and_reads_a_batch(emulator, driving_prompt):
+    async with gemini_client(await emulator(TWO_POLLS)).aio as client:
+        created = await create_gemini(client, driving_prompt, name="m1")
+        assert (created.state.name, created.display_name) == ("JOB_STATE_PENDING", "m1")
+        states = [(await client.batches.get(name=created.name)).state.name for _ in range(3)]
+        assert states == ["JOB_STATE_PENDING", "JOB_STATE_RUNNING", "JOB_STATE_SUCCEEDED"]
+        results = await gemini_results(client, await client.batches.get(name=created.name))
+    assert {line["key"] for line in results} == {"line-0", "line-1", "line-2"}
+    text = results[0]["response"]["candidates"][0]["content"]["parts"][0]["text"]
+    assert parse_reply(text, 20).plan
 
 
 async def test_gemini_lists_its_batches_page_by_page_the_newest_first(emulator, driving_prompt):
     async with gemini_client(await emulator()).aio as client:
-        created = [
-            (
-                await client.batches.create(
-                    model=MODEL, src=contents(driving_prompt), config={"display_name": name}
-                )
-            ).name
-            for name in "abc"
-        ]
+        created = [(await create_gemini(client, driving_prompt, name=n)).name for n in "abc"]
         pages = await client.batches.list(config={"page_size": 2})
         assert [batch.name async for batch in pages] == created[::-1]
 
 
 async def test_gemini_cancels_a_batch(emulator, driving_prompt):
     async with gemini_client(await emulator(NEVER)).aio as client:
-        created = await client.batches.create(
-            model=MODEL, src=contents(driving_prompt), config={"display_name": "m"}
-        )
+        created = await create_gemini(client, driving_prompt)
         await client.batches.cancel(name=created.name)
         assert (await client.batches.get(name=created.name)).state.name == "JOB_STATE_CANCELLED"
 
@@ -292,14 +247,12 @@ async def test_gemini_reads_the_error_of_a_line_and_misses_those_that_were_not_a
 ):
     plan = FaultPlan(seed=3, batch=BatchPlan(failed=0.3, expired=0.3))
     async with gemini_client(await emulator(plan)).aio as client:
-        created = await client.batches.create(
-            model=MODEL, src=contents(driving_prompt, 20), config={"display_name": "m"}
-        )
+        created = await create_gemini(client, driving_prompt, 20)
         batch = await client.batches.get(name=created.name)
+        results = await gemini_results(client, batch)
     assert batch.state.name == "JOB_STATE_SUCCEEDED"
-    responses = batch.dest.inlined_responses
-    assert len(responses) < 20
-    codes = {each.error.code for each in responses if each.error}
+    assert len(results) < 20
+    codes = {each["error"]["code"] for each in results if "error" in each}
     assert {8, 13, 14} >= codes != set()
 
 
@@ -308,9 +261,7 @@ async def test_gemini_raises_its_errors(emulator, driving_prompt):
 
     async with gemini_client(await emulator(FULL)).aio as client:
         with pytest.raises(ClientError, match="Enqueued token limit") as full:
-            await client.batches.create(
-                model=MODEL, src=contents(driving_prompt), config={"display_name": "m"}
-            )
+            await create_gemini(client, driving_prompt)
         assert full.value.code == 429
         with pytest.raises(ClientError) as missing:
             await client.batches.get(name="batches/none")
