@@ -487,7 +487,7 @@ class GeminiMode(BatchMode):
             "batchStats": {name: str(count) for name, count in stats.items() if count},
             "state": f"BATCH_STATE_{state}",
         }
-        operation = {"name": f"batches/{batch.id}", "metadata": metadata}
+        operation: dict[str, Any] = {"name": f"batches/{batch.id}", "metadata": metadata}
         if ended:
             output = {"responsesFile": f"files/batch-{batch.id}"}
             metadata["output"] = output

@@ -63,8 +63,6 @@ from merge_runner.served_model import is_other_model
 
 # Beside a call that takes seconds this delay is nothing.
 CLAIM_POLL_S = 0.1
-# A call whose lines failed so often is asked singly.
-MOST_LINES = 3
 # A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
 
@@ -311,9 +309,7 @@ class LlmClient:
 
     def _goes_in_batch(self, call: Call) -> bool:
         """Whether the next attempt at a call goes with the next round."""
-        if self.batches is None or not self.batches.rounds.submits or call.singly:
-            return False
-        return sum(attempt.batch_id is not None for attempt in call.own_attempts) < MOST_LINES
+        return self.batches is not None and self.batches.rounds.submits and not call.singly
 
     async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""
@@ -324,7 +320,7 @@ class LlmClient:
             record, outcome = self._line_record(call, end, batches.price_factor)
             record = replace(record, started_at=batches.rounds.submitted_at(line))
             call.attempts.append(record)
-            call.singly |= end.singly
+            call.singly = True
             self.meter.count_attempt(record)
             if end.error is None:
                 return await self._concluded(call, paid, outcome, end.raw)

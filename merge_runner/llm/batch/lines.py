@@ -25,15 +25,14 @@ class LineEnd:
     """How a line ended.
 
     Without a ``raw`` reply ``outcome`` names why, and nothing was charged unless it is ``unclear``.
-    Then it is asked again: ``singly`` or in another batch. An ``error`` ends the sweep.
+    Then it is asked singly. An ``error`` ends the sweep.
     """
 
-    batch_id: str | None
+    batch_id: str | None = None
     raw: RawReply | None = None
     outcome: str = ""
     message: str = ""
     unclear: bool = False
-    singly: bool = False
     error: MergeRunnerError | None = None
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import math
 import secrets
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator, Sequence
@@ -74,7 +75,7 @@ class Batch:
     """An open batch of which this process waits for ``lines``, by key.
 
     ``results`` are those that nobody has asked for yet, ``seen`` hashes of all by key. ``rest`` is
-    the end of the calls without a result.
+    the end of the calls without a result. It ``is_broken`` where one could not be used.
     """
 
     note: OpenBatch
@@ -84,6 +85,7 @@ class Batch:
     results: dict[str, LineResult] = field(default_factory=dict)
     seen: dict[str, int] = field(default_factory=dict)
     rest: LineEnd | None = None
+    is_broken: bool = False
 
     @property
     def is_open(self) -> bool:
@@ -108,11 +110,8 @@ class Batch:
 
     def end_of(self, result: LineResult) -> LineEnd:
         """Return the end of the line that has this result."""
-        if result.raw is None:
-            return LineEnd(
-                self.note.batch_id, outcome="expired", message=result.message, singly=True
-            )
-        return LineEnd(self.note.batch_id, result.raw, message=result.message)
+        expired = "expired" if result.raw is None else ""
+        return LineEnd(self.note.batch_id, result.raw, expired, result.message)
 
     def end(self, rest: LineEnd) -> None:
         """End the lines that have not ended yet, and those that join it."""
@@ -120,6 +119,11 @@ class Batch:
         for line in self.lines.values():
             line.ends(rest)
         self.lines.clear()
+
+    def fail(self, error: MergeRunnerError) -> None:
+        """Raise an error for all who wait."""
+        for line in self.lines.values():
+            line.fails(error)
 
 
 @dataclass(slots=True)
@@ -281,40 +285,42 @@ class Rounds:
             await self._submit(batch)
 
     async def _submit(self, batch: Batch) -> None:
+        """Create a batch, and follow it to its end."""
+        model = batch.note.model
+        patience_s = OUTAGE_S if model in self._reached else NOBODY_S
         try:
-            await self._create(batch)
+            await self._patiently(batch, partial(self._create, batch), patience_s)
         except BatchFailed as exc:
-            if exc.kind == "smaller":
-                self._try_smaller(batch, str(exc), exc.delay_s or 0.0)
+            if exc.kind == "lost" and not self.services[model].takes_mark:
+                batch.end(LineEnd(outcome="batch_lost", message=str(exc), unclear=True))
+            elif exc.kind in ("again", "lost"):
+                # It may be there all the same: the next run looks for it, and nothing is settled.
+                why = (
+                    f"{model}: no batch can be submitted ({exc}): nothing else is asked. "
+                    "When the service answers again, run the same command"
+                )
+                batch.fail(ProviderDown(why))
+            elif exc.kind == "single" and model not in self._reached:
+                why = f"{model}: there is no batch mode there ({exc}): leave --batch out"
+                batch.end(LineEnd(outcome="not_created", message=why, error=EndpointRefused(why)))
             else:
-                self._not_created(batch, exc)
-        else:
-            await self._follow(batch)
+                self._not_asked(batch, exc, "not_created")
+            return
+        self._reached.add(model)
+        await self._follow(batch)
 
     async def _create(self, batch: Batch) -> None:
-        """Create a batch; where it may have been created already, look for it first."""
-        model = batch.note.model
-        service, began_s, sent = self.services[model], _loop_s(), False
-        for tries in itertools.count(1):
-            try:
-                if not (sent and await self._arrived(batch)):
-                    sent = False
-                    creation = asyncio.create_task(self._create_once(batch))
-                    self._creations.add(creation)
-                    creation.add_done_callback(self._creations.discard)
-                    await asyncio.shield(creation)  # its id is noted even if the run ends now
-            except BatchFailed as exc:
-                sent = sent or exc.sent
-                if sent and not service.takes_mark:
-                    raise BatchFailed("lost", str(exc)) from exc
-                nobody = not exc.sent and model not in self._reached
-                patience_s = NOBODY_S if nobody else OUTAGE_S
-                if exc.kind != "again" or _loop_s() - began_s > patience_s:
-                    raise
-                await asyncio.sleep(max(exc.delay_s or 0.0, _backoff_s(tries)))
-            else:
-                self._reached.add(model)
-                return
+        """Create a batch; where its answer is lost, look for it."""
+        creation = asyncio.create_task(self._create_once(batch))
+        self._creations.add(creation)
+        creation.add_done_callback(self._creations.discard)
+        try:
+            await asyncio.shield(creation)  # its id is noted even if the run ends now
+        except BatchFailed as exc:
+            if exc.sent and not self.services[batch.note.model].takes_mark:
+                raise BatchFailed("lost", f"whether it was created is not known ({exc})") from exc
+            if not (exc.sent and await self._arrived(batch)):
+                raise
 
     async def _create_once(self, batch: Batch) -> None:
         note = batch.note
@@ -325,42 +331,42 @@ class Rounds:
         batch.note = replace(batch.note, **known)  # type: ignore[arg-type] # texts all of them
         await self._journal.note(batch.note)
 
-    def _not_created(self, batch: Batch, exc: BatchFailed) -> None:
-        model = batch.note.model
-        if exc.kind == "lost" and not self.services[model].takes_mark:
-            why = f"whether the batch was created is not known ({exc})"
-            batch.end(LineEnd(None, outcome="batch_lost", message=why, unclear=True, singly=True))
-        elif exc.kind in ("again", "lost"):
-            # It may be there all the same: the next run looks for it, and nothing is settled yet.
-            for line in batch.lines.values():
-                line.fails(
-                    ProviderDown(
-                        f"{model}: no batch can be submitted ({exc}): nothing else is asked. "
-                        "When the service answers again, run the same command"
-                    )
+    def _not_asked(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
+        """End a batch of which the provider asks no line, or let its lines go in smaller ones."""
+        model, lines = batch.note.model, len(batch.note.lines)
+        error: MergeRunnerError | None = None
+        match exc.kind:
+            case "quota":
+                error = QuotaExhausted(
+                    f"{model}: the account's quota is exhausted ({exc}). Every reply so far is "
+                    "saved; when there is credit again, run the same command to go on."
                 )
-        elif exc.kind == "single" and model not in self._reached:
-            why = f"{model}: there is no batch mode there ({exc}): leave --batch out"
-            batch.end(LineEnd(None, outcome="not_created", message=why, error=EndpointRefused(why)))
-        else:
-            batch.end(self._without_reply(batch, exc.kind, str(exc), "not_created"))
+            case "refused":
+                error = EndpointRefused(f"{model}: its batch mode refuses: {exc}")
+            case "smaller" | "again" if self._try_smaller(batch, exc):
+                return
+            case _:
+                self._say(f"{model}: asked singly, at the full price: {_counted(lines)} ({exc})")
+        batch.end(LineEnd(batch.note.batch_id or None, None, outcome, str(exc), error=error))
 
-    def _try_smaller(self, batch: Batch, why: str, delay_s: float) -> None:
-        """Let the lines of a batch go in the next ones, when there may be room for them."""
+    def _try_smaller(self, batch: Batch, exc: BatchFailed) -> bool:
+        """Let the lines of a batch go in the next ones, when there may be room for them.
+
+        Returns False where one line was refused so often that there seems to be none.
+        """
         model, lines = batch.note.model, len(batch.note.lines)
         if model not in self._crowds:
-            self._say(f"{model}: {_counted(lines)} go in smaller batches: {why}")
-            self._crowds[model] = Crowd(MOST_CALLS)
-        crowd = self._crowds[model]
+            self._say(f"{model}: {_counted(lines)} go in smaller batches: {exc}")
+        crowd = self._crowds.setdefault(model, Crowd(MOST_CALLS))
         batch.state = State.NEVER
         if not self._has_open(model):
             crowd.refusals += 1
             crowd.calls = max(1, lines // 2)
-            crowd.after_s = _loop_s() + max(delay_s, _backoff_s(crowd.refusals))
+            crowd.after_s = _loop_s() + max(exc.delay_s or 0.0, _backoff_s(crowd.refusals))
         if lines == 1 and crowd.refusals >= MOST_REFUSALS:
-            batch.end(self._without_reply(batch, "single", why, "not_created"))
-        else:
-            self._form_anew(batch)
+            return False
+        self._form_anew(batch)
+        return True
 
     def _has_open(self, model: str) -> bool:
         """Whether a batch of the model takes room at its provider, or is about to."""
@@ -387,7 +393,7 @@ class Rounds:
                 await self._follow(batch)
             elif not self.services[batch.note.model].takes_mark:
                 why = "the run ended before its id was known"
-                batch.end(LineEnd(None, outcome="batch_lost", message=why, unclear=True))
+                batch.end(LineEnd(outcome="batch_lost", message=why, unclear=True))
             elif await self._arrived(batch):
                 await self._follow(batch)
             else:
@@ -403,8 +409,7 @@ class Rounds:
             if self.submits:
                 self._forming.append(line)
             else:
-                why = "the run ended before"
-                line.ends(LineEnd(None, outcome="not_created", message=why, singly=True))
+                line.ends(LineEnd(outcome="not_created", message="the run ended before"))
 
     async def _arrived(self, batch: Batch) -> bool:
         """Look for a batch until its creation, if it was ever sent, must be in effect."""
@@ -423,13 +428,11 @@ class Rounds:
         """Wait for the end of a batch, and hand its results out."""
         try:
             status = await self._ended(batch)
-            kind = status.failure or "again"
             if status.state == "ended":
                 await self._hand_out(batch)
-            elif status.state == "failed" and kind == "smaller":
-                self._try_smaller(batch, status.message, 0.0)
             elif status.state == "failed":
-                batch.end(self._without_reply(batch, kind, status.message, "batch_failed"))
+                failure = BatchFailed(status.failure or "again", status.message)
+                self._not_asked(batch, failure, "batch_failed")
         except BatchFailed as exc:
             self._lost(batch, exc)
 
@@ -474,52 +477,43 @@ class Rounds:
         """Read the results of a batch until there is one for each call, or no more can be had."""
         if not batch.note.ended_at:
             await self._note(batch, ended_at=now())
-        deadline_s = _loop_s() + ENDING_S - _s_ago(batch.note.ended_at)
-        broken = 0
-        for tries in itertools.count(1):
-            is_late = _loop_s() > deadline_s
-            foreign, why, delay_s = 0, "", 0.0
-            try:
-                foreign, why = await self._read(batch)
-                broken += bool(why)
-                assert batch.status is not None
-                if not why and len(batch.seen) < batch.status.results:
-                    why = f"{len(batch.seen)} of the {batch.status.results} results are there"
-            except BatchFailed as exc:
-                if exc.kind != "again":
-                    raise
-                why, delay_s = str(exc), exc.delay_s or 0.0
-            is_whole = len(batch.seen) == len(batch.note.lines)
-            # One that is broken may have been so on its way: it is read twice.
-            if is_whole or not why or is_late or broken == 2:
-                break
-            await self._rest(batch, why, delay_s, tries)
-            await self._look(batch)
-        if foreign:
-            self._say(
-                f"{batch.note.model}: {foreign} results of batch {batch.note.batch_id} are "
-                "ignored: they are of none of its calls, or differ from an earlier one"
-            )
-        if why and not is_whole:
+        why, patience_s = "", max(0.0, ENDING_S - _s_ago(batch.note.ended_at))
+        try:
+            await self._patiently(batch, partial(self._read, batch), patience_s)
+        except BatchFailed as exc:
+            if exc.kind not in ("again", "single"):
+                raise
+            why = str(exc)
             self._say(f"{batch.note.model}: {why}")
-        batch.end(self._no_result(batch, "" if is_whole else why))
+        batch.end(self._no_result(batch, why))
         if crowd := self._crowds.get(batch.note.model):
             crowd.calls, crowd.refusals = max(crowd.calls, 2 * len(batch.note.lines)), 0
 
-    async def _read(self, batch: Batch) -> tuple[int, str]:
-        """Read all results once; returns how many are ignored, and why any cannot be used."""
-        foreign, wrong, why = 0, 0, ""
-        assert batch.status is not None
-        service = self.services[batch.note.model]
-        async for result in service.results(batch.note.batch_id, batch.status):
+    async def _read(self, batch: Batch) -> None:
+        """Give each result to its call; raises BatchFailed where there should be others."""
+        note, status = batch.note, await self._look(batch)
+        foreign, wrong = 0, []
+        async for result in self.services[note.model].results(note.batch_id, status):
             if isinstance(result, Unreadable):
-                wrong, why = wrong + 1, why or str(result)
+                wrong.append(str(result))
             else:
                 foreign += not batch.take(result)
-        if wrong:
-            which = "a result" if wrong == 1 else f"{wrong} results"
-            why = f"{which} of the batch cannot be used: {why}"
-        return foreign, why
+        if foreign:
+            self._say(
+                f"{note.model}: {foreign} results of batch {note.batch_id} are ignored: they are "
+                "of none of its calls, or differ from an earlier one"
+            )
+        if len(batch.seen) == len(note.lines):
+            return
+        if wrong:  # one may have been broken on its way: all are read twice
+            kind: FailureKind = "single" if batch.is_broken else "again"
+            batch.is_broken = True
+            which = "a result" if len(wrong) == 1 else f"{len(wrong)} results"
+            raise BatchFailed(kind, f"{which} of the batch cannot be used: {wrong[0]}")
+        if len(batch.seen) < status.results:
+            raise BatchFailed(
+                "again", f"{len(batch.seen)} of the {status.results} results are there"
+            )
 
     def _no_result(self, batch: Batch, why: str) -> LineEnd:
         return LineEnd(
@@ -528,7 +522,6 @@ class Rounds:
             message=why or "the batch has ended without a result for it",
             # What a cancelled batch does not tell of was not asked, if all was read.
             unclear=bool(why) or not batch.note.cancelled_at,
-            singly=True,
         )
 
     def _lost(self, batch: Batch, exc: BatchFailed) -> None:
@@ -545,54 +538,32 @@ class Rounds:
             "account that has submitted it. If it is gone, the same command without --batch asks "
             "its calls anew"
         )
-        for line in batch.lines.values():
-            line.fails(error)
+        batch.fail(error)
 
-    def _without_reply(
-        self, batch: Batch, kind: FailureKind, message: str, outcome: str
-    ) -> LineEnd:
-        """Return the end of a line that the provider never took."""
-        model = batch.note.model
-        error: MergeRunnerError | None = None
-        if kind == "single":
-            calls = _counted(len(batch.note.lines))
-            self._say(f"{model}: asked singly, at the full price: {calls} ({message})")
-        if kind == "quota":
-            error = QuotaExhausted(
-                f"{model}: the account's quota is exhausted ({message}). Every reply so far is "
-                "saved; when there is credit again, run the same command to go on."
-            )
-        elif kind == "refused":
-            error = EndpointRefused(f"{model}: its batch mode refuses: {message}")
-        return LineEnd(
-            batch.note.batch_id or None,
-            outcome=outcome,
-            message=message,
-            singly=kind == "single",
-            error=error,
-        )
-
-    async def _patiently(self, batch: Batch, ask: Callable[[], Awaitable[T]]) -> T:
+    async def _patiently(
+        self,
+        batch: Batch,
+        ask: Callable[[], Awaitable[T]],
+        patience_s: float = math.inf,
+    ) -> T:
         """Ask until a provider answers that may only be down; raises BatchFailed for anything else.
 
         A batch waits for a day: whoever waits for it can wait for its provider.
         """
+        began_s = _loop_s()
         for tries in itertools.count(1):
             try:
                 return await ask()
             except BatchFailed as exc:
-                if exc.kind != "again":
+                if exc.kind != "again" or _loop_s() - began_s > patience_s:
                     raise
-                await self._rest(batch, str(exc), exc.delay_s or 0.0, tries)
+                # Meanwhile nothing of the batch is on its way.
+                state, batch.state = batch.state, State.WAITING
+                if tries == 1:
+                    self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
+                await asyncio.sleep(max(exc.delay_s or 0.0, _backoff_s(tries)))
+                batch.state = state
         raise AssertionError("unreachable: it counts for ever")
-
-    async def _rest(self, batch: Batch, why: str, delay_s: float, tries: int) -> None:
-        """Rest before a provider is asked again; meanwhile nothing of the batch is on its way."""
-        state, batch.state = batch.state, State.WAITING
-        if tries == 1:
-            self._say(f"{batch.note.model}: {why}; it is asked again until it answers")
-        await asyncio.sleep(max(delay_s, _backoff_s(tries)))
-        batch.state = state
 
     def _described(self, batch: Batch) -> str:
         note, status = batch.note, batch.status

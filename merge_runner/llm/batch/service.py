@@ -210,21 +210,12 @@ class BatchService(ABC):
         return json_object(raw)
 
     async def _post(
-        self,
-        path: str,
-        body: bytes,
-        headers: Mapping[str, str] | None = None,
-        *,
-        creates: bool = True,
+        self, path: str, body: bytes, headers: Mapping[str, str] | None = None
     ) -> RawReply:
-        """Return the reply to a step of a creation; one that ``creates`` may do so unanswered."""
-        try:
-            raw = await self._ask("POST", path, body, headers, timeout_s=TRANSFER_TIMEOUT_S)
-            if not _is_success(raw):
-                raise self._failed(self.failure_of(raw.error), raw)
-        except BatchFailed as exc:
-            exc.sent &= creates
-            raise
+        """Return the reply to a step of a creation."""
+        raw = await self._ask("POST", path, body, headers, timeout_s=TRANSFER_TIMEOUT_S)
+        if not _is_success(raw):
+            raise self._failed(self.failure_of(raw.error), raw)
         return raw
 
     async def _cancel(self, path: str) -> None:
