@@ -2,7 +2,7 @@
 
 A round is closed when nothing can go on before an answer comes, so that all trials advance by one
 decision at a time, and a sweep takes as many rounds as its longest trial has decisions. A line that
-failed is in the next round again. The journal knows of a batch before its provider does: a call
+failed is asked singly. The journal knows of a batch before its provider does: a call
 that waits in an open batch is not asked anew, it joins those that wait there.
 """
 
