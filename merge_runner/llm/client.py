@@ -260,8 +260,6 @@ class LlmClient:
         deadline = Deadline(self.entry.deadline_s)
 
         async def sleep(seconds: float) -> None:
-            if self._goes_in_batch(call):
-                return  # the next round begins late enough
             until = datetime.now(UTC) + timedelta(seconds=seconds)
             with call.waiting(f"after {call.last_failure}", until) as wait:
                 if seconds >= LONG_WAIT_S:

@@ -21,8 +21,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWar
 TWO_POLLS = FaultPlan(batch=BatchPlan(polls=2))
 FULL = FaultPlan(batch=BatchPlan(enqueued_tokens=100))
 NEVER = FaultPlan(batch=BatchPlan(delay_s=1000.0))
-ONE_EXPIRED = FaultPlan(seed=1, batch=BatchPlan(expired=0.5))
-SOME_FAILED = FaultPlan(seed=1, batch=BatchPlan(failed=0.5))
 CHAT, RESPONSES = "/v1/chat/completions", "/v1/responses"
 
 
@@ -91,26 +89,6 @@ async def test_openai_cancels_a_batch(emulator, driving_prompt):
     assert [error["error"]["code"] for error in errors] == ["batch_cancelled"] * 3
 
 
-async def test_openai_finds_expired_lines_and_failed_ones_in_the_error_file(
-    emulator, driving_prompt
-):
-    async with openai_client(await emulator(ONE_EXPIRED)) as client:
-        created = await create_openai(client, openai_lines(driving_prompt, count=20))
-        batch = await client.batches.retrieve(created.id)
-        assert batch.status == "expired"
-        answered = await jsonl(client, batch.output_file_id)
-        expired = await jsonl(client, batch.error_file_id)
-    assert len(answered) + len(expired) == 20
-    assert {line["error"]["code"] for line in expired} == {"batch_expired"}
-    async with openai_client(await emulator(SOME_FAILED)) as client:
-        created = await create_openai(client, openai_lines(driving_prompt, count=20))
-        batch = await client.batches.retrieve(created.id)
-        assert (batch.status, batch.request_counts.total) == ("completed", 20)
-        failed = await jsonl(client, batch.error_file_id)
-    assert {line["response"]["status_code"] for line in failed} == {429, 500, 503}
-    assert batch.request_counts.failed == len(failed)
-
-
 async def test_openai_sees_a_batch_of_too_many_tokens_fail(emulator, driving_prompt):
     async with openai_client(await emulator(FULL)) as client:
         created = await create_openai(client, openai_lines(driving_prompt))
@@ -169,18 +147,6 @@ async def test_anthropic_cancels_a_batch(emulator, driving_prompt):
     assert {result.result.type for result in results} == {"canceled"}
 
 
-async def test_anthropic_reads_failed_lines_and_expired_ones(emulator, driving_prompt):
-    plan = FaultPlan(seed=3, batch=BatchPlan(failed=0.3, expired=0.3))
-    async with anthropic_client(await emulator(plan)) as client:
-        created = await client.messages.batches.create(requests=messages(driving_prompt, 20))
-        results = [each async for each in await client.messages.batches.results(created.id)]
-        counts = (await client.messages.batches.retrieve(created.id)).request_counts
-    types = [each.result.type for each in results]
-    assert (counts.errored, counts.expired) == (types.count("errored"), types.count("expired"))
-    errors = [each.result.error.error.type for each in results if each.result.type == "errored"]
-    assert {"rate_limit_error", "api_error", "overloaded_error"} >= set(errors) != set()
-
-
 async def test_anthropic_raises_its_errors(emulator, driving_prompt):
     from anthropic import BadRequestError, NotFoundError, RateLimitError
 
@@ -228,32 +194,11 @@ async def test_gemini_creates_polls_and_reads_a_batch(emulator, driving_prompt):
     assert parse_reply(text, 20).plan
 
 
-async def test_gemini_lists_its_batches_page_by_page_the_newest_first(emulator, driving_prompt):
-    async with gemini_client(await emulator()).aio as client:
-        created = [(await create_gemini(client, driving_prompt, name=n)).name for n in "abc"]
-        pages = await client.batches.list(config={"page_size": 2})
-        assert [batch.name async for batch in pages] == created[::-1]
-
-
 async def test_gemini_cancels_a_batch(emulator, driving_prompt):
     async with gemini_client(await emulator(NEVER)).aio as client:
         created = await create_gemini(client, driving_prompt)
         await client.batches.cancel(name=created.name)
         assert (await client.batches.get(name=created.name)).state.name == "JOB_STATE_CANCELLED"
-
-
-async def test_gemini_reads_the_error_of_a_line_and_misses_those_that_were_not_asked(
-    emulator, driving_prompt
-):
-    plan = FaultPlan(seed=3, batch=BatchPlan(failed=0.3, expired=0.3))
-    async with gemini_client(await emulator(plan)).aio as client:
-        created = await create_gemini(client, driving_prompt, 20)
-        batch = await client.batches.get(name=created.name)
-        results = await gemini_results(client, batch)
-    assert batch.state.name == "JOB_STATE_SUCCEEDED"
-    assert len(results) < 20
-    codes = {each["error"]["code"] for each in results if "error" in each}
-    assert {8, 13, 14} >= codes != set()
 
 
 async def test_gemini_raises_its_errors(emulator, driving_prompt):

@@ -59,14 +59,6 @@ async def test_a_line_has_the_reply_of_the_plain_endpoint(
     assert all(result.raw.status == 200 for result in results)
 
 
-async def test_results_come_in_another_order_each_once(emulator, service_at, form):
-    url = await emulator(plan(delay_s=0.05))
-    batch, service = lines(form), service_at(url, form)
-    results = await results_of(service, await service.create(batch, MARK))
-    assert sorted(keys(results)) == sorted(keys(batch))
-    assert keys(results) != keys(batch)
-
-
 async def test_a_status_tells_how_many_lines_have_ended(emulator, service_at, form):
     service = service_at(await emulator(plan(polls=4)), form)
     batch_id = await service.create(lines(form, 8), MARK)
@@ -103,25 +95,6 @@ async def test_failed_lines_are_judged_as_single_calls_and_others_were_never_ask
         if outcome.action == "accept"
     }
     assert {each["answered"] for each in count} == {1}
-
-
-async def test_a_failed_line_may_fare_better_in_the_next_batch(emulator, service_at, form):
-    url = await emulator(plan(seed=5, failed=0.3))
-    service, left, rounds = service_at(url, form), lines(form, 22), 0
-    while left:
-        results = await results_of(service, await service.create(left, f"{MARK}-{rounds}"))
-        failed = {result.key for result in results if result.raw.status != 200}
-        left = [line for line in left if line.key in failed]
-        rounds += 1
-    assert rounds > 1
-    assert Counter(each["answered"] for each in await answered_by(url)) == {1: 22}
-
-
-async def test_all_lines_may_expire(emulator, service_at, form):
-    service = service_at(await emulator(plan(expired=1.0)), form)
-    batch_id = await service.create(lines(form), MARK)
-    assert (await ended(service, batch_id)).state == "ended"
-    assert all(result.raw is None for result in await results_of(service, batch_id))
 
 
 async def test_a_cancelled_batch_ends_with_the_lines_that_were_finished(emulator, service_at, form):
