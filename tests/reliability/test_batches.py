@@ -232,19 +232,6 @@ async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly
 
 
 @pytest.mark.long
-async def test_an_account_that_takes_few_tokens_gets_smaller_batches(merge_runner):
-    plan = BatchPlan(delay_s=0.2, enqueued_tokens=5000)
-    async with watched(faults=FaultPlan(batch=plan)) as server:
-        run = await merge_runner(
-            "sweep", "baseline", "--first", "--reps", 1, "--batch", **account(server)
-        )
-        batched, alone = await answered(server)
-    assert run.code == 0, run.err
-    assert "go in smaller batches" in run.err
-    assert (len(batched), max(batched.values()), alone) == (22, 1, Counter())
-
-
-@pytest.mark.long
 async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
     sweep = ("sweep", "short.toml", *TWO, "--model", "priced", "--batch", "--yes")
     async with watched(faults=FaultPlan(batch=BatchPlan(delay_s=1.0))) as server:
