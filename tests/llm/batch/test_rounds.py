@@ -240,7 +240,7 @@ async def test_a_line_that_failed_is_asked_alone(cache):
     run = Run(cache, service)
     replies = await run.ask(3)
     assert texts(replies) == ["batched 1", "alone 2", "alone 3"]
-    assert (service.sizes, run.alone.asked) == ([3], [2, 3])
+    assert (service.sizes, sorted(run.alone.asked)) == ([3], [2, 3])
     assert outcomes(replies[1]) == [("server_error", "batch-0"), ("ok", None)]
     assert [reply.attempts[0].cost_usd for reply in replies[1:]] == [0.0] * 2
     assert run.ledger.read().spent_usd == pytest.approx((0.5 + 1 + 1) * ONE_USD)
@@ -663,6 +663,29 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
     assert (spending.reserved_usd, spending.open_attempts) == (0.0, 0)
     await second.end()
     assert Journal(cache).batches() == []
+
+
+@in_virtual_time
+async def test_a_run_that_dies_before_an_id_is_noted_where_no_mark_is_asks_that_round_alone(cache):
+    class Dying(Memory):
+        takes_mark = False
+
+        async def create(self, lines, mark):
+            batch_id = await super().create(lines, mark)
+            died.set()
+            await asyncio.Event().wait()
+            return batch_id
+
+    died = asyncio.Event()
+    await killed(Run(cache, Dying()), 2, died)
+    service = Memory()
+    service.takes_mark = False
+    run = Run(cache, service)
+    replies = await run.ask(2)
+    assert [outcomes(each) for each in replies] == [[("batch_lost", None), ("ok", None)]] * 2
+    assert run.ledger.read().open_attempts == 2  # what the lost batch may cost stays set aside
+    await run.ask(2, decision=1)
+    assert service.sizes == [2]  # the next round is a batch again
 
 
 @in_virtual_time
