@@ -37,7 +37,6 @@ from merge_runner.llm.batch.service import (
     LineResult,
     Unreadable,
 )
-from merge_runner.llm.first_call import NOBODY_S
 from merge_runner.records import Attempt
 
 # How often it is looked whether a round can be closed: what is seen then decides, not the time.
@@ -49,8 +48,8 @@ MOST_CALLS = 5_000
 SHORTEST_POLL_S, LONGEST_POLL_S, POLL_SHARE = 0.25, 60.0, 0.1
 # A creation whose answer was lost may be in effect only after this: gateways keep requests.
 ARRIVAL_S = 30.0
-# How long a creation is tried again, once the provider has answered any.
-OUTAGE_S = 600.0
+# How long the first creation of a run is tried again, and all others: the provider is there.
+FIRST_S, OUTAGE_S = 60.0, 600.0
 # How often a line may be refused for the size of its batch before it is asked singly.
 MOST_REFUSALS = 5
 # How old a batch may be; then it is cancelled, and what it has not answered is asked singly.
@@ -287,7 +286,7 @@ class Rounds:
     async def _submit(self, batch: Batch) -> None:
         """Create a batch, and follow it to its end."""
         model = batch.note.model
-        patience_s = OUTAGE_S if model in self._reached else NOBODY_S
+        patience_s = OUTAGE_S if model in self._reached else FIRST_S
         try:
             await self._patiently(batch, partial(self._create, batch), patience_s)
         except BatchFailed as exc:
