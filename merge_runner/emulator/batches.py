@@ -1,20 +1,35 @@
-"""Batches on the emulator's own clock: what becomes of each line, and when."""
+"""The batch modes of three providers on the emulator's own clock: what their clients ask for."""
 
 from __future__ import annotations
 
+import json
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
 from typing import Any, Literal
 
 from merge_runner.chance import draw, draw_between, draw_index
-from merge_runner.emulator.faults import OUTCOMES, FaultPlan
-from merge_runner.emulator.replies import Asked, Replies, marked
+from merge_runner.emulator.exchange import BrokenOff, Request, Response, as_error, as_json
+from merge_runner.emulator.faults import OUTCOMES, STATUS_FAULTS, FaultPlan
+from merge_runner.emulator.formats import CHAT, GEMINI, MESSAGES, RESPONSES, ServedFormat
+from merge_runner.emulator.replies import UNREADABLE, Asked, Replies, marked
 from merge_runner.errors import UsageError
+from merge_runner.llm.content_hashes import canonical_json
+from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER
 
+ID = "(?P<id>[^/]+?)"
 FAILURES = (429, 500, 503)
+GRPC_CODES = {400: 3, 429: 8, 500: 13, 503: 14}
+Handler = Callable[[Request], Response]
 Outcome = Literal["answered", "failed", "expired"]
+
+
+class NotThere(Exception):
+    """There is no such batch or file, or not yet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,38 +42,31 @@ class Fate:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A status and a body as the plain endpoint would reply; None for a line that was not asked."""
+    """A status and a body as the plain endpoint would reply; 0 for a line that was not asked."""
 
     custom_id: str
-    status: int | None
-    body: dict[str, Any] | None
+    status: int = 0
+    body: dict[str, Any] | None = None
 
 
 @dataclass(slots=True, eq=False)
 class Batch:
     """Lines that were submitted together; times are in seconds of the clock.
 
-    ``name`` is the client's own for the batch. ``details`` is what an API keeps beside it.
-    ``refused`` says why the lines are not asked at all. ``results`` are there once it has ended, in
-    the order in which they came.
+    ``told`` is the body of its creation. ``refused`` says why the lines are not asked at all.
+    ``results`` are there once it has ended, in the order in which they came.
     """
 
     id: str
-    name: str
+    told: dict[str, Any]
     lines: Sequence[Asked]
     fates: Sequence[Fate]
     began_s: float
     least_polls: int
-    details: dict[str, Any] = field(default_factory=dict)
-    refused: str | None = None
+    refused: str = ""
     polls: int = 0
     cancelled_s: float | None = None
     results: list[Result] | None = None
-
-    @property
-    def ended(self) -> bool:
-        """Whether its results are there."""
-        return self.results is not None
 
     @property
     def due_s(self) -> float:
@@ -71,20 +79,32 @@ class Batch:
         return sum(len(line.raw) for line in self.lines) // 4
 
     def finished(self, now_s: float) -> int:
-        """How many lines have their result by now."""
+        """Return how many lines have their result by now."""
         until_s = now_s if self.cancelled_s is None else self.cancelled_s
         in_time = sum(self.began_s + fate.after_s <= until_s for fate in self.fates)
         if self.polls >= self.least_polls:
             return in_time
         return min(in_time, len(self.lines) * self.polls // self.least_polls)
 
+    def count(self, *kinds: str) -> int:
+        """Return how many lines were ``answered``, ``failed`` or ``not asked``."""
+        results = self.results or ()
+        return sum(_kind(result) in kinds for result in results)
+
+    @property
+    def why_not(self) -> str:
+        """Why lines were not asked."""
+        return "expired" if self.cancelled_s is None else "cancelled"
+
 
 class Batches:
-    """All batches of all APIs, the oldest first."""
+    """All batches of all providers, the oldest first."""
 
     def __init__(self, replies: Replies, clock: Callable[[], float] = time.time) -> None:
         self._replies = replies
         self.now_s = clock
+        self.files: dict[str, bytes] = {}
+        self.requests: Counter[str] = Counter()
         self._all: dict[str, Batch] = {}
         self._submitted: Counter[str] = Counter()
 
@@ -93,51 +113,52 @@ class Batches:
         """What goes wrong."""
         return self._replies.faults
 
-    def create(
-        self, prefix: str, name: str, lines: Sequence[Asked], details: dict[str, Any]
-    ) -> Batch:
-        """A new batch, with ``refused`` set where more tokens would wait than may."""
-        if not lines:
-            raise UsageError("A batch needs at least one request.")
-        number = len(self._all)
-        batch_id = f"{prefix}{draw_index(2**40, 'batch', self.faults.seed, number):010x}"
+    def create(self, prefix: str, lines: Sequence[Asked], told: dict[str, Any]) -> Batch:
+        """Create a batch, which is ``refused`` where more tokens would wait than may."""
+        if not lines or len({line.custom_id for line in lines}) < len(lines):
+            raise UsageError("A batch needs lines, and every custom_id must be unique.")
+        batch_id = f"{prefix}{draw_index(2**40, 'batch', self.faults.seed, len(self._all)):010x}"
         fates = [self._fate(line) for line in lines]
         plan = self.faults.batch
-        batch = Batch(batch_id, name, lines, fates, self.now_s(), plan.polls, details)
-        most = plan.enqueued_tokens
-        if most is not None and self._enqueued() + batch.tokens > most:
-            batch.refused = f"Enqueued token limit reached. Limit: {most:,} enqueued tokens."
-        else:
-            self._all[batch_id] = batch
+        batch = Batch(batch_id, told, lines, fates, self.now_s(), plan.polls)
+        self.settle()
+        waiting = sum(each.tokens for each in self._all.values() if each.results is None)
+        if plan.enqueued_tokens is not None and waiting + batch.tokens > plan.enqueued_tokens:
+            limit = f"{plan.enqueued_tokens:,} enqueued tokens"
+            batch.refused, batch.results = f"Enqueued token limit reached. Limit: {limit}.", []
+        self._all[batch_id] = batch
         return batch
 
-    def keep(self, batch: Batch) -> None:
-        """Keep one that was refused, as OpenAI does."""
-        self._all[batch.id] = batch
-
     def listed(self, prefix: str) -> list[Batch]:
-        """All of an API, as it lists them."""
+        """Return all of a provider's, as it lists them."""
         self.settle()
         own = [batch for batch in self._all.values() if batch.id.startswith(prefix)]
         return own if self.faults.batch.oldest_first else own[::-1]
 
-    def poll(self, batch_id: str) -> Batch | None:
-        """A batch whose state is asked for."""
-        batch = self._all.get(batch_id)
-        if batch is not None:
-            self._settle(batch)
-            batch.polls += 1
+    def poll(self, batch_id: str) -> Batch:
+        """Return a batch whose state is asked for; raises NotThere."""
+        if batch_id not in self._all:
+            raise NotThere
+        batch = self._all[batch_id]
+        self._settle(batch)
+        batch.polls += 1
         return batch
-
-    def cancel(self, batch: Batch) -> None:
-        """Ask for the end of a batch, which it reaches at the next look."""
-        if not batch.ended and batch.cancelled_s is None:
-            batch.cancelled_s = self.now_s()
 
     def settle(self) -> None:
         """Let all batches end that are due."""
         for batch in self._all.values():
             self._settle(batch)
+
+    def shown(self, name: str, lines: Sequence[dict[str, Any]]) -> Response:
+        """Return what is there of a file of results; raises NotThere."""
+        plan = self.faults.batch
+        self.requests[name] += 1
+        if self.requests[name] <= plan.late_results:
+            raise NotThere
+        if self.requests[name] <= plan.late_results + plan.short_results:
+            lines = lines[: len(lines) // 2]
+        body = b"".join(json.dumps(line, ensure_ascii=False).encode() + b"\n" for line in lines)
+        return Response(body, headers={"content-type": "application/octet-stream"})
 
     def _fate(self, line: Asked) -> Fate:
         """A function of the seed, the line, and how often it was submitted."""
@@ -154,17 +175,10 @@ class Batches:
             return Fate(plan.delay_s, "expired")
         return Fate(after_s, "answered")
 
-    def _enqueued(self) -> int:
-        self.settle()
-        waiting = (each for each in self._all.values() if not each.ended and not each.refused)
-        return sum(batch.tokens for batch in waiting)
-
     def _settle(self, batch: Batch) -> None:
         """Make the results of a batch that is due, or was cancelled."""
-        if batch.ended or batch.refused:
-            return
         finished = batch.finished(self.now_s())
-        if finished < len(batch.lines) and batch.cancelled_s is None:
+        if batch.results is not None or (finished < len(batch.lines) and batch.cancelled_s is None):
             return
         fates = sorted(zip(batch.fates, batch.lines, strict=True), key=lambda pair: pair[0].after_s)
         batch.results = [
@@ -175,18 +189,363 @@ class Batches:
     def _result(self, line: Asked, kind: Outcome) -> Result:
         assert line.custom_id is not None
         if kind == "expired":
-            return Result(line.custom_id, None, None)
+            return Result(line.custom_id)
         if kind == "failed":
-            which = draw_index(len(FAILURES), "failure", self.faults.seed, line.where)
-            status = FAILURES[which]
-            body, _ = line.wire.error(status, "An emulated fault.")
-            return Result(line.custom_id, status, marked(body))
+            status = FAILURES[draw_index(3, "failure", self.faults.seed, line.where)]
+            return Result(line.custom_id, status, _error(line.wire, status, "An emulated fault."))
         try:
             question = self._replies.question(line)
         except UsageError as exc:
-            body, _ = line.wire.error(400, str(exc))
-            return Result(line.custom_id, 400, marked(body))
+            return Result(line.custom_id, 400, _error(line.wire, 400, str(exc)))
         attempt = self._replies.attempt(line)
         fault = self.faults.fault(line.where, attempt)
         answer = self._replies.answer(question, attempt, fault if fault in OUTCOMES else None)
         return Result(line.custom_id, 200, answer)
+
+
+class BatchMode(ABC):
+    """A provider's batch mode: its addresses, and how it puts what it says.
+
+    A page of its list is asked for by the queries ``cursor`` and ``size``.
+    """
+
+    wire: ServedFormat
+    prefix: str
+    path: str
+    cursor = "after"
+    size = "limit"
+
+    def __init__(self, batches: Batches) -> None:
+        self._batches = batches
+
+    def routes(self) -> list[tuple[str, str, Handler]]:
+        """Return the method, the pattern of paths and the handler of each address."""
+        return [
+            (method, path, partial(self._guarded, handler))
+            for method, path, handler in self._addresses()
+        ]
+
+    def _addresses(self) -> list[tuple[str, str, Handler]]:
+        return [
+            ("POST", self.path, self._create),
+            ("GET", self.path, self._list),
+            ("GET", f"{self.path}/{ID}", self._status),
+            ("POST", f"{self.path}/{ID}/cancel", self._cancel),
+        ]
+
+    @abstractmethod
+    def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
+        """Return the lines of a batch that is created; raises UsageError or what is UNREADABLE."""
+
+    @abstractmethod
+    def shown(self, batch: Batch) -> dict[str, Any]:
+        """Return a batch as its state is told."""
+
+    def page(self, batches: Sequence[Batch], more: bool) -> dict[str, Any]:
+        """Return a page of the list."""
+        last = batches[-1].id if batches else None
+        return {"data": [self.shown(batch) for batch in batches], "has_more": more, "last_id": last}
+
+    def _guarded(self, handler: Handler, request: Request) -> Response:
+        """Answer with the faults of a service, and with errors in the provider's form."""
+        faults, requests = self._batches.faults, self._batches.requests
+        where = f"{request.method} {request.path}"
+        requests[where] += 1
+        fault = faults.fault(where, requests[where])
+        if fault == "rate_limit":
+            delay_s = faults.wait_s(where, requests[where])
+            return as_error(self.wire, 429, "Rate limit reached.", delay_s)
+        if fault in STATUS_FAULTS:
+            return as_error(self.wire, STATUS_FAULTS[fault], "An emulated fault.")
+        try:
+            return handler(request)
+        except UsageError as exc:
+            return as_error(self.wire, 400, str(exc))
+        except NotThere:
+            return as_error(self.wire, 404, "There is no such thing.")
+        except UNREADABLE:
+            return as_error(self.wire, 400, "The body is not valid.")
+
+    def _create(self, request: Request) -> Response:
+        told = request.json()
+        batch = self._batches.create(self.prefix, self.lines(told, request), told)
+        if batch.refused and self.wire is not CHAT:
+            return as_error(self.wire, 429, batch.refused)
+        self._batches.requests["created"] += 1
+        faults, number = self._batches.faults, self._batches.requests["created"]
+        if draw("lost", faults.seed, number) < faults.batch.lost:
+            raise BrokenOff("lost")  # the answer is lost on its way
+        return as_json(self.shown(batch))
+
+    def _list(self, request: Request) -> Response:
+        batches = self._batches.listed(self.prefix)
+        after = request.query.get(self.cursor)
+        start = [batch.id for batch in batches].index(after) + 1 if after else 0
+        end = start + int(request.query.get(self.size, 20))
+        return as_json(self.page(batches[start:end], len(batches) > end))
+
+    def _status(self, request: Request) -> Response:
+        return as_json(self.shown(self._batches.poll(request.named["id"])))
+
+    def _cancel(self, request: Request) -> Response:
+        batch = self._batches.poll(request.named["id"])
+        if batch.results is None and batch.cancelled_s is None:
+            batch.cancelled_s = self._batches.now_s()  # it ends at the next look
+        return as_json(self.shown(batch))
+
+    def _file(self, content: bytes) -> str:
+        """Keep an uploaded file; returns its id."""
+        name = f"file-{len(self._batches.files):06x}"
+        self._batches.files[name] = content
+        return name
+
+    def _uploaded(self, name: str) -> list[dict[str, Any]]:
+        """Return the lines of an uploaded file; raises NotThere."""
+        if name not in self._batches.files:
+            raise NotThere
+        return [json.loads(line) for line in self._batches.files[name].splitlines()]
+
+
+class OpenAIMode(BatchMode):
+    """``/v1/files`` and ``/v1/batches``."""
+
+    wire, prefix, path = CHAT, "batch_", "/v1/batches"
+
+    def _addresses(self) -> list[tuple[str, str, Handler]]:
+        return [
+            *super()._addresses(),
+            ("POST", "/v1/files", self._upload),
+            ("GET", f"/v1/files/{ID}/content", self._content),
+        ]
+
+    def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
+        """See BatchMode."""
+        endpoint = told["endpoint"]
+        wire = {each.path: each for each in (CHAT, RESPONSES)}[endpoint]
+        lines = self._uploaded(told["input_file_id"])
+        if told["completion_window"] != "24h" or any(line["url"] != endpoint for line in lines):
+            raise UsageError("A line is for another endpoint, or the completion_window is not 24h.")
+        return [_asked(wire, endpoint, each["body"], each["custom_id"], each) for each in lines]
+
+    def shown(self, batch: Batch) -> dict[str, Any]:
+        """See BatchMode."""
+        ended, answered = batch.results is not None, batch.count("answered")
+        failed = batch.count("failed", "not asked")
+        status = "in_progress" if batch.cancelled_s is None else "cancelling"
+        if batch.refused:
+            status = "failed"
+        elif ended:
+            status = batch.why_not if batch.count("not asked") else "completed"
+        error = {"code": "token_limit_exceeded", "message": batch.refused}
+        counts = {
+            "total": len(batch.lines),
+            "completed": answered if ended else batch.finished(self._batches.now_s()),
+            "failed": failed,
+        }
+        return marked(
+            {
+                "id": batch.id,
+                "object": "batch",
+                **batch.told,
+                "errors": {"data": [error]} if batch.refused else None,
+                "status": status,
+                "output_file_id": f"file-{batch.id}-output" if answered else None,
+                "error_file_id": f"file-{batch.id}-error" if failed else None,
+                "created_at": int(batch.began_s),
+                "request_counts": counts,
+            }
+        )
+
+    def _upload(self, request: Request) -> Response:
+        form = request.form()
+        if form.get("purpose") != b"batch" or "file" not in form:
+            raise UsageError("A file and the purpose batch are needed.")
+        return as_json(marked({"id": self._file(form["file"]), "object": "file"}))
+
+    def _content(self, request: Request) -> Response:
+        name = request.named["id"]
+        _, batch_id, kind = name.split("-")
+        batch = self._batches.poll(batch_id)
+        chosen = [
+            each for each in batch.results or () if (each.status == 200) == (kind == "output")
+        ]
+        return self._batches.shown(name, [self._line(batch, each) for each in chosen])
+
+    def _line(self, batch: Batch, result: Result) -> dict[str, Any]:
+        line: dict[str, Any] = {"custom_id": result.custom_id, "response": None, "error": None}
+        if result.status:
+            return line | {"response": {"status_code": result.status, "body": result.body}}
+        return line | {"error": {"code": f"batch_{batch.why_not}", "message": "Not executed."}}
+
+
+class AnthropicMode(BatchMode):
+    """``/v1/messages/batches``."""
+
+    wire, prefix, path = MESSAGES, "msgbatch_", "/v1/messages/batches"
+    cursor = "after_id"
+
+    def _addresses(self) -> list[tuple[str, str, Handler]]:
+        return [*super()._addresses(), ("GET", f"{self.path}/{ID}/results", self._results)]
+
+    def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
+        """See BatchMode."""
+        return [
+            _asked(MESSAGES, MESSAGES.path, line["params"], line["custom_id"], line)
+            for line in told["requests"]
+        ]
+
+    def shown(self, batch: Batch) -> dict[str, Any]:
+        """See BatchMode."""
+        ended, cancelled = batch.results is not None, batch.cancelled_s is not None
+        counts = {
+            "processing": 0 if ended else len(batch.lines),
+            "succeeded": batch.count("answered"),
+            "errored": batch.count("failed"),
+            "canceled": batch.count("not asked") if cancelled else 0,
+            "expired": 0 if cancelled else batch.count("not asked"),
+        }
+        going_on = "canceling" if cancelled else "in_progress"
+        return marked(
+            {
+                "id": batch.id,
+                "type": "message_batch",
+                "processing_status": "ended" if ended else going_on,
+                "request_counts": counts,
+                "created_at": _rfc3339(batch.began_s),
+                "results_url": f"{self.path}/{batch.id}/results" if ended else None,
+            }
+        )
+
+    def _results(self, request: Request) -> Response:
+        batch = self._batches.poll(request.named["id"])
+        if batch.results is None:
+            raise NotThere
+        not_asked = {"type": "expired" if batch.cancelled_s is None else "canceled"}
+        lines = []
+        for result in batch.results:
+            told = {
+                "answered": {"type": "succeeded", "message": result.body},
+                "failed": {"type": "errored", "error": result.body},
+                "not asked": not_asked,
+            }
+            lines.append({"custom_id": result.custom_id, "result": told[_kind(result)]})
+        return self._batches.shown(batch.id, lines)
+
+
+class GeminiMode(BatchMode):
+    """``models/MODEL:batchGenerateContent`` and ``batches``, with requests and results in files."""
+
+    wire, prefix, path = GEMINI, "g", "/v1beta/batches"
+    cursor, size = "pageToken", "pageSize"
+
+    def _addresses(self) -> list[tuple[str, str, Handler]]:
+        return [
+            ("POST", "/v1beta/models/(?P<model>[^/]+?):batchGenerateContent", self._create),
+            ("GET", self.path, self._list),
+            ("GET", f"{self.path}/{ID}", self._status),
+            ("POST", f"{self.path}/{ID}:cancel", self._cancel),
+            ("POST", "/upload/v1beta/files", self._upload),
+            ("GET", f"/v1beta/files/{ID}:download", self._content),
+        ]
+
+    def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
+        """See BatchMode."""
+        model = request.named["model"]
+        name = told["batch"]["inputConfig"]["fileName"].removeprefix("files/")
+        path = f"/v1beta/models/{model}:generateContent"
+        return [
+            _asked(GEMINI, path, line["request"], line["key"], line, model)
+            for line in self._uploaded(name)
+        ]
+
+    def shown(self, batch: Batch) -> dict[str, Any]:
+        """See BatchMode."""
+        ended = batch.results is not None
+        state = "PENDING" if batch.polls < 2 else "RUNNING"
+        if ended:
+            state = "SUCCEEDED" if batch.count("answered", "failed") else "EXPIRED"
+        if ended and batch.cancelled_s is not None:
+            state = "CANCELLED"
+        done = len(batch.lines) if ended else batch.finished(self._batches.now_s())
+        stats = {
+            "requestCount": len(batch.lines),
+            "successfulRequestCount": batch.count("answered"),
+            "failedRequestCount": batch.count("failed"),
+            "pendingRequestCount": len(batch.lines) - done,
+        }
+        metadata = {
+            "displayName": batch.told["batch"]["displayName"],
+            "createTime": _rfc3339(batch.began_s),
+            # 64-bit numbers are texts in JSON of protobuf, and a 0 is left out.
+            "batchStats": {name: str(count) for name, count in stats.items() if count},
+            "state": f"BATCH_STATE_{state}",
+        }
+        operation: dict[str, Any] = {"name": f"batches/{batch.id}", "metadata": metadata}
+        if ended:
+            output = {"responsesFile": f"files/batch-{batch.id}"}
+            metadata["output"] = output
+            operation |= {"done": True, "response": output}
+        return marked(operation)
+
+    def page(self, batches: Sequence[Batch], more: bool) -> dict[str, Any]:
+        """See BatchMode."""
+        following = {"nextPageToken": batches[-1].id} if more else {}
+        return {"operations": [self.shown(batch) for batch in batches], **following}
+
+    def _upload(self, request: Request) -> Response:
+        """A resumable upload: it is announced, and then sent whole."""
+        if request.headers.get("x-goog-upload-command") == "start":
+            url = f"http://{request.host}{request.path}?upload_id=1"
+            return as_json(marked({}), {"x-goog-upload-url": url, "x-goog-upload-status": "active"})
+        file = {"name": f"files/{self._file(request.body)}", "sizeBytes": str(len(request.body))}
+        return as_json(marked({"file": file}), {"x-goog-upload-status": "final"})
+
+    def _content(self, request: Request) -> Response:
+        """The file of responses; a line that was not asked has none."""
+        batch = self._batches.poll(request.named["id"].removeprefix("batch-"))
+        if batch.results is None:
+            raise NotThere
+        lines = []
+        for result in batch.results:
+            told: dict[str, Any] = {"key": result.custom_id}
+            if result.status == 200:
+                lines.append(told | {"response": result.body})
+            elif result.body is not None:
+                message = result.body["error"]["message"]
+                lines.append(
+                    told | {"error": {"code": GRPC_CODES[result.status], "message": message}}
+                )
+        return self._batches.shown(batch.id, lines)
+
+
+def _asked(
+    wire: ServedFormat,
+    path: str,
+    body: Any,  # noqa: ANN401 # whatever stands there is read like the body of a request
+    custom_id: str,
+    line: dict[str, Any],
+    model: str | None = None,
+) -> Asked:
+    """A line as the request that it stands for: in canonical JSON, as our own client sends it."""
+    slot = line.get(SLOT_HEADER)
+    return Asked(
+        wire=wire,
+        path=path,
+        raw=canonical_json(body).encode(),
+        model=model,
+        slot=None if slot is None else canonical_json(slot),
+        attempt=str(line.get(ATTEMPT_HEADER, "")),
+        custom_id=custom_id,
+    )
+
+
+def _kind(result: Result) -> str:
+    return {200: "answered", 0: "not asked"}.get(result.status, "failed")
+
+
+def _error(wire: ServedFormat, status: int, message: str) -> dict[str, Any]:
+    return marked(wire.error(status, message)[0])
+
+
+def _rfc3339(moment_s: float) -> str:
+    return datetime.fromtimestamp(moment_s, UTC).isoformat().replace("+00:00", "Z")

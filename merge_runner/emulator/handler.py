@@ -10,8 +10,7 @@ from functools import partial
 
 import httpx
 
-from merge_runner.emulator.batch_routes import BatchRoutes
-from merge_runner.emulator.batches import Batches
+from merge_runner.emulator.batches import AnthropicMode, Batches, GeminiMode, OpenAIMode
 from merge_runner.emulator.exchange import BrokenOff, Request, Response, as_error, as_json
 from merge_runner.emulator.faults import STATUS_FAULTS, FaultPlan
 from merge_runner.emulator.formats import SERVED, ServedFormat
@@ -33,7 +32,9 @@ class Emulator:
         routes: list[tuple[str, str, Handler]] = [
             *(("POST", wire.path, partial(self._serve, wire)) for wire in SERVED),
             ("GET", "/v1/models", self._models),
-            *BatchRoutes(self._batches).routes(),
+            *OpenAIMode(self._batches).routes(),
+            *AnthropicMode(self._batches).routes(),
+            *GeminiMode(self._batches).routes(),
             ("GET", "/emulator/answered", self._answered),
         ]
         self._routes = [(method, re.compile(path), handler) for method, path, handler in routes]

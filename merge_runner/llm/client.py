@@ -22,7 +22,7 @@ from merge_runner.errors import (
     ReplayMiss,
     SweepStopped,
 )
-from merge_runner.llm.batch.batches import Batches
+from merge_runner.llm.batch.lines import Batches
 from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid, UnpaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Call, Wait, slot_text
@@ -64,8 +64,6 @@ if TYPE_CHECKING:
 
 # Beside a call that takes seconds this delay is nothing.
 CLAIM_POLL_S = 0.1
-# A call whose lines failed so often is asked singly.
-MOST_LINES = 3
 # A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
 
@@ -282,8 +280,6 @@ class LlmClient:
         deadline = Deadline(self.entry.deadline_s)
 
         async def sleep(seconds: float) -> None:
-            if self._goes_in_batch(call):
-                return  # the next round begins late enough
             until = datetime.now(UTC) + timedelta(seconds=seconds)
             with call.waiting(f"after {call.last_failure}", until) as wait:
                 if seconds >= LONG_WAIT_S:
@@ -423,9 +419,7 @@ class LlmClient:
 
     def _goes_in_batch(self, call: Call) -> bool:
         """Return whether the next attempt at a call goes with the next round."""
-        if self.batches is None or not self.batches.rounds.submits or call.singly:
-            return False
-        return sum(attempt.batch_id is not None for attempt in call.own_attempts) < MOST_LINES
+        return self.batches is not None and self.batches.rounds.submits and not call.singly
 
     async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""
@@ -446,13 +440,10 @@ class LlmClient:
                 cost_usd=None if usd is None else usd * batches.price_factor,
                 batch_id=end.batch_id,
             )
-            call.singly |= end.singly
-            try:
-                if end.error is None:
-                    return await self._concluded(call, paid, outcome, end.raw, record)
-                call.attempts.append(record)
-                self.meter.count_attempt(record)
-                await paid.settle(call.attempts)
-                raise end.error
-            finally:
-                batches.rounds.ended(line)
+            call.singly = True
+            if end.error is None:
+                return await self._concluded(call, paid, outcome, end.raw, record)
+            call.attempts.append(record)
+            self.meter.count_attempt(record)
+            await paid.settle(call.attempts)
+            raise end.error

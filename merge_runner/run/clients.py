@@ -19,13 +19,14 @@ from merge_runner.config import (
 )
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.batches import Batches
 from merge_runner.llm.batch.journal import Journal
-from merge_runner.llm.batch.modes import batch_service, batch_terms, require_batch
+from merge_runner.llm.batch.lines import Batches
 from merge_runner.llm.batch.rounds import Rounds
+from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
 from merge_runner.llm.budget import Budget, Unpaid
 from merge_runner.llm.cache import CallTotals, ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
@@ -151,7 +152,8 @@ def live_clients(
             )
             stack.push_async_callback(transports[model].close)
             if rounds is not None and batch_terms(entry) is not None:
-                rounds.services[model] = batch_service(entry, endpoint, transports[model])
+                service = SERVICES[entry.format]
+                rounds.services[model] = service(transports[model], endpoint, FORMATS[entry.format])
         clients[name] = LlmClient(
             name=name,
             entry=entry,
@@ -195,7 +197,7 @@ def open_rounds(
     """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
     journal = Journal(cache)
     models = set(plan.registered.values())
-    left = [each for each in journal.batches() if each.model in models and journal.waiting(each)]
+    left = [each for each in journal.batches() if each.model in models and journal.waits(each)]
     own = [each for each in left if each.ledger == plan.ledger]
     if options.dask is not None:
         if own:

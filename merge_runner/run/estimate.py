@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
-from merge_runner.llm.batch.modes import batch_terms
+from merge_runner.llm.batch.terms import batch_terms
 from merge_runner.llm.cache import CallTotals
 from merge_runner.llm.ledger import Spending
 from merge_runner.llm.prices import cost_usd

@@ -21,8 +21,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWar
 TWO_POLLS = FaultPlan(batch=BatchPlan(polls=2))
 FULL = FaultPlan(batch=BatchPlan(enqueued_tokens=100))
 NEVER = FaultPlan(batch=BatchPlan(delay_s=1000.0))
-ONE_EXPIRED = FaultPlan(seed=1, batch=BatchPlan(expired=0.5))
-SOME_FAILED = FaultPlan(seed=1, batch=BatchPlan(failed=0.5))
 CHAT, RESPONSES = "/v1/chat/completions", "/v1/responses"
 
 
@@ -91,26 +89,6 @@ async def test_openai_cancels_a_batch(emulator, driving_prompt):
     assert [error["error"]["code"] for error in errors] == ["batch_cancelled"] * 3
 
 
-async def test_openai_finds_expired_lines_and_failed_ones_in_the_error_file(
-    emulator, driving_prompt
-):
-    async with openai_client(await emulator(ONE_EXPIRED)) as client:
-        created = await create_openai(client, openai_lines(driving_prompt, count=20))
-        batch = await client.batches.retrieve(created.id)
-        assert batch.status == "expired"
-        answered = await jsonl(client, batch.output_file_id)
-        expired = await jsonl(client, batch.error_file_id)
-    assert len(answered) + len(expired) == 20
-    assert {line["error"]["code"] for line in expired} == {"batch_expired"}
-    async with openai_client(await emulator(SOME_FAILED)) as client:
-        created = await create_openai(client, openai_lines(driving_prompt, count=20))
-        batch = await client.batches.retrieve(created.id)
-        assert (batch.status, batch.request_counts.total) == ("completed", 20)
-        failed = await jsonl(client, batch.error_file_id)
-    assert {line["response"]["status_code"] for line in failed} == {429, 500, 503}
-    assert batch.request_counts.failed == len(failed)
-
-
 async def test_openai_sees_a_batch_of_too_many_tokens_fail(emulator, driving_prompt):
     async with openai_client(await emulator(FULL)) as client:
         created = await create_openai(client, openai_lines(driving_prompt))
@@ -123,23 +101,10 @@ async def test_openai_raises_its_errors_for_what_there_is_not_and_what_cannot_be
     async with openai_client(await emulator()) as client:
         with pytest.raises(NotFoundError):
             await client.batches.retrieve("batch_none")
-        with pytest.raises(BadRequestError, match="Line 1"):
+        with pytest.raises(BadRequestError, match="not valid"):
             await create_openai(client, b"no json\n")
         with pytest.raises(BadRequestError, match="unique"):
             await create_openai(client, openai_lines("a", count=1) * 2)
-
-
-async def test_openai_keeps_and_deletes_files(emulator):
-    from openai import NotFoundError
-
-    async with openai_client(await emulator()) as client:
-        file = await client.files.create(file=("in.jsonl", b"{}\n"), purpose="batch")
-        assert (file.bytes, file.purpose) == (3, "batch")
-        assert (await client.files.retrieve(file.id)).id == file.id
-        assert (await client.files.content(file.id)).content == b"{}\n"
-        assert (await client.files.delete(file.id)).deleted
-        with pytest.raises(NotFoundError):
-            await client.files.retrieve(file.id)
 
 
 def messages(prompt, count=3):
@@ -170,36 +135,16 @@ async def test_anthropic_creates_polls_and_reads_a_batch(emulator, driving_promp
     assert parse_reply(results[0].result.message.content[0].text, 20).plan
 
 
-async def test_anthropic_lists_its_batches_page_by_page_the_newest_first(emulator, driving_prompt):
-    async with anthropic_client(await emulator()) as client:
-        batches = client.messages.batches
-        created = [(await batches.create(requests=messages(driving_prompt))).id for _ in "abc"]
-        assert [batch.id async for batch in batches.list(limit=2)] == created[::-1]
-
-
 async def test_anthropic_cancels_a_batch(emulator, driving_prompt):
     async with anthropic_client(await emulator(NEVER)) as client:
         batches = client.messages.batches
         created = await batches.create(requests=messages(driving_prompt))
         cancelled = await batches.cancel(created.id)
         assert cancelled.processing_status == "canceling"
-        assert cancelled.cancel_initiated_at is not None
         ended = await batches.retrieve(created.id)
         assert (ended.processing_status, ended.request_counts.canceled) == ("ended", 3)
         results = [result async for result in await batches.results(created.id)]
     assert {result.result.type for result in results} == {"canceled"}
-
-
-async def test_anthropic_reads_failed_lines_and_expired_ones(emulator, driving_prompt):
-    plan = FaultPlan(seed=3, batch=BatchPlan(failed=0.3, expired=0.3))
-    async with anthropic_client(await emulator(plan)) as client:
-        created = await client.messages.batches.create(requests=messages(driving_prompt, 20))
-        results = [each async for each in await client.messages.batches.results(created.id)]
-        counts = (await client.messages.batches.retrieve(created.id)).request_counts
-    types = [each.result.type for each in results]
-    assert (counts.errored, counts.expired) == (types.count("errored"), types.count("expired"))
-    errors = [each.result.error.error.type for each in results if each.result.type == "errored"]
-    assert {"rate_limit_error", "api_error", "overloaded_error"} >= set(errors) != set()
 
 
 async def test_anthropic_raises_its_errors(emulator, driving_prompt):
@@ -214,93 +159,46 @@ async def test_anthropic_raises_its_errors(emulator, driving_prompt):
             await client.messages.batches.create(requests=messages("a", 1) * 2)
 
 
-def contents(prompt, count=3):
-    return [
-        {
-            "contents": [{"role": "user", "parts": [{"text": prompt}]}],
-            "metadata": {"key": f"line-{n}"},
-            "config": {"max_output_tokens": 1000 + n},
-        }
-        for n in range(count)
-    ]
-
-
-async def test_gemini_creates_polls_and_reads_an_inline_batch_in_order(emulator, driving_prompt):
-    async with gemini_client(await emulator(TWO_POLLS)).aio as client:
-        created = await client.batches.create(
-            model=MODEL, src=contents(driving_prompt), config={"display_name": "m1"}
-        )
-        assert (created.state.name, created.display_name) == ("JOB_STATE_PENDING", "m1")
-        states = [(await client.batches.get(name=created.name)).state.name for _ in range(3)]
-        assert states == ["JOB_STATE_PENDING", "JOB_STATE_RUNNING", "JOB_STATE_SUCCEEDED"]
-        batch = await client.batches.get(name=created.name)
-    responses = batch.dest.inlined_responses
-    assert [each.metadata["key"] for each in responses] == ["line-0", "line-1", "line-2"]
-    assert parse_reply(responses[0].response.text, 20).plan
-    assert batch.model == f"models/{MODEL}"
-
-
-async def test_gemini_creates_and_reads_a_batch_by_file(emulator, driving_prompt):
+async def create_gemini(client, prompt, count=3, name="m"):
     lines = [
         {
             "key": f"line-{n}",
-            "request": {"contents": [{"role": "user", "parts": [{"text": driving_prompt}]}]},
+            "request": {
+                "contents": [{"role": "user", "parts": [{"text": prompt}]}],
+                "generationConfig": {"maxOutputTokens": 1000 + n},
+            },
         }
-        for n in range(3)
+        for n in range(count)
     ]
     content = "".join(json.dumps(line) + "\n" for line in lines).encode()
-    async with gemini_client(await emulator()).aio as client:
-        file = await client.files.upload(
-            file=io.BytesIO(content), config={"mime_type": "application/jsonl"}
-        )
-        assert file.size_bytes == len(content)
-        created = await client.batches.create(
-            model=MODEL, src=file.name, config={"display_name": "m2"}
-        )
-        batch = await client.batches.get(name=created.name)
-        results = (await client.files.download(file=batch.dest.file_name)).decode().splitlines()
-    read = {line["key"]: line["response"] for line in map(json.loads, results)}
-    assert read.keys() == {"line-0", "line-1", "line-2"}
-    assert parse_reply(read["line-1"]["candidates"][0]["content"]["parts"][0]["text"], 20).plan
+    file = await client.files.upload(
+        file=io.BytesIO(content), config={"mime_type": "application/jsonl"}
+    )
+    return await client.batches.create(model=MODEL, src=file.name, config={"display_name": name})
 
 
-async def test_gemini_lists_its_batches_page_by_page_the_newest_first(emulator, driving_prompt):
-    async with gemini_client(await emulator()).aio as client:
-        created = [
-            (
-                await client.batches.create(
-                    model=MODEL, src=contents(driving_prompt), config={"display_name": name}
-                )
-            ).name
-            for name in "abc"
-        ]
-        pages = await client.batches.list(config={"page_size": 2})
-        assert [batch.name async for batch in pages] == created[::-1]
+async def gemini_results(client, batch):
+    content = await client.files.download(file=batch.dest.file_name)
+    return [json.loads(line) for line in content.decode().splitlines()]
+
+
+async def test_gemini_creates_polls_and_reads_a_batch(emulator, driving_prompt):
+    async with gemini_client(await emulator(TWO_POLLS)).aio as client:
+        created = await create_gemini(client, driving_prompt, name="m1")
+        assert (created.state.name, created.display_name) == ("JOB_STATE_PENDING", "m1")
+        states = [(await client.batches.get(name=created.name)).state.name for _ in range(3)]
+        assert states == ["JOB_STATE_PENDING", "JOB_STATE_RUNNING", "JOB_STATE_SUCCEEDED"]
+        results = await gemini_results(client, await client.batches.get(name=created.name))
+    assert {line["key"] for line in results} == {"line-0", "line-1", "line-2"}
+    text = results[0]["response"]["candidates"][0]["content"]["parts"][0]["text"]
+    assert parse_reply(text, 20).plan
 
 
 async def test_gemini_cancels_a_batch(emulator, driving_prompt):
     async with gemini_client(await emulator(NEVER)).aio as client:
-        created = await client.batches.create(
-            model=MODEL, src=contents(driving_prompt), config={"display_name": "m"}
-        )
+        created = await create_gemini(client, driving_prompt)
         await client.batches.cancel(name=created.name)
         assert (await client.batches.get(name=created.name)).state.name == "JOB_STATE_CANCELLED"
-
-
-async def test_gemini_reads_the_error_of_a_line_and_misses_those_that_were_not_asked(
-    emulator, driving_prompt
-):
-    plan = FaultPlan(seed=3, batch=BatchPlan(failed=0.3, expired=0.3))
-    async with gemini_client(await emulator(plan)).aio as client:
-        created = await client.batches.create(
-            model=MODEL, src=contents(driving_prompt, 20), config={"display_name": "m"}
-        )
-        batch = await client.batches.get(name=created.name)
-    assert batch.state.name == "JOB_STATE_SUCCEEDED"
-    responses = batch.dest.inlined_responses
-    assert len(responses) < 20
-    codes = {each.error.code for each in responses if each.error}
-    assert {8, 13, 14} >= codes != set()
 
 
 async def test_gemini_raises_its_errors(emulator, driving_prompt):
@@ -308,9 +206,7 @@ async def test_gemini_raises_its_errors(emulator, driving_prompt):
 
     async with gemini_client(await emulator(FULL)).aio as client:
         with pytest.raises(ClientError, match="Enqueued token limit") as full:
-            await client.batches.create(
-                model=MODEL, src=contents(driving_prompt), config={"display_name": "m"}
-            )
+            await create_gemini(client, driving_prompt)
         assert full.value.code == 429
         with pytest.raises(ClientError) as missing:
             await client.batches.get(name="batches/none")

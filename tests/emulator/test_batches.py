@@ -44,9 +44,9 @@ def some(prompt, count=20):
 
 def test_a_batch_ends_on_the_clock_with_its_last_line(clock, driving_prompt):
     batches = batches_of(clock, delay_s=100.0)
-    batch = batches.create("b", "", some(driving_prompt), {})
+    batch = batches.create("b", some(driving_prompt), {})
     counts = []
-    while not batches.poll(batch.id).ended:
+    while batches.poll(batch.id).results is None:
         counts.append(batch.finished(clock.now_s))
         clock.now_s += 10
     assert counts == sorted(counts)
@@ -56,9 +56,9 @@ def test_a_batch_ends_on_the_clock_with_its_last_line(clock, driving_prompt):
 
 
 def test_a_slow_line_keeps_its_batch_waiting(clock, driving_prompt):
-    usual = batches_of(clock, delay_s=100.0).create("b", "", some(driving_prompt), {})
+    usual = batches_of(clock, delay_s=100.0).create("b", some(driving_prompt), {})
     tailed = batches_of(clock, delay_s=100.0, slow=0.1, slow_factor=50.0)
-    slow = tailed.create("b", "", some(driving_prompt), {})
+    slow = tailed.create("b", some(driving_prompt), {})
     late = [fate.after_s for fate in slow.fates if fate.after_s > 100]
     assert 0 < len(late) < 10
     assert slow.due_s > usual.due_s
@@ -69,7 +69,7 @@ def test_the_fate_of_a_line_is_a_function_of_the_seed_and_of_how_often_it_was_su
 ):
     def fates(seed, times):
         batches = batches_of(clock, seed, failed=0.3, expired=0.3)
-        created = [batches.create("b", "", some(driving_prompt), {}) for _ in range(times)]
+        created = [batches.create("b", some(driving_prompt), {}) for _ in range(times)]
         return [fate.kind for fate in created[-1].fates]
 
     assert fates(0, 1) == fates(0, 1)
@@ -78,7 +78,7 @@ def test_the_fate_of_a_line_is_a_function_of_the_seed_and_of_how_often_it_was_su
 
 def test_each_kind_of_line_occurs_at_its_rate(clock, driving_prompt):
     batches = batches_of(clock, failed=0.1, expired=0.05)
-    kinds = [fate.kind for fate in batches.create("b", "", some("x", 4000), {}).fates]
+    kinds = [fate.kind for fate in batches.create("b", some("x", 4000), {}).fates]
     assert kinds.count("failed") == pytest.approx(400, abs=80)
     assert kinds.count("expired") == pytest.approx(200, abs=60)
 
@@ -87,23 +87,23 @@ def test_tokens_wait_until_their_batch_has_ended(clock, driving_prompt):
     lines = some(driving_prompt)
     tokens = sum(len(line.raw) for line in lines) // 4
     batches = batches_of(clock, delay_s=10.0, enqueued_tokens=tokens)
-    assert batches.create("b", "", lines, {}).refused is None
-    assert "Limit" in batches.create("b", "", lines[:1], {}).refused
+    assert not batches.create("b", lines, {}).refused
+    assert "Limit" in batches.create("b", lines[:1], {}).refused
     clock.now_s += 20
-    assert batches.create("b", "", lines[:1], {}).refused is None
+    assert not batches.create("b", lines[:1], {}).refused
 
 
 def test_a_line_that_cannot_be_read_fails_alone(clock, driving_prompt):
     batches = batches_of(clock)
     odd = Asked(CHAT, CHAT.path, b'{"messages": 7}', custom_id="odd")
-    batch = batches.create("b", "", [chat(driving_prompt), odd], {})
+    batch = batches.create("b", [chat(driving_prompt), odd], {})
     batches.settle()
     assert {each.custom_id: each.status for each in batch.results} == {"line-0": 200, "odd": 400}
 
 
 def test_a_batch_has_a_line(clock):
-    with pytest.raises(UsageError, match="at least one"):
-        batches_of(clock).create("b", "", [], {})
+    with pytest.raises(UsageError, match="needs lines"):
+        batches_of(clock).create("b", [], {})
 
 
 async def test_the_emulator_counts_its_answers_singly_and_in_batches(emulator, driving_prompt):
@@ -122,19 +122,6 @@ async def test_the_emulator_counts_its_answers_singly_and_in_batches(emulator, d
         (None, slot, 2),
         ("k", None, 1),
     ]
-
-
-async def test_a_file_has_an_id_that_no_other_has_had(emulator):
-    async def upload():
-        form = aiohttp.FormData({"purpose": "batch"})
-        form.add_field("file", b"{}", filename="in.jsonl")
-        async with session.post("/v1/files", data=form) as reply:
-            return (await reply.json())["id"]
-
-    async with aiohttp.ClientSession(await emulator()) as session:
-        first, second = await upload(), await upload()
-        await session.delete(f"/v1/files/{first}")
-        assert await upload() not in (first, second)
 
 
 async def test_the_command_says_how_long_batches_take(zygote, tmp_path, driving_prompt):

@@ -16,8 +16,8 @@ import pytest
 from aiohttp import web
 
 from merge_runner.config import resolve_endpoint
-from merge_runner.llm.batch.modes import batch_service
 from merge_runner.llm.batch.service import BatchLine
+from merge_runner.llm.batch.terms import SERVICES
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
@@ -220,8 +220,9 @@ async def submitted(name, url, prompt):
     async with transport_of(name, url) as (transport, endpoint):
         # Some members are sent to the provider's own host alone.
         own = replace(endpoint, identity=endpoint.provider)
-        service = batch_service(MODELS[name], own, transport)
-        await service.submit([BatchLine(request_of(name, prompt))], "a-mark")
+        form = MODELS[name].format
+        service = SERVICES[form](transport, own, FORMATS[form])
+        await service.create([BatchLine(request_of(name, prompt))], "a-mark")
 
 
 async def test_a_batch_of_o3_is_created_as_by_openais_library(driving_prompt):

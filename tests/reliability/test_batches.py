@@ -214,7 +214,7 @@ async def test_first_situations_take_one_batch(merge_runner, tmp_path):
 async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("merge_runner.llm.batch.following.ROUND_DEADLINE_S", 2.0)
+    monkeypatch.setattr("merge_runner.llm.batch.rounds.ROUND_DEADLINE_S", 2.0)
     said = []
     plan = BatchPlan(delay_s=1.0, slow=0.5, slow_factor=1000)
     async with watched(faults=FaultPlan(batch=plan)) as server:
@@ -228,19 +228,6 @@ async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly
     assert batched
     assert alone
     assert (batched + alone).total() == len(batched + alone) == 22
-
-
-@pytest.mark.long
-async def test_an_account_that_takes_few_tokens_gets_smaller_batches(merge_runner):
-    plan = BatchPlan(delay_s=0.2, enqueued_tokens=5000)
-    async with watched(faults=FaultPlan(batch=plan)) as server:
-        run = await merge_runner(
-            "sweep", "baseline", "--first", "--reps", 1, "--batch", **account(server)
-        )
-        batched, alone = await answered(server)
-    assert run.code == 0, run.err
-    assert "go in smaller batches" in run.err
-    assert (len(batched), max(batched.values()), alone) == (22, 1, Counter())
 
 
 @pytest.mark.long

@@ -7,37 +7,28 @@ has the key of its request. Results of both kinds are read.
 from __future__ import annotations
 
 import re
-from collections.abc import AsyncIterator, Collection, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from datetime import datetime
-from functools import partial
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
-from merge_runner.llm.batch.exchange import (
+from merge_runner.llm.batch.service import (
     TRANSFER_TIMEOUT_S,
-    Exchange,
-    Line,
-    Listing,
-    as_id,
+    BatchFailed,
+    BatchLine,
+    BatchService,
+    BatchStatus,
+    LineResult,
+    Unreadable,
     as_message,
     as_reply,
     as_word,
-    check_size,
-    counted,
     id_of,
+    json_object,
+    key_of,
+    leads_back,
     moment_of,
-    no_batch_yet,
-    read_results,
-    text_at,
     unreadable,
-)
-from merge_runner.llm.batch.service import (
-    BatchFailed,
-    BatchLimits,
-    BatchLine,
-    BatchStatus,
-    Found,
-    LineResult,
 )
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import as_count, as_dict, as_dicts, as_text, read_error
@@ -69,60 +60,71 @@ CODES = {
 NOT_ASKED = frozenset({"CANCELLED"})
 
 
-def _created(batch: dict[str, Any]) -> datetime | None:
-    return moment_of(as_dict(batch.get("metadata")).get("createTime"))
-
-
-def _next_page(page: dict[str, Any], batches: Sequence[dict[str, Any]]) -> str | None:
-    return as_text(page.get("nextPageToken")) or None
-
-
-def _listed_id(batch: dict[str, Any]) -> str | None:
-    name = as_id(batch.get("name"))
-    return None if name is None else _number(name)
-
-
-# A page has few batches, since one may come with all its results.
-LISTING = Listing(
-    f"{API}/batches?pageSize=10", "operations", "pageToken", _next_page, _listed_id, _created
-)
-
-
-class GeminiBatches:
+class GeminiBatches(BatchService):
     """``models/MODEL:batchGenerateContent`` and ``batches``; see BatchService."""
 
     # A file may have 2 GB, but this one is held in memory.
-    limits = BatchLimits(lines=100_000, size=200_000_000)
+    most_bytes = 200_000_000
 
-    def __init__(self, exchange: Exchange) -> None:
-        self._exchange = exchange
-
-    def size(self, line: BatchLine) -> int:
+    def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
-        return len(self._line(line))
+        slot = self.slot_members(line)
+        return f'{{"key":"{line.key}","request":{line.request.body}{slot}}}\n'.encode()
 
-    async def submit(self, lines: Sequence[BatchLine], mark: str) -> str:
+    async def create(self, lines: Sequence[BatchLine], mark: str) -> str:
         """See BatchService."""
-        check_size(lines, self)
-        with no_batch_yet():
-            name = await self._upload(lines, mark)
+        try:
+            name = await self._upload(b"".join(map(self.line, lines)), mark)
+        except BatchFailed as exc:
+            exc.sent = False  # a file is no batch yet
+            raise
         batch = {"displayName": mark, "inputConfig": {"fileName": name}}
-        body = canonical_json({"batch": batch}).encode()
         path = lines[0].request.path.replace(METHOD, BATCH_METHOD)
-        return _number(id_of(await self._exchange.create(path, body, lines=lines), "name"))
+        created = await self._post(path, canonical_json({"batch": batch}).encode())
+        return _number(id_of(json_object(created), "name"))
 
-    async def find(
-        self, mark: str, keys: Collection[str], *, since: datetime, known: Collection[str] = ()
-    ) -> Found | None:
+    async def _upload(self, content: bytes, mark: str) -> str:
+        """Return the name of a file with these lines."""
+        start = {
+            "x-goog-upload-protocol": "resumable",
+            "x-goog-upload-command": "start",
+            "x-goog-upload-header-content-length": str(len(content)),
+            "x-goog-upload-header-content-type": "application/jsonl",
+        }
+        file = canonical_json({"file": {"displayName": mark, "mimeType": "application/jsonl"}})
+        begun = await self._post(f"/upload{API}/files", file.encode(), start)
+        finish = {"x-goog-upload-command": "upload, finalize", "x-goog-upload-offset": "0"}
+        path = self._own_path(begun.headers.get("x-goog-upload-url", ""))
+        uploaded = json_object(await self._post(path, content, finish))
+        return id_of(as_dict(uploaded.get("file")), "name")
+
+    def _own_path(self, url: str) -> str:
+        """Return the path of an upload at the configured host, to which alone the key goes."""
+        try:
+            parts = urlsplit(url)
+        except ValueError:
+            parts = urlsplit("")
+        path = parts.path.removeprefix(urlsplit(self._endpoint.base_url).path)
+        if not UPLOAD_PATH.fullmatch(f"{path}?{parts.query}"):
+            raise BatchFailed("again", "the reply names no URL for the upload")
+        return f"{path}?{parts.query}"
+
+    async def find(self, mark: str, since: datetime) -> str | None:
         """By the mark, which is its display name."""
-        async for batch_id, batch in self._exchange.listed(LISTING, since, known):
-            if as_dict(batch.get("metadata")).get("displayName") == mark:
-                return Found(batch_id)
+        # A page has few batches, since one may come with all its results.
+        async for page in self._pages(f"{API}/batches?pageSize=10", "pageToken", _next_page):
+            batches = as_dicts(page.get("operations"))
+            metadata = [as_dict(batch.get("metadata")) for batch in batches]
+            for batch, its in zip(batches, metadata, strict=True):
+                if its.get("displayName") == mark:
+                    return _number(id_of(batch, "name"))
+            if leads_back([moment_of(its.get("createTime")) for its in metadata], since):
+                break
         return None
 
     async def status(self, batch_id: str) -> BatchStatus:
         """See BatchService."""
-        batch = await self._exchange.get(f"{API}/batches/{batch_id}")
+        batch = await self._get(f"{API}/batches/{batch_id}", TRANSFER_TIMEOUT_S)
         metadata, error = as_dict(batch.get("metadata")), as_dict(batch.get("error"))
         word = _word(metadata)
         stats = as_dict(metadata.get("batchStats"))
@@ -134,71 +136,49 @@ class GeminiBatches:
             word=word,
             done=None if total is None else max(0, total - (pending or 0)),
             total=total,
+            results=_count(stats, "successfulRequestCount") or 0,
             message=as_message(error.get("message")),
-            failure=self._exchange.failure_of(why) if state == "failed" else None,
+            failure=self.failure_of(why) if state == "failed" else None,
+            batch=batch,
         )
 
-    def results(self, batch_id: str) -> AsyncIterator[LineResult]:
-        """See BatchService."""
-        return read_results(partial(self._lines, batch_id), _read)
-
-    async def cancel(self, batch_id: str) -> None:
-        """See BatchService."""
-        await self._exchange.cancel(f"{API}/batches/{batch_id}:cancel")
-
-    async def _upload(self, lines: Sequence[BatchLine], mark: str) -> str:
-        """The name of a file with the lines."""
-        content = b"".join(map(self._line, lines))
-        start = {
-            "x-goog-upload-protocol": "resumable",
-            "x-goog-upload-command": "start",
-            "x-goog-upload-header-content-length": str(len(content)),
-            "x-goog-upload-header-content-type": "application/jsonl",
-        }
-        told = canonical_json({"file": {"displayName": mark, "mimeType": "application/jsonl"}})
-        files = f"/upload{API}/files"
-        begun = await self._exchange.step(files, told.encode(), start, lines=lines)
-        finish = {"x-goog-upload-command": "upload, finalize", "x-goog-upload-offset": "0"}
-        path = self._own_path(begun.headers.get("x-goog-upload-url", ""))
-        uploaded = await self._exchange.create(path, content, finish, lines=lines)
-        return id_of(as_dict(uploaded.get("file")), "name")
-
-    def _own_path(self, url: str) -> str:
-        """The path of an upload at the configured host, to which alone the key goes."""
-        try:
-            parts = urlsplit(url)
-        except ValueError:
-            parts = urlsplit("")
-        path = parts.path.removeprefix(urlsplit(self._exchange.endpoint.base_url).path)
-        if not UPLOAD_PATH.fullmatch(f"{path}?{parts.query}"):
-            raise BatchFailed("again", "the reply names no URL for the upload")
-        return f"{path}?{parts.query}"
-
-    async def _lines(self, batch_id: str) -> AsyncIterator[Line]:
-        path = f"{API}/batches/{batch_id}"
-        batch = await self._exchange.get(path, timeout_s=TRANSFER_TIMEOUT_S)
+    async def lines(
+        self, batch_id: str, batch: Mapping[str, Any]
+    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
+        """The results, in a file or beside the state."""
         metadata = as_dict(batch.get("metadata"))
         output = as_dict(metadata.get("output")) or as_dict(batch.get("response"))
         if not output and _word(metadata).upper().endswith("SUCCEEDED"):
             raise BatchFailed("again", "the results are not there yet")
-        stats = as_dict(metadata.get("batchStats"))
-        least = _count(stats, "successfulRequestCount") or 0
-        most = max(_count(stats, "requestCount") or self.limits.lines, least)
-        async for line in counted(self._output(output), least=least, most=most):
-            yield line
-
-    async def _output(self, output: dict[str, Any]) -> AsyncIterator[Line]:
-        """The results of a batch that has some, in a file or beside its state."""
         for result in as_dicts(as_dict(output.get("inlinedResponses")).get("inlinedResponses")):
             yield {"key": as_dict(result.get("metadata")).get("key"), **result}
         if output.get("responsesFile"):
             name = id_of(output, "responsesFile")
-            async for line in self._exchange.lines(f"{API}/{name}:download?alt=media"):
+            async for line in self._lines(f"{API}/{name}:download?alt=media"):
                 yield line
 
-    def _line(self, line: BatchLine) -> bytes:
-        told = self._exchange.told(line)
-        return f'{{"key":"{line.key}","request":{line.request.body}{told}}}\n'.encode()
+    def read(self, line: dict[str, Any]) -> LineResult:
+        """See BatchService."""
+        key = key_of(line, "key")
+        response, error = line.get("response"), as_dict(line.get("error"))
+        if isinstance(response, dict):
+            return LineResult(key, as_reply(200, response))
+        if not error:
+            raise unreadable(key, "has neither a response nor an error")
+        status, name = _status_of(error)
+        if name in NOT_ASKED:
+            return LineResult(key, None, as_message(error.get("message")))
+        return LineResult(
+            key, as_reply(status, {"error": {**error, "code": status, "status": name}})
+        )
+
+    async def cancel(self, batch_id: str) -> None:
+        """See BatchService."""
+        await self._cancel(f"{API}/batches/{batch_id}:cancel")
+
+
+def _next_page(page: dict[str, Any]) -> str | None:
+    return as_text(page.get("nextPageToken")) or None
 
 
 def _number(name: str) -> str:
@@ -233,16 +213,3 @@ def _status_of(error: dict[str, Any]) -> tuple[int, str | None]:
     if 400 <= code < 600:
         return code, as_text(error.get("status"))
     return CODES.get(code, CODES[2])
-
-
-def _read(line: dict[str, Any]) -> LineResult:
-    key = text_at(line, "key")
-    response, error = line.get("response"), as_dict(line.get("error"))
-    if isinstance(response, dict):
-        return LineResult(key, as_reply(200, response))
-    if not error:
-        raise unreadable(key, "has neither a response nor an error")
-    status, name = _status_of(error)
-    if name in NOT_ASKED:
-        return LineResult(key, None, as_message(error.get("message")))
-    return LineResult(key, as_reply(status, {"error": {**error, "code": status, "status": name}}))

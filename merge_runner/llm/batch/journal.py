@@ -1,15 +1,15 @@
-"""Which calls wait in which batches: written before a batch is asked for, in the cache.
+"""Which calls wait in which batches: written before a batch is created, in the cache.
 
 A process that is killed leaves here what the next one needs: the batch to look for, or to wait for,
-and under which of its attempts each call waits there.
+and under which of its attempts each call waits there. One process at a time asks a model in a
+cache, so that it knows all rows of its models once it has read them.
 """
 
 from __future__ import annotations
 
-import secrets
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -17,11 +17,8 @@ from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import Attempt
 
-# Prefixes of names in the cache.
-_BATCH, _LINE, _ENDED = "batch ", "line ", "ended batches"
-# How long an ended batch may be mistaken for one whose id was lost.
-REMEMBERED = timedelta(days=2)
-MARK_BYTES = 16
+# The prefix of names in the cache.
+_BATCH = "batch "
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,25 +35,22 @@ class OpenLine:
 
 @dataclass(frozen=True, slots=True)
 class OpenBatch:
-    """A batch that was submitted, or is about to be.
+    """A batch that was created, or is about to be.
 
-    ``mark`` is its name at the provider. ``batch_id`` is empty until the provider has told it, and
-    may be somebody else's while it is not ``sure``; ``others`` are ids that turned out to be so.
-    ``model`` is its name in the registry, ``ledger`` that of the money. ``number`` is the round:
-    which decision its trials wait for at most, counted from 1. ``submitted_at``, ``cancelled_at``
-    and ``ended_at`` are UTC in ISO 8601; empty: it was not asked to end, or not seen to have ended.
+    ``mark`` is its name at the provider, ``batch_id`` its id, empty until the provider has told it.
+    ``lines`` has the number of the attempt by the key of each call. ``model`` is its name in the
+    registry, ``ledger`` that of the money. ``number`` is the round: which decision its trials wait
+    for at most, counted from 1. ``submitted_at``, ``cancelled_at`` and ``ended_at`` are UTC in
+    ISO 8601; empty: it was not asked to end, or not seen to have ended.
     """
 
     mark: str
     model: str
-    endpoint: str
     ledger: str
     number: int
     submitted_at: str
-    keys: tuple[str, ...]
+    lines: dict[str, int]
     batch_id: str = ""
-    sure: bool = True
-    others: tuple[str, ...] = ()
     cancelled_at: str = ""
     ended_at: str = ""
 
@@ -66,130 +60,89 @@ class OpenBatch:
         return datetime.fromisoformat(self.submitted_at)
 
 
-_OPEN_BATCH, _OPEN_LINE = TypeAdapter(OpenBatch), TypeAdapter(OpenLine)
-_TIMES = TypeAdapter(dict[str, str])
-
-
-def new_mark() -> str:
-    """A name for a batch that no other one has, of whatever run, at whatever provider."""
-    return secrets.token_hex(MARK_BYTES)
+_OPEN_BATCH = TypeAdapter(OpenBatch)
 
 
 class Journal:
-    """The open batches of a cache, which several processes may share."""
+    """The open batches of a cache."""
 
     def __init__(self, cache: ResponseCache) -> None:
         self._cache = cache
-        self._ended: list[tuple[str, OpenLine]] = []
-
-    def line(self, key: str) -> OpenLine | None:
-        """Where a call waits; None: nowhere. A damaged row is none."""
-        try:
-            text = self._cache.read(_LINE + key)
-            return None if text is None else _OPEN_LINE.validate_json(text)
-        except (RecordingError, ValidationError):
-            return None
-
-    def batch(self, mark: str) -> OpenBatch | None:
-        """An open batch; None where there is none. A damaged row is none."""
-        try:
-            text = self._cache.read_checked(_BATCH + mark)
-            return None if text is None else _OPEN_BATCH.validate_json(text)
-        except (RecordingError, ValidationError):
-            return None
+        found = filter(None, map(self._read, cache.names(_BATCH)))
+        ordered = sorted(found, key=lambda batch: batch.submitted_at)
+        self._open = {batch.mark: batch for batch in ordered}
 
     def batches(self) -> list[OpenBatch]:
-        """All open batches, the oldest first."""
-        marks = (name.removeprefix(_BATCH) for name in self._cache.names(_BATCH))
-        found = [batch for batch in map(self.batch, marks) if batch is not None]
-        return sorted(found, key=lambda batch: batch.submitted_at)
+        """Return all open batches, the oldest first."""
+        return [*self._open.values()]
 
-    def waiting(self, batch: OpenBatch) -> list[str]:
-        """The keys of a batch whose calls wait there yet."""
-        lines = ((key, self.line(key)) for key in batch.keys)
-        return [
-            key
-            for key, line in lines
-            if line is not None and line.mark == batch.mark and self._is_open(key, line)
-        ]
+    def batch(self, mark: str) -> OpenBatch:
+        """Return an open batch."""
+        return self._open[mark]
 
-    async def submitting(
-        self,
-        batch: OpenBatch,
-        attempts: dict[str, int],
-        begin: Callable[[str], bool],
-        instead_of: Collection[str] = (),
-    ) -> OpenBatch:
-        """Note that a batch is about to be submitted, with what of it may ``begin``.
+    def line(self, key: str) -> OpenLine | None:
+        """Return where a call was submitted last; None: nowhere."""
+        for batch in reversed(self._open.values()):
+            if key in batch.lines:
+                return OpenLine(batch.mark, batch.lines[key])
+        return None
 
-        All in one transaction. It takes the place of the batches of the marks ``instead_of``.
+    def waits(self, batch: OpenBatch) -> bool:
+        """Whether a call of the batch waits there yet."""
+        return any(self._is_open(key, self.line(key)) for key in batch.lines)
+
+    async def begin(self, batch: OpenBatch, begins: Callable[[str], bool]) -> OpenBatch:
+        """Note that a batch is about to be created, with those of its calls that may begin.
+
+        ``begins``, an operation on the cache, is told the key of each; all is one transaction.
         """
 
         def operation() -> OpenBatch:
-            begun = tuple(key for key in batch.keys if begin(key))
-            taken = replace(batch, keys=begun)
-            for key in begun:
-                line = OpenLine(batch.mark, attempts[key])
-                self._cache.replace(_LINE + key, _OPEN_LINE.dump_json(line).decode())
-            for mark in instead_of:
-                self._cache.remove(_BATCH + mark)
+            begun = {key: attempt for key, attempt in batch.lines.items() if begins(key)}
+            taken = replace(batch, lines=begun)
             if begun:
                 self._write(taken)
             return taken
 
-        return await self._cache.write(operation)
+        taken = await self._cache.write(operation)
+        if taken.lines:
+            self._open[taken.mark] = taken
+        return taken
 
     async def note(self, batch: OpenBatch) -> None:
         """Note what is known of a batch by now."""
         await self._cache.write(lambda: self._write(batch))
-
-    def line_ended(self, key: str, line: OpenLine) -> None:
-        """The attempt has ended; once that is durable, the row goes with the next ``tidy``."""
-        self._ended.append((key, line))
+        self._open[batch.mark] = batch
 
     async def tidy(self) -> None:
-        """Remove the rows of lines that have ended, and of batches where all have."""
-        ended, self._ended = self._ended, []
-
-        oldest = (datetime.now(UTC) - REMEMBERED).isoformat()
+        """Remove the batches of which no call waits any more."""
 
         def operation() -> None:
-            times = self._ended_at()
-            for key, line in ended:
-                # It may wait in another batch by now, or what came of it could not be kept.
-                if self.line(key) == line and not self._is_open(key, line):
-                    self._cache.remove(_LINE + key)
             for batch in self.batches():
-                if not self.waiting(batch):
+                if not self.waits(batch):
                     self._cache.remove(_BATCH + batch.mark)
-                    if batch.sure:
-                        times[batch.batch_id] = batch.submitted_at
-            recent = {each: at for each, at in times.items() if at >= oldest}
-            self._cache.replace(_ENDED, _TIMES.dump_json(recent).decode())
 
-        if ended or self.batches():
+        if self._open:
             await self._cache.write(operation)
 
-    def ended_ids(self) -> set[str]:
-        """The ids of batches that have ended of late."""
-        return {*self._ended_at()}
-
-    def _ended_at(self) -> dict[str, str]:
+    def _is_open(self, key: str, line: OpenLine | None) -> bool:
         try:
-            return _TIMES.validate_json(self._cache.read(_ENDED) or "{}")
-        except (RecordingError, ValidationError):
-            return {}
-
-    def _is_open(self, key: str, line: OpenLine) -> bool:
-        try:
-            return self._cache.get(key) is None and line.goes_on(self._cache.unanswered(key))
+            ended = line is None or not line.goes_on(self._cache.unanswered(key))
+            return not ended and self._cache.get(key) is None
         except RecordingError:
             return True  # whoever asks for the call will set what is damaged aside
+
+    def _read(self, name: str) -> OpenBatch | None:
+        """Return the batch in a row; a damaged one is none."""
+        try:
+            return _OPEN_BATCH.validate_json(self._cache.read_checked(name) or "")
+        except (RecordingError, ValidationError):
+            return None
 
     def _write(self, batch: OpenBatch) -> None:
         self._cache.replace_checked(_BATCH + batch.mark, _OPEN_BATCH.dump_json(batch).decode())
 
 
 def now() -> str:
-    """The present as a journal has it."""
+    """Return the present as a journal has it."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")

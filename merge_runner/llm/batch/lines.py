@@ -1,51 +1,44 @@
-"""A line of a batch: an attempt at a call that waits for its batch, and what becomes of it."""
+"""A call as a line of a batch: with whose money it waits, and how that ends."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.batch.journal import OpenLine
 from merge_runner.llm.batch.service import BatchLine
+from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid, UnpaidAttempt
 from merge_runner.llm.http_outcome import RawReply
 from merge_runner.records import Attempt
+
+if TYPE_CHECKING:
+    from merge_runner.llm.batch.rounds import Rounds
+    from merge_runner.llm.call import Call
 
 
 @dataclass(frozen=True, slots=True)
 class LineEnd:
-    """What became of a line.
+    """How a line ended.
 
     Without a ``raw`` reply ``outcome`` names why, and nothing was charged unless it is ``unclear``.
-    Then it is asked again: ``singly`` or in another batch. An ``error`` ends the sweep.
+    Then it is asked singly. An ``error`` ends the sweep.
     """
 
-    batch_id: str | None
+    batch_id: str | None = None
     raw: RawReply | None = None
     outcome: str = ""
     message: str = ""
     unclear: bool = False
-    singly: bool = False
     error: MergeRunnerError | None = None
-
-
-class Money(Protocol):
-    """The money of an attempt; see budget.PaidAttempt."""
-
-    def set_aside(self, attempts: Sequence[Attempt]) -> bool:
-        """An operation on the cache: the attempt begins, after these; False if a cap forbids it."""
-        ...
-
-    def begun(self) -> None:
-        """What ``set_aside`` wrote is durable."""
-        ...
 
 
 @dataclass(slots=True, eq=False)
 class Line:
-    """An attempt that waits for a batch to be submitted, or to end; ``open`` where it is in one.
+    """An attempt that waits for a batch to be created, or to end; ``open`` where it is in one.
 
     ``model`` is its name in the registry, ``ledger`` that of its ``money``, ``attempts`` are those
     before it.
@@ -54,7 +47,7 @@ class Line:
     line: BatchLine
     model: str
     ledger: str
-    money: Money
+    money: PaidAttempt | UnpaidAttempt
     attempts: tuple[Attempt, ...]
     open: OpenLine | None = None
     end: asyncio.Future[LineEnd] = field(init=False)
@@ -65,11 +58,52 @@ class Line:
         return self.line.key
 
     def ends(self, end: LineEnd) -> None:
-        """Tell who waits for it."""
+        """Give its end to the call that waits for it."""
         if not self.end.done():
             self.end.set_result(end)
 
     def fails(self, error: BaseException) -> None:
-        """Raise this for who waits for it."""
+        """Raise an error in the call that waits for it."""
         if not self.end.done():
             self.end.set_exception(error)
+
+
+@dataclass(frozen=True, slots=True)
+class Batches:
+    """The batches of one model; ``model`` is its name in the registry, ``ledger`` the money's."""
+
+    rounds: Rounds
+    model: str
+    ledger: str
+    money: Budget | Unpaid
+    price_factor: float
+
+    def takes_up(self, call: Call) -> bool:
+        """Whether a call waits in a batch already, so that its trial has begun."""
+        if self.rounds.open_line(call.request.key) is None:
+            return False
+        self.money.begin_anew(call.order)
+        return True
+
+    @asynccontextmanager
+    async def attempt(
+        self, call: Call, opened: OpenLine | None
+    ) -> AsyncIterator[tuple[PaidAttempt | UnpaidAttempt, Line]]:
+        """Yield the money of a call's next attempt, and its line, which may be ``opened``."""
+        key, ledger = call.request.key, self.ledger
+        asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.price_factor)
+        paid: PaidAttempt | UnpaidAttempt
+        async with AsyncExitStack() as stack:
+            if opened is None:
+                with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
+                    paid = await stack.enter_async_context(
+                        self.money.attempt(call.order, key, asked)
+                    )
+            else:
+                ledger = self.rounds.ledger_of(opened)
+                paid = await stack.enter_async_context(
+                    self.money.going_on(call.order, key, asked, ledger)
+                )
+            attempts = tuple(call.attempts)
+            sent = BatchLine(call.request, len(attempts) + 1)
+            yield paid, Line(sent, self.model, ledger, paid, attempts, opened)

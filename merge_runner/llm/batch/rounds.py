@@ -2,7 +2,7 @@
 
 A round is closed when nothing can go on before an answer comes, so that all trials advance by one
 decision at a time, and a sweep takes as many rounds as its longest trial has decisions. A line that
-failed is in the next round again. The journal knows of a batch before its provider does: a call
+failed is asked singly. The journal knows of a batch before its provider does: a call
 that waits in an open batch is not asked anew, it joins those that wait there.
 """
 
@@ -10,35 +10,132 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import replace
+import math
+import secrets
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from enum import Enum, auto
+from functools import partial
+from typing import Any, TypeVar
 
-from merge_runner.errors import EndpointRefused, ProviderDown, TrialSuspended
-from merge_runner.llm.batch.background import Background
-from merge_runner.llm.batch.following import (
-    LONGEST_POLL_S,
-    Followed,
-    Following,
-    answered,
-    backoff_s,
-    counted,
-    duration,
+from merge_runner.errors import (
+    EndpointRefused,
+    MergeRunnerError,
+    ProviderDown,
+    QuotaExhausted,
+    TrialSuspended,
 )
-from merge_runner.llm.batch.journal import Journal, OpenBatch, OpenLine, new_mark, now
+from merge_runner.llm.batch.journal import Journal, OpenBatch, OpenLine, now
 from merge_runner.llm.batch.lines import Line, LineEnd
-from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus, in_batches
-from merge_runner.llm.http_outcome import NOBODY_S
+from merge_runner.llm.batch.service import (
+    BatchFailed,
+    BatchService,
+    BatchStatus,
+    FailureKind,
+    LineResult,
+    Unreadable,
+)
 from merge_runner.records import Attempt
 
 # How often it is looked whether a round can be closed: what is seen then decides, not the time.
 LOOK_S = 0.05
 # A task that can go on shows that when the loop has come round once; a chain of them, soon after.
 LOOKS = 5
-# How long a creation is tried again, once the provider has answered any.
-OUTAGE_S = 600.0
-# How often a line that is alone in its batch may be refused for its size before it is asked singly.
+# Fewer than any provider takes: one batch that is lost or late concerns no more calls.
+MOST_CALLS = 5_000
+SHORTEST_POLL_S, LONGEST_POLL_S, POLL_SHARE = 0.25, 60.0, 0.1
+# A creation whose answer was lost may be in effect only after this: gateways keep requests.
+ARRIVAL_S = 30.0
+# How long the first creation of a run is tried again, and all others: the provider is there.
+FIRST_S, OUTAGE_S = 60.0, 600.0
+# How often a line may be refused for the size of its batch before it is asked singly.
 MOST_REFUSALS = 5
+# How old a batch may be; then it is cancelled, and what it has not answered is asked singly.
+ROUND_DEADLINE_S = 7200.0
+# How long a batch may take to end once it was asked to, and then to show its results.
+ENDING_S = 3600.0
+T = TypeVar("T")
+
+
+class State(Enum):
+    """What is known of a batch."""
+
+    TAKEN_UP = auto()  # an earlier run has begun it, and its provider was not asked yet
+    WAITING = auto()
+    READING = auto()  # its results are on their way to their calls
+    ENDED = auto()
+    NEVER = auto()  # it was not created: its calls go with the next round
+
+
+@dataclass(slots=True, eq=False)
+class Batch:
+    """An open batch of which this process waits for ``lines``, by key.
+
+    ``results`` are those that nobody has asked for yet, ``seen`` hashes of all by key. ``rest`` is
+    the end of the calls without a result. It ``is_broken`` where one could not be used.
+    """
+
+    note: OpenBatch
+    lines: dict[str, Line] = field(default_factory=dict)
+    state: State = State.WAITING
+    status: BatchStatus | None = None
+    results: dict[str, LineResult] = field(default_factory=dict)
+    seen: dict[str, int] = field(default_factory=dict)
+    rest: LineEnd | None = None
+    is_broken: bool = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it may bring results yet."""
+        return self.state not in (State.ENDED, State.NEVER)
+
+    @property
+    def age_s(self) -> float:
+        """How long ago it was submitted."""
+        return _s_ago(self.note.submitted_at)
+
+    def take(self, result: LineResult) -> bool:
+        """Give a result to its call; False where it has none, or differs from the first one."""
+        key, content = result.key, hash(result.raw and (result.raw.status, result.raw.body))
+        if key not in self.note.lines or self.seen.setdefault(key, content) != content:
+            return False
+        if line := self.lines.pop(key, None):
+            line.ends(self.end_of(result))
+        elif key not in self.results:
+            self.results[key] = result
+        return True
+
+    def end_of(self, result: LineResult) -> LineEnd:
+        """Return the end of the line that has this result."""
+        expired = "expired" if result.raw is None else ""
+        return LineEnd(self.note.batch_id, result.raw, expired, result.message)
+
+    def end(self, rest: LineEnd) -> None:
+        """End the lines that have not ended yet, and those that join it."""
+        self.state, self.rest = State.ENDED, rest
+        for line in self.lines.values():
+            line.ends(rest)
+        self.lines.clear()
+
+    def fail(self, error: MergeRunnerError) -> None:
+        """Raise an error for all who wait."""
+        for line in self.lines.values():
+            line.fails(error)
+
+
+@dataclass(slots=True)
+class Crowd:
+    """A model of which a batch was too large: its batches go one after the other.
+
+    The next one has at most ``calls`` calls, and is not submitted before ``after_s``, on the event
+    loop's clock. The last ``refusals`` batches were refused.
+    """
+
+    calls: int
+    refusals: int = 0
+    after_s: float = 0.0
 
 
 class Rounds:
@@ -62,36 +159,25 @@ class Rounds:
         self.services = services
         self._most_rounds = most_rounds
         self._journal = journal
+        self._free = free
         self._say = say
-        self._background = Background()
-        self._following = Following(
-            journal,
-            services,
-            self._background,
-            submits=submits,
-            free=free,
-            split=self._split,
-            say=say,
-        )
         self._forming: list[Line] = []
-        self._followed: dict[str, Followed] = {}
-        self._most_lines: dict[str, int] = {}
-        self._too_large: set[str] = set()  # models of which the last batch was too large
-        self._refusals: Counter[str] = Counter()  # of lines alone in their batches, by key
-        self._reached: set[str] = set()
+        self._batches: dict[str, Batch] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._creations: set[asyncio.Task[None]] = set()
+        self._reached: set[str] = set()  # models of which a batch was created
+        self._crowds: dict[str, Crowd] = {}
 
     def open_line(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenLine | None:
-        """Where a call with these attempts waits already; None: nowhere that can be reached."""
+        """Return where a call with these attempts waits; None: nowhere that can be reached."""
         line = self._journal.line(key)
         if line is None or not line.goes_on(attempts):
             return None
-        return line if self._known(line.mark) else None
+        return line if self._journal.batch(line.mark).model in self.services else None
 
     def ledger_of(self, line: OpenLine) -> str:
-        """The ledger in which the money of an open line is set aside."""
-        known = self._known(line.mark)
-        assert known is not None
-        return known.ledger
+        """Return the ledger in which the money of an open line is set aside."""
+        return self._journal.batch(line.mark).ledger
 
     async def ask(self, line: Line) -> LineEnd:
         """Wait for the end of a line, in the next round or where it waits already."""
@@ -99,7 +185,7 @@ class Rounds:
         if line.open is None:
             self._forming.append(line)
         else:
-            self._join(line, line.open)
+            self._join(line, line.open.mark)
         try:
             return await line.end
         finally:
@@ -107,43 +193,32 @@ class Rounds:
                 self._forming.remove(line)
 
     def submitted_at(self, line: Line) -> str | None:
-        """When the batch of a line was submitted, in UTC; None: it was in none."""
-        known = None if line.open is None else self._known(line.open.mark)
-        return None if known is None else known.submitted_at
-
-    def ended(self, line: Line) -> None:
-        """A line has ended, and what came of it was given to the cache to keep."""
-        if line.open is not None:
-            self._journal.line_ended(line.key, line.open)
+        """Return when the batch of a line was submitted, in UTC; None: it was in none."""
+        return None if line.open is None else self._journal.batch(line.open.mark).submitted_at
 
     async def watch(self, is_idle: Callable[[], bool]) -> None:
         """Close each round when nothing else goes on; ``is_idle`` says whether that is so."""
         while True:
             await asyncio.sleep(LOOK_S)
-            if not self._forming:
-                continue
-            if await _is_settled(lambda: is_idle() and not self._hands_out):
+            if self._forming and await _is_settled(lambda: is_idle() and not self._hands_out):
                 self._close_round()
 
     def standing(self) -> list[str]:
-        """Which batches are waited for, a line each."""
-        return [self._described(each) for each in self._followed.values() if each.is_open]
+        """Return which batches are waited for, a line each."""
+        return [self._described(batch) for batch in self._batches.values() if batch.is_open]
 
     async def close(self) -> None:
-        """End the waiting; batches that are being submitted get their ids noted first."""
-        await self._background.close()
+        """End the waiting; batches that are being created get their ids noted first."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, *self._creations, return_exceptions=True)
         await self._journal.tidy()
 
     @property
     def _hands_out(self) -> bool:
         """Whether results are on their way to lines: those of a batch, or of one not looked at."""
-        return any(not each.looked or each.fetching for each in self._all() if each.is_open)
-
-    def _known(self, mark: str) -> OpenBatch | None:
-        if mark in self._followed:
-            return self._followed[mark].batch
-        batch = self._journal.batch(mark)
-        return batch if batch is not None and batch.model in self.services else None
+        states = (State.TAKEN_UP, State.READING)
+        return any(batch.state in states for batch in self._batches.values())
 
     def _close_round(self) -> None:
         forming, self._forming = self._forming, []
@@ -151,213 +226,372 @@ class Rounds:
         for line in forming:
             groups[line.model, line.ledger][line.key] = line
         for (model, _), lines in groups.items():
-            service = self.services[model]
-            limits = service.limits
-            most = min(limits.lines, self._most_lines.get(model, limits.lines))
-            waiting = [line.line for line in lines.values()]
-            for part in in_batches(waiting, replace(limits, lines=most), service.size):
-                together = [lines[each.key] for each in part]
-                self._background.start(self._submit(together), together)
+            if (crowd := self._crowds.get(model)) is None:
+                parts = [*_parts(lines.values(), self.services[model], MOST_CALLS)]
+            elif _loop_s() < crowd.after_s or self._has_open(model):
+                parts = []
+            else:
+                parts = [next(_parts(lines.values(), self.services[model], crowd.calls))]
+            for part in parts:
+                self._start(self._begin(part), part)
+                for line in part:
+                    del lines[line.key]
+            self._forming += lines.values()
 
-    async def _submit(self, lines: Sequence[Line], *, instead_of: Sequence[str] = ()) -> None:
-        followed = await self._noted(lines, instead_of)
-        if followed is None:
-            return
-        try:
-            await self._create(followed)
-        except BatchFailed as exc:
-            await self._not_created(followed, exc)
-            return
-        work = self._following.follow(followed)
-        self._background.start(work, followed.lines.values(), reads=True)
+    def _start(self, work: Coroutine[Any, Any, None], lines: Iterable[Line]) -> None:
+        """Do something in a task of its own; what it raises is raised for these lines."""
 
-    async def _noted(self, lines: Sequence[Line], instead_of: Sequence[str]) -> Followed | None:
-        """Note what is about to be submitted; None where no line of it may begin."""
+        async def do() -> None:
+            try:
+                await work
+            except Exception as error:  # noqa: BLE001 # it reaches the calls
+                for line in [*lines]:
+                    line.fails(error)
+
+        task = asyncio.create_task(do())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _begin(self, lines: Sequence[Line]) -> None:
+        """Note a batch of those lines that may begin, and submit it."""
         by_key = {line.key: line for line in lines if not line.end.done()}
         if not by_key:
-            return None
-        attempts = {key: line.line.attempt for key, line in by_key.items()}
+            return
         first = lines[0]
-        batch = OpenBatch(
-            mark=new_mark(),
+        note = OpenBatch(
+            mark=secrets.token_hex(16),
             model=first.model,
-            endpoint=first.line.request.endpoint,
             ledger=first.ledger,
             number=1 + max(line.line.request.slot.decision for line in lines),
             submitted_at=now(),
-            keys=tuple(by_key),
+            lines={key: line.line.attempt for key, line in by_key.items()},
         )
 
-        def begin(key: str) -> bool:
+        def begins(key: str) -> bool:
             line = by_key[key]
             return line.open is not None or line.money.set_aside(line.attempts)
 
-        batch = await self._journal.submitting(batch, attempts, begin, instead_of)
-        begun = {key: by_key.pop(key) for key in batch.keys}
+        note = await self._journal.begin(note, begins)
+        begun = {key: by_key.pop(key) for key in note.lines}
+        for line in by_key.values():
+            line.fails(TrialSuspended("another run spends from the same cap, and has used it up"))
         for line in begun.values():
             if line.open is None and not line.end.done():
                 line.money.begun()
-            line.open = OpenLine(batch.mark, line.line.attempt)
-        for line in by_key.values():
-            line.fails(TrialSuspended("another run spends from the same cap, and has used it up"))
-        if not begun:
-            return None
-        followed = self._followed[batch.mark] = Followed(batch, begun, looked=True)
-        return followed
+            line.open = OpenLine(note.mark, line.line.attempt)
+        if begun:
+            batch = self._batches[note.mark] = Batch(note, begun)
+            await self._submit(batch)
 
-    async def _create(self, followed: Followed) -> None:
-        """Create a batch; where it may have been created already, look for it first."""
-        batch, service = followed.batch, self.services[followed.batch.model]
-        lines = [line.line for line in followed.lines.values()]
-        began_s, sent = _loop_s(), False
-        for tries in itertools.count(1):
-            try:
-                if not (sent and await self._following.arrived(followed, self._following.found)):
-                    sent = False
-                    batch_id = await service.submit(lines, batch.mark)
-                    await self._following.identified(followed, batch_id)
-            except BatchFailed as exc:
-                sent = sent or exc.sent
-                nobody = not exc.sent and batch.model not in self._reached
-                patience_s = NOBODY_S if nobody else OUTAGE_S
-                if exc.kind != "again" or _loop_s() - began_s > patience_s:
-                    raise
-                await self._background.rest(max(exc.delay_s or 0.0, backoff_s(tries)))
-            else:
-                self._reached.add(batch.model)
-                self._fits(batch.model, len(lines))
-                followed.status = BatchStatus("waiting", "submitted")
-                return
-
-    def _fits(self, model: str, lines: int) -> None:
-        """A batch of so many lines was taken: the next one may have twice as many."""
-        self._too_large.discard(model)
-        if model in self._most_lines:
-            self._most_lines[model] = max(self._most_lines[model], 2 * lines)
-
-    async def _not_created(self, followed: Followed, exc: BatchFailed) -> None:
-        batch = followed.batch
-        if exc.kind == "smaller":
-            self._split(followed, str(exc), exc.delay_s)
-            return
-        if exc.kind in ("again", "lost"):
-            # It may be there all the same: the next run looks for it, and nothing is settled yet.
-            for line in followed.lines.values():
-                line.fails(
-                    ProviderDown(
-                        f"{batch.model}: no batch can be submitted ({exc}): nothing else is asked. "
-                        "When the service answers again, run the same command"
-                    )
+    async def _submit(self, batch: Batch) -> None:
+        """Create a batch, and follow it to its end."""
+        model = batch.note.model
+        patience_s = OUTAGE_S if model in self._reached else FIRST_S
+        try:
+            await self._patiently(batch, partial(self._create, batch), patience_s)
+        except BatchFailed as exc:
+            if exc.kind == "lost" and not self.services[model].takes_mark:
+                batch.end(LineEnd(outcome="batch_lost", message=str(exc), unclear=True))
+            elif exc.kind in ("again", "lost"):
+                # It may be there all the same: the next run looks for it, and nothing is settled.
+                why = (
+                    f"{model}: no batch can be submitted ({exc}): nothing else is asked. "
+                    "When the service answers again, run the same command"
                 )
+                batch.fail(ProviderDown(why))
+            elif exc.kind == "single" and model not in self._reached:
+                why = f"{model}: there is no batch mode there ({exc}): leave --batch out"
+                batch.end(LineEnd(outcome="not_created", message=why, error=EndpointRefused(why)))
+            else:
+                self._not_asked(batch, exc, "not_created")
             return
-        if exc.kind == "single" and batch.model not in self._reached:
-            why = f"{batch.model}: there is no batch mode there ({exc}): leave --batch out"
-            end = LineEnd(None, outcome="not_created", message=why, error=EndpointRefused(why))
-        else:
-            end = self._following.without_reply(batch, exc.kind, str(exc), "not_created")
-        followed.end(end)
+        self._reached.add(model)
+        await self._follow(batch)
 
-    def _split(self, followed: Followed, why: str, delay_s: float | None = None) -> None:
-        """Submit the lines of a batch again, in halves, when there may be room for them."""
-        batch, lines = followed.batch, list(followed.lines.values())
-        if len(lines) == 1 and not self._has_open(batch.model):
-            self._refusals[lines[0].key] += 1
-            if self._refusals[lines[0].key] == MOST_REFUSALS:
-                end = self._following.without_reply(batch, "single", why, "not_created")
-                followed.end(end)
+    async def _create(self, batch: Batch) -> None:
+        """Create a batch; where its answer is lost, look for it."""
+        creation = asyncio.create_task(self._create_once(batch))
+        self._creations.add(creation)
+        creation.add_done_callback(self._creations.discard)
+        try:
+            await asyncio.shield(creation)  # its id is noted even if the run ends now
+        except BatchFailed as exc:
+            if exc.sent and not self.services[batch.note.model].takes_mark:
+                raise BatchFailed("lost", f"whether it was created is not known ({exc})") from exc
+            if not (exc.sent and await self._arrived(batch)):
+                raise
+
+    async def _create_once(self, batch: Batch) -> None:
+        note = batch.note
+        lines = [line.line for line in batch.lines.values()]
+        await self._note(batch, batch_id=await self.services[note.model].create(lines, note.mark))
+
+    async def _note(self, batch: Batch, **known: str) -> None:
+        batch.note = replace(batch.note, **known)  # type: ignore[arg-type] # texts all of them
+        await self._journal.note(batch.note)
+
+    def _not_asked(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
+        """End a batch of which the provider asks no line, or let its lines go in smaller ones."""
+        model, lines = batch.note.model, len(batch.note.lines)
+        error: MergeRunnerError | None = None
+        match exc.kind:
+            case "quota":
+                error = QuotaExhausted(
+                    f"{model}: the account's quota is exhausted ({exc}). Every reply so far is "
+                    "saved; when there is credit again, run the same command to go on."
+                )
+            case "refused":
+                error = EndpointRefused(f"{model}: its batch mode refuses: {exc}")
+            case "smaller" | "again" if self._try_smaller(batch, exc):
                 return
-        followed.lines.clear()
-        followed.never_was = True
-        if batch.model not in self._too_large:
-            self._too_large.add(batch.model)
-            self._say(f"{batch.model}: {counted(len(lines))} go in smaller batches: {why}")
-        # Beside what calls this, and whose end may make room.
-        self._background.start(self._in_halves(batch, lines, delay_s), lines)
+            case _:
+                self._say(f"{model}: asked singly, at the full price: {_counted(lines)} ({exc})")
+        batch.end(LineEnd(batch.note.batch_id or None, None, outcome, str(exc), error=error))
 
-    async def _in_halves(
-        self, batch: OpenBatch, lines: Sequence[Line], delay_s: float | None
-    ) -> None:
-        half = max(1, len(lines) // 2)
-        self._most_lines[batch.model] = half
-        await self._room(batch.model, delay_s, self._refusals[lines[0].key])
-        parts = [part for part in (lines[:half], lines[half:]) if part]
-        for part in parts:
-            # The row of the whole goes with the last part: until then it tells of the rest.
-            old = [batch.mark] if part is parts[-1] else []
-            await self._submit(part, instead_of=old)
+    def _try_smaller(self, batch: Batch, exc: BatchFailed) -> bool:
+        """Let the lines of a batch go in the next ones, when there may be room for them.
+
+        Returns False where one line was refused so often that there seems to be none.
+        """
+        model, lines = batch.note.model, len(batch.note.lines)
+        if model not in self._crowds:
+            self._say(f"{model}: {_counted(lines)} go in smaller batches: {exc}")
+        crowd = self._crowds.setdefault(model, Crowd(MOST_CALLS))
+        batch.state = State.NEVER
+        if not self._has_open(model):
+            crowd.refusals += 1
+            crowd.calls = max(1, lines // 2)
+            crowd.after_s = _loop_s() + max(exc.delay_s or 0.0, _backoff_s(crowd.refusals))
+        if lines == 1 and crowd.refusals >= MOST_REFUSALS:
+            return False
+        self._form_anew(batch)
+        return True
 
     def _has_open(self, model: str) -> bool:
-        """Whether a batch of the model takes room at its provider."""
-        return any(f.created and f.is_open and f.batch.model == model for f in self._all())
+        """Whether a batch of the model takes room at its provider, or is about to."""
+        return any(each.is_open and each.note.model == model for each in self._batches.values())
 
-    async def _room(self, model: str, delay_s: float | None, refusals: int) -> None:
-        """Wait until a batch of the model has ended, or for a while."""
-        self._following.batch_ended.clear()
-        left_s = delay_s or (LONGEST_POLL_S if self._has_open(model) else backoff_s(refusals))
-        while left_s > 0 and not self._following.batch_ended.is_set():
-            await self._background.rest(min(left_s, 1.0))
-            left_s -= 1.0
+    def _join(self, line: Line, mark: str) -> None:
+        batch = self._batches.get(mark)
+        if batch is None:
+            batch = Batch(self._journal.batch(mark), state=State.TAKEN_UP)
+            self._batches[mark] = batch
+            self._start(self._take_up(batch), batch.lines.values())
+        batch.lines[line.key] = line
+        if batch.state is State.NEVER:
+            self._form_anew(batch)
+        elif line.key in batch.results:
+            batch.take(batch.results.pop(line.key))
+        elif batch.rest is not None:
+            batch.end(batch.rest)
 
-    def _all(self) -> Iterable[Followed]:
-        return self._followed.values()
-
-    def _join(self, line: Line, where: OpenLine) -> None:
-        followed = self._followed.get(where.mark)
-        if followed is None:
-            batch = self._journal.batch(where.mark)
-            if batch is None:  # another process has seen its end just now
-                line.ends(LineEnd(None, outcome="no_result", unclear=True, singly=True))
-                return
-            followed = self._followed[where.mark] = Followed(batch)
-            work = self._take_up(followed)
-            self._background.start(work, followed.lines.values(), reads=True)
-        if followed.never_was:
-            self._form_anew(line)
-        elif line.key in followed.results:
-            line.ends(answered(followed, followed.results.pop(line.key)))
-        elif followed.gone is not None:
-            line.ends(followed.gone)
-        else:
-            followed.lines[line.key] = line
-
-    async def _take_up(self, followed: Followed) -> None:
+    async def _take_up(self, batch: Batch) -> None:
         """Go on with a batch that an earlier run has submitted, or was about to."""
-        followed.created = bool(followed.batch.batch_id)
         try:
-            following = self._following
-            if followed.created or await following.arrived(followed, following.found_patiently):
-                await self._following.follow(followed)
-                return
+            if batch.note.batch_id:
+                await self._follow(batch)
+            elif not self.services[batch.note.model].takes_mark:
+                why = "the run ended before its id was known"
+                batch.end(LineEnd(outcome="batch_lost", message=why, unclear=True))
+            elif await self._arrived(batch):
+                await self._follow(batch)
+            else:
+                batch.state = State.NEVER
+                self._form_anew(batch)
         except BatchFailed as exc:
-            self._following.lost(followed, exc)
-            return
-        followed.never_was = True
-        for line in list(followed.lines.values()):
-            self._form_anew(line)
-        followed.lines.clear()
+            self._lost(batch, exc)
 
-    def _form_anew(self, line: Line) -> None:
-        """A line whose batch was never created goes with the next round."""
-        if self.submits:
-            self._forming.append(line)
-        else:
-            line.ends(
-                LineEnd(None, outcome="not_created", message="the run ended before", singly=True)
+    def _form_anew(self, batch: Batch) -> None:
+        """The lines of a batch that was never created go with the next round."""
+        lines, batch.lines = batch.lines, {}
+        for line in lines.values():
+            if self.submits:
+                self._forming.append(line)
+            else:
+                line.ends(LineEnd(outcome="not_created", message="the run ended before"))
+
+    async def _arrived(self, batch: Batch) -> bool:
+        """Look for a batch until its creation, if it was ever sent, must be in effect."""
+        note, waited_s = batch.note, 0.0
+        find = partial(self.services[note.model].find, note.mark, note.since)
+        while (batch_id := await self._patiently(batch, find)) is None:
+            if waited_s >= ARRIVAL_S:
+                return False
+            pause_s = min(max(1.0, waited_s), ARRIVAL_S - waited_s)
+            await asyncio.sleep(pause_s)
+            waited_s += pause_s
+        await self._note(batch, batch_id=batch_id)
+        return True
+
+    async def _follow(self, batch: Batch) -> None:
+        """Wait for the end of a batch, and hand its results out."""
+        try:
+            status = await self._ended(batch)
+            if status.state == "ended":
+                await self._hand_out(batch)
+            elif status.state == "failed":
+                failure = BatchFailed(status.failure or "again", status.message)
+                self._not_asked(batch, failure, "batch_failed")
+        except BatchFailed as exc:
+            self._lost(batch, exc)
+
+    async def _ended(self, batch: Batch) -> BatchStatus:
+        """Wait for the end of a batch, which is cancelled in time; not for ever after that."""
+        while (status := await self._look(batch)).state == "waiting":
+            note = batch.note
+            if note.cancelled_at and _s_ago(note.cancelled_at) > ENDING_S:
+                why = f"the batch was cancelled at {note.cancelled_at} and does not end"
+                self._say(f"{note.model}: {why}: its calls are asked singly")
+                batch.end(self._no_result(batch, why))
+                break
+            left_s = ROUND_DEADLINE_S - batch.age_s
+            if left_s <= 0 and not note.cancelled_at:
+                await self._cancel(batch)
+            pause_s = min(LONGEST_POLL_S, POLL_SHARE * batch.age_s)
+            if not batch.note.cancelled_at:
+                pause_s = min(pause_s, left_s)
+            await asyncio.sleep(max(SHORTEST_POLL_S, pause_s))
+        return status
+
+    async def _look(self, batch: Batch) -> BatchStatus:
+        """Ask for the state of a batch; one that was seen to have ended has ended."""
+        service = self.services[batch.note.model]
+        status = await self._patiently(batch, partial(service.status, batch.note.batch_id))
+        if batch.status is None or batch.status.state == "waiting" or status.state == "ended":
+            batch.status = status
+        batch.state = State.READING if batch.status.state == "ended" else State.WAITING
+        return batch.status
+
+    async def _cancel(self, batch: Batch) -> None:
+        note = batch.note
+        cancel = partial(self.services[note.model].cancel, note.batch_id)
+        await self._patiently(batch, cancel)
+        await self._note(batch, cancelled_at=now())
+        self._say(
+            f"{note.model}: batch {note.batch_id} has waited for {_duration(batch.age_s)} and is "
+            "cancelled: what it has answered is taken, the rest is asked singly"
+        )
+
+    async def _hand_out(self, batch: Batch) -> None:
+        """Read the results of a batch until there is one for each call, or no more can be had."""
+        if not batch.note.ended_at:
+            await self._note(batch, ended_at=now())
+        why, patience_s = "", max(0.0, ENDING_S - _s_ago(batch.note.ended_at))
+        try:
+            await self._patiently(batch, partial(self._read, batch), patience_s)
+        except BatchFailed as exc:
+            if exc.kind not in ("again", "single"):
+                raise
+            why = str(exc)
+            self._say(f"{batch.note.model}: {why}")
+        batch.end(self._no_result(batch, why))
+        if crowd := self._crowds.get(batch.note.model):
+            crowd.calls, crowd.refusals = max(crowd.calls, 2 * len(batch.note.lines)), 0
+
+    async def _read(self, batch: Batch) -> None:
+        """Give each result to its call; raises BatchFailed where there should be others."""
+        note, status = batch.note, await self._look(batch)
+        foreign, wrong = 0, []
+        async for result in self.services[note.model].results(note.batch_id, status):
+            if isinstance(result, Unreadable):
+                wrong.append(str(result))
+            else:
+                foreign += not batch.take(result)
+        if foreign:
+            self._say(
+                f"{note.model}: {foreign} results of batch {note.batch_id} are ignored: they are "
+                "of none of its calls, or differ from an earlier one"
+            )
+        if len(batch.seen) == len(note.lines):
+            return
+        if wrong:  # one may have been broken on its way: all are read twice
+            kind: FailureKind = "single" if batch.is_broken else "again"
+            batch.is_broken = True
+            which = "a result" if len(wrong) == 1 else f"{len(wrong)} results"
+            raise BatchFailed(kind, f"{which} of the batch cannot be used: {wrong[0]}")
+        if len(batch.seen) < status.results:
+            raise BatchFailed(
+                "again", f"{len(batch.seen)} of the {status.results} results are there"
             )
 
-    def _described(self, followed: Followed) -> str:
-        batch, status = followed.batch, followed.status
-        most = max(self._most_rounds, batch.number)
+    def _no_result(self, batch: Batch, why: str) -> LineEnd:
+        return LineEnd(
+            batch.note.batch_id,
+            outcome="no_result",
+            message=why or "the batch has ended without a result for it",
+            # What a cancelled batch does not tell of was not asked, if all was read.
+            unclear=bool(why) or not batch.note.cancelled_at,
+        )
+
+    def _lost(self, batch: Batch, exc: BatchFailed) -> None:
+        """End a batch that cannot be read: what was set aside for it stays so."""
+        note, free = batch.note, batch.note.model in self._free
+        # A key that is refused is another account's, perhaps: there the batch goes on.
+        gives_up = not self.submits and exc.kind not in ("refused", "quota")
+        if free or gives_up:
+            end = LineEnd(note.batch_id, outcome="batch_lost", message=str(exc), unclear=not free)
+            batch.end(end)
+            return
+        error = EndpointRefused(
+            f"{note.model}: {note.batch_id} is refused to this key ({exc}): set the key of the "
+            "account that has submitted it. If it is gone, the same command without --batch asks "
+            "its calls anew"
+        )
+        batch.fail(error)
+
+    async def _patiently(
+        self,
+        batch: Batch,
+        ask: Callable[[], Awaitable[T]],
+        patience_s: float = math.inf,
+    ) -> T:
+        """Ask until a provider answers that may only be down; raises BatchFailed for anything else.
+
+        A batch waits for a day: whoever waits for it can wait for its provider.
+        """
+        began_s = _loop_s()
+        for tries in itertools.count(1):
+            try:
+                return await ask()
+            except BatchFailed as exc:
+                if exc.kind != "again" or _loop_s() - began_s > patience_s:
+                    raise
+                # Meanwhile nothing of the batch is on its way.
+                state, batch.state = batch.state, State.WAITING
+                if tries == 1:
+                    self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
+                await asyncio.sleep(max(exc.delay_s or 0.0, _backoff_s(tries)))
+                batch.state = state
+        raise AssertionError("unreachable: it counts for ever")
+
+    def _described(self, batch: Batch) -> str:
+        note, status = batch.note, batch.status
+        most = max(self._most_rounds, note.number)
         done = (
             f", {status.done} of {status.total} done"
             if status is not None and status.done is not None and status.total
             else ""
         )
-        where = f"in batch {batch.batch_id}" if batch.batch_id else "in a batch that is submitted"
+        where = f"in batch {note.batch_id}" if note.batch_id else "in a batch that is submitted"
         return (
-            f"round {batch.number} of at most {most}: {counted(len(batch.keys))} of {batch.model} "
-            f"{where} since {batch.since:%H:%M:%S} UTC ({duration(followed.age_s)}){done}"
+            f"round {note.number} of at most {most}: {_counted(len(note.lines))} of {note.model} "
+            f"{where} since {note.since:%H:%M:%S} UTC ({_duration(batch.age_s)}){done}"
         )
+
+
+def _parts(lines: Iterable[Line], service: BatchService, most: int) -> Iterator[list[Line]]:
+    """The lines in order, in as few batches of at most so many as may be."""
+    part: list[Line] = []
+    filled = 0
+    for line in lines:
+        size = len(service.line(line.line)) + 1
+        if part and (len(part) == most or filled + size > service.most_bytes):
+            yield part
+            part, filled = [], 0
+        part.append(line)
+        filled += size
+    if part:
+        yield part
 
 
 async def _is_settled(is_idle: Callable[[], bool]) -> bool:
@@ -371,3 +605,23 @@ async def _is_settled(is_idle: Callable[[], bool]) -> bool:
 
 def _loop_s() -> float:
     return asyncio.get_running_loop().time()
+
+
+def _s_ago(moment: str) -> float:
+    return (datetime.now(UTC) - datetime.fromisoformat(moment)).total_seconds()
+
+
+def _backoff_s(tries: int) -> float:
+    return min(LONGEST_POLL_S, 0.5 * 2.0 ** min(tries, 10))
+
+
+def _counted(calls: int) -> str:
+    return "1 call" if calls == 1 else f"{calls} calls"
+
+
+def _duration(seconds: float) -> str:
+    """A duration for a reader, such as 1:05 h or 40 s."""
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    minutes = timedelta(seconds=seconds) // timedelta(minutes=1)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60}:{minutes % 60:02} h"

@@ -1,15 +1,48 @@
-"""What a batch mode is to a run: requests are submitted together, and their replies fetched."""
+"""What the batch modes of all providers share: requests, errors, lists and lines of results."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from datetime import datetime
-from typing import Literal, Protocol
+import json
+import re
+from abc import ABC, abstractmethod
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from urllib.parse import quote
 
+from merge_runner.config import Endpoint, is_own_host
 from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.http_outcome import RawReply
-from merge_runner.records import ChatRequest
+from merge_runner.llm.content_hashes import canonical_json
+from merge_runner.llm.formats.base import ServerError, WireFormat, as_text
+from merge_runner.llm.http_outcome import (
+    TOO_LATE,
+    ErrorReply,
+    RawReply,
+    TransportFailure,
+    judge_error,
+    may_be_charged,
+)
+from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
+
+if TYPE_CHECKING:
+    from merge_runner.llm.http import HttpTransport
+
+TIMEOUT_S = 60.0
+# A batch, its results or a page of a list may have hundreds of megabytes.
+TRANSFER_TIMEOUT_S = 900.0
+MOST_BYTES = 256_000_000
+# What a server answers that has no batch mode, or none for the model.
+NO_BATCH_MODE = frozenset({404, 405, 501})
+# What it answers of a batch that it does not have, or no longer.
+GONE = frozenset({301, 302, 303, 307, 308, 404, 410})
+# What it answers to the cancellation of a batch that has ended.
+ENDED_ALREADY = frozenset({400, 409})
+ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
+# By how much a server's clock may be behind ours.
+CLOCK_SLACK = timedelta(hours=1)
+MOST_PAGES, LONGEST_CURSOR = 100, 2000
+LONGEST_MESSAGE, LONGEST_NAME = 500, 80
 
 FailureKind = Literal["again", "smaller", "single", "quota", "refused", "lost"]
 """What to do after a failure.
@@ -25,11 +58,9 @@ server no longer has it, or answers with what cannot be read; its lines may have
 class BatchFailed(MergeRunnerError):
     """A batch mode did not do what it was asked.
 
-    ``smaller`` and ``single`` come from ``submit`` and as the ``failure`` of a status (``single``
-    also after results), ``lost`` from all other methods alone.
-    ``delay_s`` is how long the server asks to wait. ``sent`` is False where certainly no batch was
-    created; where it is True and ``kind`` is ``again``, there may be one all the same: look for it
-    with ``find`` before the lines are submitted once more.
+    ``smaller`` and ``single`` come from ``create`` and as the ``failure`` of a status, ``lost``
+    from all other methods alone. ``delay_s`` is how long the server asks to wait. ``sent`` is False
+    where certainly no batch was created.
     """
 
     def __init__(
@@ -39,6 +70,10 @@ class BatchFailed(MergeRunnerError):
         self.kind = kind
         self.delay_s = delay_s
         self.sent = sent
+
+
+class Unreadable(ValueError):
+    """A line of results that cannot be used; the message says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,34 +90,29 @@ class BatchLine:
 
 
 @dataclass(frozen=True, slots=True)
-class BatchLimits:
-    """The most that one batch takes: lines, and bytes as BatchService.size counts them."""
-
-    lines: int
-    size: int
-
-
-@dataclass(frozen=True, slots=True)
 class BatchStatus:
-    """What became of a batch so far.
+    """The state of a batch.
 
     ``ended``: there are results to fetch, perhaps not of all lines; also of one that expired or was
     cancelled. ``failed``: no line was asked and nothing is charged; ``failure`` says what to do.
-    ``done`` of ``total`` lines have ended, None where the provider does not say. ``word`` is the
-    provider's own for the state, ``message`` what it says beside it.
+    ``done`` of ``total`` lines have ended, None where the provider does not say; there are at least
+    ``results`` of them. ``word`` is the provider's own for the state, ``message`` what it says
+    beside it, ``batch`` all that it says.
     """
 
     state: Literal["waiting", "ended", "failed"]
     word: str
     done: int | None = None
     total: int | None = None
+    results: int = 0
     message: str = ""
     failure: FailureKind | None = None
+    batch: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class LineResult:
-    """What became of one line.
+    """The result of one line.
 
     ``raw`` is what the plain endpoint would have replied, an answer (status 200) or an error, to be
     judged in the same way; None where the line was never asked and is not charged, since the batch
@@ -94,80 +124,269 @@ class LineResult:
     message: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """A batch that was submitted, and whose id was lost.
+class BatchService(ABC):
+    """The batch mode of one model at one endpoint; every request raises BatchFailed.
 
-    ``sure`` is False where the provider does not tell one batch from another before it ends: then
-    it may be somebody else's. It must not be cancelled; if none of its results has one of the keys
-    it was another one, and ``find`` is to be asked once more without it.
+    A batch has at most ``most_bytes`` of lines. Where it takes no mark, one whose id was lost
+    cannot be found.
     """
 
-    batch_id: str
-    sure: bool = True
+    most_bytes: ClassVar[int]
+    takes_mark: ClassVar[bool] = True
 
+    def __init__(self, transport: HttpTransport, endpoint: Endpoint, wire: WireFormat) -> None:
+        self._transport = transport
+        self._endpoint = endpoint
+        self._wire = wire
 
-class BatchService(Protocol):
-    """The batch mode of one model at one endpoint; every method but ``size`` raises BatchFailed."""
+    @abstractmethod
+    def line(self, line: BatchLine) -> bytes:
+        """Return a line as it is sent, with the body as it is hashed."""
 
-    limits: BatchLimits
-
-    def size(self, line: BatchLine) -> int:
-        """How many bytes of a batch a line takes."""
-        ...
-
-    async def submit(self, lines: Sequence[BatchLine], mark: str) -> str:
-        """Create a batch of lines with different keys, within the limits; returns its id.
+    @abstractmethod
+    async def create(self, lines: Sequence[BatchLine], mark: str) -> str:
+        """Create a batch of lines with different keys; returns its id.
 
         ``mark``, up to 64 letters, digits, _ and -, is attached where the provider takes a name.
         """
-        ...
 
-    async def find(
-        self, mark: str, keys: Collection[str], *, since: datetime, known: Collection[str] = ()
-    ) -> Found | None:
-        """The batch that was submitted with a mark and keys, at ``since`` or later (UTC).
+    async def find(self, mark: str, since: datetime) -> str | None:
+        """Return the id of the batch with this mark, created at ``since`` (UTC) or later.
 
-        ``known`` are ids of batches that are others. None: there is none. Raises BatchFailed with
-        the kind ``lost`` where nobody can say.
+        Raises BatchFailed with the kind ``lost`` where there are too many to look through.
         """
-        ...
+        raise NotImplementedError
 
+    @abstractmethod
     async def status(self, batch_id: str) -> BatchStatus:
-        """How far a batch is."""
-        ...
+        """Return the state of a batch."""
 
-    def results(self, batch_id: str) -> AsyncIterator[LineResult]:
-        """The results of a batch that has ended, in any order, each key once.
+    @abstractmethod
+    def lines(
+        self, batch_id: str, batch: Mapping[str, Any]
+    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
+        """Yield the lines of the results of a batch that has ended, in any order."""
 
-        A line without a result was not asked. Results that cannot be read, not the second time
-        either, are left out; after all others it raises BatchFailed with the kind ``single`` that
-        says what was wrong. With ``again`` the connection was lost, or there are fewer results than
-        the provider counts, a whole file of them perhaps: they can be read from the beginning. A
-        provider may never show the others, so that the caller has to bound how long it asks.
-        """
-        ...
+    @abstractmethod
+    def read(self, line: dict[str, Any]) -> LineResult:
+        """Return the result in a line; raises Unreadable."""
 
+    @abstractmethod
     async def cancel(self, batch_id: str) -> None:
         """Ask for the end of a batch, which then ends with the results that it has.
 
         One that has ended already stays as it is.
         """
-        ...
+
+    async def results(
+        self, batch_id: str, status: BatchStatus
+    ) -> AsyncIterator[LineResult | Unreadable]:
+        """Yield the results of a batch that has ended, or why one cannot be read.
+
+        Raises BatchFailed with the kind ``again`` where they can be read from the beginning.
+        """
+        async for line in self.lines(batch_id, status.batch):
+            try:
+                yield line if isinstance(line, Unreadable) else self.read(line)
+            except Unreadable as exc:
+                yield exc
+
+    def failure_of(self, error: ServerError) -> FailureKind:
+        """Return what to do with lines whose batch is not created, or fails as a whole."""
+        if "token_limit_exceeded" in error.names or "enqueued" in error.message.lower():
+            return "smaller"
+        if error.status == 413:
+            return "smaller"
+        if error.status in NO_BATCH_MODE:
+            return "single"
+        return self._judged(error) or "single"
+
+    def slot_members(self, line: BatchLine) -> str:
+        """Return what our own emulator alone is told of a line, as members of its JSON object."""
+        if not self._endpoint.is_emulator:
+            return ""
+        slot = canonical_json(line.request.slot.as_dict())
+        return f',"{SLOT_HEADER}":{slot},"{ATTEMPT_HEADER}":{line.attempt}'
+
+    async def _get(self, path: str, timeout_s: float = TIMEOUT_S) -> dict[str, Any]:
+        """Return the JSON object at a path."""
+        raw = await self._ask("GET", path, timeout_s=timeout_s)
+        if not _is_success(raw):
+            raise self._unread(raw)
+        return json_object(raw)
+
+    async def _post(
+        self, path: str, body: bytes, headers: Mapping[str, str] | None = None
+    ) -> RawReply:
+        """Return the reply to a step of a creation."""
+        raw = await self._ask("POST", path, body, headers, timeout_s=TRANSFER_TIMEOUT_S)
+        if not _is_success(raw):
+            raise self._failed(self.failure_of(raw.error), raw)
+        return raw
+
+    async def _cancel(self, path: str) -> None:
+        raw = await self._ask("POST", path, timeout_s=TIMEOUT_S)
+        if not _is_success(raw) and raw.status not in ENDED_ALREADY:
+            raise self._unread(raw)
+
+    async def _lines(self, path: str) -> AsyncIterator[dict[str, Any] | Unreadable]:
+        """Yield the objects of a JSONL file.
+
+        One that is not there is asked for again: it belongs to a batch that is there.
+        """
+        number = 0
+        try:
+            async for line in self._transport.lines(
+                path, self._wire.headers, timeout_s=TRANSFER_TIMEOUT_S
+            ):
+                number += 1
+                yield _parsed(number, line)
+        except ErrorReply as exc:
+            if exc.raw.status == 404:
+                raise self._failed("again", exc.raw) from exc
+            raise self._unread(exc.raw) from exc
+        except TransportFailure as exc:
+            raise _unanswered(exc, reads=True) from exc
+
+    async def _pages(
+        self, path: str, cursor_name: str, cursor_of: Callable[[dict[str, Any]], str | None]
+    ) -> AsyncIterator[dict[str, Any]]:
+        """Yield the pages of a list, each found by the cursor of the one before."""
+        cursor: str | None = ""
+        seen: set[str] = set()
+        while cursor is not None and cursor not in seen:  # ends where a server knows no pages
+            if len(seen) == MOST_PAGES or len(cursor) > LONGEST_CURSOR:
+                raise BatchFailed("lost", "the list of batches cannot be read to its end")
+            seen.add(cursor)
+            after = f"&{cursor_name}={quote(cursor, safe='')}" if cursor else ""
+            page = await self._get(path + after, TRANSFER_TIMEOUT_S)
+            yield page
+            cursor = cursor_of(page)
+
+    async def _ask(
+        self,
+        method: str,
+        path: str,
+        body: bytes = b"",
+        headers: Mapping[str, str] | None = None,
+        *,
+        timeout_s: float,
+    ) -> RawReply:
+        sent = {**self._wire.headers, **(headers or {})}
+        most_bytes = MOST_BYTES if method == "GET" else None
+        try:
+            return await self._transport.ask(
+                method, path, sent, body, timeout_s=timeout_s, most_bytes=most_bytes
+            )
+        except TransportFailure as exc:
+            raise _unanswered(exc, reads=not body) from exc
+
+    def _unread(self, raw: RawReply) -> BatchFailed:
+        """Return the failure where a batch exists, or may exist, whatever its server says now."""
+        if raw.status in GONE:
+            return self._failed("lost", raw)
+        return self._failed(self._judged(raw.error) or "again", raw)
+
+    def _judged(self, error: ServerError) -> FailureKind | None:
+        """Return what the judgement of single calls means here; None: nothing."""
+        match judge_error(error, self._wire).action:
+            case "quota":
+                return "quota"
+            case "refused":
+                return "refused"
+            case "retry":
+                return "again"
+        return None
+
+    def _failed(self, kind: FailureKind, raw: RawReply) -> BatchFailed:
+        delay_s = judge_error(raw.error, self._wire).delay_s
+        message = f"HTTP {raw.status}: {as_message(raw.error.message)}"
+        maybe_done = raw.status >= 500 or raw.status in TOO_LATE
+        if not self.takes_mark:  # it cannot be looked for: what the provider says of itself decides
+            own = is_own_host(self._endpoint.provider, self._endpoint.identity)
+            provider = self._endpoint.provider if own else None
+            maybe_done = maybe_done and may_be_charged(raw, provider)
+        return BatchFailed(kind, message, delay_s=delay_s, sent=maybe_done)
 
 
-def in_batches(
-    lines: Iterable[BatchLine], limits: BatchLimits, size: Callable[[BatchLine], int]
-) -> Iterator[list[BatchLine]]:
-    """The lines in order, in as few batches as fit the limits."""
-    batch: list[BatchLine] = []
-    filled = 0
-    for line in lines:
-        taken = size(line)
-        if batch and (len(batch) == limits.lines or filled + taken > limits.size):
-            yield batch
-            batch, filled = [], 0
-        batch.append(line)
-        filled += taken
-    if batch:
-        yield batch
+def leads_back(created: Sequence[datetime | None], since: datetime) -> bool:
+    """Whether a page of batches is older than a moment, and the next one older still."""
+    known = [each for each in created if each is not None]
+    return bool(known) and known[0] > known[-1] and max(known) < since - CLOCK_SLACK
+
+
+def json_object(raw: RawReply) -> dict[str, Any]:
+    """Return the body of a reply as a JSON object; raises BatchFailed."""
+    if not isinstance(raw.payload, dict):
+        raise BatchFailed("again", f"HTTP {raw.status}: the body is not a JSON object")
+    return raw.payload
+
+
+def as_reply(status: int, body: dict[str, Any]) -> RawReply:
+    """Return the reply of the plain endpoint that a result stands for."""
+    # In ASCII, since JSON can spell half of a surrogate pair, which no file can hold.
+    return RawReply(status, {}, json.dumps(body))
+
+
+def as_message(value: object, longest: int = LONGEST_MESSAGE) -> str:
+    """Return a text for a reader in one line, empty where there is none."""
+    return " ".join((as_text(value) or "").split())[:longest]
+
+
+def as_word(value: object) -> str:
+    """Return a provider's word for a state."""
+    return as_message(value, LONGEST_NAME) or "unknown"
+
+
+def key_of(line: dict[str, Any], member: str) -> str:
+    """Return the key of a result; raises Unreadable."""
+    key = as_text(line.get(member))
+    if not key:
+        raise Unreadable(f"it has no {member}")
+    return key
+
+
+def unreadable(key: str, why: str) -> Unreadable:
+    """Return the error of a result whose key is known."""
+    return Unreadable(f"the result of {as_message(key, LONGEST_NAME)} {why}")
+
+
+def id_of(reply: Mapping[str, Any], member: str = "id") -> str:
+    """Return an id, which can stand in a path; raises BatchFailed."""
+    value = reply.get(member)
+    if not isinstance(value, str) or not ID.fullmatch(value):
+        raise BatchFailed("again", f"the reply cannot be used: it has no {member} of a known form")
+    return value
+
+
+def moment_of(text: object) -> datetime | None:
+    """Return a moment in RFC 3339, None where there is none."""
+    try:
+        moment = datetime.fromisoformat(str(text))
+    except ValueError:
+        return None
+    return moment if moment.tzinfo else None
+
+
+def _is_success(raw: RawReply) -> bool:
+    return 200 <= raw.status < 300
+
+
+def _parsed(number: int, line: str | TransportFailure) -> dict[str, Any] | Unreadable:
+    if isinstance(line, TransportFailure):
+        return Unreadable(f"line {number}: {line}")
+    try:
+        value = json.loads(line)
+    except ValueError:
+        return Unreadable(f"line {number} is no JSON")
+    return value if isinstance(value, dict) else Unreadable(f"line {number} is no JSON object")
+
+
+def _unanswered(failure: TransportFailure, *, reads: bool) -> BatchFailed:
+    """Return what no reply means; one that is refused for what it is will be no other next time."""
+    kind: FailureKind = "again"
+    if failure.action == "refused":
+        kind = "refused"
+    elif failure.action == "fail" and reads:
+        kind = "lost"
+    return BatchFailed(kind, str(failure), sent=failure.sent)

@@ -7,7 +7,8 @@ from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry
 from merge_runner.emulator.server import serve
-from merge_runner.llm.batch.modes import batch_service
+from merge_runner.llm.batch.terms import SERVICES
+from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 
 # What stands before the paths of a provider: OpenAI's version belongs to its base URL.
@@ -82,7 +83,7 @@ def service_at(transport_to):
     def make(url, form, provider=None, **options):
         endpoint = endpoint_at(url, form, provider)
         transport = transport_to(endpoint, **options)
-        return batch_service(entry_of(form, provider), endpoint, transport)
+        return SERVICES[form](transport, endpoint, FORMATS[form])
 
     return make
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -10,8 +11,8 @@ from hypothesis import strategies as st
 
 from merge_runner.config import PROVIDERS, BatchTerms
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.modes import BATCH_MODES, batch_terms, require_batch
-from merge_runner.llm.batch.service import BatchLimits, in_batches
+from merge_runner.llm.batch.rounds import _parts
+from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import split_lines
 from merge_runner.llm.models import load_models
@@ -26,7 +27,7 @@ def test_the_shipped_models_of_four_providers_have_a_batch_mode_at_half_price():
     without = {name for name, each in terms.items() if each is None}
     assert without == {"local", "smollm2", "smollm2-free"}
     assert {each.price_factor for each in terms.values() if each} == {0.5}
-    assert BATCH_MODES.keys() == FORMATS.keys()
+    assert SERVICES.keys() == FORMATS.keys()
 
 
 def test_an_entry_may_have_terms_of_its_own_or_no_batch_mode():
@@ -66,14 +67,16 @@ def test_a_key_is_an_id_that_every_provider_takes(form):
 
 @given(st.lists(st.integers(1, 60)), st.integers(1, 7), st.integers(60, 200))
 def test_lines_are_parted_in_order_into_as_few_batches_as_fit(sizes, most_lines, most_size):
-    numbered = list(enumerate(sizes))
-    parts = list(in_batches(numbered, BatchLimits(most_lines, most_size), lambda line: line[1]))
-    assert [line for part in parts for line in part] == numbered
-    totals = [sum(size for _, size in part) for part in parts]
+    service = SimpleNamespace(line=bytes, most_bytes=most_size)
+    waiting = [SimpleNamespace(line=size) for size in sizes]
+    parts = list(_parts(waiting, service, most_lines))
+    assert [line for part in parts for line in part] == waiting
+    # With a byte between two of them.
+    totals = [sum(line.line + 1 for line in part) for part in parts]
     assert all(len(part) <= most_lines for part in parts)
-    assert all(total <= most_size for total in totals)
+    assert all(total <= most_size for total, part in zip(totals, parts, strict=True) if part[1:])
     for part, total, following in zip(parts, totals, parts[1:], strict=False):
-        assert len(part) == most_lines or total + following[0][1] > most_size
+        assert len(part) == most_lines or total + following[0].line + 1 > most_size
 
 
 @given(st.lists(st.text(alphabet="ab\u2028\u00e9", max_size=9)), st.data())

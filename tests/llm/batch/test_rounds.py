@@ -25,16 +25,10 @@ from merge_runner.errors import (
     ProviderDown,
     QuotaExhausted,
 )
-from merge_runner.llm.batch.batches import Batches
 from merge_runner.llm.batch.journal import Journal
+from merge_runner.llm.batch.lines import Batches
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.batch.service import (
-    BatchFailed,
-    BatchLimits,
-    BatchStatus,
-    Found,
-    LineResult,
-)
+from merge_runner.llm.batch.service import BatchFailed, BatchStatus, LineResult, Unreadable
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
@@ -68,7 +62,8 @@ class Memory:
     before the usual.
     """
 
-    limits = BatchLimits(lines=1000, size=10**6)
+    most_bytes = 10**6
+    takes_mark = True
 
     def __init__(self):
         self.batches = {}
@@ -78,13 +73,11 @@ class Memory:
         self.states = []
         self.cancelled = []
         self.answered = Counter()
-        self.hidden = set()
-        self.unsure = []
 
-    def size(self, line):
-        return 1
+    def line(self, line):
+        return b"line"
 
-    async def submit(self, lines, mark):
+    async def create(self, lines, mark):
         step = self.creations.pop(0) if self.creations else None
         if isinstance(step, BatchFailed) and not step.sent:
             raise step
@@ -95,14 +88,8 @@ class Memory:
             raise step
         return batch_id
 
-    async def find(self, mark, keys, *, since, known=()):
-        for batch_id in self.unsure:
-            if batch_id not in known:
-                return Found(batch_id, sure=False)
-        for batch_id, its in self.marks.items():
-            if its == mark and batch_id not in known:
-                return Found(batch_id)
-        return None
+    async def find(self, mark, since):
+        return next((each for each, its in self.marks.items() if its == mark), None)
 
     async def status(self, batch_id):
         if batch_id not in self.batches:
@@ -112,7 +99,7 @@ class Memory:
             raise step
         return step
 
-    async def results(self, batch_id):
+    async def results(self, batch_id, status):
         for line in reversed(self.batches[batch_id]):
             repetition = line.request.slot.repetition
             fates = self.fates.get(repetition, [])
@@ -233,10 +220,10 @@ async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
 @in_virtual_time
 async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
     class Watching(Memory):
-        async def submit(self, lines, mark):
+        async def create(self, lines, mark):
             aside.append(run.ledger.read().reserved_usd)
             self.size = len(lines[0].request.body.encode())
-            return await super().submit(lines, mark)
+            return await super().create(lines, mark)
 
     aside = []
     service = Watching()
@@ -247,17 +234,16 @@ async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
 
 
 @in_virtual_time
-async def test_a_line_that_failed_goes_with_the_next_round_and_the_third_time_alone(cache):
+async def test_a_line_that_failed_is_asked_alone(cache):
     service = Memory()
-    service.fates = {2: [error(500)], 3: [error(429), error(500), error(503)]}
+    service.fates = {2: [error(500)], 3: [error(429)]}
     run = Run(cache, service)
     replies = await run.ask(3)
-    assert texts(replies) == ["batched 1", "batched 2", "alone 3"]
-    assert service.sizes == [3, 2, 1]
-    assert outcomes(replies[1]) == [("server_error", "batch-0"), ("ok", "batch-1")]
-    assert [attempt.cost_usd for attempt in replies[2].attempts[:3]] == [0.0] * 3
-    assert run.alone.asked == [3]
-    assert run.ledger.read().spent_usd == pytest.approx((0.5 + 0.5 + 1) * ONE_USD)
+    assert texts(replies) == ["batched 1", "alone 2", "alone 3"]
+    assert (service.sizes, sorted(run.alone.asked)) == ([3], [2, 3])
+    assert outcomes(replies[1]) == [("server_error", "batch-0"), ("ok", None)]
+    assert [reply.attempts[0].cost_usd for reply in replies[1:]] == [0.0] * 2
+    assert run.ledger.read().spent_usd == pytest.approx((0.5 + 1 + 1) * ONE_USD)
     assert run.ledger.read().reserved_usd == 0.0
 
 
@@ -374,30 +360,7 @@ async def left_behind(cache, service, repetitions=1, **options):
 @pytest.fixture
 def no_patience(monkeypatch):
     """Every batch that waits is over its time."""
-    monkeypatch.setattr("merge_runner.llm.batch.following.ROUND_DEADLINE_S", 0.0)
-
-
-@pytest.mark.usefixtures("no_patience")
-@in_virtual_time
-async def test_a_batch_that_may_be_a_strangers_is_no_ones_own_in_the_next_run_either(cache):
-    class Dying(Memory):
-        async def submit(self, lines, mark):
-            await super().submit(lines, mark)
-            created.set()
-            await asyncio.Event().wait()
-
-    created = asyncio.Event()
-    dying = Dying()
-    await killed(Run(cache, dying), 1, created)
-    service = Memory()
-    service.batches = {"stranger": [], **dying.batches}
-    service.unsure = ["stranger", "batch-0"]
-    await left_behind(cache, service)
-    service.states = [BatchStatus("waiting", "in_progress")] * 2
-    run = Run(cache, service)
-    (reply,) = await run.ask()
-    assert outcomes(reply) == [("ok", "batch-0")]
-    assert (service.cancelled, run.alone.asked, len(service.batches)) == ([], [], 2)
+    monkeypatch.setattr("merge_runner.llm.batch.rounds.ROUND_DEADLINE_S", 0.0)
 
 
 @in_virtual_time
@@ -422,13 +385,13 @@ async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_pa
 @in_virtual_time
 async def test_a_creation_that_comes_into_effect_late_is_not_repeated(cache):
     class Late(Memory):
-        async def submit(self, lines, mark):
+        async def create(self, lines, mark):
             service.tasks.append(asyncio.create_task(self.arrive(lines, mark)))
             raise BatchFailed("again", "HTTP 504")
 
         async def arrive(self, lines, mark):
             await asyncio.sleep(20)
-            await super().submit(lines, mark)
+            await super().create(lines, mark)
 
     service = Late()
     service.tasks = []
@@ -450,16 +413,17 @@ async def test_a_single_line_that_finds_no_room_is_asked_alone_after_a_few_tries
 @pytest.mark.usefixtures("no_patience")
 @in_virtual_time
 async def test_what_a_cancelled_batch_answered_unreadably_stays_set_aside(cache):
-    class Unreadable(Memory):
-        async def results(self, batch_id):
-            raise BatchFailed("single", "a result of the batch cannot be used")
-            yield
+    class Broken(Memory):
+        async def results(self, batch_id, status):
+            yield Unreadable("line 1 is no JSON")
+            yield Unreadable("line 2 is no JSON")
 
-    service = Unreadable()
+    service = Broken()
     service.states = [BatchStatus("waiting", "in_progress")]
     run = Run(cache, service)
     (reply,) = await run.ask()
     assert service.cancelled == ["batch-0"]
+    assert run.said[-1] == "m: 2 results of the batch cannot be used: line 1 is no JSON"
     assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
     assert run.ledger.read().open_attempts == 1
 
@@ -467,7 +431,7 @@ async def test_what_a_cancelled_batch_answered_unreadably_stays_set_aside(cache)
 @in_virtual_time
 async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
     class Down(Memory):
-        async def submit(self, lines, mark):
+        async def create(self, lines, mark):
             self.creations.append(mark)
             await asyncio.sleep(30)
             raise BatchFailed("again", "HTTP 502")
@@ -483,8 +447,31 @@ async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
     assert len(service.creations) == 1
 
 
+@pytest.mark.parametrize("shown", [[], [Unreadable("line 1 is no JSON")]])
+@in_virtual_time
+async def test_results_that_are_broken_or_fewer_than_the_provider_counts_are_read_again(
+    cache, shown
+):
+    class Late(Memory):
+        looks = 0
+
+        async def status(self, batch_id):
+            return BatchStatus("ended", "completed", results=3)
+
+        async def results(self, batch_id, status):
+            self.looks += 1
+            whole = [each async for each in super().results(batch_id, status)]
+            for result in whole if self.looks > 1 else [whole[0], *shown]:
+                yield result
+
+    service = Late()
+    run = Run(cache, service)
+    assert texts(await run.ask(3)) == ["batched 1", "batched 2", "batched 3"]
+    assert (service.looks, service.sizes) == (2, [3])
+
+
 class WithoutResults(Memory):
-    async def results(self, batch_id):
+    async def results(self, batch_id, status):
         raise BatchFailed("again", "HTTP 503")
         yield
 
@@ -552,21 +539,6 @@ async def test_a_cancelled_batch_that_does_not_end_is_waited_for_in_bounds(cache
     assert run.ledger.read().open_attempts == 1
 
 
-@in_virtual_time
-async def test_a_batch_that_may_be_a_strangers_is_looked_at_as_any_other_after_its_deadline(cache):
-    service = Endless()
-    await left_behind(cache, service)
-    await note(cache, submitted_at=HOURS_AGO, sure=False)
-    run = Run(cache, service)
-    asking = asyncio.create_task(run.ask())
-    service.looks = 0
-    await asyncio.sleep(3600)
-    assert 50 < service.looks < 70  # once a minute
-    assert service.cancelled == []
-    asking.cancel()
-    await run.end()
-
-
 @pytest.mark.parametrize(
     ("kind", "raised"),
     [("quota", QuotaExhausted), ("refused", EndpointRefused)],
@@ -585,24 +557,15 @@ async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothin
     assert Journal(cache).batches() == []
 
 
-@pytest.mark.parametrize("sent", [True, False])
 @in_virtual_time
-async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cache, sent):
+async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cache):
     service = Memory()
     service.creations = [BatchFailed("again", "no", sent=False)] * 99
-    if sent:
-        service.creations = [BatchFailed("again", "lost", sent=True)]
-
-        async def down(*_, **__):
-            raise BatchFailed("again", "down", sent=True)
-
-        service.find = down
     run = Run(cache, service)
     assert {type(each) for each in await run.ask(3)} == {ProviderDown}
     await run.end()
     assert run.ledger.read().open_attempts == 3  # whether it was created is not known yet
     service.creations = []
-    vars(service).pop("find", None)
     assert texts(await Run(cache, service).ask(3)) == ["batched 1", "batched 2", "batched 3"]
     assert service.sizes == [3]
     assert Ledger(cache, "test").read().open_attempts == 0
@@ -614,6 +577,17 @@ async def test_a_batch_whose_creation_got_no_answer_is_found_and_not_created_aga
     service.creations = [BatchFailed("again", "connection lost", sent=True)]
     assert texts(await Run(cache, service).ask(3)) == ["batched 1", "batched 2", "batched 3"]
     assert service.sizes == [3]
+
+
+@in_virtual_time
+async def test_a_batch_that_may_have_been_created_where_it_takes_no_mark_is_asked_alone(cache):
+    service = Memory()
+    service.takes_mark = False
+    service.creations = [BatchFailed("again", "connection lost", sent=True)]
+    run = Run(cache, service)
+    replies = await run.ask(2)
+    assert [outcomes(each) for each in replies] == [[("batch_lost", None), ("ok", None)]] * 2
+    assert run.ledger.read().open_attempts == 2  # what it may cost stays set aside
 
 
 @in_virtual_time
@@ -646,7 +620,7 @@ async def killed(run, repetitions, when):
     asking = asyncio.create_task(run.ask(repetitions))
     await when.wait()
     asking.cancel()
-    for task in run.rounds._background._tasks:
+    for task in (*run.rounds._tasks, *run.rounds._creations):
         task.cancel()
     await run.client.drain()
 
@@ -655,11 +629,11 @@ async def killed(run, repetitions, when):
 @in_virtual_time
 async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice(cache, step):
     class Dying(Memory):
-        async def submit(self, lines, mark):
+        async def create(self, lines, mark):
             if step == "before the creation":
                 died.set()
                 await asyncio.Event().wait()
-            batch_id = await super().submit(lines, mark)
+            batch_id = await super().create(lines, mark)
             if step == "after it":
                 died.set()
                 await asyncio.Event().wait()
@@ -689,6 +663,29 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
     assert (spending.reserved_usd, spending.open_attempts) == (0.0, 0)
     await second.end()
     assert Journal(cache).batches() == []
+
+
+@in_virtual_time
+async def test_a_run_that_dies_before_an_id_is_noted_where_no_mark_is_asks_that_round_alone(cache):
+    class Dying(Memory):
+        takes_mark = False
+
+        async def create(self, lines, mark):
+            batch_id = await super().create(lines, mark)
+            died.set()
+            await asyncio.Event().wait()
+            return batch_id
+
+    died = asyncio.Event()
+    await killed(Run(cache, Dying()), 2, died)
+    service = Memory()
+    service.takes_mark = False
+    run = Run(cache, service)
+    replies = await run.ask(2)
+    assert [outcomes(each) for each in replies] == [[("batch_lost", None), ("ok", None)]] * 2
+    assert run.ledger.read().open_attempts == 2  # what the lost batch may cost stays set aside
+    await run.ask(2, decision=1)
+    assert service.sizes == [2]  # the next round is a batch again
 
 
 @in_virtual_time
@@ -752,21 +749,6 @@ async def test_a_batch_that_is_gone_is_asked_anew_and_costs_nothing_where_nobody
 
 
 @in_virtual_time
-async def test_somebody_elses_batch_is_not_taken_for_ones_own(cache):
-    service = Memory()
-    other = Run(cache, service, scope="other")
-    await other.ask(3, decision=7)
-    await other.end()
-    service.unsure = ["batch-0"]
-    service.creations = [BatchFailed("again", "lost", sent=True)]
-    Journal(cache)._cache.run_now([lambda: cache.remove("ended batches")])
-    run = Run(cache, service)
-    replies = await run.ask(3)
-    assert {attempt.batch_id for reply in replies for attempt in reply.attempts} == {"batch-1"}
-    assert service.cancelled == []
-
-
-@in_virtual_time
 async def test_under_a_cap_a_round_takes_what_fits_and_the_next_ones_the_rest(cache):
     service = Memory()
     run = Run(cache, service, cap=0.06)
@@ -785,8 +767,8 @@ class Dear(Memory):
         self.chance = random.Random(seed)
         self.bill_usd = 0.0
 
-    async def results(self, batch_id):
-        async for result in super().results(batch_id):
+    async def results(self, batch_id, status):
+        async for result in super().results(batch_id, status):
             read = 10
             written = self.chance.randint(0, 100)
             kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 
 import httpx
 import pytest
-from aiohttp import web
 
 from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.llm.batch.service import BatchFailed
@@ -36,8 +35,8 @@ async def ended(service, batch_id):
 
 
 async def results_of(service, batch_id):
-    await ended(service, batch_id)
-    return [result async for result in service.results(batch_id)]
+    status = await ended(service, batch_id)
+    return [result async for result in service.results(batch_id, status)]
 
 
 async def answered_by(url):
@@ -53,24 +52,16 @@ async def test_a_line_has_the_reply_of_the_plain_endpoint(
     plain = transport_to(endpoint_at(await emulator(), form, provider))
     replies = {line.key: await plain.send(line.request, attempt=1, timeout_s=10) for line in batch}
     service = service_at(await emulator(), form, provider)
-    results = await results_of(service, await service.submit(batch, MARK))
+    results = await results_of(service, await service.create(batch, MARK))
     assert {result.key: result.raw.body for result in results} == {
         key: raw.body for key, raw in replies.items()
     }
     assert all(result.raw.status == 200 for result in results)
 
 
-async def test_results_come_in_another_order_each_once(emulator, service_at, form):
-    url = await emulator(plan(delay_s=0.05))
-    batch, service = lines(form), service_at(url, form)
-    results = await results_of(service, await service.submit(batch, MARK))
-    assert sorted(keys(results)) == sorted(keys(batch))
-    assert keys(results) != keys(batch)
-
-
 async def test_a_status_tells_how_many_lines_have_ended(emulator, service_at, form):
     service = service_at(await emulator(plan(polls=4)), form)
-    batch_id = await service.submit(lines(form, 8), MARK)
+    batch_id = await service.create(lines(form, 8), MARK)
     told = [await service.status(batch_id) for _ in range(5)]
     assert [status.state for status in told] == ["waiting"] * 4 + ["ended"]
     assert {status.total for status in told} == {8}
@@ -84,7 +75,7 @@ async def test_failed_lines_are_judged_as_single_calls_and_others_were_never_ask
 ):
     url = await emulator(plan(seed=5, failed=0.3, expired=0.2))
     batch, service = lines(form, 44), service_at(url, form)
-    results = await results_of(service, await service.submit(batch, MARK))
+    results = await results_of(service, await service.create(batch, MARK))
     replies = [result for result in results if result.raw is not None]
     outcomes = [judge(result.raw, FORMATS[form]) for result in replies]
     assert Counter(outcome.action for outcome in outcomes).keys() == {"accept", "retry"}
@@ -106,29 +97,10 @@ async def test_failed_lines_are_judged_as_single_calls_and_others_were_never_ask
     assert {each["answered"] for each in count} == {1}
 
 
-async def test_a_failed_line_may_fare_better_in_the_next_batch(emulator, service_at, form):
-    url = await emulator(plan(seed=5, failed=0.3))
-    service, left, rounds = service_at(url, form), lines(form, 22), 0
-    while left:
-        results = await results_of(service, await service.submit(left, f"{MARK}-{rounds}"))
-        failed = {result.key for result in results if result.raw.status != 200}
-        left = [line for line in left if line.key in failed]
-        rounds += 1
-    assert rounds > 1
-    assert Counter(each["answered"] for each in await answered_by(url)) == {1: 22}
-
-
-async def test_all_lines_may_expire(emulator, service_at, form):
-    service = service_at(await emulator(plan(expired=1.0)), form)
-    batch_id = await service.submit(lines(form), MARK)
-    assert (await ended(service, batch_id)).state == "ended"
-    assert all(result.raw is None for result in await results_of(service, batch_id))
-
-
 async def test_a_cancelled_batch_ends_with_the_lines_that_were_finished(emulator, service_at, form):
     url = await emulator(plan(polls=100))
     batch, service = lines(form, 20), service_at(url, form)
-    batch_id = await service.submit(batch, MARK)
+    batch_id = await service.create(batch, MARK)
     for _ in range(50):
         await service.status(batch_id)
     await service.cancel(batch_id)
@@ -139,117 +111,61 @@ async def test_a_cancelled_batch_ends_with_the_lines_that_were_finished(emulator
     assert {each["custom_id"] for each in await answered_by(url)} == set(keys(answered))
 
 
+MARKED = ["openai-chat", "gemini"]
+
+
+@pytest.mark.parametrize("form", MARKED, indirect=True)
 async def test_a_batch_whose_creation_was_not_answered_is_found(emulator, service_at, form):
     url = await emulator(plan(lost=1.0))
     batch, service, since = lines(form), service_at(url, form), now()
-    others = lines(form, first=100)
-    for mark, each in (("other", others), (MARK, batch), ("later", lines(form, first=200))):
+    for mark, each in (("other", lines(form, first=100)), (MARK, batch)):
         with pytest.raises(BatchFailed) as lost:
-            await service.submit(each, mark)
+            await service.create(each, mark)
         assert (lost.value.kind, lost.value.sent) == ("again", True)
-    found = await service.find(MARK, keys(batch), since=since)
-    assert found.sure
-    assert set(keys(await results_of(service, found.batch_id))) == set(keys(batch))
-    assert (await service.find("other", keys(others), since=since)).batch_id != found.batch_id
-    assert await service.find("none", keys(lines(form, first=300)), since=since) is None
+    found = await service.find(MARK, since)
+    assert set(keys(await results_of(service, found))) == set(keys(batch))
+    assert await service.find("other", since) not in (found, None)
+    assert await service.find("none", since) is None
     assert {each["answered"] for each in await answered_by(url)} == {1}
 
 
 @pytest.mark.parametrize("oldest_first", [False, True])
-async def test_a_batch_is_found_among_many_in_any_order_but_not_for_ever(
-    emulator, service_at, form, oldest_first
-):
+@pytest.mark.parametrize("form", MARKED, indirect=True)
+async def test_a_batch_is_found_among_many_in_any_order(emulator, service_at, form, oldest_first):
     service, since = service_at(await emulator(plan(oldest_first=oldest_first)), form), now()
-    mine = lines(form, 1, first=500)
     for number in range(110):
         if number == (100 if oldest_first else 5):
-            created = await service.submit(mine, MARK)
-        await service.submit(lines(form, 2, first=number), f"other-{number}")
-    assert (await service.find(MARK, keys(mine), since=since)).batch_id == created
-    assert await service.find(MARK, keys(mine), since=since + timedelta(hours=2)) is None
-
-
-async def test_a_batch_of_anthropic_that_has_not_ended_may_be_somebody_elses(emulator, service_at):
-    url = await emulator(plan(polls=1))
-    service, since = service_at(url, "anthropic"), now()
-    others, mine = lines("anthropic", 5), lines("anthropic", 5, first=100)
-    of_others = await service.submit(others, "")
-    possible = await service.find("", keys(mine), since=since)
-    assert (possible.batch_id, possible.sure) == (of_others, False)
-    assert await service.find("", keys(mine), since=since, known=[of_others]) is None
-    assert await service.find("", keys(lines("anthropic", 6)), since=since) is None
-    await ended(service, of_others)
-    assert await service.find("", keys(mine), since=since) is None
-    assert (await service.find("", keys(others), since=since)).sure
+            created = await service.create(lines(form, 1, first=500), MARK)
+        await service.create(lines(form, 2, first=number), f"other-{number}")
+    assert await service.find(MARK, since) == created
 
 
 async def test_too_many_enqueued_tokens_ask_for_smaller_batches(emulator, service_at, form):
     batch = lines(form)
     tokens = sum(len(line.request.body) for line in batch) // 4
     service = service_at(await emulator(plan(delay_s=1000.0, enqueued_tokens=tokens)), form)
-    await service.submit(batch[:6], MARK)
+    await service.create(batch[:6], MARK)
     if form.startswith("openai"):
-        status = await service.status(await service.submit(batch, "second"))
+        status = await service.status(await service.create(batch, "second"))
         assert (status.state, status.failure) == ("failed", "smaller")
         assert "Enqueued token limit" in status.message
     else:
         with pytest.raises(BatchFailed, match="Enqueued token limit") as full:
-            await service.submit(batch, "second")
+            await service.create(batch, "second")
         assert (full.value.kind, full.value.sent) == ("smaller", False)
-    third = await service.submit(batch[6:9], "third")
+    third = await service.create(batch[6:9], "third")
     assert (await service.status(third)).state == "waiting"
 
 
-async def test_results_that_come_late_and_in_part_are_read_until_all_are_there(
-    emulator, service_at, form
-):
+async def test_results_that_come_late_and_in_part_can_be_read_again(emulator, service_at, form):
     service = service_at(await emulator(plan(late_results=2, short_results=1)), form)
     batch = lines(form)
-    batch_id = await service.submit(batch, MARK)
-    await ended(service, batch_id)
-
-    async def read():
-        async for result in service.results(batch_id):
-            seen.append(result.key)
-
-    for there in (0, 0, 5):
-        seen = []
+    batch_id = await service.create(batch, MARK)
+    status = await ended(service, batch_id)
+    for _ in range(2):
         with pytest.raises(BatchFailed) as failed:
-            await read()
-        assert (failed.value.kind, len(seen)) == ("again", there)
-    seen = []
-    await read()
-    assert sorted(seen) == sorted(keys(batch))
-
-
-async def test_a_batch_with_all_around_its_lines_keeps_to_the_limit(server, service_at):
-    sent = []
-
-    async def keep(request):
-        sent.append(int(request.headers["content-length"]))
-        return web.json_response({"id": "b1"})
-
-    server.replies["POST /v1/messages/batches"] = keep
-    service, batch = service_at(server.url, "anthropic"), lines("anthropic", 3)
-    await service.submit(batch, MARK)
-    around = sent[0] - sum(map(service.size, batch))
-    assert service.limits.size + around <= 256_000_000
-
-
-async def test_a_size_is_that_of_the_line_as_it_is_sent(emulator, service_at, form, server):
-    batch, sent = lines(form, 3), []
-
-    async def keep(request):
-        sent.append(int(request.headers["content-length"]))
-        raise RuntimeError
-
-    # Two batches that differ by a line differ by its size.
-    begun = (200, {}, {"x-goog-upload-url": f"{server.url}/up"})
-    server.replies["POST /upload/v1beta/files"] = begun
-    for path in ("/v1/files", "/v1/messages/batches", "/up"):
-        server.replies[f"POST {path}"] = keep
-    service = service_at(server.url, form)
-    for part in (batch[:2], batch):
-        with pytest.raises(BatchFailed):
-            await service.submit(part, MARK)
-    assert sent[1] - sent[0] == service.size(batch[2])
+            await results_of(service, batch_id)
+        assert failed.value.kind == "again"
+    assert len(await results_of(service, batch_id)) == 5
+    assert status.results == len(batch)
+    assert sorted(keys(await results_of(service, batch_id))) == sorted(keys(batch))

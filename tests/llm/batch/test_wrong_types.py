@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from merge_runner.llm.batch.service import BatchFailed
+from merge_runner.llm.batch.service import BatchFailed, Unreadable
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import judge
 
@@ -109,15 +109,14 @@ async def uses(service):
 
     async def results():
         return [
-            judge(each.raw, FORMATS["gemini"]) async for each in service.results("b1") if each.raw
+            judge(each.raw, FORMATS["gemini"])
+            async for each in service.results("b1", await service.status("b1"))
+            if not isinstance(each, Unreadable) and each.raw
         ]
 
     since = datetime(2026, 11, 22, tzinfo=UTC)
-    for use in (
-        lambda: service.status("b1"),
-        lambda: service.find(MARK, ["a", "b"], since=since),
-        results,
-    ):
+    finds = [lambda: service.find(MARK, since)] if service.takes_mark else []
+    for use in (lambda: service.status("b1"), results, *finds):
         try:
             await use()
         except BatchFailed as exc:
