@@ -49,7 +49,7 @@ class Numbers:
         """
         match list(request):
             case ["study"]:
-                import firthmodels  # noqa: F401 # as the next: what the first table is made with
+                # What the first table is made with.
                 import statsmodels.regression.linear_model  # noqa: F401
 
                 return {"groups": len(self.study.groups)}
