@@ -31,8 +31,7 @@ from analysis.stats.measures import (
     no_human_value,
     undecided_note,
 )
-from analysis.stats.mixed import MIN_PAIRS
-from analysis.stats.regressions import Regression
+from analysis.stats.regressions import MIN_PAIRS, Regression
 from analysis.tables.notes import one_sided_note, replayed_notes
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS

@@ -7,6 +7,7 @@ columns of ``load_trials``; only finished trials count.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf, sqrt
 from typing import Protocol
@@ -28,6 +29,7 @@ GAP_TERMS = (
     "headway_x_velocity",
 )
 BY_SIDE = ("the left vehicle", "the right vehicle")
+MIN_PAIRS = 3  # fewer say nothing of how pairs vary
 # Gaps of a program can be equal but for the rounding of a step: that is no effect.
 STEADY_GAP_M = 0.01
 
@@ -233,6 +235,32 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
     return Regression(
         len(gap), _terms(GAP_TERMS, fit), freedom=freedom, apart=apart, velocity_p=velocity_p
     )
+
+
+def by_pairs(
+    fit: Callable[[pd.DataFrame], Regression], trials: pd.DataFrame, measure: str
+) -> Regression:
+    """A fit to those trials that have the measure, with errors clustered by human pair.
+
+    Errors are a jackknife over the pairs (CV3 of MacKinnon, Nielsen and Webb 2023), whose
+    correction holds for as few clusters as there are; tests are t on pairs - 1 degrees of freedom.
+    """
+    used = trials[(trials["status"] == "finished") & trials[measure].notna()]
+    whole, pairs = fit(used), used["pair"].dropna().unique()
+    if len(pairs) < MIN_PAIRS:
+        return Regression(whole.n, {}, f"{len(pairs)} pairs are too few for errors by pair")
+    parts = {pair: fit(used[used["pair"] != pair]) for pair in pairs} if whole.terms else {}
+    lacking = [f"without {pair}: {part.problem}" for pair, part in parts.items() if part.problem]
+    if whole.problem or lacking:
+        return Regression(whole.n, {}, whole.problem or lacking[0])
+    # CV3: the squares of what each pair moves an estimate by, about the whole fit and not the mean.
+    freedom = len(pairs) - 1
+    terms = {}
+    for name, term in whole.terms.items():
+        moved = sum((part.terms[name].b - term.b) ** 2 for part in parts.values())
+        terms[name] = wald_term(term.b, sqrt(moved * freedom / len(pairs)), freedom)
+    remark = f"errors by jackknife over {len(pairs)} pairs"
+    return Regression(whole.n, terms, freedom=freedom, remark=remark)
 
 
 def _terms(names: tuple[str, ...], fit: _Fit) -> dict[str, Term]:

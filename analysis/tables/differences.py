@@ -10,7 +10,7 @@ from math import isinf
 from analysis.data.study import Group, Study
 from analysis.stats.intervals import Difference
 from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions, pairs_known
-from analysis.stats.mixed import MIN_PAIRS
+from analysis.stats.regressions import MIN_PAIRS
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import replayed_notes, sample_notes
 from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER

@@ -95,11 +95,11 @@ def least_squares(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray | None, ...]
     rest = y - x @ b
     hat = np.einsum("ij,jk,ik->i", x, bread, x)
     plain = bread * (rest @ rest) / freedom
-    found = [_wald(b, np.sqrt(np.diag(plain)), freedom), None, None]
+    found = [wald(b, np.sqrt(np.diag(plain)), freedom), None, None]
     if hat.max() < 1 - 1e-9:
         meat = x.T @ (x * ((rest / (1 - hat)) ** 2)[:, None])
         found[2] = bread @ meat @ bread
-        found[1] = _wald(b, np.sqrt(np.diag(found[2])), freedom)
+        found[1] = wald(b, np.sqrt(np.diag(found[2])), freedom)
     return tuple(found)
 
 
@@ -122,72 +122,8 @@ def joint_p(b: np.ndarray, covariance: np.ndarray, freedom: int) -> float | None
     return stats.f.sf(b @ np.linalg.solve(covariance, b) / len(b), len(b), freedom)
 
 
-def _wald(b, se, freedom=np.inf) -> np.ndarray:
+def wald(b, se, freedom=np.inf) -> np.ndarray:
     return np.column_stack([b, se, b / se, 2 * stats.t.sf(np.abs(b / se), freedom)])
-
-
-def mixed_least_squares(x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray:
-    """A random intercept per pair, by restricted maximum likelihood; normal tests."""
-    groups = [(x[pair == name], y[pair == name]) for name in np.unique(pair)]
-
-    def solved(ratio):
-        inverses = [
-            np.eye(len(v)) - ratio / (1 + len(v) * ratio) * np.ones((len(v), len(v)))
-            for _, v in groups
-        ]
-        a = sum(u.T @ w @ u for (u, _), w in zip(groups, inverses, strict=True))
-        b = np.linalg.solve(a, sum(u.T @ w @ v for (u, v), w in zip(groups, inverses, strict=True)))
-        rest = sum(
-            (v - u @ b) @ w @ (v - u @ b) for (u, v), w in zip(groups, inverses, strict=True)
-        )
-        variance = rest / (len(y) - x.shape[1])
-        logs = sum(np.log1p(len(v) * ratio) for _, v in groups) + np.linalg.slogdet(a)[1]
-        return (len(y) - x.shape[1]) * np.log(variance) + logs, b, variance, a
-
-    best = optimize.minimize_scalar(
-        lambda log: solved(np.exp(log))[0], bounds=(-12, 6), options={"xatol": 1e-9}
-    )
-    _, b, variance, a = solved(np.exp(best.x))
-    return _wald(b, np.sqrt(variance * np.diag(np.linalg.inv(a))))
-
-
-def mixed_logit(x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray:
-    """The same of a logit, its likelihood integrated by adaptive quadrature of 41 points."""
-    nodes, weights = np.polynomial.hermite.hermgauss(41)
-    groups = [(x[pair == name], y[pair == name]) for name in np.unique(pair)]
-
-    def loss(theta):
-        b, sd = theta[:-1], theta[-1]
-        total = 0.0
-        for u, v in groups:
-            eta = u @ b
-            mode = 0.0
-            for _ in range(100):
-                p = 1 / (1 + np.exp(-eta - sd * mode))
-                curve = 1 + sd**2 * (p * (1 - p)).sum()
-                step = (sd * (v - p).sum() - mode) / curve
-                mode += step
-                if abs(step) < 1e-12:
-                    break
-            at = mode + np.sqrt(2 / curve) * nodes
-            line = eta[:, None] + sd * at
-            logs = v @ line - np.logaddexp(0, line).sum(axis=0) - at**2 / 2 + nodes**2
-            total += np.log(np.exp(logs - logs.max()) @ weights) + logs.max() - np.log(curve) / 2
-        return -total
-
-    start = np.r_[logit(x, y)[:, 0], 0.5]
-    best = optimize.minimize(loss, start, method="BFGS", options={"gtol": 1e-7}).x
-    best = optimize.minimize(loss, best, method="Nelder-Mead", options={"xatol": 1e-9}).x
-    step = 1e-4 * np.eye(len(best))
-    second = [
-        [
-            (loss(best + i + j) - loss(best + i - j) - loss(best - i + j) + loss(best - i - j))
-            / 4e-8
-            for j in step
-        ]
-        for i in step
-    ]
-    return _wald(best[:-1], np.sqrt(np.diag(np.linalg.inv(np.array(second))))[:-1])
 
 
 def by_pairs(fit, x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray | None:
