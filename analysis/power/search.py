@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from analysis.power.questions import Question
 from analysis.power.samples import Conditions, Sample, human_sample, simulate
 from analysis.power.truths import Truth, human
-from analysis.stats.contrasts import SEED
+from analysis.stats.ceiling import SEED
 from analysis.stats.intervals import POWER
 
 MOST = 4

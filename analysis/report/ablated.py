@@ -99,7 +99,7 @@ def _changes(group: Group, baseline: Group, rows: dict[str, Row]) -> Iterator[Ch
         row = rows.get(f"{group.id}/{baseline.setting}/{metric.name}")
         if row is not None:
             # Before Holm's correction, which only makes p larger: a lenient bound.
-            possible = smallest_p(group, baseline, metric) < ALPHA
+            possible = not metric.rate or smallest_p(group, baseline, metric) < ALPHA
             values: dict[str, Any] = dict(row.values)
             yield Change(
                 group.setting,
@@ -113,10 +113,9 @@ def _changes(group: Group, baseline: Group, rows: dict[str, Row]) -> Iterator[Ch
 
 
 def smallest_p(group: Group, baseline: Group, metric: Metric) -> float:
-    """The smallest p that a test of so many trials can give, whatever their outcomes.
+    """The smallest p that Fisher's test of so many trials can give, whatever their outcomes.
 
-    Only one of all ways to shuffle within the conditions is the most extreme, or two that mirror
-    each other; of a rate it is 1 in one group and 0 in the other.
+    That is where the rate is 1 in one group and 0 in the other.
     """
     first, second = (
         one.trials.dropna(subset=[metric.column])["condition"].value_counts()

@@ -55,7 +55,7 @@ def contrasts(study: Study) -> Table:
             Column(
                 "ci", "95 % CI", "interval", 2, "Newcombe; least squares; by pairs", optional=True
             ),
-            Column("p", "p", "p", 3, "Fisher's exact or permutation test; t test by pairs"),
+            Column("p", "p", "p", 3, "Fisher's exact test or t test"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
             Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
             Column(
@@ -71,13 +71,13 @@ def contrasts(study: Study) -> Table:
                 "n_reference", "n ref.", "count", 0, "trials of the reference in these conditions"
             ),
             Column("errors", "errors", meaning="what is taken as independent: trials, or pairs"),
-            Column("freedom", "df", "number", 0, "of a t test by pairs", optional=True),
+            Column("freedom", "df", "number", 0, "of a t test", optional=True),
         ),
         rows,
         (
             "all are compared within the conditions that both have: rates by the weights of Mantel "
             "and Haenszel, with Newcombe's interval and Fisher's exact test within conditions; "
-            "means by least squares, with a seeded permutation test. A family is one measure of "
+            "means by least squares, with its t test. A family is one measure of "
             "one driver over its prompts, or over all drivers against humans",
             *human_notes,
             "detectable: the smallest difference that is found at p < .05, before correction, with "

@@ -1,7 +1,7 @@
 """The tables of a results database, recomputed: {table: {row: {column: number or None}}}.
 
 Nothing of the project is imported. Rates are in percent. A row of ``contrasts`` or ``factors`` with
-a p has its ``family``, whose p are corrected together, and says whether p is ``simulated``.
+a p has its ``family``, whose p are corrected together.
 """
 
 from __future__ import annotations
@@ -419,7 +419,6 @@ def _level(trials, reference, column, kind, orders) -> dict:
     if found:
         row |= {"difference": found["difference"], "p": found["p"], "family": "all"}
         row |= {f"difference_{end}": found[end] for end in ("ci_low", "ci_high")}
-        row["simulated"] = found.get("simulated", False)
     return row
 
 
