@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from analysis.power.search import MOST
-from analysis.power.study import MULTIPLES, Chance, Power
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from analysis.power.study import MOST, MULTIPLES, Chance
 from analysis.stats.intervals import POWER
 from analysis.tables.model import Column, Row, Table, Value
 
@@ -24,33 +26,42 @@ COLUMNS = (
 )
 
 
-def table(found: Power) -> Table:
-    """The table of a study's chances."""
+def table(found: Mapping[str, Any], chances: Sequence[Chance]) -> Table:
+    """The table of a study's chances; ``found`` is what the command tells of the study."""
+
+    def usd(cost: float | None) -> str:
+        return "free" if found["free"] else "unknown" if cost is None else f"{cost:.2f}"
+
+    costs = "nothing"
+    if not found["free"]:
+        each = zip(found["costs_usd"], MULTIPLES, strict=True)
+        how = "as measured before" if found["measured"] else "by the registry's typical tokens"
+        costs = f"about {', '.join(f'{usd(cost)} (x{m:g})' for cost, m in each)} USD, {how}"
     return Table(
         "power",
-        f"What the study {found.study} can find ({found.driver}, {found.trials} trials)",
+        f"What the study {found['study']} can find ({found['driver']}, {found['trials']} trials)",
         COLUMNS,
-        [_row(found, each) for each in found.chances],
+        [_row(each, usd) for each in chances],
         (
             f"n: trials of an arm; {', '.join(f'x{m:g}' for m in MULTIPLES)}: the chance to find "
-            f"the effect at p < .05 with so many times the repetitions, of {found.simulations} "
-            f"simulated studies with the seed {found.seed}",
+            f"the effect at p < .05 with so many times the repetitions, of {found['simulations']} "
+            f"simulated studies with the seed {found['seed']}",
             f"smallest: the smallest effect that is found with a chance of {100 * POWER:.0f} % at "
             f"n; n for {100 * POWER:.0f} %: the trials of an arm from which on the effect is found "
             f"with this chance, at most {MOST} times those of the study; USD: the whole study then",
-            "if trials go as: the published odds and gaps of humans; those of the driver cei; "
-            "those of humans, but that who merges first does not depend on the relative velocity; "
-            "or what is planted in the emulator. Against another arm: that one goes so, and this "
-            "one lacks the cue, leaves 1 m more, or collides twice as often",
+            "if trials go as: the published odds and gaps of humans; those of the driver as it was "
+            "played; or what is planted in the emulator. Against another arm: if both go as "
+            "humans, this one leaves 1 m more, or collides twice as often",
             "tests: Firth's likelihood ratio (who merges first), HC3 (gap), equivalence (I4), "
             "Fisher's exact test (collisions), the linear model within conditions (gap of two "
             "arms); each by itself, without correction for their number",
-            f"the whole study costs {_costs(found)}",
+            f"the whole study costs {costs}",
         ),
     )
 
 
-def _row(found: Power, each: Chance) -> Row:
+def _row(each: Chance, usd: Callable[[float | None], str]) -> Row:
+    enough = NOTHING if each.effect == 0 else NOT_FINDABLE if each.enough is None else each.enough
     values: dict[str, Value] = {
         "table": each.table,
         "question": each.question,
@@ -61,32 +72,10 @@ def _row(found: Power, each: Chance) -> Row:
         "unit": each.unit,
         "trials": each.trials,
         "smallest": each.smallest,
-        "enough": _enough(each),
-        "cost_usd": "" if each.enough is None else _usd(found, each.cost_usd),
+        "enough": str(enough),
+        "cost_usd": "" if each.enough is None else usd(each.cost_usd),
     }
     values |= {f"times_{m:g}": 100 * share for m, share in zip(MULTIPLES, each.found, strict=True)}
-    row = "/".join((each.table, each.question, each.truth, each.against, *each.arms))
-    return Row(row, (), values)
-
-
-def _enough(each: Chance) -> str:
-    if each.effect == 0:
-        return NOTHING
-    return NOT_FINDABLE if each.enough is None else str(each.enough)
-
-
-def _costs(found: Power) -> str:
-    if found.free:
-        return "nothing"
-    costs = ", ".join(
-        f"{_usd(found, cost)} (x{multiple:g})"
-        for multiple, cost in zip(MULTIPLES, found.costs_usd, strict=True)
+    return Row(
+        "/".join((each.table, each.question, each.truth, each.against, *each.arms)), (), values
     )
-    how = "as measured before" if found.measured else "by the registry's typical tokens"
-    return f"about {costs} USD, {how}"
-
-
-def _usd(found: Power, cost_usd: float | None) -> str:
-    if found.free:
-        return "free"
-    return "unknown" if cost_usd is None else f"{cost_usd:.2f}"
