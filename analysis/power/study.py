@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from analysis.data.study import Group
+from analysis.names import BASELINE
 from analysis.power.truths import (
     SPEED,
     Conditions,
@@ -31,7 +32,6 @@ from merge_runner.run.estimate import Estimate, typical_prompt
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.crossing import Arm
-from merge_runner.study.file import BASELINE
 
 MULTIPLES = (0.5, 1.0, 2.0)
 MOST = 4  # so many times the study's repetitions are looked at

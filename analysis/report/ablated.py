@@ -9,12 +9,12 @@ from typing import Any
 
 from analysis.data.study import Group, Study
 from analysis.metrics import Metric, compared
+from analysis.names import BASELINE
 from analysis.stats.indicators import ALPHA
 from analysis.stats.intervals import POWER
 from analysis.tables import finished_tables
 from analysis.tables.model import Row
 from analysis.tables.notes import listed
-from merge_runner.study.file import BASELINE
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from math import isinf
 
-from analysis.data.study import HUMAN, Group, Study, in_one_study
+from analysis.data.study import Group, Study, in_one_study
 from analysis.metrics import JUDGED, RULES_NOTE, Metric, compared
+from analysis.names import BASELINE, HUMAN
 from analysis.stats.against_humans import by_known_pairs, contrast_with_humans
 from analysis.stats.contrasts import contrast_cells, contrast_means, corrected, shared_cells
 from analysis.stats.intervals import Difference
@@ -14,7 +15,6 @@ from analysis.stats.joint import NO_PAIRS
 from analysis.stats.measures import known, outcomes_note, trials_of, undecided
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import listed, replayed_notes, sample_notes
-from merge_runner.study.file import BASELINE
 from merge_runner.text_safety import quoted
 
 # The columns that rest on human outcomes, in rows whose metric does.

@@ -67,7 +67,6 @@ def who_first(study: Study) -> Table:
             *sample_notes(study, study.groups),
             *_mixed_notes(study, "S4"),
         ),
-        "Table III",
     )
 
 
@@ -114,7 +113,6 @@ def gap(study: Study) -> Table:
             *sample_notes(study, study.groups),
             *_mixed_notes(study, "S6"),
         ),
-        "Table IV",
     )
 
 
