@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from analysis.power.study import MOST, MULTIPLES, Chance
 from analysis.stats.intervals import POWER
-from analysis.tables.model import Column, Row, Table, Value
+from analysis.tables.model import Column, Row, Table
 
 NOT_FINDABLE, NOTHING = "not findable", "nothing to find"
 COLUMNS = (
@@ -62,16 +63,8 @@ def table(found: Mapping[str, Any], chances: Sequence[Chance]) -> Table:
 
 def _row(each: Chance, usd: Callable[[float | None], str]) -> Row:
     enough = NOTHING if each.effect == 0 else NOT_FINDABLE if each.enough is None else each.enough
-    values: dict[str, Value] = {
-        "table": each.table,
-        "question": each.question,
+    values = asdict(each) | {
         "arms": each.arms[0] if len(each.arms) == 1 else f"each of {len(each.arms)}",
-        "against": each.against,
-        "truth": each.truth,
-        "effect": each.effect,
-        "unit": each.unit,
-        "trials": each.trials,
-        "smallest": each.smallest,
         "enough": str(enough),
         "cost_usd": "" if each.enough is None else usd(each.cost_usd),
     }
