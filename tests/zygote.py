@@ -42,7 +42,6 @@ WARM = (
     "matplotlib.backends.backend_agg",
     "matplotlib.backends.backend_pdf",
     "matplotlib.backends.backend_svg",
-    "firthmodels",
     "statsmodels.formula.api",
 )
 # So that linear algebra starts none.

@@ -46,7 +46,6 @@ ROWS = {
 }
 LIBRARIES = (
     "duckdb",
-    "firthmodels",
     "jinja2",
     "matplotlib",
     "numpy",

@@ -34,6 +34,7 @@ from analysis.data.load import (
 )
 from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
 from analysis.data.studies import Order, Studies, read_studies, study_name
+from analysis.names import BASELINE, HUMAN
 from merge_runner.drivers.registry import has_chance, language_models, stand_in, unresponsive
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.content_hashes import canonical_json, spec_hash
@@ -43,10 +44,9 @@ from merge_runner.registry import require
 from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF, listed_levels
-from merge_runner.study.file import BASELINE, StudySource, read_study
+from merge_runner.study.file import StudySource, read_study
 from merge_runner.text_safety import quoted
 
-HUMAN = "human"
 # What tells groups apart, and is no measure.
 COLUMNS_OF_GROUPS = [
     "driver", "image", "task", "usual", "mark", "apart", "shared", "trace", "left_scripted",

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
 from analysis.explorer.child import serve, use_given
 from analysis.metrics import GAP, LEFT_FIRST, Metric
+from analysis.names import HUMAN
 from analysis.tables import make_tables
 from analysis.tables.formats import shown_value
 from analysis.tables.model import Table, from_text, to_text
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from analysis.data.study import Group, Study
     from analysis.explain import Source
 
-HUMAN = "human"
 # The tables that have the rows of groups: of each driver and prompt, or each level of a factor.
 VARIANTS, FACTORS = "ablation-quantitative", "factors"
 
@@ -49,7 +49,7 @@ class Numbers:
         """
         match list(request):
             case ["study"]:
-                import firthmodels  # noqa: F401 # as the next: what the first table is made with
+                # What the first table is made with.
                 import statsmodels.regression.linear_model  # noqa: F401
 
                 return {"groups": len(self.study.groups)}

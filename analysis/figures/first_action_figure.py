@@ -11,9 +11,9 @@ from analysis.data.study import Study
 from analysis.figures.drawing import COLUMN_IN, draw_points, key, wrapped
 from analysis.figures.panels import Point
 from analysis.figures.styles import HUMAN_STYLE, driver_style
+from analysis.names import BASELINE
 from analysis.stats.first_action import Seat, first_actions, mean, seats
 from analysis.stats.intervals import Estimate, interval
-from merge_runner.study.file import BASELINE
 
 COLUMNS = 2
 

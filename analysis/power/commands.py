@@ -48,8 +48,9 @@ def power(
     as_json: JsonOption = False,
 ) -> None:
     """Say what a study could find and what it costs; send nothing."""
-    from analysis.power.shown import table
-    from analysis.power.study import power as chances
+    from analysis.data.study import Study
+    from analysis.power.study import MULTIPLES, chances, times
+    from analysis.power.table import table
     from analysis.table_format import TableFormat
     from analysis.tables.formats import render
     from merge_runner.run.plan import Options, make_plan
@@ -65,8 +66,21 @@ def power(
         trust=trust,
     )
     expected = asyncio.run(of_all(plan, Options(db=Path(db), cache=Path(cache)), say=say))
-    found = chances(plan, expected, simulations=sims, seed=seed)
+    played = Study(db).models if Path(db).exists() else []
+    found = {
+        "study": plan.name,
+        "driver": plan.driver,
+        "arms": len(plan.arms),
+        "trials": plan.trials,
+        "costs_usd": [times(expected.cost_usd, multiple) for multiple in MULTIPLES],
+        "free": expected.free,
+        "measured": bool(expected.measured),
+        "simulations": sims,
+        "seed": seed,
+    }
+    rows = chances(plan, expected, played, simulations=sims, seed=seed)
     if as_json:
-        print_out(json.dumps(asdict(found), ensure_ascii=False))
+        found["chances"] = [asdict(row) for row in rows]
+        print_out(json.dumps(found, ensure_ascii=False))
     else:
-        print_out(render([table(found)], TableFormat.TEXT, terminal_width()))
+        print_out(render([table(found, rows)], TableFormat.TEXT, terminal_width()))

@@ -9,6 +9,7 @@ from analysis.data.provenance import Provenance
 from analysis.data.reference_data import HUMAN_TRIALS, PAIRS
 from analysis.data.study import Group, Study
 from analysis.metrics import BOXES, Metric, shown_in
+from analysis.names import BASELINE
 from analysis.report.ablated import ablation_sentences
 from analysis.report.alarms import mismatch
 from analysis.report.unlike import unlike
@@ -31,12 +32,10 @@ from analysis.stats.measures import (
     no_human_value,
     undecided_note,
 )
-from analysis.stats.mixed import MIN_PAIRS
-from analysis.stats.regressions import Regression
+from analysis.stats.regressions import MIN_PAIRS, Regression
 from analysis.tables.notes import one_sided_note, replayed_notes
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.study.file import BASELINE
 
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",

@@ -26,7 +26,7 @@ from merge_runner.results.provenance import program
 TEMPLATES = Path(__file__).with_name("templates")
 # At most so many trials are listed for a cell: a page with all of them would be unwieldy.
 LISTED = 300
-LIBRARIES = ("statsmodels", "firthmodels", "scipy", "numpy", "pandas", "matplotlib")
+LIBRARIES = ("statsmodels", "scipy", "numpy", "pandas", "matplotlib")
 
 
 @dataclass

@@ -17,7 +17,7 @@ from analysis.metrics import Metric
 from analysis.stats.contrasts import contrast_cells, contrast_means, shared_cells
 from analysis.stats.intervals import Difference, difference
 from analysis.stats.measures import trials_of, undecided
-from analysis.stats.mixed import MIN_PAIRS
+from analysis.stats.regressions import MIN_PAIRS
 
 Array = NDArray[np.float64]
 

@@ -1,10 +1,10 @@
-"""Differences between two groups of trials: exact and permutation tests, and corrections."""
+"""Differences between two groups of trials: exact tests, least squares, and corrections."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from math import ceil
+from functools import cache
+from math import inf
 
 import numpy as np
 import pandas as pd
@@ -22,9 +22,7 @@ from analysis.stats.intervals import (
     two_sided_p,
 )
 
-SEED = 260409609
-PERMUTATIONS = 9999
-DRAWN_AT_ONCE = 2**15  # they stay in the processor
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,16 +134,14 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class Within:
-    """The measures of two groups, less the mean of their condition, in the order of conditions.
+    """The measures of two groups, less the mean of their condition.
 
-    ``chosen`` are those of the first group, ``sizes`` those of the conditions, and ``group`` is
-    ``chosen`` less its mean in the condition.
+    ``group`` is 1 for those of the first group and else 0, less its mean in the condition.
     """
 
     value: NDArray[np.float64]
     group: NDArray[np.float64]
-    chosen: NDArray[np.bool_]
-    sizes: NDArray[np.int_]
+    conditions: int
 
     @property
     def weight(self) -> float:
@@ -163,7 +159,7 @@ class Within:
     @property
     def error(self) -> tuple[float, int] | None:
         """Its standard error with the degrees of freedom; None without any."""
-        freedom = len(self.value) - len(self.sizes) - 1
+        freedom = len(self.value) - self.conditions - 1
         if freedom <= 0:
             return None
         variance = float(((self.value - self.difference * self.group) ** 2).sum()) / freedom
@@ -173,31 +169,31 @@ class Within:
 def within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Within:
     """Return the measures of two groups within conditions."""
     both = pd.concat([first.assign(_first=1.0), second.assign(_first=0.0)]).dropna(subset=[measure])
-    both = both.sort_values("condition", kind="stable")
     by_condition = both.groupby("condition")
     return Within(
         (both[measure].astype(float) - by_condition[measure].transform("mean")).to_numpy(float),
         (both["_first"] - by_condition["_first"].transform("mean")).to_numpy(float),
-        both["_first"].to_numpy(float) == 1,
-        by_condition.size().to_numpy(),
+        by_condition.ngroups,
     )
 
 
 def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Difference | None:
-    """Two means, compared within conditions: permutation test, least-squares interval.
+    """Two means, compared within conditions by least squares.
 
-    The difference is that of a linear model with a level for each condition, so that another mix of
-    conditions, as when one group collides more in some, makes none. The test shuffles the groups
-    within each condition, seeded. None where the groups share no condition.
+    Difference, interval and Student's t are those of a linear model with a level for each
+    condition, so that another mix of conditions, as when one group collides more in some, makes no
+    difference. None where the groups share no condition, or have too few trials for an error.
     """
     both = within(first, second, measure)
-    if not both.weight:
+    if not (both.weight and both.error):
         return None
-    low = high = found = None
-    if both.error:
-        low, high = interval(both.difference, *both.error)
-        found = detectable(*both.error)
-    return Difference(both.difference, low, high, _permutation_p(both), found)
+    value, (se, freedom) = both.difference, both.error
+    # Equal but for rounding is equal; where nothing varies, any other difference is sure.
+    statistic = 0.0 if abs(value) < ROUNDING else value / se if se else inf
+    p = two_sided_p(statistic, freedom)
+    return Difference(
+        value, *interval(value, se, freedom), p, detectable(se, freedom), float(freedom)
+    )
 
 
 def interaction_of_means(one: Within, other: Within) -> Difference | None:
@@ -205,61 +201,6 @@ def interaction_of_means(one: Within, other: Within) -> Difference | None:
     if not (one.weight and other.weight and one.error and other.error):
         return None
     return difference(one.difference - other.difference, one.error, other.error)
-
-
-def _permutation_p(both: Within) -> float:
-    """Share of shuffles within conditions, the observed one included, with as large a difference.
-
-    Conditions lie one after another, in ``sizes``.
-    """
-    starts = np.cumsum(both.sizes) - both.sizes
-    counts = np.add.reduceat(both.chosen.astype(int), starts)
-    shuffles = _shuffles(tuple(zip(both.sizes.tolist(), counts.tolist(), strict=True)))
-    values = np.split(both.value, starts[1:])
-    parts = [shuffled_sums(*each) for each in zip(shuffles, values, strict=True)]
-    # As large but for rounding is as large.
-    found = np.abs(np.sum(parts, axis=0) / both.weight)
-    extreme = int((found >= abs(both.difference) - 1e-12).sum())
-    # The trials as they are count as a shuffle, so that p is never 0 (Phipson and Smyth 2010).
-    return (extreme + 1) / (PERMUTATIONS + 1)
-
-
-@lru_cache(maxsize=16)
-def _shuffles(conditions: tuple[tuple[int, int], ...]) -> list[NDArray[np.uint8]]:
-    """Who comes first in the shuffles of conditions of (size, count); see ``first_in_shuffles``.
-
-    The measures of two groups mostly have values in the same trials, and are shuffled alike.
-    """
-    rng = np.random.default_rng(SEED)
-    return [first_in_shuffles(rng, size, count) for size, count in conditions]
-
-
-def first_in_shuffles(rng: np.random.Generator, size: int, count: int) -> NDArray[np.uint8]:
-    """Which ``count`` come first in each of PERMUTATIONS shuffles, (shuffle, bits of ``size``).
-
-    Shuffled is by random draws: the ``count`` smallest come first, in whatever order.
-    """
-    found = np.zeros((PERMUTATIONS, ceil(size / 8)), dtype=np.uint8)
-    drawn = np.empty((_rows(size), size))
-    for start in range(0, PERMUTATIONS, len(drawn)):
-        draws = drawn[: PERMUTATIONS - start]
-        rng.random(out=draws)
-        if count:
-            last = np.partition(draws, count - 1, axis=1)[:, count - 1]
-            found[start : start + len(drawn)] = np.packbits(draws <= last[:, None], axis=1)
-    return found
-
-
-def shuffled_sums(first: NDArray[np.uint8], value: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The sum of the values that come first in each shuffle."""
-    rows = _rows(len(value))
-    parts = [first[start : start + rows] for start in range(0, len(first), rows)]
-    return np.concatenate([np.unpackbits(part, axis=1, count=len(value)) @ value for part in parts])
-
-
-def _rows(size: int) -> int:
-    """How many shuffles of that size are drawn at once."""
-    return max(1, DRAWN_AT_ONCE // size)
 
 
 def corrected(p: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

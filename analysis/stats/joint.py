@@ -7,28 +7,25 @@ driver's coefficient minus the humans' (see ``regressions.differences``). Where 
 separated, it has no finite estimate, and there is none.
 
 The driver's trials are independent: Fisher's information in the logit, HC3 errors for the gap. The
-humans' come from pairs who differ: a jackknife over the pairs (CV3 of MacKinnon, Nielsen and Webb
-2023, on pairs - 1 degrees of freedom), with Satterthwaite's degrees of freedom (1946) for the sum.
+humans' come from pairs who differ (see ``regressions.by_pairs``); the sum has Satterthwaite's
+degrees of freedom (1946).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from math import sqrt
-
-import pandas as pd
 
 from analysis.data.reference_data import citation, published
 from analysis.data.study import Group
 from analysis.stats.group_scores import fits
 from analysis.stats.intervals import Difference
-from analysis.stats.mixed import MIN_PAIRS
 from analysis.stats.regressions import (
     GAP_TERMS,
+    MIN_PAIRS,
     WHO_FIRST_TERMS,
     Regression,
+    by_pairs,
     differences,
     gap_ols,
     wald_term,
@@ -74,26 +71,6 @@ def pairs_known(human: Group, outcome: str) -> int:
     """How many pairs of imported humans have the outcome; 0 where that of the published counts."""
     trials = human.outcomes if outcome == WHO_FIRST else human.finished
     return trials["pair"].nunique() if "pair" in trials else 0
-
-
-def by_pairs(
-    fit: Callable[[pd.DataFrame], Regression], trials: pd.DataFrame, measure: str
-) -> Regression:
-    """A fit with the errors of a jackknife over the pairs of those trials that have the measure."""
-    used = trials[(trials["status"] == "finished") & trials[measure].notna()]
-    whole, pairs = fit(used), used["pair"].unique()
-    parts = {pair: fit(used[used["pair"] != pair]) for pair in pairs} if whole.terms else {}
-    lacking = [f"without {pair}: {part.problem}" for pair, part in parts.items() if part.problem]
-    if whole.problem or lacking:
-        return Regression(whole.n, {}, whole.problem or lacking[0])
-    # CV3: the squares of what each pair moves an estimate by, about the whole fit and not the mean.
-    freedom = len(pairs) - 1
-    terms = {}
-    for name, term in whole.terms.items():
-        moved = sum((part.terms[name].b - term.b) ** 2 for part in parts.values())
-        terms[name] = wald_term(term.b, sqrt(moved * freedom / len(pairs)), freedom)
-    remark = f"errors by jackknife over {len(pairs)} pairs"
-    return Regression(whole.n, terms, freedom=freedom, remark=remark)
 
 
 def _by_term(outcome: str, driver: Regression, human: Regression, by: str) -> list[Interaction]:

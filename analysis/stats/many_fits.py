@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import expit
 
+from analysis.stats import firth
 from analysis.stats.indicators import APART, Criterion
 from analysis.stats.regressions import (
     GAP_TERMS,
@@ -26,10 +27,6 @@ Array = NDArray[np.float64]
 Holds = NDArray[np.bool_]
 
 WALD_STEPS = 35  # statsmodels' limit
-FIRTH_STEPS = 60
-HALVINGS = 8
-# Of a log-likelihood: what is smaller than this is no loss.
-ROUNDING = 1e-11
 
 HEADWAYS = np.array([c.projected_headway_m for c in HUMAN_CONDITIONS.values()])
 VELOCITIES = np.array([c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()])
@@ -124,13 +121,13 @@ def logit_fits(draws: Draws) -> Fits:
     """Who merges first by maximum likelihood (Newton's method), with Wald tests."""
     design, sets = draws.logit_design, len(draws.n)
     b, se = np.zeros((sets, 3)), np.zeros((sets, 3))
-    alive = _rank(design, draws.n)
+    alive = firth.identified(design, draws.n)
     sound = np.zeros(sets, bool)
     rows = np.flatnonzero(alive)  # a data set that has converged is left as it is
     for _ in range(WALD_STEPS):
         n = draws.n[rows]
         p = expit(b[rows] @ design.T)
-        covariance, regular = _inverse(design, n * p * (1 - p), alive[rows])
+        covariance, regular = firth.inverse(design, n * p * (1 - p), alive[rows])
         step = np.einsum("bjk,bk->bj", covariance, (draws.left[rows] - n * p) @ design)
         # Under separation the steps never end; clipped, they overflow nothing until they are cut.
         b[rows] += np.where(regular[:, None], np.clip(step, -10, 10), 0)
@@ -147,7 +144,7 @@ def logit_fits(draws: Draws) -> Fits:
 
 def firth_fits(draws: Draws) -> Fits:
     """Who merges first by Firth's fit, with penalised likelihood-ratio tests of the slopes."""
-    b, p, alive = _firth_tested(draws.logit_design, draws.n, draws.left, (1, 2))
+    b, p, alive = firth.tested_fits(draws.logit_design, draws.n, draws.left, (1, 2))
     # Likelihood ratios need no errors.
     return Fits(WHO_FIRST_TERMS, b, np.zeros_like(b), p, NORMAL, alive)
 
@@ -162,92 +159,15 @@ def firth_differences(draws: Draws, others: Draws, term: str) -> Fits:
     design = np.block([[rest, 0 * rest], [own, own]])
     n, left = (np.hstack(pair) for pair in ((others.n, draws.n), (others.left, draws.left)))
     at = 3 + WHO_FIRST_TERMS.index(term)
-    b, p, alive = _firth_tested(design, n, left, (at,))
+    b, p, alive = firth.tested_fits(design, n, left, (at,))
     return Fits(WHO_FIRST_TERMS, b[:, 3:], np.zeros_like(b[:, 3:]), p[:, 3:], NORMAL, alive)
-
-
-def _firth_tested(
-    design: Array, n: Array, left: Array, tested: tuple[int, ...]
-) -> tuple[Array, Array, Holds]:
-    """Firth's coefficients (sets, terms), p-values of the ``tested`` (else 1), and where they are.
-
-    ``n`` and ``left`` are counts of the shape (sets, rows of the design).
-    """
-    alive = _rank(design, n)
-    every = tuple(range(design.shape[1]))
-    full, b = _firth(design, n, left, alive, every)
-    p = np.ones_like(b)
-    for column in tested:
-        without = tuple(other for other in every if other != column)
-        constrained, _ = _firth(design, n, left, alive, without)
-        p[:, column] = stats.chi2.sf(2 * (full - constrained), 1)
-    return b, p, alive
-
-
-def _firth(
-    design: Array, n: Array, left: Array, alive: Holds, free: tuple[int, ...]
-) -> tuple[Array, Array]:
-    """Maximal penalised log-likelihoods (sets,) over ``free`` coefficients, and all of these.
-
-    Newton steps on Firth's score with the whole design's information, halved where they do not
-    increase the penalised likelihood (Heinze and Schemper 2002).
-    """
-    b, best = np.zeros((len(n), design.shape[1])), np.zeros(len(n))
-    rows = np.flatnonzero(alive)  # a data set that has converged is left as it is
-    best[rows] = _penalised(design, n[rows], left[rows], b[rows])
-    for _ in range(FIRTH_STEPS):
-        some, firsts = n[rows], left[rows]
-        step = _firth_step(design, some, firsts, b[rows], free)
-        for _ in range(HALVINGS):
-            tried = _penalised(design, some, firsts, b[rows] + step)
-            worse = tried < best[rows] - ROUNDING
-            if not worse.any():
-                break
-            step[worse] /= 2
-        step[worse] = 0
-        b[rows] += step
-        best[rows] = np.maximum(tried, best[rows])
-        rows = rows[np.abs(step).max(axis=1) >= 1e-8]
-        if not len(rows):
-            break
-    return best, b
-
-
-def _penalised(design: Array, n: Array, left: Array, b: Array) -> Array:
-    """Log-likelihoods of the coefficients ``b`` (sets, terms) with Firth's penalty.
-
-    It is half the logarithm of the determinant of the information: Jeffreys' prior (Firth 1993).
-    """
-    linear = b @ design.T
-    p = expit(linear)
-    determinant = np.linalg.det(_information(design, n * p * (1 - p)))
-    fit = (left * linear - n * np.logaddexp(0, linear)).sum(axis=1)
-    return np.asarray(fit + np.log(np.maximum(determinant, 1e-300)) / 2)
-
-
-def _firth_step(design: Array, n: Array, left: Array, b: Array, free: tuple[int, ...]) -> Array:
-    """A Newton step (sets, terms) of the ``free`` coefficients from ``b``."""
-    alive = np.ones(len(b), bool)
-    p = expit(b @ design.T)
-    weights = n * p * (1 - p)
-    covariance, _ = _inverse(design, weights, alive)
-    # Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were split,
-    # and half of its leverage had gone either way (Heinze and Schemper 2002).
-    leverage = weights * (covariance.reshape(-1, design.shape[1] ** 2) @ _products(design).T)
-    score = (left - n * p + leverage * (0.5 - p)) @ design
-    step = np.zeros_like(b)
-    step[:, free] = np.einsum(
-        "bjk,bk->bj", _inverse(design[:, free], weights, alive)[0], score[:, free]
-    )
-    # Near separation a Newton step can leave the region where the information is regular.
-    return np.clip(step, -5, 5)
 
 
 def gap_fits(draws: Draws) -> tuple[Fits, Fits]:
     """The gap by least squares, with classical and with HC3 errors."""
     x, n = draws.gap_design, draws.n
-    alive = _rank(x, n) & (n.sum(axis=1) > x.shape[1])
-    inverse, _ = _inverse(x, n, alive)
+    alive = firth.identified(x, n) & (n.sum(axis=1) > x.shape[1])
+    inverse, _ = firth.inverse(x, n, alive)
     b = np.einsum("bjk,bk->bj", inverse, draws.gap @ x)
     fitted = b @ x.T
     # Sums of squares per condition, whose trials share their regressors and so their leverage.
@@ -294,28 +214,3 @@ def _gap_fit(draws: Draws, b: Array, covariance: Array, freedom: Array, alive: H
     played = (draws.n[:, more] > 0) & (draws.n[:, less] > 0)
     apart = Apart(b @ contrasts.T, apart_se, played)
     return Fits(GAP_TERMS, b, se, p, freedom, alive, apart)
-
-
-def _inverse(design: Array, weights: Array, alive: Holds) -> tuple[Array, Holds]:
-    """(X' W X)^-1 for each row of ``weights``, and where it exists; elsewhere the identity."""
-    information = _information(design, weights)
-    size = design.shape[1]
-    sound = alive & (np.linalg.det(information) > 1e-12)
-    return np.linalg.inv(np.where(sound[:, None, None], information, np.eye(size))), sound
-
-
-def _rank(design: Array, n: Array) -> Holds:
-    """In which data sets the conditions with trials tell all terms apart."""
-    information = _information(design, (n > 0).astype(float))
-    return np.asarray(np.linalg.matrix_rank(information) == design.shape[1])
-
-
-def _information(design: Array, weights: Array) -> Array:
-    """X' W X for each row of ``weights`` (sets, conditions)."""
-    size = design.shape[1]
-    return np.asarray((weights @ _products(design)).reshape(-1, size, size))
-
-
-def _products(design: Array) -> Array:
-    """The products of each two regressors, (conditions, regressors squared)."""
-    return np.asarray((design[:, :, None] * design[:, None, :]).reshape(len(design), -1))

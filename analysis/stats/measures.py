@@ -53,21 +53,13 @@ def estimate(group: Group, metric: Metric) -> Estimate:
 
 
 def median(sample: np.ndarray) -> Estimate:
-    """A median with its interval of order statistics, which no distribution is assumed for.
-
-    Of ``n`` sorted values the k-th and the (n + 1 - k)-th enclose it where as many as k - 1 heads
-    in n throws of a coin have a chance of at most 2.5 % (David and Nagaraja, Order Statistics,
-    section 7.1); with fewer than six values no such pair does.
-    """
-    n = len(sample)
-    if not n:
+    """A median with its interval of order statistics; fewer than six values have no interval."""
+    if not len(sample):
         return Estimate(None, None, None, 0)
     value = float(np.median(sample))
-    k = int(stats.binom.ppf((1 - LEVEL) / 2, n, 0.5))
-    if not k:
-        return Estimate(value, None, None, n)
-    ordered = np.sort(sample)
-    return Estimate(value, float(ordered[k - 1]), float(ordered[n - k]), n)
+    found = stats.quantile_test(sample, q=value, p=0.5).confidence_interval(LEVEL)
+    low, high = (None if np.isnan(end) else float(end) for end in found)
+    return Estimate(value, low, high, len(sample))
 
 
 def undecided(group: Group, metric: Metric) -> int:

@@ -7,6 +7,7 @@ columns of ``load_trials``; only finished trials count.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf, sqrt
 from typing import Protocol
@@ -16,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from analysis.stats import intervals
+from analysis.stats import firth, intervals
 
 Array = NDArray[np.float64]
 
@@ -28,9 +29,7 @@ GAP_TERMS = (
     "headway_x_velocity",
 )
 BY_SIDE = ("the left vehicle", "the right vehicle")
-# The defaults of firthmodels, 25 and 1e-4, are too few and too coarse under separation.
-MAX_ITERATIONS = 1000
-TOLERANCE = 1e-6
+MIN_PAIRS = 3  # fewer say nothing of how pairs vary
 # Gaps of a program can be equal but for the rounding of a step: that is no effect.
 STEADY_GAP_M = 0.01
 
@@ -179,33 +178,21 @@ def who_first_firth(trials: pd.DataFrame) -> Regression:
 
     It is finite under separation (Firth 1993; Heinze and Schemper 2002).
     """
-    from firthmodels import FirthLogisticRegression
-
     design, left = who_first_data(trials)
     problem = _unidentified(design, left, vehicles(trials))
     if problem:
         return Regression(len(left), {}, problem)
-    fit = FirthLogisticRegression(max_iter=MAX_ITERATIONS, gtol=TOLERANCE, xtol=TOLERANCE).fit(
-        design[:, 1:], left
-    )
-    if not fit.converged_:
+    cells, n, lefts = _cells(design, left)
+    (estimates,), (p_values,), found = firth.tested_fits(cells, n[None], lefts[None], (0, 1, 2))
+    if not found:
         return Regression(len(left), {}, "Firth's penalised fit does not converge")
-    fit.lrt()
-    estimates = np.array([fit.intercept_, *fit.coef_])
-    p = expit(design @ estimates)
-    information = design.T @ (design * (p * (1 - p))[:, None])
-    errors = np.sqrt(np.diag(np.linalg.inv(information)))
-    if not np.isfinite(fit.lrt_pvalues_).all():
-        return Regression(len(left), {}, "a likelihood-ratio test of Firth's fit does not converge")
+    p = expit(cells @ estimates)
+    errors = np.sqrt(np.diag(np.linalg.inv(cells.T @ (cells * (n * p * (1 - p))[:, None]))))
     return Regression(
         len(left),
         {
             name: Term(float(b), float(se), None, float(p))
-            for name, b, se, p in zip(
-                # firthmodels puts the intercept's test last.
-                *(WHO_FIRST_TERMS, estimates, errors, np.roll(fit.lrt_pvalues_, 1)),
-                strict=True,
-            )
+            for name, b, se, p in zip(WHO_FIRST_TERMS, estimates, errors, p_values, strict=True)
         },
     )
 
@@ -250,6 +237,32 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
     )
 
 
+def by_pairs(
+    fit: Callable[[pd.DataFrame], Regression], trials: pd.DataFrame, measure: str
+) -> Regression:
+    """A fit to those trials that have the measure, with errors clustered by human pair.
+
+    Errors are a jackknife over the pairs (CV3 of MacKinnon, Nielsen and Webb 2023), whose
+    correction holds for as few clusters as there are; tests are t on pairs - 1 degrees of freedom.
+    """
+    used = trials[(trials["status"] == "finished") & trials[measure].notna()]
+    whole, pairs = fit(used), used["pair"].dropna().unique()
+    if len(pairs) < MIN_PAIRS:
+        return Regression(whole.n, {}, f"{len(pairs)} pairs are too few for errors by pair")
+    parts = {pair: fit(used[used["pair"] != pair]) for pair in pairs} if whole.terms else {}
+    lacking = [f"without {pair}: {part.problem}" for pair, part in parts.items() if part.problem]
+    if whole.problem or lacking:
+        return Regression(whole.n, {}, whole.problem or lacking[0])
+    # CV3: the squares of what each pair moves an estimate by, about the whole fit and not the mean.
+    freedom = len(pairs) - 1
+    terms = {}
+    for name, term in whole.terms.items():
+        moved = sum((part.terms[name].b - term.b) ** 2 for part in parts.values())
+        terms[name] = wald_term(term.b, sqrt(moved * freedom / len(pairs)), freedom)
+    remark = f"errors by jackknife over {len(pairs)} pairs"
+    return Regression(whole.n, terms, freedom=freedom, remark=remark)
+
+
 def _terms(names: tuple[str, ...], fit: _Fit) -> dict[str, Term]:
     return {
         name: Term(float(b), float(se), float(statistic), float(p))
@@ -283,21 +296,18 @@ def _unidentified(design: Array, left: Array, called: tuple[str, str]) -> str:
 
 
 def _separated(design: Array, left: Array) -> str:
-    from firthmodels import detect_separation
-
-    # Trials that are alike separate no better than one of them, and take longer.
-    distinct = np.unique(np.column_stack([design, left]), axis=0)
-    found = detect_separation(distinct[:, 1:-1], distinct[:, -1])
-    if not found.separation:
+    infinite = firth.infinite_coefficients(*_cells(design, left))
+    if not infinite.any():
         return ""
-    infinite = [
-        name
-        for name, finite in zip(
-            (*WHO_FIRST_TERMS[1:], WHO_FIRST_TERMS[0]), found.is_finite, strict=True
-        )
-        if not finite
-    ]
-    return f"separation: no finite estimate of {', '.join(infinite)}; see Firth's fit"
+    # The level comes last, as it is said.
+    named = np.array([*WHO_FIRST_TERMS[1:], WHO_FIRST_TERMS[0]])[np.roll(infinite, -1)]
+    return f"separation: no finite estimate of {', '.join(named)}; see Firth's fit"
+
+
+def _cells(design: Array, left: Array) -> tuple[Array, Array, Array]:
+    """Trials of equal regressors as one binomial: design (k, 3), trials (k,), left-first (k,)."""
+    cells, place, trials = np.unique(design, axis=0, return_inverse=True, return_counts=True)
+    return cells, trials.astype(float), np.bincount(place, weights=left).astype(float)
 
 
 def _too_few(n: int, what: str) -> str:

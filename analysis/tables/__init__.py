@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
 from analysis.tables.formats import value_names, value_rows
@@ -18,23 +18,85 @@ if TYPE_CHECKING:
 
     from analysis.data.study import Group, Study
 
-# Maps each table to its module. A module is imported only when its table is computed, so that a
-# table stored in the database can be shown without waiting for pandas.
+
+class Listed(NamedTuple):
+    """A table as lists show it: the module of its maker, what it shows, its number in the paper."""
+
+    module: str
+    shows: str
+    number: str = ""
+
+
+# A module is imported only when its table is computed, so that a table stored in the database can
+# be shown without waiting for pandas.
 TABLES = {
-    "who-first": "regressions",
-    "gap": "regressions",
-    "indicators": "indicators",
-    "ablation-qualitative": "ablations",
-    "ablation-quantitative": "ablations",
-    "contrasts": "contrasts",
-    "factors": "factors",
-    "differences": "differences",
-    "velocity-profiles": "profiles",
-    "conflict-resolution": "conflicts",
-    "criticality": "conflicts",
-    "attempts": "attempts",
-    "first-action": "first_action",
-    "words": "words",
+    "who-first": Listed(
+        "regressions",
+        "logit of left-first on projected headway h (m) and relative velocity Δv (m/s), both left "
+        "minus right, of every driver and variant",
+        "Table III",
+    ),
+    "gap": Listed(
+        "regressions",
+        "least squares of the gap (m) on |h|, |Δv| and the signed product h·Δv, of every driver "
+        "and variant",
+        "Table IV",
+    ),
+    "indicators": Listed(
+        "indicators",
+        "I1 to I5, the score, and the quantitative measures",
+        "Table V",
+    ),
+    "ablation-qualitative": Listed(
+        "ablations",
+        "I1 to I5 of every driver and variant",
+        "Table VI",
+    ),
+    "ablation-quantitative": Listed(
+        "ablations",
+        "collisions, gap, RMSE and joint rate of every driver and variant",
+        "Table VII",
+    ),
+    "contrasts": Listed(
+        "contrasts",
+        "every prompt against its driver's reference, every baseline against the humans",
+    ),
+    "factors": Listed(
+        "factors",
+        "the levels of each factor of a study, of models and of prompts, pooled over all other "
+        "factors: every metric with its interval, and the difference from the reference",
+    ),
+    "differences": Listed(
+        "differences",
+        "every baseline against the humans in one model of both: who merged first, the gap",
+    ),
+    "velocity-profiles": Listed(
+        "profiles",
+        "the numbers behind I5, and by how much plans are revised",
+    ),
+    "conflict-resolution": Listed(
+        "conflicts",
+        "quartiles of the conflict resolution time, by condition",
+    ),
+    "criticality": Listed(
+        "conflicts",
+        "time to merge, post-encroachment time, time to collision, largest acceleration",
+    ),
+    "attempts": Listed(
+        "attempts",
+        "what became of the calls of every driver and variant: retried, lost, refused, truncated, "
+        "empty, invalid by reason, fallbacks, attempts whose fate is unknown, answers of another "
+        "model",
+    ),
+    "first-action": Listed(
+        "first_action",
+        "net acceleration at the first decision by own relative velocity, for every driver and "
+        "prompt, beside the humans'",
+    ),
+    "words": Listed(
+        "words",
+        "how often M is followed by yielding and Y by going, and what the first word follows",
+    ),
 }
 # The table that also has drivers that were only asked.
 OF_ASKED = "first-action"
@@ -45,7 +107,7 @@ def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
     from analysis.tables.against import placed
     from analysis.tables.notes import footnoted
 
-    made = [_with_unjudged(_maker(name)(study), study) for name in _valid(names)]
+    made = [_with_unjudged(_made(name, study), study) for name in _valid(names)]
     return [placed(footnoted(table, study), study) for table in made]
 
 
@@ -128,7 +190,7 @@ def _valid(names: Sequence[str]) -> Sequence[str]:
     return names or tuple(TABLES)
 
 
-def _maker(name: str) -> Callable[[Study], Table]:
-    module = import_module(f"analysis.tables.{TABLES[name]}")
+def _made(name: str, study: Study) -> Table:
+    module = import_module(f"analysis.tables.{TABLES[name].module}")
     maker: Callable[[Study], Table] = getattr(module, name.replace("-", "_"))
-    return maker
+    return replace(maker(study), number=TABLES[name].number)

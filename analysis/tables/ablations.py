@@ -90,7 +90,6 @@ def ablation_qualitative(study: Study) -> Table:
             *intermittency_notes(study),
             *sample_notes(study, study.groups),
         ),
-        "Table VI",
     )
 
 
@@ -107,7 +106,6 @@ def ablation_quantitative(study: Study) -> Table:
             RULES_NOTE,
             *sample_notes(study, study.groups),
         ),
-        "Table VII",
     )
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import pandas as pd
 
 from analysis.data.reference_data import citation, published
-from analysis.data.study import HUMAN, Group, Study
+from analysis.data.study import Group, Study
 from analysis.metrics import shown_in
+from analysis.names import HUMAN
 from analysis.stats.indicators import INDICATORS
 from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.drivers.registry import MOCKS

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from math import isinf
 
-from analysis.data.study import HUMAN, Group, Study, in_one_study
+from analysis.data.study import Group, Study, in_one_study
 from analysis.metrics import JUDGED, RULES_NOTE, Metric, compared
+from analysis.names import BASELINE, HUMAN
 from analysis.stats.against_humans import by_known_pairs, contrast_with_humans
 from analysis.stats.contrasts import contrast_cells, contrast_means, corrected, shared_cells
 from analysis.stats.intervals import Difference
@@ -14,7 +15,6 @@ from analysis.stats.joint import NO_PAIRS
 from analysis.stats.measures import known, outcomes_note, trials_of, undecided
 from analysis.tables.model import Column, Row, Table
 from analysis.tables.notes import listed, replayed_notes, sample_notes
-from merge_runner.study.file import BASELINE
 from merge_runner.text_safety import quoted
 
 # The columns that rest on human outcomes, in rows whose metric does.
@@ -55,7 +55,7 @@ def contrasts(study: Study) -> Table:
             Column(
                 "ci", "95 % CI", "interval", 2, "Newcombe; least squares; by pairs", optional=True
             ),
-            Column("p", "p", "p", 3, "Fisher's exact or permutation test; t test by pairs"),
+            Column("p", "p", "p", 3, "Fisher's exact test or t test"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
             Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
             Column(
@@ -71,13 +71,13 @@ def contrasts(study: Study) -> Table:
                 "n_reference", "n ref.", "count", 0, "trials of the reference in these conditions"
             ),
             Column("errors", "errors", meaning="what is taken as independent: trials, or pairs"),
-            Column("freedom", "df", "number", 0, "of a t test by pairs", optional=True),
+            Column("freedom", "df", "number", 0, "of a t test", optional=True),
         ),
         rows,
         (
             "all are compared within the conditions that both have: rates by the weights of Mantel "
             "and Haenszel, with Newcombe's interval and Fisher's exact test within conditions; "
-            "means by least squares, with a seeded permutation test. A family is one measure of "
+            "means by least squares, with its t test. A family is one measure of "
             "one driver over its prompts, or over all drivers against humans",
             *human_notes,
             "detectable: the smallest difference that is found at p < .05, before correction, with "

@@ -8,13 +8,13 @@ from __future__ import annotations
 from math import isinf
 
 from analysis.data.study import Group, Study
+from analysis.names import BASELINE
 from analysis.stats.intervals import Difference
 from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions, pairs_known
-from analysis.stats.mixed import MIN_PAIRS
+from analysis.stats.regressions import MIN_PAIRS
 from analysis.tables.model import Column, Row, Table, Value
 from analysis.tables.notes import replayed_notes, sample_notes
 from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
-from merge_runner.study.file import BASELINE
 
 OUTCOMES = {WHO_FIRST: "left first (logit)", GAP: "gap (m)"}
 COUNTS = {WHO_FIRST: WITH_MERGER, GAP: WITH_GAP}

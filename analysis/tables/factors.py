@@ -27,7 +27,7 @@ DIFFERENCES = (
     "differences are from the reference, the level that stands first, in the cells that both have "
     "(a cell is a condition with one level of each other factor): of rates by the weights of "
     "Mantel and Haenszel, with Newcombe's interval and Fisher's exact test within cells; of means "
-    "by least squares, with a seeded permutation test within cells; of medians without a test"
+    "by least squares with a level for each cell, and its t test; of medians without a test"
 )
 INTERACTIONS = (
     "an interaction (×) is the difference at that level minus the one at the first level of {by}, "
@@ -75,7 +75,7 @@ def factors(study: Study) -> Table:
             Column("ci", "95 % CI", "interval", 2, "of the measure", optional=True),
             _compared("difference", "difference", "number", "from the factor's reference"),
             _compared("difference_ci", "95 % CI", "interval", "of the difference"),
-            _compared("p", "p", "p", "exact or permutation test"),
+            _compared("p", "p", "p", "exact or t test"),
             _compared("p_holm", "Holm", "p", "corrected by Holm"),
         ),
         list(_corrected(rows, tested)),

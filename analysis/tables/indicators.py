@@ -80,7 +80,6 @@ def indicators(study: Study) -> Table:
             *intermittency_notes(study),
             *sample_notes(study, study.baselines),
         ),
-        "Table V",
     )
 
 

@@ -10,8 +10,14 @@ from analysis.data.study import Group, Study
 from analysis.stats.group_scores import fits
 from analysis.stats.indicators import GAP_MARGIN_M, equivalence_p, furthest_apart
 from analysis.stats.measures import outcomes_note
-from analysis.stats.mixed import gap_mixed, who_first_mixed
-from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS, Regression
+from analysis.stats.regressions import (
+    GAP_TERMS,
+    WHO_FIRST_TERMS,
+    Regression,
+    by_pairs,
+    gap_ols,
+    who_first_logit,
+)
 from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from analysis.tables.notes import sample_notes
 
@@ -39,7 +45,10 @@ def who_first(study: Study) -> Table:
     rows = []
     for term in WHO_FIRST_TERMS:
         for group in study.groups:
-            rows += [_who_first_row(group, term), *_mixed_rows(group, term, _who_first_mixed)]
+            rows += [
+                _who_first_row(group, term),
+                *_clustered_rows(group, term, _who_first_clustered),
+            ]
     return Table(
         "who-first",
         "Logistic regression of which driver merged first (1: left)",
@@ -58,7 +67,6 @@ def who_first(study: Study) -> Table:
             *sample_notes(study, study.groups),
             *_mixed_notes(study, "S4"),
         ),
-        "Table III",
     )
 
 
@@ -67,7 +75,7 @@ def gap(study: Study) -> Table:
     rows = []
     for term in GAP_TERMS:
         for group in study.groups:
-            rows += [_gap_row(group, term), *_mixed_rows(group, term, _gap_mixed)]
+            rows += [_gap_row(group, term), *_clustered_rows(group, term, _gap_clustered)]
     return Table(
         "gap",
         "Linear regression of the gap at the merge point (m, net of the vehicle length)",
@@ -105,7 +113,6 @@ def gap(study: Study) -> Table:
             *sample_notes(study, study.groups),
             *_mixed_notes(study, "S6"),
         ),
-        "Table IV",
     )
 
 
@@ -188,10 +195,10 @@ def _problems(*found: Regression) -> str:
     return "; ".join(dict.fromkeys(fit.problem for fit in found if fit.problem))
 
 
-def _mixed_rows(
-    group: Group, term: str, mixed: Callable[[Group], dict[str, tuple[str, Regression]]]
+def _clustered_rows(
+    group: Group, term: str, clustered: Callable[[Group], dict[str, tuple[str, Regression]]]
 ) -> list[Row]:
-    """The humans again, with a random intercept per pair; none before an import."""
+    """The humans again, with errors clustered by pair; none before an import."""
     # Only humans drove in pairs: repeated trials of a pair are alike, which the pooled fit ignores.
     if group.setting or not group.measured:
         return []
@@ -207,24 +214,26 @@ def _mixed_rows(
             fit.problem or fit.remark,
             item=f"{name}/{term}",
         )
-        for name, (label, fit) in mixed(group).items()
+        for name, (label, fit) in clustered(group).items()
     ]
 
 
 @cache
-def _who_first_mixed(group: Group) -> dict[str, tuple[str, Regression]]:
-    """The mixed model: its label and fit by the name of its rows; once for all terms."""
-    return {"mixed": (RANDOM_INTERCEPT, who_first_mixed(group.trials))}
+def _who_first_clustered(group: Group) -> dict[str, tuple[str, Regression]]:
+    """The logit by pairs: its label and fit by the name of its rows; once for all terms."""
+    fit = by_pairs(who_first_logit, group.trials, "merged_first")
+    return {"clustered": ("errors by pair", fit)}
 
 
 @cache
-def _gap_mixed(group: Group) -> dict[str, tuple[str, Regression]]:
+def _gap_clustered(group: Group) -> dict[str, tuple[str, Regression]]:
     """The same for our gap, and for the definition that the published mixed model uses."""
+    mean100 = "gap_mean100_m"
     return {
-        "mixed": (RANDOM_INTERCEPT, gap_mixed(group.trials)),
-        "mixed-mean100": (
-            f"{RANDOM_INTERCEPT}, mean at 100 m",
-            gap_mixed(group.trials, "gap_mean100_m"),
+        "clustered": ("errors by pair", by_pairs(gap_ols, group.trials, "gap_m")),
+        "clustered-mean100": (
+            "errors by pair, mean at 100 m",
+            by_pairs(lambda trials: gap_ols(trials, mean100), group.trials, mean100),
         ),
     }
 

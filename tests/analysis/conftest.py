@@ -11,7 +11,6 @@ import pytest
 from analysis.commands import main
 from analysis.data.study import Study
 from analysis.stats.ceiling import ceiling
-from analysis.stats.contrasts import _shuffles
 from analysis.tables import make_tables
 from tests.analysis.studies import ANSWERS, Said, write_study, yielding
 from tests.harness import CONFIGURING
@@ -59,13 +58,10 @@ def in_process(tmp_path, monkeypatch):
 def few_draws(monkeypatch):
     """For tests that look at no chance: never with the studies that others read."""
     monkeypatch.setattr("analysis.stats.ceiling.DATA_SETS", 20)
-    monkeypatch.setattr("analysis.stats.contrasts.PERMUTATIONS", 99)
-    # What is kept for all studies has another number of draws: the published humans, and shuffles.
+    # What is kept of the published humans has another number of draws.
     ceiling.cache_clear()
-    _shuffles.cache_clear()
     yield
     ceiling.cache_clear()
-    _shuffles.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -93,7 +93,7 @@ def test_a_cell_of_published_outcomes_names_no_imported_trial(imported):
         assert human.text.startswith("990 published outcomes"), (name, cell)
     for name, cell in (
         ("ablation-quantitative", "human:gap_m"),
-        ("who-first", "human/mixed/intercept:n"),
+        ("who-first", "human/clustered/intercept:n"),
     ):
         (human,) = explain(imported, tables[name], cell).sources
         assert len(human.trials) == 55, (name, cell)
@@ -120,9 +120,9 @@ def test_the_panels_have_published_outcomes_and_imported_gaps(imported):
     assert "66 imported trials" in found["caveat"]
 
 
-def test_humans_have_further_rows_with_a_random_intercept_per_pair(imported):
+def test_humans_have_further_rows_with_errors_by_pair(imported):
     for table in make_tables(imported, ["who-first", "gap"]):
-        rows = [row for row in table.rows if "/mixed/" in row.id]
+        rows = [row for row in table.rows if "/clustered/" in row.id]
         terms = {row.id.rpartition("/")[2] for row in table.rows}
         assert {row.id.rpartition("/")[2] for row in rows} == terms
         assert all(row.values.get("b") is not None or row.note for row in rows)

@@ -8,7 +8,7 @@ from html import unescape
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.analysis_worker import HUMAN, Numbers
+from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
 from analysis.explorer.charts import Kind, chart, marks
 from analysis.explorer.pictures import marker
@@ -17,6 +17,7 @@ from analysis.figures.styles import HUMAN_STYLE, MARKERS, driver_style
 from analysis.human.archive import open_files
 from analysis.human.load import import_trials, sort_files
 from analysis.metrics import GAP, RMSE
+from analysis.names import HUMAN
 from merge_runner.config import ScenarioConfig
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS

@@ -21,11 +21,10 @@ from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
 from analysis.explorer.child import Ended, NoAnswer
 from analysis.explorer.pages.ablations import ablations
-from analysis.explorer.pages.tables import ABOUT
 from analysis.explorer.pictures import ends_and_ticks
 from analysis.explorer.site import Site
 from analysis.metrics import METRICS, shown_in
-from analysis.tables import TABLES, make_tables
+from analysis.tables import make_tables
 from merge_runner.errors import MergeRunnerError
 from tests.analysis.studies import Said, write_study, yielding
 from tests.gate import HANGS_S
@@ -162,7 +161,6 @@ def test_a_cell_that_is_none_says_so(ask):
         assert "<p>the table attempts has no column 'nothing'</p>" in column
     assert "TABLE/ROW:COLUMN" in ask("/trials?cell=nothing", 404)
     assert "who-first" in ask("/tables/nothing", 404)
-    assert set(ABOUT) == set(TABLES)
 
 
 def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at_once(db):

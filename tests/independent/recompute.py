@@ -1,7 +1,7 @@
 """The tables of a results database, recomputed: {table: {row: {column: number or None}}}.
 
 Nothing of the project is imported. Rates are in percent. A row of ``contrasts`` or ``factors`` with
-a p has its ``family``, whose p are corrected together, and says whether p is ``simulated``.
+a p has its ``family``, whose p are corrected together.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
     # Who went first is published, trial by trial.
     who = humans or {("human", ""): measured.published_humans()}
     found = {
-        "who-first": _by_term(who | judged, WHO_FIRST, _who_first) | _mixed(recorded, "who-first"),
-        "gap": _by_term(humans | judged, GAP, _gap) | _mixed(recorded, "gap"),
+        "who-first": _by_term(who | judged, WHO_FIRST, _who_first)
+        | _clustered(recorded, "who-first"),
+        "gap": _by_term(humans | judged, GAP, _gap) | _clustered(recorded, "gap"),
         "ablation-qualitative": {_id(k): _qualities(v) for k, v in (humans | judged).items()},
         "ablation-quantitative": {_id(k): _quantities(v) for k, v in (humans | judged).items()},
         "indicators": _indicators(who | baselines),
@@ -144,25 +145,33 @@ def _gap(trials: pd.DataFrame) -> list[dict]:
     return rows
 
 
-def _mixed(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
-    """The humans with a random intercept per pair."""
+def _ordinary(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
+    return statistics.least_squares(x, y)[0]
+
+
+def _clustered(recorded: pd.DataFrame, table: str) -> dict[str, dict]:
+    """The humans with the errors of a jackknife over their pairs."""
     if recorded.empty:
         return {}
     if table == "who-first":
-        fits = {"mixed": (statistics.mixed_logit, who_first_data(recorded))}
+        data = {"clustered": (statistics.logit, who_first_data(recorded))}
         terms, names, other = WHO_FIRST, "b se z p", ("firth_b", "firth_se", "firth_p")
     else:
-        fits = {
-            "mixed": (statistics.mixed_least_squares, gap_data(recorded)),
-            "mixed-mean100": (statistics.mixed_least_squares, gap_data(recorded, "gap_mean100")),
+        data = {
+            "clustered": (_ordinary, gap_data(recorded)),
+            "clustered-mean100": (_ordinary, gap_data(recorded, "gap_mean100")),
         }
         terms, names, other = GAP, "b se t p", ("hc3_se", "hc3_p", "equivalence_p", "velocity_p")
-    return {
-        f"human/{name}/{term}": {"n": len(y)} | _columns(names, rows, k) | dict.fromkeys(other)
-        for name, (fit, (x, y, used)) in fits.items()
-        for rows in [fit(x, y, used["pair"].to_numpy())]
-        for k, term in enumerate(terms)
-    }
+    found = {}
+    for name, (fit, (x, y, used)) in data.items():
+        pair = used["pair"].to_numpy()
+        rows = statistics.by_pairs(fit, x, y, pair)
+        if rows is not None:
+            rows = statistics.wald(*rows.T, len(np.unique(pair)) - 1)
+        for k, term in enumerate(terms):
+            row = {"n": len(y)} | _columns(names, rows, k) | dict.fromkeys(other)
+            found[f"human/{name}/{term}"] = row
+    return found
 
 
 def _values(trials: pd.DataFrame, column: str, kind: str) -> pd.Series:
@@ -281,7 +290,7 @@ def _differences(recorded: pd.DataFrame, baselines) -> dict[str, dict]:
         sizes = HUMAN_TRIALS, HUMAN_TRIALS
     else:
         found = [who_first_data(recorded), gap_data(recorded)]
-        fits = (statistics.logit, lambda x, y: statistics.least_squares(x, y)[0])
+        fits = (statistics.logit, _ordinary)
         who, gap = (
             statistics.by_pairs(fit, x, y, used["pair"].to_numpy())
             for fit, (x, y, used) in zip(fits, found, strict=True)
@@ -410,7 +419,6 @@ def _level(trials, reference, column, kind, orders) -> dict:
     if found:
         row |= {"difference": found["difference"], "p": found["p"], "family": "all"}
         row |= {f"difference_{end}": found[end] for end in ("ci_low", "ci_high")}
-        row["simulated"] = found.get("simulated", False)
     return row
 
 

@@ -10,7 +10,6 @@ import pandas as pd
 import statsmodels.api as sm
 from scipy import optimize, stats
 
-DRAWS = 20_000
 Z = stats.norm.ppf(0.975)
 
 
@@ -95,11 +94,11 @@ def least_squares(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray | None, ...]
     rest = y - x @ b
     hat = np.einsum("ij,jk,ik->i", x, bread, x)
     plain = bread * (rest @ rest) / freedom
-    found = [_wald(b, np.sqrt(np.diag(plain)), freedom), None, None]
+    found = [wald(b, np.sqrt(np.diag(plain)), freedom), None, None]
     if hat.max() < 1 - 1e-9:
         meat = x.T @ (x * ((rest / (1 - hat)) ** 2)[:, None])
         found[2] = bread @ meat @ bread
-        found[1] = _wald(b, np.sqrt(np.diag(found[2])), freedom)
+        found[1] = wald(b, np.sqrt(np.diag(found[2])), freedom)
     return tuple(found)
 
 
@@ -122,72 +121,8 @@ def joint_p(b: np.ndarray, covariance: np.ndarray, freedom: int) -> float | None
     return stats.f.sf(b @ np.linalg.solve(covariance, b) / len(b), len(b), freedom)
 
 
-def _wald(b, se, freedom=np.inf) -> np.ndarray:
+def wald(b, se, freedom=np.inf) -> np.ndarray:
     return np.column_stack([b, se, b / se, 2 * stats.t.sf(np.abs(b / se), freedom)])
-
-
-def mixed_least_squares(x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray:
-    """A random intercept per pair, by restricted maximum likelihood; normal tests."""
-    groups = [(x[pair == name], y[pair == name]) for name in np.unique(pair)]
-
-    def solved(ratio):
-        inverses = [
-            np.eye(len(v)) - ratio / (1 + len(v) * ratio) * np.ones((len(v), len(v)))
-            for _, v in groups
-        ]
-        a = sum(u.T @ w @ u for (u, _), w in zip(groups, inverses, strict=True))
-        b = np.linalg.solve(a, sum(u.T @ w @ v for (u, v), w in zip(groups, inverses, strict=True)))
-        rest = sum(
-            (v - u @ b) @ w @ (v - u @ b) for (u, v), w in zip(groups, inverses, strict=True)
-        )
-        variance = rest / (len(y) - x.shape[1])
-        logs = sum(np.log1p(len(v) * ratio) for _, v in groups) + np.linalg.slogdet(a)[1]
-        return (len(y) - x.shape[1]) * np.log(variance) + logs, b, variance, a
-
-    best = optimize.minimize_scalar(
-        lambda log: solved(np.exp(log))[0], bounds=(-12, 6), options={"xatol": 1e-9}
-    )
-    _, b, variance, a = solved(np.exp(best.x))
-    return _wald(b, np.sqrt(variance * np.diag(np.linalg.inv(a))))
-
-
-def mixed_logit(x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray:
-    """The same of a logit, its likelihood integrated by adaptive quadrature of 41 points."""
-    nodes, weights = np.polynomial.hermite.hermgauss(41)
-    groups = [(x[pair == name], y[pair == name]) for name in np.unique(pair)]
-
-    def loss(theta):
-        b, sd = theta[:-1], theta[-1]
-        total = 0.0
-        for u, v in groups:
-            eta = u @ b
-            mode = 0.0
-            for _ in range(100):
-                p = 1 / (1 + np.exp(-eta - sd * mode))
-                curve = 1 + sd**2 * (p * (1 - p)).sum()
-                step = (sd * (v - p).sum() - mode) / curve
-                mode += step
-                if abs(step) < 1e-12:
-                    break
-            at = mode + np.sqrt(2 / curve) * nodes
-            line = eta[:, None] + sd * at
-            logs = v @ line - np.logaddexp(0, line).sum(axis=0) - at**2 / 2 + nodes**2
-            total += np.log(np.exp(logs - logs.max()) @ weights) + logs.max() - np.log(curve) / 2
-        return -total
-
-    start = np.r_[logit(x, y)[:, 0], 0.5]
-    best = optimize.minimize(loss, start, method="BFGS", options={"gtol": 1e-7}).x
-    best = optimize.minimize(loss, best, method="Nelder-Mead", options={"xatol": 1e-9}).x
-    step = 1e-4 * np.eye(len(best))
-    second = [
-        [
-            (loss(best + i + j) - loss(best + i - j) - loss(best - i + j) + loss(best - i - j))
-            / 4e-8
-            for j in step
-        ]
-        for i in step
-    ]
-    return _wald(best[:-1], np.sqrt(np.diag(np.linalg.inv(np.array(second))))[:-1])
 
 
 def by_pairs(fit, x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray | None:
@@ -289,9 +224,9 @@ def _detectable(n: int, m: int, rate: float) -> float | None:
 
 
 def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
-    """Two means by least squares with a level for each cell; p by permutation within cells.
+    """Two means by least squares with a level for each cell.
 
-    Empty where no cell has both.
+    Empty where no cell has both, or no error is left.
     """
     y = np.r_[one.to_numpy(float), other.to_numpy(float)]
     group = np.r_[np.ones(len(one)), np.zeros(len(other))]
@@ -302,23 +237,18 @@ def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
     x = np.column_stack([group, levels])
     bread = np.linalg.inv(x.T @ x)
     b = bread @ x.T @ y
-    found = {"difference": b[0], "ci_low": None, "ci_high": None, "detectable": None}
     freedom = len(y) - x.shape[1]
-    if freedom > 0:
-        se = np.sqrt(bread[0, 0] * ((y - x @ b) ** 2).sum() / freedom)
-        t = stats.t(freedom)
-        found |= {"ci_low": b[0] - t.ppf(0.975) * se, "ci_high": b[0] + t.ppf(0.975) * se}
-        found["detectable"] = (t.ppf(0.975) + t.ppf(0.8)) * se
-    # The estimate is linear in y: what a shuffle of the groups makes of it needs no other fit.
-    centred = y - levels @ np.linalg.lstsq(levels, y, rcond=None)[0]
-    rng, sums, spread = np.random.default_rng(1), np.zeros(DRAWS), 0.0
-    for k in np.unique(cell):
-        here, count = centred[cell == k], int(group[cell == k].sum())
-        spread += count * (len(here) - count) / len(here)
-        order = rng.random((DRAWS, len(here))).argsort(axis=1)[:, :count]
-        sums += here[order].sum(axis=1)
-    extreme = (np.abs(sums / spread) >= abs(b[0]) - 1e-9).sum()
-    return found | {"p": (extreme + 1) / (DRAWS + 1), "simulated": True}
+    if freedom <= 0:
+        return {}
+    se = np.sqrt(bread[0, 0] * ((y - x @ b) ** 2).sum() / freedom)
+    t = stats.t(freedom)
+    return {
+        "difference": b[0],
+        "ci_low": b[0] - t.ppf(0.975) * se,
+        "ci_high": b[0] + t.ppf(0.975) * se,
+        "p": 1.0 if abs(b[0]) < 1e-12 else 2 * t.sf(abs(b[0]) / se if se else np.inf),
+        "detectable": (t.ppf(0.975) + t.ppf(0.8)) * se,
+    }
 
 
 def by_pairs_within(one: pd.DataFrame, other: pd.DataFrame, *, rate: bool) -> dict:

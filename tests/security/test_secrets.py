@@ -142,7 +142,6 @@ async def test_no_key_and_no_account_id_is_in_anything_that_a_sweep_leaves(
     assert [run.code for run in runs] == [0] * len(runs), runs
     # What chance draws is of no interest here.
     monkeypatch.setattr("analysis.stats.ceiling.DATA_SETS", 20)
-    monkeypatch.setattr("analysis.stats.contrasts.PERMUTATIONS", 99)
     results = tmp_path / "results"
     report = write_report(
         results / "merge.duckdb", None, results / "report.html", tmp_path / "files"

@@ -16,11 +16,11 @@ from analysis.explorer.pictures import Scale, marker
 from analysis.explorer.site import NotThere, Site
 from analysis.metrics import COLLISIONS
 from analysis.metrics import JOINT as JOINT_RATE
+from analysis.names import BASELINE
 from analysis.tables.formats import printed, shown_value
 from analysis.tables.model import Column, Row, Table, Value, from_text
 from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
 
-BASELINE = "baseline"
 # The blocks of each prompt, as its spec names them; a program has none.
 STORED = """
 SELECT variant, any_value(names) AS names FROM listed JOIN (

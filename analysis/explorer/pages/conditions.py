@@ -13,8 +13,8 @@ from analysis.explorer.pictures import Axis, Scale
 from analysis.explorer.reading import Row
 from analysis.explorer.site import NotThere, Site, news_of
 from analysis.explorer.traces import MEASURES, read_band, read_traces
+from analysis.names import HUMAN
 
-HUMAN = "human"
 # So many trials are drawn: a browser can still show them, and more would be one dark spot.
 MOST = 500
 # Sizes in the picture, in its units.

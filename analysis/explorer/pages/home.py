@@ -8,7 +8,6 @@ from typing import Any
 
 from analysis.data.human_counts import human_counts, published_accounts
 from analysis.data.studies import DESCRIPTIONS
-from analysis.explorer.analysis_worker import HUMAN
 from analysis.explorer.catalogue import FACTOR, Filter
 from analysis.explorer.charts import Kind, drawn
 from analysis.explorer.conditions import ordered
@@ -20,6 +19,7 @@ from analysis.explorer.sweeps import standing_of
 from analysis.explorer.task_picture import task_picture
 from analysis.explorer.urls import HOME
 from analysis.metrics import GAP, LEFT_FIRST
+from analysis.names import HUMAN
 from analysis.tables.formats import notes_of, printed
 from analysis.tables.model import Table, from_text
 from merge_runner.results.validity import not_judged

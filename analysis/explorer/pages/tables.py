@@ -8,6 +8,7 @@ from typing import Any
 from analysis.explorer.analysis_process import Request
 from analysis.explorer.pages.computed import computed
 from analysis.explorer.site import NotThere, Site
+from analysis.figures import SHOWS as FIGURES
 from analysis.table_format import TableFormat
 from analysis.tables import TABLES
 from analysis.tables.formats import render, table_view
@@ -16,29 +17,7 @@ from merge_runner.errors import StoreError
 
 # What each shows, for the list: their own titles are known only when they are made.
 ABOUT = {
-    "who-first": "Table III: who merges first, by headway and relative velocity, for every prompt",
-    "gap": "Table IV: the gap, by headway and relative velocity, for every prompt",
-    "indicators": "Table V: the indicators I1 to I5, the score and the measures",
-    "ablation-qualitative": "Table VI: the indicators of every driver and variant",
-    "ablation-quantitative": "Table VII: the measures of every driver and variant",
-    "contrasts": "every variant against its baseline, every baseline against the humans",
-    "factors": "each level of a study's factors, models and prompts, pooled over the others",
-    "differences": "who merges first and the gap, against the humans in one model of both",
-    "velocity-profiles": "the numbers behind I5, and how much plans are revised",
-    "conflict-resolution": "when the conflict is resolved, by condition",
-    "criticality": "times to merge and to collision, the hardest acceleration",
-    "attempts": "what became of the calls",
-    "first-action": "the first action of every driver, by own relative velocity, beside humans",
-    "words": "what follows a tactical word, and what the first word follows",
-}
-# The figures of the report, which are drawn when they are asked for.
-FIGURES = {
-    "figure2": "Figure 2: speeds, who merges first, the gap and the RMSE, with the baseline",
-    "figure2-variants": "the same for every driver and prompt variant",
-    "ablation-matrix": "which indicators hold for which driver and variant",
-    "distributions": "every metric that is no share: median, quartiles and every trial",
-    "factors": "each level of a study's factors, by every metric",
-    "first-action": "the first action, by own relative velocity",
+    name: f"{one.number}: {one.shows}" if one.number else one.shows for name, one in TABLES.items()
 }
 # How a table can be downloaded, by the suffix of the file: its format, and the file's type.
 FILES = {

@@ -90,16 +90,6 @@ def fit(db: DbOption = DEFAULT_DB) -> None:
     print_out(_line(threshold_set(*fits), "\n"))
 
 
-@app.command()
-def outcomes() -> None:
-    """Print analysis/data/cei_outcomes.csv anew: what `merge-runner power` supposes of cei."""
-    from merge_runner_cei.calibration.shipped import SAMPLE_SETS, rows, trials
-
-    print_out("measure,term,value")
-    for measure, term, value in rows(trials(SAMPLE_SETS)):
-        print_out(f"{measure},{term},{value:.4f}")
-
-
 def _line(thresholds: ThresholdSet, between: str = ", ") -> str:
     return between.join(f"{name} = {value:.4f}" for name, value in asdict(thresholds).items())
 

@@ -52,6 +52,19 @@ def test_values_of_the_paper_and_of_the_humans_are_cited_as_theirs():
     assert "S4 and S6" in citation("human_mixed_models")
 
 
+def test_the_published_mixed_models_load():
+    tables = published("human_mixed_models").set_index(["table", "term"])
+    assert tables.apply(tuple, axis=1).to_dict() == {
+        ("S4", "intercept"): (-0.32, 0.212),
+        ("S4", "projected_headway"): (1.15, 0.08),
+        ("S4", "relative_velocity"): (-3.413, 0.321),
+        ("S6", "intercept"): (4.13, 0.45),
+        ("S6", "abs_projected_headway"): (0.15, 0.04),
+        ("S6", "abs_relative_velocity"): (-0.18, 0.17),
+        ("S6", "headway_x_velocity"): (0.18, 0.03),
+    }
+
+
 def test_the_human_counts_add_up_to_the_published_sums():
     counts = published("human_outcomes")
     assert list(counts["condition"]) == list(CONDITIONS)

@@ -12,17 +12,11 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from analysis.power.questions import BESIDE_HUMANS, OF_AN_ARM, OF_TWO_ARMS
-from analysis.power.samples import Conditions
-from analysis.power.search import Arms, Search, beside_humans
-from analysis.power.shown import table
-from analysis.power.study import power
-from analysis.power.truths import SPEED, human, planted, without_relative_speed
+from analysis.power.study import BESIDE_HUMANS, OF_AN_ARM, OF_TWO_ARMS, Case, Search, chances
+from analysis.power.truths import SPEED, Conditions, human, planted
 from analysis.stats.ceiling import ceiling, published_humans
 from analysis.stats.indicators import ROBUST, judged
 from analysis.stats.regressions import who_first_firth
-from analysis.table_format import TableFormat
-from analysis.tables.formats import render
 from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.planted_effect import PlantedEffect
@@ -38,13 +32,21 @@ HUMANS = Conditions(
     tuple(each.projected_headway_m for each in HUMAN_CONDITIONS.values()),
     tuple(each.relative_velocity_mps for each in HUMAN_CONDITIONS.values()),
 )
-HEADWAY_FOUND, SPEED_FOUND, GAP_FOUND, GAP_STEADY, ALL_FOUND = OF_AN_ARM
+_, SPEED_FOUND, GAP_FOUND, *_ = OF_AN_ARM
 STUDIES = 20
 PLANTED = """
 repetitions = 10
 [factors]
 x_relative_speed = [-3.3, -0.2]
 """
+
+
+def of_an_arm(test, truth, repetitions=10, *other):
+    return Case(test, "", truth.name, truth, repetitions, *other)
+
+
+def with_speed(value):
+    return human().changed("who_first", SPEED, value)
 
 
 @cache
@@ -72,7 +74,7 @@ def emulated(effect: PlantedEffect, repetitions: int, sample_set: int) -> pd.Dat
 @pytest.mark.parametrize("of_speed", [-0.9, -1.4, -2.2])
 def test_twenty_planted_studies_find_the_effect_at_the_stated_rate(of_speed):
     effect = PlantedEffect(x_relative_speed=of_speed)
-    stated = Search(HUMANS, 1000, 0).chance(SPEED_FOUND, Arms(planted(effect), 10), 10)
+    stated = Search(HUMANS, 1000, 0).chance(of_an_arm(SPEED_FOUND, planted(effect)), 10)
     found = sum(
         bool(judged(ROBUST["I2"], who_first_firth(emulated(effect, 10, study))).passed)
         for study in range(STUDIES)
@@ -83,75 +85,72 @@ def test_twenty_planted_studies_find_the_effect_at_the_stated_rate(of_speed):
 
 
 def test_the_chances_of_humans_are_their_ceiling():
-    search, arms = Search(HUMANS, 1000, 1), Arms(human(), 10)
+    search = Search(HUMANS, 1000, 1)
     shares = ceiling(published_humans(), (10,) * len(HUMAN_CONDITIONS)).robust
     for name, question in zip((*ROBUST, "I1-I4"), OF_AN_ARM, strict=True):
-        assert search.chance(question, arms, 10) == pytest.approx(shares[name], abs=0.06)
+        assert search.chance(of_an_arm(question, human()), 10) == pytest.approx(
+            shares[name], abs=0.06
+        )
 
 
 @pytest.mark.slow
 def test_the_chance_to_find_nothing_is_that_of_a_false_alarm():
-    search, truth = Search(HUMANS, 1000, 2), without_relative_speed()
+    search, truth = Search(HUMANS, 1000, 2), with_speed(0.0)
     # Two-sided tests at 5 %, of which one side counts; between two arms both do.
-    assert search.chance(SPEED_FOUND, Arms(truth, 10), 10) == pytest.approx(0.025, abs=0.015)
-    two = Arms(truth, 10, truth, 10)
-    gap, collisions = OF_TWO_ARMS
-    assert search.chance(gap, two, 10) == pytest.approx(0.05, abs=0.025)
-    assert search.chance(collisions, two, 10) < 0.05  # Fisher's test is conservative
+    assert search.chance(of_an_arm(SPEED_FOUND, truth), 10) == pytest.approx(0.025, abs=0.015)
+    gap, collisions = (of_an_arm(test, truth, 10, truth, 10) for test in OF_TWO_ARMS)
+    assert search.chance(gap, 10) == pytest.approx(0.05, abs=0.025)
+    assert search.chance(collisions, 10) < 0.05  # Fisher's test is conservative
 
 
 @pytest.mark.parametrize(
-    ("question", "arms"),
+    "case",
     [
-        (SPEED_FOUND, Arms(human(), 10)),
-        (GAP_FOUND, Arms(human(), 10)),
-        (BESIDE_HUMANS[0], beside_humans(human(), 10)),
-        (BESIDE_HUMANS[1], beside_humans(human(), 10)),
-        (OF_TWO_ARMS[0], Arms(human(), 10, human(), 5)),
+        of_an_arm(SPEED_FOUND, human()),
+        of_an_arm(GAP_FOUND, human()),
+        of_an_arm(BESIDE_HUMANS[0], human(), 10, human()),
+        of_an_arm(BESIDE_HUMANS[1], human(), 10, human()),
+        of_an_arm(OF_TWO_ARMS[0], human(), 10, human(), 5),
     ],
     ids=["speed", "gap slope", "humans", "collisions", "gap of two arms"],
 )
-def test_the_smallest_effect_is_found_with_a_chance_of_80_percent_in_other_studies_too(
-    question, arms
-):
-    smallest = Search(HUMANS, 400, 3).smallest(question, arms)
-    none = 0.0 if arms.other is None else question.effect.of(arms.other)
+def test_the_smallest_effect_is_found_with_a_chance_of_80_percent_in_other_studies_too(case):
+    smallest, none = Search(HUMANS, 400, 3).smallest(case), case.test.of(case.other)
     elsewhere = Search(HUMANS, 1000, 4)
 
     def chance(part):
-        truth = question.effect.put(arms.truth, none + part * smallest)
-        return elsewhere.chance(question, dataclasses.replace(arms, truth=truth), 10)
+        own = case.own.changed(case.test.field, case.test.at, none + part * smallest)
+        return elsewhere.chance(dataclasses.replace(case, own=own), 10)
 
     assert chance(1) == pytest.approx(0.8, abs=0.07)
     assert chance(0.5) < 0.6
 
 
 def test_so_many_trials_as_are_said_to_be_enough_are_enough_and_half_of_them_are_not():
-    arms = Arms(human().with_who_first(SPEED, -1.2), 10)
-    enough = Search(HUMANS, 400, 5).fewest_repetitions(SPEED_FOUND, arms)
+    case = of_an_arm(SPEED_FOUND, with_speed(-1.2))
+    enough = Search(HUMANS, 400, 5).fewest_repetitions(case)
     assert 10 < enough < 40
     elsewhere = Search(HUMANS, 1000, 6)
-    assert elsewhere.chance(SPEED_FOUND, arms, enough) == pytest.approx(0.8, abs=0.06)
-    assert elsewhere.chance(SPEED_FOUND, arms, enough // 2) < 0.7
+    assert elsewhere.chance(case, enough) == pytest.approx(0.8, abs=0.06)
+    assert elsewhere.chance(case, enough // 2) < 0.7
 
 
 def test_an_effect_that_four_times_the_trials_do_not_show_is_not_findable():
     search = Search(HUMANS, 200, 0)
-    weak = Arms(human().with_who_first(SPEED, -0.5), 10)
-    assert search.chance(SPEED_FOUND, weak, 40) < 0.8
-    assert search.fewest_repetitions(SPEED_FOUND, weak) is None
-    assert search.fewest_repetitions(SPEED_FOUND, Arms(human().with_who_first(SPEED, -1.2), 10))
+    weak = of_an_arm(SPEED_FOUND, with_speed(-0.5))
+    assert search.chance(weak, 40) < 0.8
+    assert search.fewest_repetitions(weak) is None
     # One condition cannot tell the cues apart, however often it is played.
     alone = Search(Conditions((4.0,), (-0.8,)), 50, 0)
-    assert alone.fewest_repetitions(SPEED_FOUND, Arms(human(), 10)) is None
-    assert alone.smallest(SPEED_FOUND, Arms(human(), 10)) is None
+    assert alone.fewest_repetitions(of_an_arm(SPEED_FOUND, human())) is None
+    assert alone.smallest(of_an_arm(SPEED_FOUND, human())) is None
 
 
 def powered(tmp_path, study, model=(), simulations=60, seed=0):
     plan = make_plan(study, model)
     options = Options(db=tmp_path / "none.duckdb", cache=tmp_path / "none")
     expected = asyncio.run(of_all(plan, options, say=print))
-    return power(plan, expected, simulations=simulations, seed=seed)
+    return chances(plan, expected, [], simulations=simulations, seed=seed)
 
 
 @pytest.mark.slow
@@ -160,42 +159,29 @@ def test_equal_seeds_give_equal_chances_and_other_seeds_others(tmp_path):
         powered(tmp_path, "baseline", simulations=20, seed=seed) for seed in (0, 0, 1)
     )
     assert one == same
-    assert one.chances != other.chances
+    assert one != other
 
 
 @pytest.mark.slow
 def test_a_planted_study_is_told_by_what_is_planted(tmp_path):
     (tmp_path / "planted.toml").write_text(PLANTED)
     found = powered(tmp_path, str(tmp_path / "planted.toml"))
-    assert {each.truth for each in found.chances} == {"as planted"}
-    speeds = {each.arms: each for each in found.chances if each.question == SPEED_FOUND.asked}
+    assert {each.truth for each in found} == {"as planted"}
+    speeds = {each.arms: each for each in found if each.question == SPEED_FOUND.question}
     strong, weak = speeds["x_relative_speed=-3.3",], speeds["x_relative_speed=-0.2",]
     assert (strong.effect, weak.effect) == (-3.3, -0.2)
     assert strong.enough < strong.trials == 110
     assert weak.enough is None
-    shown = render([table(found)], TableFormat.TEXT)
-    (line,) = (line for line in shown.splitlines() if SPEED_FOUND.asked in line and "=-0.2" in line)
-    assert line.rstrip().endswith("not findable")
-    assert "the whole study costs nothing" in shown
 
 
 @pytest.mark.long
-def test_a_usual_study_takes_less_than_20_seconds_of_one_core_and_costs_what_it_would(tmp_path):
+def test_a_usual_study_takes_less_than_20_seconds_of_one_core(tmp_path):
     began = time.process_time()
     found = powered(tmp_path, "ablations", ("o3",), simulations=200)
     assert time.process_time() - began < 20
-    assert found.trials == 495
-    half, once, twice = found.costs_usd
-    assert (half, twice) == (once / 2, once * 2)
-    assert 50 < once < 500
-    for each in found.chances:
-        # The whole study's cost, in proportion to the trials of the arm.
-        expected = None if each.enough is None else once * each.enough / each.trials
-        assert each.cost_usd == pytest.approx(expected)
     # Seven ablations of the same size are one row.
-    assert {len(each.arms) for each in found.chances} == {1, 7}
-    # Whether gaps are found does not hang on who merges first.
-    assert {each.truth for each in found.chances if each.table == "gap"} == {"human", "cei"}
+    assert {len(each.arms) for each in found} == {1, 7}
+    assert {each.truth for each in found} == {"human"}
 
 
 @pytest.mark.slow
@@ -235,14 +221,5 @@ add = [{text = "You are late."}]
 def test_a_planted_persona_is_supposed_where_the_prompt_contains_it(tmp_path):
     (tmp_path / "persona.toml").write_text(PERSONA)
     found = powered(tmp_path, str(tmp_path / "persona.toml"), simulations=20)
-    effects = {
-        each.arms[0]: each.effect for each in found.chances if each.question == SPEED_FOUND.asked
-    }
+    effects = {each.arms[0]: each.effect for each in found if each.question == SPEED_FOUND.question}
     assert effects == {"baseline": -3.3, "hurried": pytest.approx(-1.3)}
-
-
-@pytest.mark.slow
-def test_a_program_is_free_and_supposed_to_go_like_any_driver(tmp_path):
-    found = powered(tmp_path, "baseline", ("projected-order",), simulations=20)
-    assert found.free
-    assert {each.truth for each in found.chances} == {"human", "cei", "no relative velocity"}

@@ -16,8 +16,7 @@ from scipy.special import expit, logit
 from analysis.data.human_counts import human_counts
 from analysis.stats.against_humans import contrast_by_pairs
 from analysis.stats.contrasts import contrast_means
-from analysis.stats.joint import by_pairs
-from analysis.stats.regressions import Regression, differences, gap_ols, who_first_logit
+from analysis.stats.regressions import Regression, by_pairs, differences, gap_ols, who_first_logit
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 SEED = 260409609

@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-from itertools import combinations
 from math import comb, sqrt
 
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from analysis.stats import intervals
 from analysis.stats.contrasts import (
-    PERMUTATIONS,
     Cells,
     contrast_cells,
     contrast_means,
     corrected,
     detectable_rate,
-    first_in_shuffles,
     interaction_of_means,
     interaction_of_rates,
     rejected,
     shared_cells,
-    shuffled_sums,
     within,
 )
 
@@ -235,39 +229,7 @@ def within_conditions(first, second) -> float:
     return total / weights
 
 
-def enumerated(first, second) -> float:
-    """The exact share of all shuffles within conditions with as large a difference."""
-    ways = []
-    for name in NAMES:
-        mine, other = (list(g.loc[g["condition"] == name, "gap_m"]) for g in (first, second))
-        pool, n = mine + other, len(mine)
-        weight = n * len(other) / len(pool)
-        differences = [
-            sum(chosen) / n - (sum(pool) - sum(chosen)) / len(other)
-            for chosen in combinations(pool, n)
-        ]
-        ways.append((weight, differences))
-    (u, one), (v, two) = ways
-    found = [abs(u * a + v * b) / (u + v) for a in one for b in two]
-    assert len(found) == 150
-    observed = abs(within_conditions(first, second))
-    return sum(difference >= observed - 1e-9 for difference in found) / len(found)
-
-
-def test_the_permutation_p_is_that_of_all_shuffles_within_conditions():
-    exact = enumerated(FIRST, SECOND)
-    assert 0.1 < exact < 0.9
-    error = sqrt(exact * (1 - exact) / PERMUTATIONS)
-    assert contrast_means(FIRST, SECOND, "gap_m").p == pytest.approx(exact, abs=4 * error)
-
-
-def test_the_permutation_p_is_two_sided():
-    assert enumerated(SECOND, FIRST) == enumerated(FIRST, SECOND)
-    found = [contrast_means(*pair, "gap_m").p for pair in ((FIRST, SECOND), (SECOND, FIRST))]
-    assert found[0] == pytest.approx(found[1], abs=0.02)
-
-
-def test_the_interval_is_that_of_least_squares_with_a_level_for_each_condition():
+def test_interval_and_test_are_those_of_least_squares_with_a_level_for_each_condition():
     found = contrast_means(FIRST, SECOND, "gap_m")
     both = pd.concat([FIRST, SECOND])
     group_of = np.repeat([1.0, 0.0], [len(FIRST), len(SECOND)])
@@ -281,6 +243,8 @@ def test_the_interval_is_that_of_least_squares_with_a_level_for_each_condition()
     assert (found.low, found.high) == pytest.approx((b[0] - half, b[0] + half))
     t = stats.t(freedom)
     assert found.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * se)
+    assert found.p == pytest.approx(2 * t.sf(abs(found.value) / se))
+    assert found.freedom == freedom
 
 
 def mixes(shift, seed=2):
@@ -312,7 +276,7 @@ def test_a_difference_within_conditions_is_found():
     rng = np.random.default_rng(2)
     first = group(N_0_0=rng.normal(2, 1, 20), L_4_8=rng.normal(8, 1, 20))
     second = first.assign(gap_m=first["gap_m"] + 1.5)
-    assert contrast_means(first, second, "gap_m").p == 1 / (PERMUTATIONS + 1)
+    assert contrast_means(first, second, "gap_m").p < 0.001
 
 
 def test_trials_without_the_measure_do_not_count():
@@ -321,21 +285,19 @@ def test_trials_without_the_measure_do_not_count():
     assert found == contrast_means(FIRST, SECOND, "gap_m")
 
 
-def test_a_contrast_of_means_is_the_same_every_time():
-    found = contrast_means(FIRST, SECOND, "gap_m")
-    assert found == contrast_means(FIRST.copy(), SECOND.copy(), "gap_m")
-    assert found.p == 0.1072
-
-
 def test_where_nothing_varies_there_is_no_difference():
     equal = group(N_0_0=[3.0] * 4)
     found = contrast_means(equal, equal, "gap_m")
     assert (found.value, found.low, found.high, found.p) == (0, 0, 0, 1)
 
 
-def test_two_trials_alone_have_no_interval():
-    found = contrast_means(group(N_0_0=[3.0]), group(N_0_0=[4.0]), "gap_m")
-    assert (found.value, found.low, found.detectable, found.p) == (-1, None, None, 1)
+def test_where_nothing_varies_within_conditions_a_difference_is_sure():
+    found = contrast_means(group(N_0_0=[3.0] * 4), group(N_0_0=[2.0] * 4), "gap_m")
+    assert (found.value, found.low, found.high, found.p) == (1, 1, 1, 0)
+
+
+def test_two_trials_alone_have_no_test():
+    assert contrast_means(group(N_0_0=[3.0]), group(N_0_0=[4.0]), "gap_m") is None
 
 
 def test_a_family_is_corrected_by_holm_and_by_benjamini_and_hochberg():
@@ -355,17 +317,3 @@ def test_corrected_p_values_stay_at_most_1():
     holm, false_discovery = corrected([0.6, 0.9, 0.2])
     assert list(holm) == pytest.approx([1.0, 1.0, 0.6])
     assert list(false_discovery) == pytest.approx([0.9, 0.9, 0.6])
-
-
-@settings(max_examples=20)
-@given(st.integers(1, 40), st.data())
-def test_the_sums_of_shuffles_are_those_of_the_first_in_each_order(n, data):
-    """Drawn in parts, from the same stream of numbers, and leaving it where a whole draw does."""
-    count, seed = data.draw(st.integers(0, n)), data.draw(st.integers(0, 2**32))
-    value = np.random.default_rng(seed).normal(size=n)
-    plain, parts = np.random.default_rng(seed), np.random.default_rng(seed)
-    order = np.argsort(plain.random((PERMUTATIONS, n)), axis=1)
-    expected = value[order[:, :count]].sum(axis=1)
-    first = first_in_shuffles(parts, n, count)
-    assert np.allclose(shuffled_sums(first, value), expected, atol=1e-12)
-    assert plain.random() == parts.random()

@@ -17,8 +17,8 @@ from analysis.data.imported_humans import RECORDINGS, imported
 from analysis.data.reference_data import human_outcomes, published
 from analysis.data.study import Group
 from analysis.stats.intervals import detectable
-from analysis.stats.joint import GAP, WHO_FIRST, by_pairs, interactions
-from analysis.stats.regressions import gap_data, gap_ols, who_first_data
+from analysis.stats.joint import GAP, WHO_FIRST, interactions
+from analysis.stats.regressions import by_pairs, gap_data, gap_ols, who_first_data
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 H, V = np.array([(c.projected_headway_m, c.relative_velocity_mps) for c in CONDITIONS.values()]).T
@@ -105,6 +105,14 @@ def test_with_a_pair_for_each_trial_the_jackknife_gives_hc3_errors():
     for name, term in found.terms.items():
         # HC3 leaves out the factor (n - 1) / n.
         assert term.se == pytest.approx(hc3.terms[name].se * sqrt(109 / 110))
+
+
+@pytest.mark.parametrize("pairs", [0, 1, 2])
+def test_fewer_than_three_pairs_have_no_errors_by_pair(pairs):
+    named = [f"pair{i % pairs}" for i in range(110)] if pairs else None
+    found = by_pairs(gap_ols, driver().trials.assign(pair=named), "gap_m")
+    assert found.terms == {}
+    assert found.problem == f"{pairs} pairs are too few for errors by pair"
 
 
 def leverage_errors(trials):

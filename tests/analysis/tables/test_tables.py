@@ -14,6 +14,8 @@ import pytest
 from analysis.data.load import load
 from analysis.data.study import Study
 from analysis.explain import explain
+from analysis.explorer.pages.tables import ABOUT
+from analysis.figures import SHOWS
 from analysis.stats.group_scores import score
 from analysis.stats.intervals import proportion
 from analysis.table_format import TableFormat
@@ -26,6 +28,7 @@ from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Drive, changed, write_study, yielding
+from tests.harness import PROJECT
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "tables"
 CRASH = (0.0,)
@@ -40,6 +43,13 @@ def cell(table, row_id, column):
 def test_a_table_reads_as_its_golden_file(tables, name):
     text = render([tables[name]], TableFormat.TEXT)
     assert text + "\n" == (GOLDEN / f"{name}.txt").read_text(encoding="utf-8")
+
+
+def test_the_docs_list_the_tables_and_figures_as_the_explorer_does():
+    text = (PROJECT / "docs/reference/analysis.md").read_text(encoding="utf-8").replace("\\|", "|")
+    for shows in (ABOUT, SHOWS):
+        rows = [f"| `{name}` | {what} |" for name, what in shows.items()]
+        assert "\n".join(["|---|---|", *rows, ""]) in text
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
