@@ -12,8 +12,6 @@ Side = Literal["left", "right"]
 Road = Literal["merge", "straight"]
 Tactical = Literal["M", "Y"]
 Status = Literal["finished", "collided", "timeout", "failed"]
-# An arm of a study, which is a prompt variant where nothing else varies, and a condition.
-Cell = tuple[str, str]
 
 # The outcomes of an attempt that are answers.
 ANSWERS = ("ok", "refusal", "truncated", "empty")
@@ -219,11 +217,6 @@ class TrialSpec:
     pair: str | None = None
     factors: tuple[tuple[str, str], ...] = ()
     arm: str = ""
-
-    @property
-    def cell(self) -> Cell:
-        """Its arm of the study and its condition."""
-        return self.arm or self.variant or "", self.condition
 
 
 @dataclass(frozen=True, slots=True)

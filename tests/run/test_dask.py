@@ -318,6 +318,26 @@ def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
 
 
 @pytest.mark.long
+async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(merge_runner, started):
+    gate = Gate(40)
+    async with watched(gate.middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await started(*SIX, "--in-flight", 3, "--dask", "local:3", **env)
+        await all_held(gate, trials=3)
+        still = next(w for w in workers_of(process.pid) if held_from(gate, w))
+        still.suspend()
+        gate.open()
+        # Each worker has two trials of 19 calls, one at a time; those of the others are made.
+        async with asyncio.timeout(HANGS_S):
+            while len(gate.asked) < 76:
+                await asyncio.sleep(0.1)
+        still.resume()
+        code, _, err = await ended(process)
+    assert code == 0, err
+    assert not gate.asked_again
+
+
+@pytest.mark.long
 async def test_a_coordinator_that_is_killed_takes_its_workers_along(merge_runner, started):
     gate = Gate(40)
     async with watched(gate.middle) as server:
@@ -359,26 +379,22 @@ async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, n
 
 
 @pytest.mark.long
-async def test_requests_and_tokens_a_minute_hold_over_all_workers(merge_runner):
-    times, tokens = [], []
+async def test_requests_a_minute_hold_over_all_workers(merge_runner):
+    times = []
 
     async def middle(request, handler):
         times.append(time.monotonic())
-        reply = await handler(request)
-        usage = json.loads(reply.body)["usage"]
-        tokens.append(usage["prompt_tokens"] + usage["completion_tokens"])
-        return reply
+        return await handler(request)
 
     async with watched(middle) as server:
         run = await merge_runner(
-            *SIX, "--in-flight", 3, "--dask", "local:3", "--rpm", 600, "--tpm", 10**6,
+            *SIX, "--in-flight", 3, "--dask", "local:3", "--rpm", 600,
             EMULATOR_BASE_URL=f"{server.url}/v1",
         )  # fmt: skip
     assert run.code == 0, run.err
     # Half a second's worth goes at a time at each worker, and may come a little late; one limiter
     # of 600 for each would let three times as many through.
     assert fullest_window(times, [1] * len(times), length=1.0) <= 1.5 * 10 + 3
-    assert sum(tokens) <= 10**6
 
 
 @pytest.mark.long
