@@ -33,6 +33,7 @@ from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply, judge
+from merge_runner.llm.verify import DAMAGED
 from merge_runner.prompts.blocks import blocks_of
 from merge_runner.records import ANSWERS, SIDES, Attempt, Slot, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import in_use, use
@@ -52,7 +53,7 @@ from merge_runner.run.clients import sealed_clients
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.study.crossing import Arm
+from merge_runner.study.crossing import MOST_TRIALS, Arm
 from merge_runner.study.parts import declared_catalogue
 
 TOLERANCE = 1e-9
@@ -131,7 +132,7 @@ def _audit(
         _use_stored(plan)
         problems += _disagreements(plan, json.loads(config), sweep_id)
         plan, planned, specs = _part_that_is_here(connection, plan, notes)
-    except (ValueError, MergeRunnerError) as exc:
+    except (*DAMAGED, AttributeError, MergeRunnerError) as exc:
         text = f"its configuration cannot be read, so that its trials are not known: {_first(exc)}"
         problems.append(Finding("config", text, sweep_id))
     audit = check_sweep(connection, sweep_id, list(planned.items()), finished=finished)
@@ -155,6 +156,8 @@ def _part_that_is_here(
     Also all its trials, each with the hash of its spec, or none where that cannot be known, and
     the specs of the part. Raises ValueError for a format that there is not.
     """
+    if plan.trials > MOST_TRIALS:
+        raise ValueError(f"it has {plan.trials} trials")
     planned = {}
     arms = []
     conditions = tuple(name for name in plan.conditions if name in CONDITIONS)

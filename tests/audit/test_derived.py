@@ -127,6 +127,16 @@ def test_a_format_that_there_is_not_is_a_finding_and_switches_nothing_off_in_sil
     assert "has the format 'zz', which there is not" in finding.text
 
 
+@pytest.mark.parametrize(
+    "config",
+    ["'1'", "'[]'", "json_merge_patch(config, '{\"endpoints\": {\"emulator\": null}}')",
+     "json_merge_patch(config, '{\"study\": 1}')", "json_merge_patch(config, '{\"arms\": [1]}')"],
+)  # fmt: skip
+def test_a_configuration_that_cannot_be_read_is_a_finding(db, config):
+    change(db, f"UPDATE sweeps SET config = {config}")
+    assert "config" in {finding.kind for finding in findings(db)}
+
+
 @pytest.mark.slow
 def test_what_is_not_replayed_is_listed_in_the_docs_and_by_the_command(made, prepare):
     page = (PROJECT / "docs/reference/audit.md").read_text()
