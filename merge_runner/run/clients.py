@@ -25,7 +25,8 @@ from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.modes import batch_service, batch_terms, require_batch
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.budget import Budget, Unpaid
-from merge_runner.llm.cache import CallTotals, ResponseCache
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call_totals import CallTotals
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.first_call import FirstCall
 from merge_runner.llm.ledger import Ledger

@@ -24,7 +24,8 @@ from merge_runner.errors import (
     UsageError,
 )
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.cache import CallTotals, ResponseCache
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call_totals import CallTotals, call_totals
 from merge_runner.llm.content_hashes import canonical_json, manner
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger, Spending, scopes
@@ -238,7 +239,8 @@ class Sweep:
                 await self._store_rest(flusher, outcome)
             self._explain(self._misses, outcome)
             try:
-                outcome.cache_cost_usd = self._cache.cost_usd()
+                ledgers = (Ledger(self._cache, scope) for scope in scopes(self._cache))
+                outcome.cache_cost_usd = sum(ledger.read().spent_usd for ledger in ledgers)
                 outcome.spending = self._ledger.read()
             except MergeRunnerError as exc:
                 if self._options.replay:  # which spends nothing
@@ -306,8 +308,14 @@ class Sweep:
         for name, entry in self._plan.entries.items():
             sent = FORMATS[entry.format].request(entry, "")
             asked = manner(sent.path, canonical_json(sent.body))
-            facts[name] = self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
+            place = entry.id, self._plan.endpoints[name], asked
+            facts[name] = self._totals.get(place, CallTotals())
         return facts
+
+    @cached_property
+    def _totals(self) -> dict[tuple[str, str, str], CallTotals]:
+        """What the recorded calls took, by model, endpoint and how it was asked."""
+        return call_totals(self._cache.entries())
 
     def close(self) -> None:
         """Close what was opened, if the sweep is not run after all."""
@@ -355,10 +363,11 @@ class Sweep:
             return LocalRunner(plan, clients, in_flight)
         services = open_services(plan, options, self._cache, self._ledger, self._measured())
         urls = await start_endpoints(plan, options, stack)
+        answered = {(model, endpoint) for model, endpoint, _ in self._totals}
         known = frozenset(
             name
             for name, entry in plan.entries.items()
-            if plan.endpoints[name] in self._cache.stats(entry.id).totals
+            if (entry.id, plan.endpoints[name]) in answered
         )
         endpoint_plan = EndpointPlan(urls, options.strict_model, known)
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
@@ -570,8 +579,10 @@ class Sweep:
             configured += self._options.faults_identity
         if not self._options.replay:
             return configured
-        recorded = self._cache.recorded_endpoints(entry.id)
-        if configured in recorded or not recorded:
+        if configured in self._cache.recorded_endpoints(entry.id):
+            return configured
+        recorded = sorted(self._cache.recorded_endpoints(entry.id))
+        if not recorded:
             return configured
         if len(recorded) > 1:
             raise UsageError(

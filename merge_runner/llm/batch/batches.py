@@ -11,7 +11,7 @@ from merge_runner.llm.batch.journal import OpenLine
 from merge_runner.llm.batch.lines import Line
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.service import BatchLine
-from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid, UnpaidAttempt
+from merge_runner.llm.budget import Budget, PaidAttempt
 
 if TYPE_CHECKING:
     from merge_runner.llm.call import Call
@@ -24,7 +24,7 @@ class Batches:
     rounds: Rounds
     model: str
     ledger: str
-    money: Budget | Unpaid
+    money: Budget
     price_factor: float
 
     def takes_up(self, call: Call) -> bool:
@@ -37,11 +37,10 @@ class Batches:
     @asynccontextmanager
     async def attempt(
         self, call: Call, opened: OpenLine | None
-    ) -> AsyncIterator[tuple[PaidAttempt | UnpaidAttempt, Line]]:
+    ) -> AsyncIterator[tuple[PaidAttempt, Line]]:
         """The money of a call's next attempt, and its line, which may be ``opened`` already."""
         key, ledger = call.request.key, self.ledger
         asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.price_factor)
-        paid: PaidAttempt | UnpaidAttempt
         async with AsyncExitStack() as stack:
             if opened is None:
                 with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):

@@ -93,7 +93,7 @@ class Journal:
     def batch(self, mark: str) -> OpenBatch | None:
         """An open batch; None where there is none. A damaged row is none."""
         try:
-            text = self._cache.read_checked(_BATCH + mark)
+            text = self._cache.read(_BATCH + mark)
             return None if text is None else _OPEN_BATCH.validate_json(text)
         except (RecordingError, ValidationError):
             return None
@@ -187,7 +187,7 @@ class Journal:
             return True  # whoever asks for the call will set what is damaged aside
 
     def _write(self, batch: OpenBatch) -> None:
-        self._cache.replace_checked(_BATCH + batch.mark, _OPEN_BATCH.dump_json(batch).decode())
+        self._cache.replace(_BATCH + batch.mark, _OPEN_BATCH.dump_json(batch).decode())
 
 
 def now() -> str:
