@@ -71,8 +71,8 @@ class Outcome:
 
     ``stored_before`` trials were not played because they were stored already; ``suspended`` ones
     wait for money, and their replies are in the cache. ``meter`` counts the calls of this run,
-    ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` what all replies in
-    the cache cost when they were made. ``facts`` summarises what the database holds of the sweep,
+    ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` that of
+    all sweeps on the cache. ``facts`` summarises what the database holds of the sweep,
     and ``audit`` the checks made there; both are None where nothing is stored, or its user
     ``gave_up`` waiting for the database. ``batches`` are those that go on without this run.
     ``playing_s`` is how long the trials took, ``worst_stall_s`` the longest delay of the event
