@@ -193,15 +193,17 @@ class ResponseCache:
 
         That is another one where an import was first: a kept reply is never replaced.
         """
-        self.set_damage_aside(entry.request.key)
-        return await self.write(partial(self._keep, entry))
+        while (kept := await self.write(partial(self._keep, entry))) is None:
+            self.set_damage_aside(entry.request.key)
+        return kept
 
     def put_now(self, entries: Iterable[CachedCall]) -> list[CachedCall]:
         """Keep entries in one transaction, in this thread; returns those that are kept."""
         entries = list(entries)
         for entry in entries:
             self.set_damage_aside(entry.request.key)
-        return self.run_now([partial(self._keep, entry) for entry in entries])
+        kept = self.run_now([partial(self._keep, entry) for entry in entries])
+        return [each for each in kept if each is not None]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
         """Keep the entries that the cache lacks; returns (added, already there)."""
@@ -320,12 +322,15 @@ class ResponseCache:
             raise sqlite3.OperationalError("it was opened to be read alone")
         return self._texts
 
-    def _keep(self, entry: CachedCall) -> CachedCall:
+    def _keep(self, entry: CachedCall) -> CachedCall | None:
+        """An operation: keep an entry unless there is one; None where that is damaged."""
         key = entry.request.key
-        if not self._written.add(key, _behind_checksum(entry.to_json())):
-            return self._kept(key) or entry
-        self._written.delete(_UNANSWERED + key)
-        return entry
+        if self._written.add(key, _behind_checksum(entry.to_json())):
+            self._written.delete(_UNANSWERED + key)
+            return entry
+        with contextlib.suppress(RecordingError):
+            return self._kept(key)
+        return None
 
     def _holds(self, key: str) -> bool:
         try:

@@ -147,7 +147,9 @@ class LedgerFile:
 
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
         """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
-        rows = self.read(_BEGUN, call, tried)
+        rows: list[tuple[Any, ...]] = []
+        with contextlib.suppress(UsageError):  # which is told before anything is paid
+            rows = self.read(_BEGUN, call, tried)
         for number, (since,) in enumerate(rows, tried + 1):
             yield Attempt(
                 number=number,

@@ -26,8 +26,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import KEY_VERSION, call_key, canonical_json
-from merge_runner.llm.verify import DAMAGED, check_attempts, check_body, check_slot
+from merge_runner.llm.content_hashes import KEY_VERSION, canonical_json
+from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
 from merge_runner.results.database import Settings, in_memory
@@ -101,8 +101,6 @@ def export_recording(
     if file.is_dir():
         raise UsageError(f"{file} is a folder: name a file")
     refuse_another_kind(file, b"PAR1", "recording")
-    missing: list[str] = []
-    damaged: dict[str, str] = {}
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with (
@@ -110,12 +108,7 @@ def export_recording(
             in_memory(SETTINGS) as connection,
         ):
             connection.execute(f"ATTACH {quoted(f'{folder}/calls.duckdb')} AS file; USE file")
-            _append(connection, cache, keys, missing, damaged)
-            if missing:
-                raise RecordingError(
-                    f"{len(missing)} of {len(keys)} replies are not in the cache {cache.folder}, "
-                    f"the first is {missing[0]}: run the sweep again with this cache"
-                )
+            damaged = _collect(connection, cache, keys)
             _copy(connection, Path(folder) / "calls.parquet", provenance)
             os.replace(f"{folder}/calls.parquet", file)  # so that no reader sees half a file
     except (OSError, duckdb.Error) as exc:
@@ -130,17 +123,14 @@ def export_recording(
     return len(keys)
 
 
-def _append(
-    connection: duckdb.DuckDBPyConnection,
-    cache: ResponseCache,
-    keys: list[str],
-    missing: list[str],
-    damaged: dict[str, str],
-) -> None:
-    """Make a table of the entries under these keys, in the order of their slots."""
+def _collect(
+    connection: duckdb.DuckDBPyConnection, cache: ResponseCache, keys: list[str]
+) -> dict[str, str]:
+    """Make a table of the entries under these keys; returns what is wrong with damaged ones."""
     columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
     connection.execute(f"CREATE TABLE unordered ({columns})")
     appender, size = connection.appender("unordered"), 0
+    damaged: dict[str, str] = {}
     for key in keys:
         try:
             entry = cache.get(key)
@@ -148,8 +138,9 @@ def _append(
             damaged[key] = str(exc)
             continue
         if entry is None:
-            missing.append(key)
-            continue
+            raise RecordingError(
+                f"the reply {key} is not in the cache {cache.folder}: run the sweep again with it"
+            )
         row = _row(entry)
         appender.append_rows([row])
         size += len(row[-1]) + len(row[-2])
@@ -159,6 +150,7 @@ def _append(
     appender.flush()
     order = ", ".join((*SLOT, "call_key"))
     connection.execute(f"CREATE TABLE calls AS FROM unordered ORDER BY {order}")
+    return damaged
 
 
 def _copy(connection: duckdb.DuckDBPyConnection, file: Path, provenance: dict[str, str]) -> None:
@@ -190,22 +182,14 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
     content = hashlib.sha256()
     with opened(file) as connection:
         for number, values in enumerate(_rows(file, connection), 1):
-            row = dict(zip(COLUMNS, values, strict=True))
             try:
-                entry = _entry(row)
+                entry = _entry(dict(zip(COLUMNS, values, strict=True)))
             except DAMAGED as exc:
                 raise RecordingError(f"{file}: row {number} is damaged: {first_line(exc)}") from exc
-            key = entry.request.key
-            if key != row["call_key"]:
-                raise RecordingError(
-                    f"{file}: the content of row {number} does not belong to its key"
-                )
-            if not entry.attempts:
-                raise RecordingError(f"{file}: row {number} holds no reply")
-            if key in seen:
-                raise RecordingError(f"{file}: row {number} repeats {key}")
-            seen.add(key)
-            content.update(_fingerprint(key, row["attempts"]))
+            if entry.request.key in seen:
+                raise RecordingError(f"{file}: row {number} repeats {entry.request.key}")
+            seen.add(entry.request.key)
+            content.update(_fingerprint(values[0], values[-1]))
             yield entry
         told = _metadata(file, connection)
     if (str(len(seen)), content.hexdigest()) != (told.get("calls"), told.get("content_sha256")):
@@ -309,25 +293,22 @@ def _row(entry: CachedCall) -> tuple[Any, ...]:
 
 
 def _entry(row: dict[str, Any]) -> CachedCall:
-    """The entry of a row, under the key of its content; raises one of DAMAGED."""
+    """Return the entry of a row, which belongs to its key; raises one of DAMAGED."""
     if empty := [name for name, value in row.items() if value is None]:
         raise ValueError(f"it has no {', '.join(empty)}")
     if row["side"] not in SIDES:
         raise ValueError(f"its side is none of {', '.join(SIDES)}")
     check_body(row["body"])
-    slot = Slot(*(row[name] for name in SLOT))
-    check_slot(slot)
-    headers = HEADERS.validate_json(row["headers"], strict=True)
-    keyed = {"endpoint": row["endpoint"], "path": row["path"], "body": row["body"], "slot": slot}
-    attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
-    check_attempts(attempts)
     request = ChatRequest(
-        key=call_key(headers=headers, **keyed),
-        provider=row["provider"],
-        model=row["model"],
-        headers=headers,
-        **keyed,
+        key=row["call_key"],
+        headers=HEADERS.validate_json(row["headers"], strict=True),
+        slot=Slot(*(row[name] for name in SLOT)),
+        **{name: row[name] for name in ("provider", "endpoint", "model", "path", "body")},
     )
+    attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
+    if not attempts:
+        raise ValueError("it holds no reply")
+    check_call(request.key, request, attempts)
     return CachedCall(request, attempts)
 
 
