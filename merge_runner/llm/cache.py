@@ -406,6 +406,25 @@ class ResponseCache:
         return status.st_dev, status.st_ino
 
 
+def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
+    """Add what the cache lacks of another folder's replies; returns (added, already there).
+
+    Each is verified, and the folder is only read. Raises RecordingError, when all others are added,
+    if any was damaged or none of ours.
+    """
+    if folder.resolve() == cache.folder.resolve():
+        raise UsageError(f"{folder} is the cache itself: name another one with --cache")
+    left_out: list[str] = []
+    with contextlib.closing(ResponseCache(folder, read_only=True)) as source:
+        added, there = cache.add_missing(source.entries(left_out))
+    if left_out:
+        raise RecordingError(
+            f"{added} calls of {folder} added to {cache.folder}, {there} were there already, and "
+            f"{len(left_out)} rows are left out, the first: {left_out[0]}"
+        )
+    return added, there
+
+
 def _make(folder: Path) -> None:
     """Make the file whole or not at all, so that an empty one is never one that is being made."""
     with tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from threading import Lock
+from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 from merge_runner.errors import CacheFailed, UsageError
@@ -136,7 +136,8 @@ class LedgerFile:
     def __init__(self, folder: Path) -> None:
         self._file = folder / FILE
         self._connections: dict[str, sqlite3.Connection] = {}
-        self._one_at_a_time = Lock()
+        self._one_at_a_time = RLock()
+        self._in_transaction = False
         self.writer = BatchWriter(self.run_now)
 
     def read(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
@@ -160,15 +161,26 @@ class LedgerFile:
 
     def run_now(self, operations: list[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread; raises UsageError."""
+        with self.transaction():
+            return [operation() for operation in operations]
+
+    @contextlib.contextmanager
+    def transaction(self) -> Iterator[None]:
+        """Make what is written within it, in this thread, one durable transaction."""
         with self._told(), self._one_at_a_time:
+            if self._in_transaction:  # a part of the one around it
+                yield
+                return
             self.write("BEGIN IMMEDIATE")
+            self._in_transaction = True
             try:
-                results = [operation() for operation in operations]
+                yield
                 self.write("COMMIT")
             except BaseException:
                 self.write("ROLLBACK")
                 raise
-        return results
+            finally:
+                self._in_transaction = False
 
     def spending(self, scope: str, query: Query | None = None) -> Spending:
         """Return the sums of a sweep; raises UsageError where they cannot be."""

@@ -94,7 +94,9 @@ def refuse_others(folder: Path, connection: sqlite3.Connection) -> None:
             )
     sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
     (mark,) = connection.execute(sql, [FORMAT_KEY]).fetchone() or (b"1",)
-    if mark.isascii() and mark != FORMAT.encode():  # of a damaged one each entry is checked
+    if (
+        mark is not None and mark.isascii() and mark != FORMAT.encode()
+    ):  # of a damaged one each entry is checked
         raise UsageError(
             f"the cache {folder} has format {one_line(mark.decode()[:9])}, and this merge-runner "
             f"has format {FORMAT}: name another folder with --cache; `merge-runner recording "

@@ -126,7 +126,8 @@ class Journal:
         """
 
         def operation() -> OpenBatch:
-            begun = tuple(key for key in batch.keys if begin(key))
+            with self._cache.money.transaction():
+                begun = tuple(key for key in batch.keys if begin(key))
             taken = replace(batch, keys=begun)
             for key in begun:
                 line = OpenLine(batch.mark, attempts[key])
