@@ -24,6 +24,7 @@ import contextlib
 from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.cache import CachedCall
@@ -64,15 +65,17 @@ class PaidAttempt:
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
         """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
-        cap_usd = self.budget.cap_usd
-        if not await self.ledger.reserve(self.key, attempts, self.aside_usd, cap_usd, self.asked):
+        reserve = partial(self.set_aside, attempts)
+        if self.ledger.scope and not await self.ledger.cache.money.writer.write(reserve):
             raise TrialSuspended("another run spends from the same cap, and has used it up")
         self.begun()
 
     def set_aside(self, attempts: Sequence[Attempt]) -> bool:
         """Do the durable part of ``begin`` in this thread; False if the cap is used up."""
-        cap_usd = self.budget.cap_usd
-        return self.ledger.set_aside(self.key, attempts, self.aside_usd, cap_usd, self.asked)
+        number, cap_usd = len(attempts) + 1, self.budget.cap_usd
+        return not self.ledger.scope or self.ledger.reserve(
+            self.key, number, self.aside_usd, cap_usd, self.asked
+        )
 
     def begun(self) -> None:
         """What ``set_aside`` wrote is durable."""
@@ -186,7 +189,7 @@ class Budget:
         self, trial: int, key: str, asked: Asked, scope: str
     ) -> AsyncIterator[PaidAttempt]:
         """The money of an attempt that an earlier run has begun, under the ledger of this name."""
-        ledger = self.ledger.other(scope) if self.ledger.scope else self.ledger
+        ledger = Ledger(self.ledger.cache, scope) if self.ledger.scope else self.ledger
         paid = PaidAttempt(self, ledger, trial, key, asked, ledger.aside_usd(key), queued=False)
         self.in_flight += 1
         self._charge(trial, paid.aside_usd)

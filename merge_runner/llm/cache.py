@@ -44,6 +44,12 @@ CHECKSUM_LENGTH = 32
 BATCH = 1_000
 ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
 FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
+ADVICE = {
+    "read": "Put a copy of it back, or name another with --cache; the database and any exported "
+    "recording are not affected",
+    "written": "Every reply up to now is kept, those in flight are lost; when that is fixed, run "
+    "the same command again",
+}
 # Prefixes of keys that are no call keys.
 _UNANSWERED, _DAMAGED = "attempts ", "damaged "
 _GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
@@ -382,15 +388,9 @@ class ResponseCache:
                     "and what it kept with it. Put it back if you can, and run the same command "
                     "again: what is in no cache is asked again. The database is not affected"
                 ) from exc
-            advice = {
-                "read": "Put a copy of it back, or name another with --cache; the database and any "
-                "exported recording are not affected",
-                "written": "Every reply up to now is kept, those in flight are lost; when that is "
-                "fixed, run the same command again",
-            }
             why = str(exc) or "it cannot be locked to be written"
             raise CacheFailed(
-                f"the cache {self.folder} cannot be {done}: {why}. {advice[done]}"
+                f"the cache {self.folder} cannot be {done}: {why}. {ADVICE[done]}"
             ) from exc
 
     @property

@@ -12,7 +12,6 @@ import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any
@@ -248,7 +247,7 @@ class Ledger:
     def __init__(self, cache: ResponseCache, scope: str) -> None:
         self.spending = Spending()
         self.scope = scope
-        self._cache = cache
+        self.cache = cache
         # A damaged record is an error only where money is to be spent: a replay needs none.
         with contextlib.suppress(UsageError):
             self.read()
@@ -256,69 +255,41 @@ class Ledger:
     def read(self) -> Spending:
         """The current state; raises UsageError where its record is damaged."""
         if self.scope:
-            self.spending = self._cache.money.spending(self.scope)
+            self.spending = self.cache.money.spending(self.scope)
         return self.spending
 
-    async def reserve(
-        self,
-        key: str,
-        attempts: Sequence[Attempt],
-        worst_usd: float,
-        cap_usd: float | None,
-        asked: Asked,
-    ) -> bool:
-        """Reserve the worst case of a call's next attempt; False if that exceeds the cap."""
-        if not self.scope:
-            return True
-        operation = partial(self._reserve, key, len(attempts) + 1, worst_usd, cap_usd, asked)
-        return await self._cache.money.writer.write(operation)
-
-    def set_aside(
-        self,
-        key: str,
-        attempts: Sequence[Attempt],
-        worst_usd: float,
-        cap_usd: float | None,
-        asked: Asked,
-    ) -> bool:
-        """Do what ``reserve`` does, in this thread."""
-        operation = partial(self._reserve, key, len(attempts) + 1, worst_usd, cap_usd, asked)
-        return not self.scope or bool(self._cache.money.run_now([operation])[0])
-
-    def _reserve(
+    def reserve(
         self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
     ) -> bool:
-        money = self._cache.money
-        committed_usd = money.spending(self.scope, money.write).committed_usd
-        if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
-            return False
-        place = (asked.driver, asked.slot, asked.honest_usd or usd, _now(), IN_FLIGHT)
-        money.write(_RESERVE, self.scope, key, number, usd, *place)
+        """Reserve the worst case of an attempt at a call; False if that exceeds the cap."""
+        money = self.cache.money
+        with money.transaction():
+            committed_usd = money.spending(self.scope, money.write).committed_usd
+            if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
+                return False
+            place = (asked.driver, asked.slot, asked.honest_usd or usd, _now(), IN_FLIGHT)
+            money.write(_RESERVE, self.scope, key, number, usd, *place)
         return True
 
     def aside_usd(self, key: str) -> float:
         """What is reserved for the last attempt at a call; 0 where nothing is."""
         sql = "SELECT usd FROM open WHERE scope = ? AND call = ? ORDER BY attempt DESC LIMIT 1"
-        rows = self._cache.money.read(sql, self.scope, key) if self.scope else []
+        rows = self.cache.money.read(sql, self.scope, key) if self.scope else []
         return float(rows[0][0]) if rows else 0.0
-
-    def other(self, scope: str) -> Ledger:
-        """The ledger of this name in the same cache, which may be this one."""
-        return self if scope == self.scope else Ledger(self._cache, scope)
 
     async def settle(self, key: str, attempts: Sequence[Attempt], asked: Asked) -> None:
         """The last of a call's attempts brought no answer; its cost may be unknown."""
-        await self._cache.put_unanswered(key, tuple(attempts))
+        await self.cache.put_unanswered(key, tuple(attempts))
         await self._settle(key, attempts[-1], asked)
 
     async def keep(self, entry: CachedCall, asked: Asked) -> CachedCall:
         """Keep an answered call, then what its last attempt cost: killed between, all of it is."""
-        kept = await self._cache.put(entry)
+        kept = await self.cache.put(entry)
         await self._settle(entry.request.key, entry.attempts[-1], asked)
         return kept
 
     async def _settle(self, key: str, attempt: Attempt, asked: Asked) -> None:
-        money, place = self._cache.money, (self.scope, key, attempt.number)
+        money, place = self.cache.money, (self.scope, key, attempt.number)
 
         def operation() -> None:
             if attempt.cost_usd is None:  # it stays reserved: it may have been charged
@@ -339,11 +310,11 @@ class Ledger:
 
     def reasons(self) -> list[Reason]:
         """Why something is reserved, the largest sum first."""
-        return [Reason(*row) for row in self._cache.money.read(_REASONS, self.scope)]
+        return [Reason(*row) for row in self.cache.money.read(_REASONS, self.scope)]
 
     def release(self) -> None:
         """Count no longer what is reserved; nobody may be asking meanwhile."""
-        money = self._cache.money
+        money = self.cache.money
         money.run_now([lambda: money.write("DELETE FROM open WHERE scope = ?", self.scope)])
         self.read()
 

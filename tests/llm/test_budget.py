@@ -83,8 +83,8 @@ def test_what_is_spent_and_set_aside_never_exceeds_the_cap(plan, trial_usd):
         budget = Budget(ledger, CAP, each(trial_usd))
         reserve = ledger.reserve
 
-        async def watched(*arguments):
-            begun = await reserve(*arguments)
+        def watched(*arguments):
+            begun = reserve(*arguments)
             assert ledger.spending.committed_usd <= CAP + 1e-6
             return begun
 
@@ -339,10 +339,10 @@ O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
 
 async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
     for key, outcome in (("a", "timeout"), ("b", "timeout"), ("c", "server_error")):
-        await ledger.reserve(key, [], 0.25, None, O3)
+        ledger.reserve(key, 1, 0.25, None, O3)
         await ledger.settle(key, tried(None, outcome), O3)
-    await ledger.reserve("d", [], 0.125, None, O3)
-    await ledger.reserve("paid", [], 0.25, None, O3)
+    ledger.reserve("d", 1, 0.125, None, O3)
+    ledger.reserve("paid", 1, 0.25, None, O3)
     await ledger.settle("paid", tried(0.1), O3)
     reasons = ledger.reasons()
     assert [(r.outcome, r.attempts, r.usd) for r in reasons] == [
@@ -358,7 +358,7 @@ async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
 async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
     for number, outcome in enumerate(("timeout", "connection_lost", "bad_body"), 1):
         attempts = [Attempt(n, "x") for n in range(1, number)]
-        await ledger.reserve("key", attempts, 0.25, None, O3)
+        ledger.reserve("key", number, 0.25, None, O3)
         actual = 0.0 if outcome == "connection_lost" else None
         last = Attempt(number, outcome, cost_usd=actual)
         await ledger.settle("key", [*attempts, last], O3)
