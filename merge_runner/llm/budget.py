@@ -78,7 +78,7 @@ class PaidAttempt:
         )
 
     def begun(self) -> None:
-        """What ``set_aside`` wrote is durable."""
+        """Count the reservation no longer here: ``set_aside`` has made it durable."""
         self.queued = False
         self.budget.queued_usd -= self.aside_usd
 
@@ -143,18 +143,18 @@ class Budget:
         await self._in_queue(self._trials, trial, lambda first, _: self._begins(trial, first))
 
     def begin_anew(self, trial: int) -> None:
-        """The trial goes on where an earlier run has asked for it, so that it waits for nothing."""
+        """Admit a trial at once: it goes on where an earlier run has asked for it."""
         if self.cap_usd is not None and trial not in self._left:
             self._charged_usd.setdefault(trial, 0.0)
 
     def leave(self, trial: int) -> None:
-        """The trial has ended or is suspended, and needs no more money."""
+        """Free the money of a trial that has ended or is suspended."""
         self._left.add(trial)
         if self._charged_usd.pop(trial, None) is not None:
             self._wake()
 
     def readmit(self, trials: Iterable[int]) -> None:
-        """The worker that played these trials is gone, and they may be admitted anew."""
+        """Let the trials of a worker that is gone be admitted anew."""
         for trial in trials:
             self._charged_usd.pop(trial, None)
             self._left.discard(trial)
@@ -162,7 +162,7 @@ class Budget:
 
     @asynccontextmanager
     async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[PaidAttempt]:
-        """The money of one attempt; waits for it as ``set_aside`` does."""
+        """Yield the money of one attempt; waits for it as ``set_aside`` does."""
         paid = await self.set_aside(trial, key, asked)
         try:
             yield paid
@@ -188,7 +188,7 @@ class Budget:
     async def going_on(
         self, trial: int, key: str, asked: Asked, scope: str
     ) -> AsyncIterator[PaidAttempt]:
-        """The money of an attempt that an earlier run has begun, under the ledger of this name."""
+        """Yield the money of an attempt that an earlier run has begun under a ledger's name."""
         ledger = Ledger(self.ledger.cache, scope) if self.ledger.scope else self.ledger
         paid = PaidAttempt(self, ledger, trial, key, asked, ledger.aside_usd(key), queued=False)
         self.in_flight += 1
@@ -209,7 +209,7 @@ class Budget:
         self._wake()
 
     def _begins(self, trial: int, first: bool) -> bool:
-        """Whether a trial may begin: there is money for it beside all that have begun."""
+        """Begin a trial if there is money for it beside all that have begun."""
         if trial in self._charged_usd:  # its other driver stood in the queue, too
             return True
         if not first:
@@ -226,7 +226,7 @@ class Budget:
         return True
 
     def _taken(self, paid: PaidAttempt, waited_s: float) -> bool:
-        """Whether there is money for an attempt, which is taken."""
+        """Take the money for an attempt if there is any."""
         worst_usd, spending = self._worst_usd(paid.asked), self.ledger.read()
         left_usd = self._left_usd(spending) - worst_usd + TOLERANCE_USD
         if left_usd < 0 and not self.in_flight:
@@ -254,16 +254,15 @@ class Budget:
             self._charged_usd[trial] += usd
 
     def _worst_usd(self, asked: Asked) -> float:
-        """The worst case, scaled by this driver's largest observed cost overrun."""
+        """Return the worst case, scaled by this driver's largest observed cost overrun."""
         return asked.honest_usd * self.ledger.spending.times(asked.driver)
 
     def _left_usd(self, spending: Spending) -> float:
-        """What is neither spent nor reserved."""
         assert self.cap_usd is not None
         return self.cap_usd - spending.committed_usd - self.queued_usd
 
     def _needed_usd(self, trials: Iterable[int]) -> float:
-        """What these begun trials are still expected to cost."""
+        """Return what these begun trials are still expected to cost."""
         return sum(max(0.0, self.costs.usd(each) - self._charged_usd[each]) for each in trials)
 
     async def _in_queue(
@@ -289,7 +288,7 @@ class Budget:
             self._wake()
 
     def _wake(self) -> None:
-        """Something has changed for those who are first in their queues, or may go on anyway."""
+        """Wake those who are first in their queues, or may go on anyway."""
         for waiting in (*self._trials[:1], *self._attempts[:1]):
             waiting.changed.set()
         for waiting in self._trials:

@@ -71,7 +71,7 @@ class CachedCall:
     attempts: tuple[Attempt, ...]
 
     def to_json(self) -> str:
-        """The entry as one JSON text."""
+        """Return the entry as one JSON text."""
         return _STORED.dump_json(_Stored(1, self)).decode()
 
     @classmethod
@@ -101,7 +101,7 @@ _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 
 @dataclass(frozen=True, slots=True)
 class KnownCall:
-    """What is recorded of a call: its entry, or the attempts of earlier runs.
+    """The record of a call: its entry, or the attempts of earlier runs.
 
     ``damaged`` names what was found damaged and is in quarantine now.
     """
@@ -172,7 +172,7 @@ class ResponseCache:
         return self._read_overlay() if self._read_overlay else {}
 
     def get(self, key: str) -> CachedCall | None:
-        """The entry of a call key; raises RecordingError for one that is damaged or made up."""
+        """Return the entry of a call key; raises RecordingError where it is damaged or made up."""
         return self._overlay.get(key) or self._kept(key)
 
     async def claim(self, key: str) -> KnownCall | None:
@@ -238,7 +238,7 @@ class ResponseCache:
         return damaged
 
     def unanswered(self, key: str) -> tuple[Attempt, ...]:
-        """The attempts at a call that earlier runs made without an answer.
+        """Return the attempts at a call that earlier runs made without an answer.
 
         Those that a run began before it died are among them, with an unknown outcome.
         """
@@ -263,7 +263,7 @@ class ResponseCache:
         return results
 
     def read(self, name: str) -> str | None:
-        """The text that was kept under a name that is no call key, or None.
+        """Return the text that was kept under a name that is no call key, or None.
 
         Raises RecordingError where it is damaged, CacheFailed where the folder cannot be read.
         """
@@ -271,15 +271,15 @@ class ResponseCache:
         return None if text is None else _checked(text)
 
     def replace(self, name: str, text: str) -> None:
-        """An operation: keep a text under a name that is no call key, behind a checksum."""
+        """Keep a text under a name that is no call key, behind a checksum; an operation."""
         self._written.set(name, _behind_checksum(text))
 
     def remove(self, name: str) -> None:
-        """An operation: forget what is under a name that is no call key."""
+        """Forget the text under a name that is no call key; an operation."""
         self._written.delete(name)
 
     def names(self, prefix: str) -> list[str]:
-        """The names that begin so, of what is no call; damaged ones do not."""
+        """Return the names, none of a call, that begin with a prefix; damaged ones do not."""
         found = []
         with self._told("read"):
             for (name,) in self._reading.execute(_KEYS, [prefix, prefix + chr(0x10FFFF)]):
@@ -288,7 +288,7 @@ class ResponseCache:
         return found
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
-        """All entries, of the folder and of the overlay, each verified.
+        """Yield all entries, of the folder and of the overlay, each verified.
 
         What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
         """
@@ -307,7 +307,7 @@ class ResponseCache:
                 return
 
     def recorded_models(self, provider: str) -> list[str]:
-        """The models of a provider that have replied: the recording's, else the folder's."""
+        """Return the models of a provider that have replied: the recording's, else the folder's."""
         for entries in (self._overlay.values(), self._own_entries([])):
             requests = (entry.request for entry in entries)
             if models := {r.model for r in requests if r.provider == provider}:
@@ -329,7 +329,7 @@ class ResponseCache:
         return self._texts
 
     def _keep(self, entry: CachedCall) -> CachedCall | None:
-        """An operation: keep an entry unless there is one; None where that is damaged."""
+        """Keep an entry unless there is one; None where that is damaged; an operation."""
         key = entry.request.key
         if self._written.add(key, _behind_checksum(entry.to_json())):
             self._written.delete(_UNANSWERED + key)
@@ -363,7 +363,6 @@ class ResponseCache:
             return None if row is None else self._disk.fetch(*row)
 
     def _own_entries(self, left_out: list[str]) -> Iterator[CachedCall]:
-        """The entries of the folder; see ``entries``."""
         sql = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
         with self._told("read"):
             for row in self._reading.execute(_CALLS):
@@ -395,7 +394,7 @@ class ResponseCache:
 
     @property
     def _in_place(self) -> bool:
-        """Whether the file is still the one that was opened: SQLite writes on where it is gone."""
+        """True while the file is the one that was opened: SQLite writes on where it is gone."""
         try:
             return self._identity() == self._own
         except OSError:
@@ -463,7 +462,6 @@ def _verified(key: str, text: str) -> CachedCall:
 
 
 def _behind_checksum(text: str) -> str:
-    """A text as it is stored."""
     return hashlib.sha256(text.encode()).hexdigest()[:CHECKSUM_LENGTH] + text
 
 

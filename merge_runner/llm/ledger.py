@@ -85,7 +85,7 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """Why something is reserved: ``attempts`` at one driver that came to the same outcome.
+    """The reservations for ``attempts`` at one driver that came to the same outcome.
 
     ``first`` and ``last`` are UTC in ISO 8601; ``slot`` is one of those that it was for.
     """
@@ -115,16 +115,16 @@ class Spending:
 
     @property
     def committed_usd(self) -> float:
-        """What may have been spent, at worst."""
+        """The most that may have been spent."""
         return self.spent_usd + self.reserved_usd
 
     def times(self, driver: str) -> float:
-        """How often the worst case is reserved: more than once where a server ignores the cap."""
+        """Return how many worst cases are reserved: more than 1 where a server ignores the cap."""
         return self.overruns.get(driver, 1.0)
 
     @property
     def dearest(self) -> str:
-        """How much more than their worst case replies cost at most, by driver, in words."""
+        """The largest overruns by driver, in words."""
         ratios = self.overruns.items()
         return ", ".join(f"{driver} up to {ratio:.2f} times as much" for driver, ratio in ratios)
 
@@ -137,13 +137,15 @@ class LedgerFile:
         self._connections: dict[str, sqlite3.Connection] = {}
         self._one_at_a_time = RLock()
         self._in_transaction = False
+        self._made = False
         self.writer = BatchWriter(self.run_now)
 
     def read(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
         """Return the rows of a query; raises UsageError where the file is damaged."""
         with self._told():
-            made = self._file.exists() and self._execute("ro", _MADE)  # another may be making it
-            return self._execute("ro", sql, *values) if made else []
+            if not self._made:  # another process may be making it
+                self._made = self._file.exists() and bool(self._execute("ro", _MADE))
+            return self._execute("ro", sql, *values) if self._made else []
 
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
         """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
@@ -232,7 +234,7 @@ class LedgerFile:
 
 
 def scopes(cache: ResponseCache) -> list[str]:
-    """The names of all ledgers in a cache."""
+    """Return the names of all ledgers in a cache."""
     rows = cache.money.read("SELECT scope FROM spent UNION SELECT scope FROM open ORDER BY 1")
     return [scope for (scope,) in rows]
 
@@ -253,7 +255,7 @@ class Ledger:
             self.read()
 
     def read(self) -> Spending:
-        """The current state; raises UsageError where its record is damaged."""
+        """Return the current state; raises UsageError where its record is damaged."""
         if self.scope:
             self.spending = self.cache.money.spending(self.scope)
         return self.spending
@@ -272,13 +274,13 @@ class Ledger:
         return True
 
     def aside_usd(self, key: str) -> float:
-        """What is reserved for the last attempt at a call; 0 where nothing is."""
+        """Return the USD reserved for the last attempt at a call; 0 where nothing is."""
         sql = "SELECT usd FROM open WHERE scope = ? AND call = ? ORDER BY attempt DESC LIMIT 1"
         rows = self.cache.money.read(sql, self.scope, key) if self.scope else []
         return float(rows[0][0]) if rows else 0.0
 
     async def settle(self, key: str, attempts: Sequence[Attempt], asked: Asked) -> None:
-        """The last of a call's attempts brought no answer; its cost may be unknown."""
+        """Settle the last of a call's attempts, without an answer; its cost may be unknown."""
         await self.cache.put_unanswered(key, tuple(attempts))
         await self._settle(key, attempts[-1], asked)
 
@@ -309,7 +311,7 @@ class Ledger:
             self.read()
 
     def reasons(self) -> list[Reason]:
-        """Why something is reserved, the largest sum first."""
+        """Return the reservations by driver and outcome, the largest sum first."""
         return [Reason(*row) for row in self.cache.money.read(_REASONS, self.scope)]
 
     def release(self) -> None:

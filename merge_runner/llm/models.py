@@ -25,7 +25,7 @@ HOW_TO_RECORD = "docs/how-to/record-before-shutdown.md"
 
 
 def load_models(beside: Path | None = None) -> dict[str, ModelEntry]:
-    """The entries by name, each with a known format and provider; raises UsageError.
+    """Return the entries by name, each with a known format and provider; raises UsageError.
 
     Those of a ``models.toml`` in the working directory, in its ``experiments``, or ``beside`` a
     study are added to those that ship, and take the place of those of the same name.
@@ -55,7 +55,7 @@ def read_entries(path: Path) -> dict[str, ModelEntry]:
 
 
 def read_models(path: Path) -> dict[str, ModelEntry]:
-    """The entries of one file; raises UsageError."""
+    """Return the entries of one file; raises UsageError."""
     entries = read_entries(path)
     for name, entry in entries.items():
         try:

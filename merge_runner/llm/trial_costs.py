@@ -33,7 +33,7 @@ class TrialCalls:
 
 @dataclass(slots=True)
 class Answers:
-    """How many answers are measured, and what they cost together in USD."""
+    """The number of measured answers, and what they cost together in USD."""
 
     number: int = 0
     usd: float = 0.0
@@ -62,16 +62,16 @@ class TrialCosts:
         self._answers = defaultdict(Answers, earlier)
 
     def usd(self, trial: int) -> float:
-        """What the trial is expected to cost in USD."""
+        """Return the USD that a trial is expected to cost."""
         calls = self._calls.get(self._cell_of(trial), {})
         return sum(_usd(each, self._answers[model]) for model, each in calls.items())
 
     def models(self, trial: int) -> Collection[str]:
-        """The models that the trial asks."""
+        """Return the models that a trial asks."""
         return self._calls.get(self._cell_of(trial), {})
 
     def learn(self, model: str, usd: float) -> None:
-        """An answer of a model cost so much."""
+        """Count the cost of an answer of a model."""
         self._answers[model].add(usd)
 
 

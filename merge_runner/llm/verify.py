@@ -75,7 +75,7 @@ def _check_attempts(attempts: tuple[Attempt, ...]) -> None:
 
 @lru_cache(maxsize=1)  # who checks a reply reads it next
 def reply_object(text: str) -> dict[str, Any]:
-    """The JSON object that a reply is, not to be changed; raises one of DAMAGED for another."""
+    """Return the JSON object of a reply, not to be changed; raises one of DAMAGED."""
     value = json.loads(text)
     if not isinstance(value, dict):
         raise ValueError("a reply is not a JSON object")

@@ -177,7 +177,7 @@ def _copy(connection: duckdb.DuckDBPyConnection, file: Path, provenance: dict[st
 
 
 def read_recording(file: Path) -> Iterator[CachedCall]:
-    """All entries of a recording, each verified against its key; raises RecordingError."""
+    """Yield all entries of a recording, each verified; raises RecordingError."""
     seen: set[str] = set()
     content = hashlib.sha256()
     with opened(file) as connection:
@@ -271,12 +271,12 @@ def summarise(file: Path) -> Summary:
 
 
 def _fingerprint(key: str, attempts: str) -> bytes:
-    """The part of a row that the recording's hash covers directly; the key covers the rest."""
+    """Return what a recording's hash covers of a row; the key covers the rest."""
     return f"{key} {attempts}\n".encode()
 
 
 def _provenance_hash(metadata: dict[str, str]) -> str:
-    """A hash of everything that a file says about itself."""
+    """Return a hash of everything that a file says about itself."""
     told = {name: text for name, text in metadata.items() if name != PROVENANCE_HASH}
     return hashlib.sha256(canonical_json(told).encode()).hexdigest()
 
@@ -313,7 +313,7 @@ def _entry(row: dict[str, Any]) -> CachedCall:
 
 
 def opened(file: Path) -> duckdb.DuckDBPyConnection:
-    """A connection with the view ``recording``, not verified; RecordingError for a foreign file."""
+    """Return a connection with the view ``recording``, not verified; raises RecordingError."""
     if not file.is_file():
         raise UsageError(f"there is no recording {file}")
     connection = in_memory(SETTINGS)
@@ -367,13 +367,13 @@ def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def read_provenance(file: Path) -> dict[str, str]:
-    """What a recording says about its origin, not verified; raises RecordingError."""
+    """Return what a recording says about its origin, not verified; raises RecordingError."""
     with opened(file) as connection:
         return _metadata(file, connection)
 
 
 def sweeps_of(provenance: dict[str, str]) -> list[dict[str, str]]:
-    """The rows of the sweeps whose calls a recording holds, as it says itself."""
+    """Return the rows of the sweeps whose calls a recording holds, as it says itself."""
     if SWEEPS not in provenance:
         return [provenance]
     try:
@@ -383,7 +383,7 @@ def sweeps_of(provenance: dict[str, str]) -> list[dict[str, str]]:
 
 
 def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
-    """What a recording says of the sweeps that it is made of; see ``sweeps_of``."""
+    """Return the metadata of the sweeps that a recording is made of; see ``sweeps_of``."""
     rows = [
         {name: str(value) for name, value in row.items() if value is not None} for row in sweeps
     ]
@@ -407,7 +407,7 @@ def _rows(file: Path, connection: duckdb.DuckDBPyConnection) -> Iterator[tuple[A
 
 @contextmanager
 def readable(file: Path) -> Iterator[None]:
-    """What cannot be read of a recording is a RecordingError."""
+    """Raise RecordingError where a recording cannot be read."""
     try:
         yield
     except (duckdb.Error, UnicodeDecodeError) as exc:
@@ -421,5 +421,5 @@ def _listed(columns: dict[str, str]) -> str:
 
 
 def _pattern(file: Path) -> str:
-    """The file as a quoted pattern that matches it alone, whatever its name."""
+    """Return the file as a quoted pattern that matches it alone, whatever its name."""
     return quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))

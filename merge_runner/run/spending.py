@@ -22,12 +22,12 @@ class Account:
     reasons: list[Reason]
 
     def as_dict(self) -> dict[str, Any]:
-        """The account as JSON values."""
+        """Return the account as JSON values."""
         reasons = [asdict(reason) for reason in self.reasons]
         return {"sweep": self.sweep, **asdict(self.spending), "reasons": reasons}
 
     def lines(self) -> Iterator[str]:
-        """The account for a reader."""
+        """Yield the account in lines for a reader."""
         spending = self.spending
         yield (
             f"{self.sweep}: {spending.spent_usd:.4f} USD spent, {spending.reserved_usd:.4f} set "
@@ -51,7 +51,7 @@ class Account:
 
 
 def accounts(folder: Path) -> list[Account]:
-    """All ledgers of a cache folder; raises UsageError where there is none."""
+    """Return all ledgers of a cache folder; raises UsageError where there is none."""
     if not (folder / "cache.db").is_file():
         raise UsageError(f"there is no cache in {folder}, so nothing was spent: name it by --cache")
     with closing(ResponseCache(folder, read_only=True)) as cache:
@@ -60,7 +60,7 @@ def accounts(folder: Path) -> list[Account]:
 
 
 def account(folder: Path, sweep: str) -> Account:
-    """The ledger of one sweep; raises UsageError for one that is not there."""
+    """Return the ledger of one sweep; raises UsageError for one that is not there."""
     found = {each.sweep: each for each in accounts(folder)}
     if sweep not in found:
         raise unknown_name("sweep", sweep, found, f"with a ledger in {folder}")
