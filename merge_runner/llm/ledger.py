@@ -84,22 +84,6 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Reason:
-    """The reservations for ``attempts`` at one driver that came to the same outcome.
-
-    ``first`` and ``last`` are UTC in ISO 8601; ``slot`` is one of those that it was for.
-    """
-
-    driver: str
-    outcome: str
-    attempts: int
-    usd: float
-    first: str
-    last: str
-    slot: str
-
-
-@dataclass(frozen=True, slots=True)
 class Spending:
     """In USD: what attempts cost, and what is reserved for those whose cost is not known.
 
@@ -310,9 +294,14 @@ class Ledger:
             await money.writer.write(operation)
             self.read()
 
-    def reasons(self) -> list[Reason]:
-        """Return the reservations by driver and outcome, the largest sum first."""
-        return [Reason(*row) for row in self.cache.money.read(_REASONS, self.scope)]
+    def reasons(self) -> list[dict[str, Any]]:
+        """Return the reservations by driver and outcome, the largest sum in USD first.
+
+        ``first`` and ``last`` are UTC in ISO 8601; ``slot`` is one of those that they are for.
+        """
+        names = ("driver", "outcome", "attempts", "usd", "first", "last", "slot")
+        rows = self.cache.money.read(_REASONS, self.scope)
+        return [dict(zip(names, row, strict=True)) for row in rows]
 
     def release(self) -> None:
         """Count no longer what is reserved; nobody may be asking meanwhile."""

@@ -345,14 +345,14 @@ async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
     ledger.reserve("paid", 1, 0.25, None, O3)
     await ledger.settle("paid", tried(0.1), O3)
     reasons = ledger.reasons()
-    assert [(r.outcome, r.attempts, r.usd) for r in reasons] == [
+    assert [(r["outcome"], r["attempts"], r["usd"]) for r in reasons] == [
         ("timeout", 2, 0.5),
         ("server_error", 1, 0.25),
         ("in flight", 1, 0.125),
     ]
-    assert sum(r.usd for r in reasons) == pytest.approx(ledger.read().reserved_usd)
-    assert {(r.driver, r.slot) for r in reasons} == {(O3.driver, O3.slot)}
-    assert reasons[0].first <= reasons[0].last
+    assert sum(r["usd"] for r in reasons) == pytest.approx(ledger.read().reserved_usd)
+    assert {(r["driver"], r["slot"]) for r in reasons} == {(O3.driver, O3.slot)}
+    assert reasons[0]["first"] <= reasons[0]["last"]
 
 
 async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
@@ -362,7 +362,7 @@ async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
         actual = 0.0 if outcome == "connection_lost" else None
         last = Attempt(number, outcome, cost_usd=actual)
         await ledger.settle("key", [*attempts, last], O3)
-    assert {r.outcome: r.attempts for r in ledger.reasons()} == {"timeout": 1, "bad_body": 1}
+    assert {r["outcome"]: r["attempts"] for r in ledger.reasons()} == {"timeout": 1, "bad_body": 1}
 
 
 async def test_what_is_released_counts_no_longer(ledger, cache):
