@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
-from merge_runner.errors import CacheFailed, UsageError
+from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.write_batcher import BatchWriter, Operation
 from merge_runner.records import Attempt
 
@@ -55,6 +56,7 @@ INSERT INTO spent VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET usd = usd + e
 overrun_usd = overrun_usd + excluded.overrun_usd,
 most_overrun = max(most_overrun, excluded.most_overrun)
 """
+_IN_FLIGHT = "SELECT call, attempt, driver FROM open WHERE scope = ? AND outcome = 'in flight'"
 _NOTE = """
 UPDATE open SET outcome = ?
 WHERE rowid = (SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
@@ -269,30 +271,47 @@ class Ledger:
         await self._settle(key, attempts[-1], asked)
 
     async def keep(self, entry: CachedCall, asked: Asked) -> CachedCall:
-        """Keep an answered call, then what its last attempt cost: killed between, all of it is."""
+        """Keep an answered call, then settle its last attempt; see also ``settle_kept``."""
         kept = await self.cache.put(entry)
         await self._settle(entry.request.key, entry.attempts[-1], asked)
         return kept
 
     async def _settle(self, key: str, attempt: Attempt, asked: Asked) -> None:
-        money, place = self.cache.money, (self.scope, key, attempt.number)
-
-        def operation() -> None:
-            if attempt.cost_usd is None:  # it stays reserved: it may have been charged
-                money.write(_NOTE, attempt.outcome, *place)
-                return
-            rows = money.write(_CLOSE, *place)
-            # A batch may end after its money was released: then nothing is known to compare with.
-            usd, worst_usd = rows[0] if rows else (attempt.cost_usd, attempt.cost_usd)
-            overrun_usd = attempt.cost_usd - usd
-            overran = overrun_usd > TOLERANCE_USD
-            ratio = attempt.cost_usd / max(worst_usd, TOLERANCE_USD) if overran else 0.0
-            over = (overrun_usd if overran else 0.0, ratio)
-            money.write(_PAY, self.scope, asked.driver, attempt.cost_usd, *over)
-
         if self.scope:
-            await money.writer.write(operation)
+            operation = partial(self._settled, key, attempt, asked.driver)
+            await self.cache.money.writer.write(operation)
             self.read()
+
+    def _settled(self, key: str, attempt: Attempt, driver: str) -> None:
+        money, place = self.cache.money, (self.scope, key, attempt.number)
+        if attempt.cost_usd is None:  # it stays reserved: it may have been charged
+            money.write(_NOTE, attempt.outcome, *place)
+            return
+        rows = money.write(_CLOSE, *place)
+        # A batch may end after its money was released: then nothing is known to compare with.
+        usd, worst_usd = rows[0] if rows else (attempt.cost_usd, attempt.cost_usd)
+        overrun_usd = attempt.cost_usd - usd
+        overran = overrun_usd > TOLERANCE_USD
+        ratio = attempt.cost_usd / max(worst_usd, TOLERANCE_USD) if overran else 0.0
+        over = (overrun_usd if overran else 0.0, ratio)
+        money.write(_PAY, self.scope, driver, attempt.cost_usd, *over)
+
+    def settle_kept(self, drivers: Collection[str]) -> None:
+        """Settle attempts that were kept right before their run was killed.
+
+        No other run may ask these drivers meanwhile.
+        """
+        money = self.cache.money
+        for key, number, driver in money.read(_IN_FLIGHT, self.scope):
+            with contextlib.suppress(RecordingError):
+                entry = self.cache.get(key)
+                for attempt in entry.attempts if entry else self.cache.unanswered(key):
+                    if (
+                        driver in drivers
+                        and attempt.number == number
+                        and attempt.outcome != "unknown"
+                    ):
+                        money.run_now([partial(self._settled, key, attempt, driver)])
 
     def reasons(self) -> list[dict[str, Any]]:
         """Return the reservations by driver and outcome, the largest sum in USD first.

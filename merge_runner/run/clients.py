@@ -13,6 +13,7 @@ from merge_runner.config import (
     ModelEntry,
     base_urls,
     check_network,
+    driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
     running_emulator_url,
@@ -102,6 +103,7 @@ def open_services(
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
+        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
     # An account's limits are those of a model, with whatever parameters it is asked.

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from merge_runner.errors import TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.trial_costs import TrialCalls, TrialCosts
 from merge_runner.records import Attempt, ChatRequest, Slot
@@ -373,6 +374,23 @@ async def test_what_is_released_counts_no_longer(ledger, cache):
     again = Ledger(cache, ledger.scope)
     assert (again.spending.committed_usd, again.reasons()) == (0, [])
     await set_aside(Budget(again, 1.0), 1, 0.5)
+
+
+async def test_an_answer_that_was_kept_right_before_a_kill_is_settled_by_the_next_run(
+    ledger, cache
+):
+    slot = Slot("N_0_0", 1, "left", 0, 0)
+    request = make_request(
+        provider="openai", endpoint="e", model="m", path="/p", headers={}, body={}, slot=slot
+    )
+    for key in (request.key, "another"):
+        ledger.reserve(key, 1, 0.25, None, O3)
+    await cache.put(CachedCall(request, (Attempt(1, "ok", 200, cost_usd=0.125, reply="{}"),)))
+    ledger.settle_kept({"another driver"})
+    assert ledger.read().spent_usd == 0
+    ledger.settle_kept({O3.driver})
+    spending = ledger.read()
+    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.125, 0.25, 1)
 
 
 async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
