@@ -28,7 +28,8 @@ FILE = "ledger.db"
 BUSY_S = 600.0
 TOLERANCE_USD = 1e-9  # sums of floats
 IN_FLIGHT = "in flight"
-Query = Callable[..., list[tuple[Any, ...]]]
+Rows = list[tuple[Any, ...]]
+Query = Callable[..., Rows]
 TABLES = """
 CREATE TABLE IF NOT EXISTS spent (
   scope TEXT, driver TEXT, usd REAL NOT NULL, overrun_usd REAL NOT NULL,
@@ -65,6 +66,10 @@ _CLOSE = """
 DELETE FROM open
 WHERE rowid = (SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
 RETURNING usd, worst_usd
+"""
+_ROWS_SPENT = "SELECT driver, usd, overrun_usd, most_overrun FROM spent WHERE scope = ?"
+_ROWS_OPEN = """
+SELECT call, attempt, usd, driver, slot, worst_usd, since, outcome FROM open WHERE scope = ?
 """
 _REASONS = """
 SELECT driver, outcome, count(*), sum(usd), min(since), max(since), min(slot) FROM open
@@ -312,6 +317,21 @@ class Ledger:
                         and attempt.outcome != "unknown"
                     ):
                         money.run_now([partial(self._settled, key, attempt, driver)])
+
+    def rows(self) -> tuple[Rows, Rows]:
+        """Return the rows of what is spent and of what is open, for ``settle_share``."""
+        read = self.cache.money.read
+        return read(_ROWS_SPENT, self.scope), read(_ROWS_OPEN, self.scope)
+
+    def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
+        """Put what a task has spent, and has open, in the place of the share reserved for it."""
+        money = self.cache.money
+        with money.transaction():
+            money.write("DELETE FROM open WHERE scope = ? AND call = ?", self.scope, name)
+            for row in spent:
+                money.write(_PAY, self.scope, *row)
+            for row in opened:
+                money.write(_RESERVE, self.scope, *row)
 
     def reasons(self) -> list[dict[str, Any]]:
         """Return the reservations by driver and outcome, the largest sum in USD first.

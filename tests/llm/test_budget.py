@@ -393,6 +393,20 @@ async def test_an_answer_that_was_kept_right_before_a_kill_is_settled_by_the_nex
     assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.125, 0.25, 1)
 
 
+async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledger, tmp_path):
+    cache = ResponseCache(tmp_path)
+    task = Ledger(cache, "task")
+    for key in ("a", "b"):
+        task.reserve(key, 1, 0.25, None, O3)
+    await task.settle("a", tried(0.5), O3)
+    ledger.reserve("task 1", 1, 2.0, None, O3)
+    ledger.settle_share("task 1", *task.rows())
+    assert ledger.read() == task.read()
+    assert (ledger.spending.spent_usd, ledger.spending.reserved_usd) == (0.5, 0.25)
+    assert ledger.spending.times(O3.driver) == 2
+    cache.close()
+
+
 async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
     budget = Budget(ledger, 10.0)
     async with budget.attempt(1, "key", O3) as paid:
