@@ -247,8 +247,21 @@ class ResponseCache:
 
     async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
         """Keep the attempts at a call that has no answer yet, durably."""
-        text = ATTEMPTS.dump_json(attempts).decode()
-        await self.write(lambda: self.replace(_UNANSWERED + key, text))
+        await self.write(partial(self.keep_all, (), {key: attempts}))
+
+    def keep_all(
+        self, entries: Iterable[CachedCall], unanswered: Mapping[str, tuple[Attempt, ...]]
+    ) -> None:
+        """Keep entries, and the attempts at calls that have no answer yet; an operation."""
+        for entry in entries:
+            self._keep(entry)
+        for key, attempts in unanswered.items():
+            self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())
+
+    def all_unanswered(self) -> dict[str, tuple[Attempt, ...]]:
+        """Return the attempts at all calls without an answer, by call key."""
+        keys = (name.removeprefix(_UNANSWERED) for name in self.names(_UNANSWERED))
+        return {key: self._tried(key) for key in keys}
 
     async def write(self, operation: Callable[[], ResultT]) -> ResultT:
         """Run an operation on this cache in the next durable batch; raises CacheFailed."""

@@ -131,7 +131,7 @@ class LedgerFile:
         self._made = False
         self.writer = BatchWriter(self.run_now)
 
-    def read(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
+    def read(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises UsageError where the file is damaged."""
         with self._told():
             if not self._made:  # another process may be making it
@@ -140,7 +140,7 @@ class LedgerFile:
 
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
         """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
-        rows: list[tuple[Any, ...]] = []
+        rows: Rows = []
         with contextlib.suppress(UsageError):  # which is told before anything is paid
             rows = self.read(_BEGUN, call, tried)
         for number, (since,) in enumerate(rows, tried + 1):
@@ -185,7 +185,7 @@ class LedgerFile:
                 raise sqlite3.IntegrityError("no sweep can have spent that")
         return Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
 
-    def write(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
+    def write(self, sql: str, *values: object) -> Rows:
         """Execute a statement within the transaction of ``run_now``, and return its rows."""
         return self._execute("rwc", sql, *values)
 
@@ -194,7 +194,7 @@ class LedgerFile:
         while self._connections:
             self._connections.popitem()[1].close()
 
-    def _execute(self, mode: str, sql: str, *values: object) -> list[tuple[Any, ...]]:
+    def _execute(self, mode: str, sql: str, *values: object) -> Rows:
         if mode not in self._connections:
             self._connections[mode] = connection = sqlite3.connect(
                 f"{self._file.absolute().as_uri()}?mode={mode}",
