@@ -7,7 +7,7 @@ import json
 from contextlib import closing
 from pathlib import Path
 
-from merge_runner.llm.cache_db import open_read_only
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import SLOT_HEADER
 
 # Only what never ends takes so long, however loaded the machine is.
@@ -59,5 +59,5 @@ def _trial(slot: str) -> tuple[str, int]:
 
 
 def _saved(cache: Path) -> int:
-    with closing(open_read_only(cache)) as disk:
-        return sum(1 for _ in disk.calls())
+    with closing(ResponseCache(cache, read_only=True)) as opened:
+        return sum(1 for _ in opened.entries())

@@ -55,8 +55,7 @@ def recording_import(
     cache: CacheOption = DEFAULT_CACHE,
 ) -> None:
     """Verify a recording or a cache folder, and add it to the cache."""
-    from merge_runner.llm.cache import ResponseCache
-    from merge_runner.llm.cache_import import import_folder
+    from merge_runner.llm.cache import ResponseCache, import_folder
     from merge_runner.results.recording import import_recording
 
     take = import_folder if file.is_dir() else import_recording

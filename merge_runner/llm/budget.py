@@ -1,6 +1,6 @@
 """A cap on what a sweep spends, over all its runs, that holds whatever happens.
 
-The worst case of an attempt is set aside when it queues for its turn, and durably, in the ledger,
+The worst case of an attempt is reserved when it queues for its turn, and durably, in the ledger,
 right before it is sent. ``async with budget.attempt(...)`` surrounds all that; PaidAttempt says
 where the money goes when the attempt ends, however it ends.
 
@@ -11,7 +11,7 @@ older trials need, and for no younger one's. So the oldest trial has all the mon
 is suspended only where that does not pay for a single attempt.
 
 A server may ignore the output cap. What a reply cost beyond its worst case is taken from what is
-left, and from then on the worst case is multiplied by as much as that driver's dearest reply
+left, and from then on the worst case is multiplied by as much as that driver's most expensive reply
 exceeded it. Several attempts are in flight only while twice their worst cases fit, so that one
 reply at most, the last one, can pass the cap.
 """
@@ -21,10 +21,10 @@ from __future__ import annotations
 import asyncio
 import bisect
 import contextlib
-import itertools
 from collections.abc import AsyncIterator, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.cache import CachedCall, ResponseCache
@@ -39,17 +39,10 @@ NOTHING_EXPECTED = TrialCosts(str, {}, {})
 
 
 @dataclass(slots=True)
-class TrialAccount:
-    """What a trial that has begun was charged in USD, with what is set aside for its attempts."""
-
-    charged_usd: float = 0.0
-
-
-@dataclass(slots=True)
 class PaidAttempt:
-    """The money of one attempt, from being set aside to the end of the attempt.
+    """The money of one attempt, from its reservation to the end of the attempt.
 
-    ``aside_usd`` is set aside in this process, and from ``begin`` on in the ledger. An attempt that
+    ``aside_usd`` is reserved in this process, and from ``begin`` on in the ledger. An attempt that
     ends
 
     - before ``begin`` (cancelled while waiting, refused by the cap) gives all of it back;
@@ -67,64 +60,58 @@ class PaidAttempt:
     asked: Asked
     aside_usd: float = 0.0
     queued: bool = True
-    # That of its trial; a trial that begins anew has another one.
-    account: TrialAccount = field(default_factory=TrialAccount)
-    _cost_usd: float | None = None
-
-    @property
-    def charged_usd(self) -> float:
-        """What it takes of the money in the end: its cost, the worst case if that is unknown."""
-        if self.queued:
-            return 0.0
-        return self.aside_usd if self._cost_usd is None else self._cost_usd
+    cost_usd: float | None = None
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
-        """The attempt is sent now, after these: what is set aside for it becomes durable."""
-        await self.budget.make_durable(self, attempts)
+        """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
+        reserve = partial(self.set_aside, attempts)
+        if self.ledger.scope and not await self.ledger.cache.money.writer.write(reserve):
+            raise TrialSuspended("another run spends from the same cap, and has used it up")
+        self.begun()
 
     def set_aside(self, attempts: Sequence[Attempt]) -> bool:
-        """An operation on the cache: the durable part of ``begin``; False if the cap is used up."""
-        return self.ledger.set_aside(
-            self.key, attempts, self.aside_usd, self.budget.cap_usd, self.asked
+        """Do the durable part of ``begin`` in this thread; False if the cap is used up."""
+        number, cap_usd = len(attempts) + 1, self.budget.cap_usd
+        return not self.ledger.scope or self.ledger.reserve(
+            self.key, number, self.aside_usd, cap_usd, self.asked
         )
 
     def begun(self) -> None:
-        """What ``set_aside`` wrote is durable."""
-        self.budget.unqueue(self)
+        """Count the reservation no longer here: ``set_aside`` has made it durable."""
+        self.queued = False
+        self.budget.queued_usd -= self.aside_usd
 
     async def settle(self, attempts: Sequence[Attempt]) -> None:
-        """The attempt, the last of these, brought no answer; its cost may be unknown."""
-        await self.ledger.settle(self.key, attempts, self.aside_usd, self.asked)
-        self._cost_usd = attempts[-1].cost_usd
+        """Settle the attempt, the last of these, which brought no answer."""
+        await self.ledger.settle(self.key, attempts, self.asked)
+        self.cost_usd = attempts[-1].cost_usd
 
     async def keep(self, entry: CachedCall) -> CachedCall:
-        """Keep the answer that the attempt brought, and what it cost, in one transaction."""
-        kept = await self.ledger.keep(entry, self.aside_usd, self.asked)
-        self._cost_usd = entry.attempts[-1].cost_usd
-        if self._cost_usd is not None:
-            self.budget.costs.learn(self.trial, self.asked.model, self._cost_usd)
+        """Keep the answer that the attempt brought, then settle what it cost."""
+        kept = await self.ledger.keep(entry, self.asked)
+        self.cost_usd = entry.attempts[-1].cost_usd
+        if self.cost_usd is not None:
+            self.budget.costs.learn(self.asked.model, self.cost_usd)
         return kept
 
     def close(self) -> None:
-        """The attempt has ended."""
+        """End the attempt."""
         self.budget.end(self)
 
 
 @dataclass(slots=True, eq=False)
-class _Place:
-    """A place in a line, that of the oldest trial first."""
+class _Waiting:
+    """An entry of a priority queue; the oldest trial, with the lowest order, comes first."""
 
     trial: int
-    number: int
-    told: asyncio.Event = field(default_factory=asyncio.Event)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 class Budget:
     """Spending under a cap in USD; without one nothing is refused, and all of it recorded.
 
     A trial is named by its order in the sweep. ``in_flight`` counts the attempts that have money,
-    ``queued_usd`` is set aside in this process alone, and ``largest_usd`` is the most that was set
-    aside for one attempt.
+    ``queued_usd`` is reserved in this process alone.
     """
 
     def __init__(
@@ -141,34 +128,33 @@ class Budget:
         self._largest_usd = 0.0
         self._spent_before = ledger.spending.committed_usd > 0
         self._asked: set[str] = set()
-        self._begun: dict[int, TrialAccount] = {}
+        self._charged_usd: dict[int, float] = {}  # by trial that has begun, with reservations
         self._left: set[int] = set()
-        self._door: list[_Place] = []
-        self._attempts: list[_Place] = []
-        self._numbers = itertools.count()
+        self._trials: list[_Waiting] = []
+        self._attempts: list[_Waiting] = []
 
     async def admit(self, trial: int) -> None:
         """Wait until a trial may begin; raises TrialSuspended when no trial's end can let it."""
-        if self.cap_usd is None or trial in self._begun:
+        if self.cap_usd is None or trial in self._charged_usd:
             return
         if trial in self._left:
             raise TrialSuspended("its trial is suspended")
-        await self._in_line(self._door, trial, lambda first, _: self._begins(trial, first))
+        await self._in_queue(self._trials, trial, lambda first, _: self._begins(trial, first))
 
     def begin_anew(self, trial: int) -> None:
-        """The trial goes on where an earlier run has asked for it, so that it waits for nothing."""
+        """Admit a trial at once: it goes on where an earlier run has asked for it."""
         if self.cap_usd is not None and trial not in self._left:
-            self._begun.setdefault(trial, TrialAccount())
+            self._charged_usd.setdefault(trial, 0.0)
 
     def leave(self, trial: int) -> None:
-        """The trial has ended or is suspended, and needs no more money."""
+        """Free the money of a trial that has ended or is suspended."""
         self._left.add(trial)
-        if self._begun.pop(trial, None) is not None:
-            self._tell()
+        if self._charged_usd.pop(trial, None) is not None:
+            self._wake()
 
     @asynccontextmanager
     async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[PaidAttempt]:
-        """The money of one attempt; waits for it as ``set_aside`` does."""
+        """Yield the money of one attempt; waits for it as ``set_aside`` does."""
         paid = await self.set_aside(trial, key, asked)
         try:
             yield paid
@@ -176,16 +162,16 @@ class Budget:
             paid.close()
 
     async def set_aside(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
-        """Set an attempt's worst case aside, more where its server ignores the output cap.
+        """Reserve an attempt's worst case, more where its server ignores the output cap.
 
         Waits while other attempts or older trials may free money, then raises TrialSuspended. The
         caller closes what is returned; ``attempt`` does so by itself.
         """
         paid = PaidAttempt(self, self.ledger, trial, key, asked)
         if self.cap_usd is None:
-            self._take(paid, self._expected_usd(asked))
+            self._take(paid, self._worst_usd(asked))
         else:
-            await self._in_line(
+            await self._in_queue(
                 self._attempts, trial, lambda first, waited_s: first and self._taken(paid, waited_s)
             )
         return paid
@@ -194,132 +180,123 @@ class Budget:
     async def going_on(
         self, trial: int, key: str, asked: Asked, scope: str
     ) -> AsyncIterator[PaidAttempt]:
-        """The money of an attempt that an earlier run has begun, under the ledger of this name."""
-        ledger = self.ledger.other(scope)
+        """Yield the money of an attempt that an earlier run has begun under a ledger's name."""
+        ledger = Ledger(self.ledger.cache, scope) if self.ledger.scope else self.ledger
         paid = PaidAttempt(self, ledger, trial, key, asked, ledger.aside_usd(key), queued=False)
         self.in_flight += 1
-        paid.account = self._begun.get(trial, paid.account)
-        paid.account.charged_usd += paid.aside_usd
+        self._charge(trial, paid.aside_usd)
         try:
             yield paid
         finally:
             paid.close()
 
-    async def make_durable(self, paid: PaidAttempt, attempts: Sequence[Attempt]) -> None:
-        """Move what is set aside for an attempt to the ledger; raises TrialSuspended."""
-        if not await self.ledger.reserve(
-            paid.key, attempts, paid.aside_usd, self.cap_usd, paid.asked
-        ):
-            raise TrialSuspended("another run spends from the same cap, and has used it up")
-        self.unqueue(paid)
-
     def end(self, paid: PaidAttempt) -> None:
-        """An attempt has ended."""
+        """Give back what an attempt that has ended did not spend."""
         self.in_flight -= 1
-        paid.account.charged_usd += paid.charged_usd - paid.aside_usd
         if paid.queued:
-            self.unqueue(paid)
-        self._tell()
-
-    def unqueue(self, paid: PaidAttempt) -> None:
-        """What is set aside for an attempt lies in the ledger now, or is given back."""
-        paid.queued = False
-        self.queued_usd -= paid.aside_usd
+            self.queued_usd -= paid.aside_usd
+            self._charge(paid.trial, -paid.aside_usd)
+        elif paid.cost_usd is not None:
+            self._charge(paid.trial, paid.cost_usd - paid.aside_usd)
+        self._wake()
 
     def _begins(self, trial: int, first: bool) -> bool:
-        """Whether a trial may begin: there is money for it beside all that have begun."""
-        if trial in self._begun:  # its other driver stood in the line, too
+        """Begin a trial if there is money for it beside all that have begun."""
+        if trial in self._charged_usd:  # its other driver stood in the queue, too
             return True
         if not first:
             return False
         needed_usd, spending = self.costs.usd(trial), self.ledger.read()
         left_usd = self._left_usd(spending) - needed_usd + TOLERANCE_USD
-        if left_usd < 0 and not self._begun and not self.in_flight:
+        if left_usd < 0 and not self._charged_usd and not self.in_flight:
             if self._spent_before or not self._asked.isdisjoint(self.costs.models(trial)):
                 raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD", spending)
             # The first one of a model shows what a trial costs; each attempt must still fit.
-        elif left_usd < self._needed_usd(self._begun):
+        elif left_usd < self._needed_usd(self._charged_usd):
             return False
-        self._begun[trial] = TrialAccount()
+        self._charged_usd[trial] = 0.0
         return True
 
     def _taken(self, paid: PaidAttempt, waited_s: float) -> bool:
-        """Whether there is money for an attempt, which is taken."""
-        aside_usd, spending = self._expected_usd(paid.asked), self.ledger.read()
-        left_usd = self._left_usd(spending) - aside_usd + TOLERANCE_USD
+        """Take the money for an attempt if there is any."""
+        worst_usd, spending = self._worst_usd(paid.asked), self.ledger.read()
+        left_usd = self._left_usd(spending) - worst_usd + TOLERANCE_USD
         if left_usd < 0 and not self.in_flight:
-            raise self._suspended(f"the next call may cost {aside_usd:.4f} USD", spending)
+            raise self._suspended(f"the next call may cost {worst_usd:.4f} USD", spending)
         counted_on = self.in_flight or waited_s < PATIENCE_S
-        older = (trial for trial in self._begun if trial < paid.trial and counted_on)
-        if left_usd < max(self._needed_usd(older), self._twice_usd(aside_usd)):
+        older = (trial for trial in self._charged_usd if trial < paid.trial and counted_on)
+        # A server that ignores the output cap is known only by its first expensive reply, when the
+        # others are sent already: all in flight may cost twice as much.
+        twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
+        if left_usd < max(self._needed_usd(older), twice_usd if self.in_flight else 0.0):
             return False
-        self._take(paid, aside_usd)
+        self._take(paid, worst_usd)
         return True
 
-    def _take(self, paid: PaidAttempt, aside_usd: float) -> None:
+    def _take(self, paid: PaidAttempt, usd: float) -> None:
         self.in_flight += 1
-        self.queued_usd += aside_usd
-        self._largest_usd = max(self._largest_usd, aside_usd)
+        self.queued_usd += usd
+        self._largest_usd = max(self._largest_usd, usd)
         self._asked.add(paid.asked.model)
-        paid.aside_usd = aside_usd
-        paid.account = self._begun.get(paid.trial, paid.account)
-        paid.account.charged_usd += aside_usd
+        paid.aside_usd = usd
+        self._charge(paid.trial, usd)
 
-    def _expected_usd(self, asked: Asked) -> float:
-        """The worst case, as many times as this driver's dearest reply has cost it."""
+    def _charge(self, trial: int, usd: float) -> None:
+        if trial in self._charged_usd:
+            self._charged_usd[trial] += usd
+
+    def _worst_usd(self, asked: Asked) -> float:
+        """Return the worst case, scaled by this driver's largest observed cost overrun."""
         return asked.honest_usd * self.ledger.spending.times(asked.driver)
 
     def _left_usd(self, spending: Spending) -> float:
-        """What is neither spent nor set aside."""
         assert self.cap_usd is not None
         return self.cap_usd - spending.committed_usd - self.queued_usd
 
-    def _twice_usd(self, aside_usd: float) -> float:
-        """What must be left beside an attempt so that all in flight may cost twice as much."""
-        # A server that ignores the output cap is known only by its first dear reply, when the
-        # others are sent already.
-        return (self.in_flight + 1) * max(aside_usd, self._largest_usd) if self.in_flight else 0.0
-
     def _needed_usd(self, trials: Iterable[int]) -> float:
-        """What these begun trials are still expected to cost."""
-        return sum(
-            max(0.0, self.costs.usd(trial) - self._begun[trial].charged_usd) for trial in trials
-        )
+        """Return what these begun trials are still expected to cost."""
+        return sum(max(0.0, self.costs.usd(each) - self._charged_usd[each]) for each in trials)
 
-    async def _in_line(
-        self, line: list[_Place], trial: int, serve: Callable[[bool, float], bool]
+    async def _in_queue(
+        self, queue: list[_Waiting], trial: int, serve: Callable[[bool, float], bool]
     ) -> None:
         """Wait until ``serve`` says True.
 
-        It is told whether this trial is the first in the line, and how long it has waited, in s.
+        It is told whether this trial is the first in the queue, and how long it has waited, in s.
         """
-        place, waited_s = _Place(trial, next(self._numbers)), 0.0
-        bisect.insort(line, place, key=lambda each: (each.trial, each.number))
+        own, loop = _Waiting(trial), asyncio.get_running_loop()
+        began_s = loop.time()
+        bisect.insort(queue, own, key=lambda waiting: waiting.trial)
         try:
-            while not serve(line[0] is place, waited_s):
-                waited_s += await _told(place)
+            while not serve(queue[0] is own, loop.time() - began_s):
+                own.changed.clear()
+                # For ever it could be that an older trial waits for a call of ours, or that the run
+                # of another model, which spends under the same cap, frees money.
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(PATIENCE_S):
+                        await own.changed.wait()
         finally:
-            line.remove(place)
-            self._tell()
+            queue.remove(own)
+            self._wake()
 
-    def _tell(self) -> None:
-        """Something has changed for those who are first in their lines, or may go on anyway."""
-        for place in (*self._door[:1], *self._attempts[:1]):
-            place.told.set()
-        for place in self._door:
-            if place.trial in self._begun:
-                place.told.set()
+    def _wake(self) -> None:
+        """Wake those who are first in their queues, or may go on anyway."""
+        for waiting in (*self._trials[:1], *self._attempts[:1]):
+            waiting.changed.set()
+        for waiting in self._trials:
+            if waiting.trial in self._charged_usd:
+                waiting.changed.set()
 
     def _suspended(self, what: str, spending: Spending) -> TrialSuspended:
-        aside_usd = spending.reserved_usd + self.queued_usd
-        kept_usd = self._needed_usd(self._begun)
+        reserved_usd = spending.reserved_usd + self.queued_usd
+        kept_usd = self._needed_usd(self._charged_usd)
         return TrialSuspended(
-            f"{what}, and {spending.spent_usd + aside_usd:.4f} of {self.cap_usd:g} USD are spent "
-            f"or set aside ({spending.spent_usd:.4f} spent"
+            f"{what}, and {spending.spent_usd + reserved_usd:.4f} of {self.cap_usd:g} USD are "
+            f"spent or set aside ({spending.spent_usd:.4f} spent"
             + (
-                f", {aside_usd:.4f} set aside for {spending.open_attempts} attempts whose cost is "
-                "not known: `merge-runner ledger`"
-                if aside_usd > TOLERANCE_USD
+                f", {reserved_usd:.4f} set aside for {spending.open_attempts} attempts whose cost "
+                "is not known: `merge-runner ledger`"
+                if reserved_usd > TOLERANCE_USD
                 else ""
             )
             + ")"
@@ -327,69 +304,8 @@ class Budget:
         )
 
 
-async def _told(place: _Place) -> float:
-    """Wait for a change, for a while only; returns for how long in s."""
-    # For ever it could be that an older trial waits for a call of ours, or that the run of another
-    # model, which spends under the same cap, frees money.
-    loop = asyncio.get_running_loop()
-    began = loop.time()
-    place.told.clear()
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(PATIENCE_S):
-            await place.told.wait()
-    return loop.time() - began
-
-
-@dataclass(frozen=True, slots=True)
-class Unpaid:
+class Unpaid(Budget):
     """The budget of a model that costs nothing: only replies and attempts are kept."""
 
-    cache: ResponseCache
-
-    async def admit(self, trial: int) -> None:
-        """Every trial may begin."""
-
-    def begin_anew(self, trial: int) -> None:
-        """Every trial may begin."""
-
-    def leave(self, trial: int) -> None:
-        """No money is kept for the trial."""
-
-    @asynccontextmanager
-    async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[UnpaidAttempt]:
-        """Nothing is set aside."""
-        yield UnpaidAttempt(self.cache, key)
-
-    @asynccontextmanager
-    async def going_on(
-        self, trial: int, key: str, asked: Asked, scope: str
-    ) -> AsyncIterator[UnpaidAttempt]:
-        """Nothing was set aside."""
-        yield UnpaidAttempt(self.cache, key)
-
-
-@dataclass(frozen=True, slots=True)
-class UnpaidAttempt:
-    """One attempt that costs nothing; see PaidAttempt."""
-
-    cache: ResponseCache
-    key: str
-    aside_usd: float = 0.0
-
-    async def begin(self, attempts: Sequence[Attempt]) -> None:
-        """Nothing is noted: what a process that dies has in flight costs nothing."""
-
-    def set_aside(self, attempts: Sequence[Attempt]) -> bool:
-        """There is nothing to set aside."""
-        return True
-
-    def begun(self) -> None:
-        """See ``set_aside``."""
-
-    async def settle(self, attempts: Sequence[Attempt]) -> None:
-        """Keep the attempts for a later run."""
-        await self.cache.put_unanswered(self.key, tuple(attempts))
-
-    async def keep(self, entry: CachedCall) -> CachedCall:
-        """Keep the answer."""
-        return await self.cache.put(entry)
+    def __init__(self, cache: ResponseCache) -> None:
+        super().__init__(Ledger(cache, ""))  # no money is asked of it

@@ -23,7 +23,7 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.batch.lines import Batches
-from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid, UnpaidAttempt
+from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Call, Wait, slot_text
 from merge_runner.llm.content_hashes import make_request
@@ -98,7 +98,7 @@ class LlmClient:
     driver: str = field(init=False)
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
-    _money: Budget | Unpaid = field(init=False)
+    _money: Budget = field(init=False)
     _consequences: Consequences = field(init=False)
     _calls: dict[str, Call] = field(default_factory=dict)
     _stopping: bool = False
@@ -305,7 +305,7 @@ class LlmClient:
             return await self._attempt_in_batch(call, self.batches)
         async with AsyncExitStack() as stack:
             with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid: PaidAttempt | UnpaidAttempt = await stack.enter_async_context(
+                paid: PaidAttempt = await stack.enter_async_context(
                     self._money.attempt(call.order, call.request.key, call.asked)
                 )
             # A turn must be used as soon as it is given, or the limits do not hold.
@@ -344,7 +344,7 @@ class LlmClient:
     async def _concluded(
         self,
         call: Call,
-        paid: PaidAttempt | UnpaidAttempt,
+        paid: PaidAttempt,
         outcome: AttemptOutcome,
         raw: RawReply | None,
         record: Attempt,

@@ -1,27 +1,80 @@
-"""What a sweep has spent, over all its runs: a durable number beside the replies it paid for.
+"""The money of sweeps: what attempts cost, and a reservation for each whose cost is not known.
 
-Before each attempt at a paid call the worst case is set aside, in one transaction with a note of
-the attempt and of the reason. A process that dies leaves them: its attempt counts with the worst
-case until a user releases it, and stands in the call's list of attempts with an unknown outcome.
+Before each attempt at a paid call its worst case is reserved, in one transaction that sums what is
+spent and open. A process that dies leaves its reservations: each attempt counts with its worst case
+until a user releases it, and stands in the call's list of attempts with an unknown outcome.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import sqlite3
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from threading import RLock
+from typing import TYPE_CHECKING, Any
 
-from pydantic import TypeAdapter, ValidationError
-
-from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.errors import CacheFailed, RecordingError, UsageError
+from merge_runner.llm.write_batcher import BatchWriter, Operation
 from merge_runner.records import Attempt
 
+if TYPE_CHECKING:
+    from merge_runner.llm.cache import CachedCall, ResponseCache
+
+FILE = "ledger.db"
+BUSY_S = 600.0
 TOLERANCE_USD = 1e-9  # sums of floats
-IN_FLIGHT, UNRECORDED = "in flight", "not recorded"
-EXAMPLES = 3  # slots that are named for a reason: enough to find the trials
-_SPENT, _OPEN = "spent ", "open "
+IN_FLIGHT = "in flight"
+Rows = list[tuple[Any, ...]]
+Query = Callable[..., Rows]
+TABLES = """
+CREATE TABLE IF NOT EXISTS spent (
+  scope TEXT, driver TEXT, usd REAL NOT NULL, overrun_usd REAL NOT NULL,
+  most_overrun REAL NOT NULL, PRIMARY KEY (scope, driver)
+) STRICT;
+CREATE TABLE IF NOT EXISTS open (
+  scope TEXT, call TEXT, attempt INTEGER, usd REAL NOT NULL, driver TEXT, slot TEXT,
+  worst_usd REAL, since TEXT, outcome TEXT
+) STRICT;
+CREATE INDEX IF NOT EXISTS open_call ON open (call);
+"""
+_SPENDING = """
+SELECT spent.usd, open.usd, open.attempts, spent.overrun_usd FROM
+(SELECT total(usd) AS usd, total(overrun_usd) AS overrun_usd FROM spent WHERE scope = ?1) AS spent,
+(SELECT total(usd) AS usd, count(*) AS attempts FROM open WHERE scope = ?1) AS open
+"""
+_OVERRUNS = "SELECT driver, most_overrun FROM spent WHERE scope = ? AND most_overrun > 0"
+_RESERVE = "INSERT INTO open VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+_MADE = "SELECT 1 FROM sqlite_master WHERE name = 'open_call'"
+_BEGUN = """
+SELECT since FROM open WHERE call = ? AND attempt > ? AND outcome = 'in flight' ORDER BY attempt
+"""
+_PAY = """
+INSERT INTO spent VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET usd = usd + excluded.usd,
+overrun_usd = overrun_usd + excluded.overrun_usd,
+most_overrun = max(most_overrun, excluded.most_overrun)
+"""
+_IN_FLIGHT = "SELECT call, attempt, driver FROM open WHERE scope = ? AND outcome = 'in flight'"
+_NOTE = """
+UPDATE open SET outcome = ?
+WHERE rowid = (SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
+"""
+_CLOSE = """
+DELETE FROM open
+WHERE rowid = (SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
+RETURNING usd, worst_usd
+"""
+_ROWS_SPENT = "SELECT driver, usd, overrun_usd, most_overrun FROM spent WHERE scope = ?"
+_ROWS_OPEN = """
+SELECT call, attempt, usd, driver, slot, worst_usd, since, outcome FROM open WHERE scope = ?
+"""
+_REASONS = """
+SELECT driver, outcome, count(*), sum(usd), min(since), max(since), min(slot) FROM open
+WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,53 +91,8 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class SetAside:
-    """One attempt of unknown cost; ``outcome`` stays IN_FLIGHT where its process died."""
-
-    usd: float
-    asked: Asked
-    since: str
-    outcome: str = IN_FLIGHT
-
-
-@dataclass(slots=True)
-class Reason:
-    """Why something is set aside: ``attempts`` at one driver that came to the same outcome.
-
-    ``first`` and ``last`` are UTC in ISO 8601; ``slots`` are some of those that it was for.
-    """
-
-    driver: str
-    outcome: str
-    attempts: int = 0
-    usd: float = 0.0
-    first: str = ""
-    last: str = ""
-    slots: list[str] = field(default_factory=list)
-
-    def add(self, one: SetAside) -> None:
-        """Count an attempt."""
-        self.attempts += 1
-        self.usd += one.usd
-        self.first = min(self.first or one.since, one.since)
-        self.last = max(self.last, one.since)
-        if one.asked.slot not in self.slots and len(self.slots) < EXAMPLES:
-            self.slots.append(one.asked.slot)
-
-
-@dataclass(frozen=True, slots=True)
-class Release:
-    """What a user has released at their own risk, and why it had been set aside."""
-
-    at: str
-    usd: float
-    attempts: int
-    reasons: tuple[Reason, ...]
-
-
-@dataclass(slots=True)
 class Spending:
-    """In USD: what attempts cost, and what is set aside for those whose cost is not known.
+    """In USD: what attempts cost, and what is reserved for those whose cost is not known.
 
     ``open_attempts`` are in flight, or nobody knows what became of them. ``overrun_usd`` is by how
     much replies cost more than their worst case, ``overruns`` the largest such ratio by driver.
@@ -95,244 +103,250 @@ class Spending:
     open_attempts: int = 0
     overrun_usd: float = 0.0
     overruns: dict[str, float] = field(default_factory=dict)
-    releases: list[Release] = field(default_factory=list)
 
     @property
     def committed_usd(self) -> float:
-        """What may have been spent, at worst."""
+        """The most that may have been spent."""
         return self.spent_usd + self.reserved_usd
 
     def times(self, driver: str) -> float:
-        """How often the worst case is set aside: more than once where a server ignores the cap."""
+        """Return how many worst cases are reserved: more than 1 where a server ignores the cap."""
         return self.overruns.get(driver, 1.0)
 
     @property
     def dearest(self) -> str:
-        """How much more than their worst case replies cost at most, by driver, in words."""
+        """The largest overruns by driver, in words."""
         ratios = self.overruns.items()
         return ", ".join(f"{driver} up to {ratio:.2f} times as much" for driver, ratio in ratios)
 
 
-_SPENDING = TypeAdapter(Spending)
-_SET_ASIDE = TypeAdapter(list[SetAside])
+class LedgerFile:
+    """The SQLite file with the money of all sweeps of a cache folder, made when it is needed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / FILE
+        self._connections: dict[str, sqlite3.Connection] = {}
+        self._one_at_a_time = RLock()
+        self._in_transaction = False
+        self._made = False
+        self.writer = BatchWriter(self.run_now)
+
+    def read(self, sql: str, *values: object) -> Rows:
+        """Return the rows of a query; raises UsageError where the file is damaged."""
+        with self._told():
+            if not self._made:  # another process may be making it
+                self._made = self._file.exists() and bool(self._execute("ro", _MADE))
+            return self._execute("ro", sql, *values) if self._made else []
+
+    def begun(self, call: str, tried: int) -> Iterator[Attempt]:
+        """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
+        rows: Rows = []
+        with contextlib.suppress(UsageError):  # which is told before anything is paid
+            rows = self.read(_BEGUN, call, tried)
+        for number, (since,) in enumerate(rows, tried + 1):
+            yield Attempt(
+                number=number,
+                outcome="unknown",
+                started_at=since,
+                error="the run ended before a reply was seen; it may have been charged",
+            )
+
+    def run_now(self, operations: list[Operation]) -> list[Any]:
+        """Run operations in one durable transaction, in this thread; raises UsageError."""
+        with self.transaction():
+            return [operation() for operation in operations]
+
+    @contextlib.contextmanager
+    def transaction(self) -> Iterator[None]:
+        """Make what is written within it, in this thread, one durable transaction."""
+        with self._told(), self._one_at_a_time:
+            if self._in_transaction:  # a part of the one around it
+                yield
+                return
+            self.write("BEGIN IMMEDIATE")
+            self._in_transaction = True
+            try:
+                yield
+                self.write("COMMIT")
+            except BaseException:
+                self.write("ROLLBACK")
+                raise
+            finally:
+                self._in_transaction = False
+
+    def spending(self, scope: str, query: Query | None = None) -> Spending:
+        """Return the sums of a sweep; raises UsageError where they cannot be."""
+        ask = query or self.read
+        with self._told():
+            rows = ask(_SPENDING, scope)
+            overruns: dict[str, float] = dict(ask(_OVERRUNS, scope))
+            spent_usd, reserved_usd, attempts, overrun_usd = rows[0] if rows else (0.0, 0.0, 0, 0.0)
+            if not (spent_usd >= 0 and reserved_usd >= 0):
+                raise sqlite3.IntegrityError("no sweep can have spent that")
+        return Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
+
+    def write(self, sql: str, *values: object) -> Rows:
+        """Execute a statement within the transaction of ``run_now``, and return its rows."""
+        return self._execute("rwc", sql, *values)
+
+    def close(self) -> None:
+        """Close the file."""
+        while self._connections:
+            self._connections.popitem()[1].close()
+
+    def _execute(self, mode: str, sql: str, *values: object) -> Rows:
+        if mode not in self._connections:
+            self._connections[mode] = connection = sqlite3.connect(
+                f"{self._file.absolute().as_uri()}?mode={mode}",
+                uri=True,
+                timeout=BUSY_S,
+                isolation_level=None,
+                check_same_thread=False,  # one batch at a time, each in a thread
+            )
+            if mode == "rwc":
+                connection.execute("PRAGMA journal_mode = wal")
+                connection.execute("PRAGMA synchronous = full")  # it survives a power cut
+                connection.executescript(TABLES)
+        return self._connections[mode].execute(sql, values).fetchall()
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.OperationalError as exc:
+            raise CacheFailed(f"the ledger {self._file} cannot be used: {exc}") from exc
+        except sqlite3.Error as exc:
+            raise UsageError(
+                f"the record of what sweeps have spent ({self._file}) is damaged, so that no cap "
+                f"could hold ({exc}): put a copy of it back, or take the replies with "
+                f"`merge-runner recording import {self._file.parent} --cache NEW`, and go on with "
+                "--cache NEW, which counts from 0"
+            ) from exc
 
 
 def scopes(cache: ResponseCache) -> list[str]:
-    """The names of all ledgers in a cache."""
-    return [name.removeprefix(_SPENT) for name in cache.names(_SPENT)]
+    """Return the names of all ledgers in a cache."""
+    rows = cache.money.read("SELECT scope FROM spent UNION SELECT scope FROM open ORDER BY 1")
+    return [scope for (scope,) in rows]
 
 
 class Ledger:
-    """The spending of one sweep; ``scope`` names it in the cache. ``spending`` is its last state.
+    """The spending of one sweep; ``scope`` names it in the file. ``spending`` is its last state.
 
-    Several processes may run the sweep: every change reads the state anew.
+    Several processes may run the sweep: every change sums anew. The ledger of a model that costs
+    nothing has no name, and keeps no record.
     """
 
     def __init__(self, cache: ResponseCache, scope: str) -> None:
         self.spending = Spending()
         self.scope = scope
-        self._cache = cache
-        self._name = _SPENT + scope
-        self._open = f"{_OPEN}{scope} "
+        self.cache = cache
         # A damaged record is an error only where money is to be spent: a replay needs none.
         with contextlib.suppress(UsageError):
             self.read()
 
-    async def reserve(
-        self,
-        key: str,
-        attempts: Sequence[Attempt],
-        worst_usd: float,
-        cap_usd: float | None,
-        asked: Asked,
-    ) -> bool:
-        """Set the worst case of a call's next attempt aside; False if that exceeds the cap."""
-        return await self._cache.write(
-            lambda: self.set_aside(key, attempts, worst_usd, cap_usd, asked)
-        )
+    def read(self) -> Spending:
+        """Return the current state; raises UsageError where its record is damaged."""
+        if self.scope:
+            self.spending = self.cache.money.spending(self.scope)
+        return self.spending
 
-    def set_aside(
-        self,
-        key: str,
-        attempts: Sequence[Attempt],
-        worst_usd: float,
-        cap_usd: float | None,
-        asked: Asked,
+    def reserve(
+        self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
     ) -> bool:
-        """An operation on the cache: what ``reserve`` does."""
-        # Read within the transaction: another process may have spent since.
-        spending = self.read()
-        committed_usd = spending.committed_usd + worst_usd
-        if cap_usd is not None and committed_usd > cap_usd + TOLERANCE_USD:
-            return False
-        spending.reserved_usd += worst_usd
-        spending.open_attempts += 1
-        self._write(spending)
-        self._write_open(key, [*self._opened(key), SetAside(worst_usd, asked, _now())])
-        self._cache.keep_unanswered(key, (*attempts, _begun(len(attempts) + 1)))
+        """Reserve the worst case of an attempt at a call; False if that exceeds the cap."""
+        money = self.cache.money
+        with money.transaction():
+            committed_usd = money.spending(self.scope, money.write).committed_usd
+            if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
+                return False
+            place = (asked.driver, asked.slot, asked.honest_usd or usd, _now(), IN_FLIGHT)
+            money.write(_RESERVE, self.scope, key, number, usd, *place)
         return True
 
     def aside_usd(self, key: str) -> float:
-        """What is set aside for the last attempt at a call; 0 where nothing is."""
-        opened = self._opened(key)
-        return opened[-1].usd if opened else 0.0
+        """Return the USD reserved for the last attempt at a call; 0 where nothing is."""
+        sql = "SELECT usd FROM open WHERE scope = ? AND call = ? ORDER BY attempt DESC LIMIT 1"
+        rows = self.cache.money.read(sql, self.scope, key) if self.scope else []
+        return float(rows[0][0]) if rows else 0.0
 
-    def other(self, scope: str) -> Ledger:
-        """The ledger of this name in the same cache, which may be this one."""
-        return self if scope == self.scope else Ledger(self._cache, scope)
+    async def settle(self, key: str, attempts: Sequence[Attempt], asked: Asked) -> None:
+        """Settle the last of a call's attempts, without an answer; its cost may be unknown."""
+        await self.cache.put_unanswered(key, tuple(attempts))
+        await self._settle(key, attempts[-1], asked)
 
-    async def settle(
-        self, key: str, attempts: Sequence[Attempt], worst_usd: float, asked: Asked
-    ) -> None:
-        """The last of a call's attempts brought no answer; its cost may be unknown."""
+    async def keep(self, entry: CachedCall, asked: Asked) -> CachedCall:
+        """Keep an answered call, then settle its last attempt; see also ``settle_kept``."""
+        kept = await self.cache.put(entry)
+        await self._settle(entry.request.key, entry.attempts[-1], asked)
+        return kept
 
-        def operation() -> None:
-            self._settle(key, attempts, worst_usd, asked)
-            self._cache.keep_unanswered(key, tuple(attempts))
+    async def _settle(self, key: str, attempt: Attempt, asked: Asked) -> None:
+        if self.scope:
+            operation = partial(self._settled, key, attempt, asked.driver)
+            await self.cache.money.writer.write(operation)
+            self.read()
 
-        await self._cache.write(operation)
+    def _settled(self, key: str, attempt: Attempt, driver: str) -> None:
+        money, place = self.cache.money, (self.scope, key, attempt.number)
+        if attempt.cost_usd is None:  # it stays reserved: it may have been charged
+            money.write(_NOTE, attempt.outcome, *place)
+            return
+        rows = money.write(_CLOSE, *place)
+        # A batch may end after its money was released: then nothing is known to compare with.
+        usd, worst_usd = rows[0] if rows else (attempt.cost_usd, attempt.cost_usd)
+        overrun_usd = attempt.cost_usd - usd
+        overran = overrun_usd > TOLERANCE_USD
+        ratio = attempt.cost_usd / max(worst_usd, TOLERANCE_USD) if overran else 0.0
+        over = (overrun_usd if overran else 0.0, ratio)
+        money.write(_PAY, self.scope, driver, attempt.cost_usd, *over)
 
-    async def keep(self, entry: CachedCall, worst_usd: float, asked: Asked) -> CachedCall:
-        """Keep an answered call, and settle its last attempt in the same transaction."""
-        key = entry.request.key
-        return await self._cache.put(
-            entry, lambda: self._settle(key, entry.attempts, worst_usd, asked)
-        )
+    def settle_kept(self, drivers: Collection[str]) -> None:
+        """Settle attempts that were kept right before their run was killed.
 
-    def reserve_share(self, name: str, asked: Asked) -> None:
-        """An operation: reserve a task's share of the cap, as if it were one attempt."""
-        spending = self.read()
-        spending.reserved_usd += asked.honest_usd
-        spending.open_attempts += 1
-        self._write(spending)
-        self._write_open(name, [SetAside(asked.honest_usd, asked, _now())])
+        No other run may ask these drivers meanwhile.
+        """
+        money = self.cache.money
+        for key, number, driver in money.read(_IN_FLIGHT, self.scope):
+            with contextlib.suppress(RecordingError):
+                entry = self.cache.get(key)
+                for attempt in entry.attempts if entry else self.cache.unanswered(key):
+                    if (
+                        driver in drivers
+                        and attempt.number == number
+                        and attempt.outcome != "unknown"
+                    ):
+                        money.run_now([partial(self._settled, key, attempt, driver)])
 
-    def settle_share(
-        self, name: str, task: Spending, opened: Mapping[str, Sequence[SetAside]]
-    ) -> None:
-        """An operation: put what a task has spent, and has open, in the place of its share."""
-        spending = self.read()
-        share = self._opened(name)  # none where a user has released it
-        spending.spent_usd += task.spent_usd
-        spending.reserved_usd += task.reserved_usd - sum(each.usd for each in share)
-        spending.open_attempts += task.open_attempts - len(share)
-        if not spending.open_attempts:
-            spending.reserved_usd = 0.0  # what is left is rounding
-        spending.overrun_usd += task.overrun_usd
-        for driver, ratio in task.overruns.items():
-            spending.overruns[driver] = max(ratio, spending.times(driver))
-        self._write(spending)
-        self._write_open(name, [])
-        for key, attempts in opened.items():
-            self._write_open(key, [*self._opened(key), *attempts])
+    def rows(self) -> tuple[Rows, Rows]:
+        """Return the rows of what is spent and of what is open, for ``settle_share``."""
+        read = self.cache.money.read
+        return read(_ROWS_SPENT, self.scope), read(_ROWS_OPEN, self.scope)
 
-    def opened(self) -> dict[str, list[SetAside]]:
-        """The attempts without a known cost, by call key."""
-        keys = (name.removeprefix(self._open) for name in self._cache.names(self._open))
-        return {key: self._opened(key) for key in keys}
+    def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
+        """Put what a task has spent, and has open, in the place of the share reserved for it."""
+        money = self.cache.money
+        with money.transaction():
+            money.write("DELETE FROM open WHERE scope = ? AND call = ?", self.scope, name)
+            for row in spent:
+                money.write(_PAY, self.scope, *row)
+            for row in opened:
+                money.write(_RESERVE, self.scope, *row)
 
-    def reasons(self) -> list[Reason]:
-        """Why something is set aside, the largest sum first."""
-        found: dict[tuple[str, str], Reason] = {}
-        for attempts_of_call in self.opened().values():
-            for one in attempts_of_call:
-                driver = one.asked.driver
-                found.setdefault((driver, one.outcome), Reason(driver, one.outcome)).add(one)
-        spending = self.read()
-        attempts = spending.open_attempts - sum(reason.attempts for reason in found.values())
-        if attempts > 0:
-            usd = spending.reserved_usd - sum(reason.usd for reason in found.values())
-            found["", UNRECORDED] = Reason("", UNRECORDED, attempts, usd)
-        return sorted(found.values(), key=lambda reason: -reason.usd)
+    def reasons(self) -> list[dict[str, Any]]:
+        """Return the reservations by driver and outcome, the largest sum in USD first.
 
-    def release(self) -> Release:
-        """Count no longer what is set aside; nobody may be asking meanwhile."""
+        ``first`` and ``last`` are UTC in ISO 8601; ``slot`` is one of those that they are for.
+        """
+        names = ("driver", "outcome", "attempts", "usd", "first", "last", "slot")
+        rows = self.cache.money.read(_REASONS, self.scope)
+        return [dict(zip(names, row, strict=True)) for row in rows]
 
-        def operation() -> Release:
-            spending = self.read()
-            reasons = tuple(self.reasons())
-            released = Release(_now(), spending.reserved_usd, spending.open_attempts, reasons)
-            spending.open_attempts, spending.reserved_usd = 0, 0.0
-            spending.releases.append(released)
-            self._write(spending)
-            for name in self._cache.names(self._open):
-                self._cache.remove(name)  # its reasons are those of the release now
-            return released
-
-        released: Release = self._cache.run_now([operation])[0]
-        return released
-
-    def _settle(
-        self, key: str, attempts: Sequence[Attempt], worst_usd: float, asked: Asked
-    ) -> None:
-        actual_usd = attempts[-1].cost_usd
-        opened = self._opened(key)
-        # A batch may end after its money was released.
-        released = not opened and worst_usd == 0
-        # The row of reasons may be damaged; the sums, which the cap needs, lie elsewhere.
-        *earlier, one = opened or [SetAside(worst_usd, asked, _now())]
-        if actual_usd is None:
-            self._write_open(key, [*earlier, replace(one, outcome=attempts[-1].outcome)])
-            return  # it stays set aside: it may have been charged
-        self._write_open(key, earlier)
-        spending = self.read()
-        spending.spent_usd += actual_usd
-        spending.reserved_usd = max(0.0, spending.reserved_usd - worst_usd)
-        if not released:
-            spending.open_attempts -= 1
-        if not spending.open_attempts:
-            spending.reserved_usd = 0.0  # what is left is rounding
-        if not released and actual_usd > worst_usd + TOLERANCE_USD:
-            spending.overrun_usd += actual_usd - worst_usd
-            driver, honest_usd = one.asked.driver, one.asked.honest_usd or worst_usd
-            ratio = actual_usd / max(honest_usd, TOLERANCE_USD)
-            spending.overruns[driver] = max(ratio, spending.times(driver))
-        self._write(spending)
-
-    def _opened(self, key: str) -> list[SetAside]:
-        """The attempts at a call that have no known cost, the one in flight last."""
-        try:
-            text = self._cache.read(self._open + key)
-            return [] if text is None else _SET_ASIDE.validate_json(text)
-        except (RecordingError, ValidationError):
-            return []  # damaged: the sums, which count, lie elsewhere
-
-    def _write_open(self, key: str, attempts: list[SetAside]) -> None:
-        if attempts:
-            text = _SET_ASIDE.dump_json(attempts).decode()
-            self._cache.replace(self._open + key, text)
-        else:
-            self._cache.remove(self._open + key)
-
-    def read(self) -> Spending:
-        """The current state; raises UsageError where its record is damaged."""
-        try:
-            text = self._cache.read_checked(self._name)
-            self.spending = Spending() if text is None else _SPENDING.validate_json(text)
-            if not (self.spending.spent_usd >= 0 and self.spending.reserved_usd >= 0):
-                raise RecordingError("no sweep can have spent that")
-        except (RecordingError, ValidationError) as exc:
-            raise UsageError(
-                f"the record of what this sweep has spent ({self._name!r} in the cache "
-                f"{self._cache.folder}) is damaged, so that no cap could hold: take the replies "
-                f"with `merge-runner recording import {self._cache.folder} --cache NEW`, and go "
-                "on with --cache NEW, which counts from 0"
-            ) from exc
-        return self.spending
-
-    def _write(self, spending: Spending) -> None:
-        self.spending = spending
-        self._cache.replace_checked(self._name, _SPENDING.dump_json(spending).decode())
-
-
-def _begun(number: int) -> Attempt:
-    """An attempt as it is noted before it is made; what comes of it takes its place."""
-    return Attempt(
-        number=number,
-        outcome="unknown",
-        started_at=_now(),
-        error="the run ended before a reply was seen; it may have been charged",
-    )
+    def release(self) -> None:
+        """Count no longer what is reserved; nobody may be asking meanwhile."""
+        money = self.cache.money
+        money.run_now([lambda: money.write("DELETE FROM open WHERE scope = ?", self.scope)])
+        self.read()
 
 
 def _now() -> str:

@@ -13,12 +13,12 @@ PER_MILLION = Decimal(1_000_000)
 
 
 def is_known(entry: ModelEntry) -> bool:
-    """Whether anybody knows the price of a model."""
+    """Return whether anybody knows the price of a model."""
     return cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is not None
 
 
 def cost_usd(entry: ModelEntry, usage: Usage) -> float | None:
-    """The cost of an attempt in USD, None where the price or the tokens are unknown."""
+    """Return the cost of an attempt in USD, None where the price or the tokens are unknown."""
     if entry.price == "free":
         return 0.0
     if usage.input_tokens is None or usage.output_tokens is None:

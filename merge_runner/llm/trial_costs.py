@@ -1,7 +1,7 @@
-"""What a whole trial is expected to cost, from the calls that are measured so far.
+"""What a whole trial is expected to cost: the mean of its models' answers, for each usual call.
 
-It decides which trials begin, never what may be spent: each attempt still sets its own worst case
-aside. Before anything is measured a trial is expected to cost as much as it can.
+It decides which trials begin, never what may be spent: each attempt still reserves its own worst
+case. Before anything is measured a trial is expected to cost as much as it can.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 # Trials that turn out longer, and attempts that are charged but bring no answer.
 MARGIN = 1.5
-# With fewer answers of its own a cell borrows from its model's other answers.
-ENOUGH = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +33,7 @@ class TrialCalls:
 
 @dataclass(slots=True)
 class Answers:
-    """How many answers are measured, and what they cost together in USD."""
+    """The number of measured answers, and what they cost together in USD."""
 
     number: int = 0
     usd: float = 0.0
@@ -61,37 +59,27 @@ class TrialCosts:
     ) -> None:
         self._cell_of = cell_of
         self._calls = calls
-        self._by_model = defaultdict(Answers, earlier)
-        self._by_cell: defaultdict[tuple[str, str], Answers] = defaultdict(Answers)
-        self._expected: dict[str, float] = {}
+        self._answers = defaultdict(Answers, earlier)
 
     def usd(self, trial: int) -> float:
-        """What the trial is expected to cost in USD."""
-        cell = self._cell_of(trial)
-        if cell not in self._expected:
-            calls = self._calls.get(cell, {})
-            self._expected[cell] = sum(self._usd(cell, model) for model in calls)
-        return self._expected[cell]
+        """Return the USD that a trial is expected to cost."""
+        calls = self._calls.get(self._cell_of(trial), {})
+        return sum(_usd(each, self._answers[model]) for model, each in calls.items())
 
     def models(self, trial: int) -> Collection[str]:
-        """The models that the trial asks."""
+        """Return the models that a trial asks."""
         return self._calls.get(self._cell_of(trial), {})
 
-    def learn(self, trial: int, model: str, usd: float) -> None:
-        """An answer to a call of this trial cost so much."""
-        self._by_model[model].add(usd)
-        self._by_cell[self._cell_of(trial), model].add(usd)
-        self._expected.clear()
+    def learn(self, model: str, usd: float) -> None:
+        """Count the cost of an answer of a model."""
+        self._answers[model].add(usd)
 
-    def _usd(self, cell: str, model: str) -> float:
-        calls = self._calls[cell][model]
-        own, alike = self._by_cell[cell, model], self._by_model[model]
-        most_usd = calls.most * calls.worst_usd
-        if not alike.number:
-            return most_usd
-        borrowed = max(0, min(ENOUGH, alike.number) - own.number)
-        usd = own.usd + borrowed * alike.usd / alike.number
-        # The worst case counts as one more answer: a few cheap ones prove little.
-        each_usd = (usd + calls.worst_usd) / (own.number + borrowed + 1)
-        # Up to its last call a trial must be able to set that call's worst case aside.
-        return min(most_usd, MARGIN * calls.usual * each_usd + calls.worst_usd)
+
+def _usd(calls: TrialCalls, answers: Answers) -> float:
+    most_usd = calls.most * calls.worst_usd
+    if not answers.number:
+        return most_usd
+    # The worst case counts as one more answer: a few cheap ones prove little.
+    mean_usd = (answers.usd + calls.worst_usd) / (answers.number + 1)
+    # Up to its last call a trial must be able to reserve that call's worst case.
+    return min(most_usd, MARGIN * calls.usual * mean_usd + calls.worst_usd)

@@ -10,7 +10,7 @@ from typing import Any
 
 from merge_runner.config import MOST_REPETITIONS, MOST_STEPS
 from merge_runner.llm.content_hashes import call_key, canonical_json
-from merge_runner.records import ANSWERS, Attempt, ChatRequest, Slot
+from merge_runner.records import ANSWERS, Attempt, ChatRequest
 from merge_runner.registry import NAME
 
 # What reading content of others can raise; RecursionError where JSON is nested deeply.
@@ -33,12 +33,7 @@ def check_call(key: str, request: ChatRequest, attempts: tuple[Attempt, ...]) ->
     )
     if not key == request.key == content:
         raise ValueError("its content does not belong to its key")
-    check_slot(request.slot)
-    check_attempts(attempts)
-
-
-def check_slot(slot: Slot) -> None:
-    """Raise ValueError for a place that no study has."""
+    slot = request.slot
     if not (
         NAME.fullmatch(slot.condition)
         and 1 <= slot.repetition <= MOST_REPETITIONS
@@ -46,6 +41,7 @@ def check_slot(slot: Slot) -> None:
         and slot.sample_set >= 0
     ):
         raise ValueError("its slot is none of a study")
+    _check_attempts(attempts)
 
 
 def check_body(body: str) -> None:
@@ -55,7 +51,7 @@ def check_body(body: str) -> None:
         raise ValueError("its request is not a canonical JSON object")
 
 
-def check_attempts(attempts: tuple[Attempt, ...]) -> None:
+def _check_attempts(attempts: tuple[Attempt, ...]) -> None:
     """Raise one of DAMAGED for values that no attempt has, and no replay or table can take.
 
     The last attempt is the one that was answered.
@@ -79,7 +75,7 @@ def check_attempts(attempts: tuple[Attempt, ...]) -> None:
 
 @lru_cache(maxsize=1)  # who checks a reply reads it next
 def reply_object(text: str) -> dict[str, Any]:
-    """The JSON object that a reply is, not to be changed; raises one of DAMAGED for another."""
+    """Return the JSON object of a reply, not to be changed; raises one of DAMAGED."""
     value = json.loads(text)
     if not isinstance(value, dict):
         raise ValueError("a reply is not a JSON object")

@@ -13,6 +13,7 @@ from merge_runner.config import (
     ModelEntry,
     base_urls,
     check_network,
+    driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
     with_base_urls,
@@ -24,7 +25,8 @@ from merge_runner.llm.batch.lines import Batches
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
 from merge_runner.llm.budget import Budget, Unpaid
-from merge_runner.llm.cache import CallTotals, ResponseCache
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call_totals import CallTotals
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
@@ -128,6 +130,7 @@ def live_clients(
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
+        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
     costs = trial_costs(plan, endpoint_plan.measured, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
     limiters = _limiters(plan, options, share)

@@ -37,7 +37,7 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Wait
-from merge_runner.llm.ledger import Asked, Ledger, SetAside, Spending
+from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import WINDOW_S
 from merge_runner.llm.meter import Meter
 from merge_runner.records import Attempt, ChatReply, Slot, TrialRecord, TrialSpec
@@ -97,8 +97,8 @@ class Played:
     suspended: list[tuple[TrialSpec, str]] = field(default_factory=list)
     replies: list[CachedCall] = field(default_factory=list)
     unanswered: dict[str, tuple[Attempt, ...]] = field(default_factory=dict)
-    spending: Spending = field(default_factory=Spending)
-    opened: dict[str, list[SetAside]] = field(default_factory=dict)
+    spent: Rows = field(default_factory=list)
+    opened: Rows = field(default_factory=list)
     meters: dict[str, Meter] = field(default_factory=dict)
     tokens: dict[str, int] = field(default_factory=dict)
     error: MergeRunnerError | None = None
@@ -170,11 +170,10 @@ async def _play(task: Task, stopping: threading.Event) -> Played:
         cache = ResponseCache(folder)
         stack.callback(cache.close)
         ledger = Ledger(cache, task.plan.ledger)
-        overruns = Spending(overruns=dict(task.overruns))
-        cache.run_now([
-            lambda: cache.keep_all(task.recorded, task.unanswered),
-            lambda: ledger.settle_share("", overruns, {}),
-        ])  # fmt: skip
+        cache.run_now([lambda: cache.keep_all(task.recorded, task.unanswered)])
+        ledger.settle_share(
+            "", [(driver, 0, 0, ratio) for driver, ratio in task.overruns.items()], []
+        )
         try:
             runner = await _runner(task, cache, ledger, stack)
             played.meters = dict(runner.meters)
@@ -190,7 +189,7 @@ async def _play(task: Task, stopping: threading.Event) -> Played:
         known = {call.request.key for call in task.recorded}
         played.replies = [call for call in cache.entries() if call.request.key not in known]
         played.unanswered = cache.all_unanswered()
-        played.spending, played.opened = ledger.read(), ledger.opened()
+        played.spent, played.opened = ledger.rows()
         played.tokens = {name: meter.last_minute()[1] for name, meter in played.meters.items()}
     return played
 
@@ -358,7 +357,7 @@ class DaskTasks:
         name, usd = f"task {self._run} {next(self._numbers)}", self._usd(specs, idle)
         if usd is not None:
             asked = Asked(f"Dask worker {address}", specs[0].trial_id, usd)
-            self._cache.run_now([lambda: self._ledger.reserve_share(name, asked)])
+            self._ledger.reserve(name, 1, usd, None, asked)
         capped = self._options.max_cost_usd is not None
         task = Task(
             worker=self._ids[address],
@@ -438,12 +437,8 @@ class DaskTasks:
 
     def _keep(self, given: _Given, played: Played) -> None:
         """Keep what a task has brought: its replies first."""
-
-        def operation() -> None:
-            self._cache.keep_all(played.replies, played.unanswered)
-            self._ledger.settle_share(given.name, played.spending, played.opened)
-
-        self._cache.run_now([operation])
+        self._cache.run_now([lambda: self._cache.keep_all(played.replies, played.unanswered)])
+        self._ledger.settle_share(given.name, played.spent, played.opened)
         now = asyncio.get_running_loop().time()
         used: Counter[str] = Counter(played.tokens)
         if now - given.given_at < WINDOW_S:

@@ -152,7 +152,7 @@ def _costs(outcome: Outcome, options: Options, expected: Estimate | None) -> Ite
                 if open_ones
                 else ""
             )
-            + f"; all replies in {options.cache}: {outcome.cache_cost_usd:.4f} USD"
+            + f"; all sweeps on {options.cache}: {outcome.cache_cost_usd:.4f} USD"
         )
     if spending.overrun_usd:
         yield (

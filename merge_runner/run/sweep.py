@@ -27,7 +27,8 @@ from merge_runner.errors import (
     UsageError,
 )
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.cache import CallTotals, ResponseCache
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call_totals import CallTotals, call_totals
 from merge_runner.llm.content_hashes import canonical_json, manner
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger, Spending, scopes
@@ -72,8 +73,8 @@ class Outcome:
 
     ``stored_before`` trials were not played because they were stored already; ``suspended`` ones
     wait for money, and their replies are in the cache. ``meter`` counts the calls of this run,
-    ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` what all replies in
-    the cache cost when they were made. ``facts`` summarises what the database holds of the sweep,
+    ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` that of
+    all sweeps on the cache. ``facts`` summarises what the database holds of the sweep,
     and ``audit`` the checks made there; both are None where nothing is stored, or its user
     ``gave_up`` waiting for the database. ``batches`` are those that go on without this run.
     ``playing_s`` is how long the trials took, ``worst_stall_s`` the longest delay of the event
@@ -206,7 +207,8 @@ class Sweep:
                 await self._store_rest(flusher, outcome)
             self._explain(self._misses, outcome)
             try:
-                outcome.cache_cost_usd = self._cache.cost_usd()
+                ledgers = (Ledger(self._cache, scope) for scope in scopes(self._cache))
+                outcome.cache_cost_usd = sum(ledger.read().spent_usd for ledger in ledgers)
                 outcome.spending = self._ledger.read()
             except MergeRunnerError as exc:
                 if self._options.replay:  # which spends nothing
@@ -274,8 +276,14 @@ class Sweep:
         for name, entry in self._plan.entries.items():
             sent = FORMATS[entry.format].request(entry, "")
             asked = manner(sent.path, canonical_json(sent.body))
-            facts[name] = self._cache.stats(entry.id).of(self._plan.endpoints[name], asked)
+            place = entry.id, self._plan.endpoints[name], asked
+            facts[name] = self._totals.get(place, CallTotals())
         return facts
+
+    @cached_property
+    def _totals(self) -> dict[tuple[str, str, str], CallTotals]:
+        """What the recorded calls took, by model, endpoint and how it was asked."""
+        return call_totals(self._cache.entries())
 
     def _explain(self, misses: list[Miss], outcome: Outcome) -> None:
         if not misses:
@@ -317,10 +325,11 @@ class Sweep:
             # Recorded replies come at once: more trials in flight would only wait for each other.
             in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
             return LocalRunner(plan, clients, in_flight)
+        answered = {(model, endpoint) for model, endpoint, _ in self._totals}
         known = frozenset(
             name
             for name, entry in plan.entries.items()
-            if plan.endpoints[name] in self._cache.stats(entry.id).totals
+            if (entry.id, plan.endpoints[name]) in answered
         )
         endpoints = endpoint_plan(plan, options, known, self._measured())
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
@@ -530,7 +539,7 @@ def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> 
         configured += options.faults.identity
     if not options.replay:
         return configured
-    recorded = cache.recorded_endpoints(entry.id)
+    recorded = sorted(cache.recorded_endpoints(entry.id))
     if configured in recorded or not recorded:
         return configured
     if len(recorded) > 1:

@@ -93,6 +93,8 @@ def opened(tmp_path_factory):
 def cache(opened):
     with sqlite3.connect(opened.folder / "cache.db") as database:
         database.execute("DELETE FROM Cache")
+    for table in ("open", "spent"):
+        opened.money.run_now([lambda table=table: opened.money.write(f"DELETE FROM {table}")])
     return opened
 
 
@@ -238,7 +240,8 @@ async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
     assert (await client.ask("prompt", slot())).text == "new"
     assert client.meter.damaged == [key]
     assert any(key in note and "set aside" in note for note in client.meter.notes)
-    assert cache.read(f"damaged {key}") == damaged
+    with diskcache.Cache(str(cache.folder)) as stock:
+        assert stock[f"damaged {key}"] == damaged
     assert (await make(answer("third")).ask("prompt", slot())).text == "new"
 
 

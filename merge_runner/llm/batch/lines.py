@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.batch.journal import OpenLine
 from merge_runner.llm.batch.service import BatchLine
-from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid, UnpaidAttempt
+from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.http_outcome import RawReply
 from merge_runner.records import Attempt
 
@@ -47,7 +47,7 @@ class Line:
     line: BatchLine
     model: str
     ledger: str
-    money: PaidAttempt | UnpaidAttempt
+    money: PaidAttempt
     attempts: tuple[Attempt, ...]
     open: OpenLine | None = None
     end: asyncio.Future[LineEnd] = field(init=False)
@@ -75,7 +75,7 @@ class Batches:
     rounds: Rounds
     model: str
     ledger: str
-    money: Budget | Unpaid
+    money: Budget
     price_factor: float
 
     def takes_up(self, call: Call) -> bool:
@@ -88,11 +88,11 @@ class Batches:
     @asynccontextmanager
     async def attempt(
         self, call: Call, opened: OpenLine | None
-    ) -> AsyncIterator[tuple[PaidAttempt | UnpaidAttempt, Line]]:
+    ) -> AsyncIterator[tuple[PaidAttempt, Line]]:
         """Yield the money of a call's next attempt, and its line, which may be ``opened``."""
         key, ledger = call.request.key, self.ledger
         asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.price_factor)
-        paid: PaidAttempt | UnpaidAttempt
+        paid: PaidAttempt
         async with AsyncExitStack() as stack:
             if opened is None:
                 with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
