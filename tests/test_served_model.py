@@ -15,7 +15,7 @@ from analysis.data.study import Study
 from analysis.explorer.catalogue import Catalogue, Filter
 from analysis.explorer.sweeps import find_sweep
 from analysis.tables.attempts import attempts
-from merge_runner.audit import audit_sweep
+from merge_runner.audit.checks import audit_sweep
 from merge_runner.results.database import in_memory
 from merge_runner.results.store import sweep_facts
 from merge_runner.served_model import is_other_model, others_among, sql_of
@@ -50,7 +50,9 @@ def test_all_that_tell_of_other_models_tell_the_same(db):
     assert sorted(served for _, served, _ in sweep_facts(db, "sweep-1").others) == OTHERS
     assert sorted(served for _, served in load_calls(db).others) == OTHERS
     assert sorted(one.served for one in provenance(db).mismatches) == OTHERS
-    found = [f.text for f in audit_sweep(db, "sweep-1").findings if f.kind == "served"]
+    found = [
+        f.text for f in audit_sweep(db, "sweep-1", [], finished=True).findings if f.kind == "served"
+    ]
     assert sorted(text.split(": ")[0] for text in found) == [f"o3 -> {name}" for name in OTHERS]
     catalogue = Catalogue(db)
     sweep = find_sweep(catalogue, "sweep-1")

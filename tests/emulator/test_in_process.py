@@ -78,4 +78,4 @@ async def test_a_connection_that_breaks_off_is_lost(carried, driving_prompt, fau
 
 
 async def test_what_is_not_there_is_not_found(carried):
-    assert (await carried().get("/nothing", timeout_s=5)).status == 404
+    assert (await carried().ask("GET", "/nothing", {}, timeout_s=5)).status == 404

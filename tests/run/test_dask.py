@@ -12,7 +12,6 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from functools import partial
 
 import psutil
 import pytest
@@ -21,7 +20,7 @@ from aiohttp import web
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.ledger import Asked, Ledger, SetAside, Spending
+from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.registry import Catalogue, in_use, use
 from merge_runner.run.dask_cluster import connected
 from merge_runner.run.dask_tasks import use_study
@@ -306,15 +305,14 @@ def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
         ledger = Ledger(cache, "baseline")
         for name in ("lost", "kept"):
             asked = Asked("Dask worker tcp://1", "L_4_0", 5.0)
-            cache.run_now([partial(ledger.reserve_share, name, asked)])
+            assert ledger.reserve(name, 1, 5.0, None, asked)
         assert (ledger.read().reserved_usd, ledger.read().open_attempts) == (10, 2)
-        unclear = SetAside(0.5, Asked("o3", "N_0_0"), "", "read_timeout")
-        spent = Spending(1.5, 0.5, 1, overrun_usd=0.25, overruns={"o3": 2.0})
-        cache.run_now([partial(ledger.settle_share, "kept", spent, {"a key": [unclear]})])
+        unclear = ("a key", 1, 0.5, "o3", "N_0_0", 0.5, "2026-01-01T00:00:00Z", "read_timeout")
+        ledger.settle_share("kept", [("o3", 1.5, 0.25, 2.0)], [unclear])
         spending = Ledger(cache, "baseline").read()
         assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (1.5, 5.5, 2)
         assert spending.overruns == {"o3": 2.0}
-        assert [reason.driver for reason in ledger.reasons()] == ["Dask worker tcp://1", "o3"]
+        assert [reason["driver"] for reason in ledger.reasons()] == ["Dask worker tcp://1", "o3"]
 
 
 @pytest.mark.long

@@ -33,7 +33,10 @@ def plant(folder, statement, mark):
 @pytest.mark.parametrize(
     ("statement", "says"),
     [
-        ("UPDATE Cache SET value = ?, mode = 4 WHERE length(key) = 64", "a pickled value"),
+        (
+            "UPDATE Cache SET value = ?, mode = 4 WHERE length(key) = 64",
+            "holds a pickle or names a file",
+        ),
         (
             "INSERT INTO Cache (key, raw, store_time, access_time, mode, value) "
             "SELECT ?, 0, 0, 0, 1, '{}'",

@@ -13,12 +13,12 @@ from starlette.testclient import TestClient
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
 from analysis.human.load import import_trials, sort_files
-from merge_runner.audit.sweeps import audit_database
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.store import Store, query
 from merge_runner.run.plan import make_plan
+from merge_runner.run.stored_replay import audit_database
 from merge_runner.trial import play_trial
 from merge_runner_cei.human_replay import HUMAN_REPLAY, HUMANS
 from tests.analysis.recordings import drive, file
@@ -196,7 +196,7 @@ async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
     assert (await merge_runner("sweep", *command)).summary["exit_code"] == 0
     (first, *_) = audit_database(db)
     assert not first.findings
-    assert not [note for note in first.notes if "derived" in note]
+    assert not [note for note in first.notes if "not replayed" in note]
     tables = await merge_runner("tables", "ablation-quantitative")
     cautioned = "human-replay+idm: the human on the left is replayed and does not react"
     assert cautioned in " ".join(tables.out.split())
@@ -211,7 +211,7 @@ async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
     with duckdb.connect(str(db)) as connection:
         connection.execute("DELETE FROM trials WHERE source = 'human'")
     (first, *_) = audit_database(db)
-    assert [note for note in first.notes if "what a program drives by is not here" in note]
+    assert [note for note in first.notes if "other data: left.data" in note]
 
 
 async def test_a_replay_needs_the_same_import_and_says_so(merge_runner, tmp_path, db):
