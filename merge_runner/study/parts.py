@@ -30,7 +30,7 @@ from merge_runner.prompts.blocks import (
     blocks_of,
 )
 from merge_runner.registry import FAULTS, Catalogue, collecting, use
-from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.crossing import chosen_models, driver_names
 from merge_runner.study.file import (
     AddedText,
@@ -71,9 +71,9 @@ def catalogue_of(file: StudyFile, text: str, plugins: Mapping[str, str]) -> Cata
     _import_others(plugins.values())
     with collecting(Catalogue(text, plugins)) as catalogue:
         _run_plugins(plugins)
-        for condition in file.conditions or ():
-            if condition.numbers:
-                CONDITIONS.register(condition.name, Condition(**condition.numbers))
+        for name, condition in (file.conditions or {}).items():
+            if condition is not None:
+                CONDITIONS.register(name, condition)
         for name, prompt in _by_dependence(file.prompts).items():
             VARIANTS.register(name, _variant(name, prompt))
         for name, driver in file.drivers.items():
@@ -208,8 +208,8 @@ def _with_added(
         name = added.block
         block = BLOCKS.require(name, f"the prompt {prompt} adds it")
     else:
-        name, texts = f"{prompt}.{number}", added.texts
-        block = Block(f"added by {prompt}", texts.merge, texts.straight, before=None)
+        name = f"{prompt}.{number}"
+        block = Block(f"added by {prompt}", added.merge, added.straight, before=None)
     if name in blocks:
         raise UsageError(f"the prompt {prompt} adds the block {name!r}, which it has already")
     anchor = added.before or added.after or _own_place(block, blocks)
