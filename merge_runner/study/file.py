@@ -120,11 +120,6 @@ class StudyDriver(Frozen):
     program: str
     clock: Positive | None = None
 
-    @property
-    def parameters(self) -> dict[str, object]:
-        """The parameters that it sets."""
-        return dict(self.model_extra or {})
-
 
 class Plugins(Frozen):
     """Python files that register drivers, prompt blocks, metrics and so on, beside the study."""

@@ -112,18 +112,13 @@ def _run_plugins(sources: Mapping[str, str]) -> None:
     """Run plug-ins, given by file name and source, as the modules of one package."""
     for name in [name for name in sys.modules if name.startswith(f"{PACKAGE}.")]:
         del sys.modules[name]
-    loaders = {_module(file): _Source(file, source) for file, source in sources.items()}
-    if len(loaders) < len(sources):
-        raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
     package = sys.modules[PACKAGE] = ModuleType(PACKAGE)
     package.__path__ = []
-    for name, loader in loaders.items():
-        _run(name, loader)
-
-
-def _module(file: str) -> str:
-    stem = re.sub(r"[^A-Za-z0-9_]", "_", Path(file).stem)
-    return f"{PACKAGE}.{stem}"
+    for file, source in sources.items():
+        name = f"{PACKAGE}.{re.sub('[^A-Za-z0-9_]', '_', Path(file).stem)}"
+        if name in sys.modules:
+            raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
+        _run(name, _Source(file, source))
 
 
 def _by_dependence(prompts: Mapping[str, StudyPrompt]) -> dict[str, StudyPrompt]:
@@ -171,7 +166,7 @@ def _program(name: str, driver: StudyDriver) -> Program:
     """The program that a driver of a study is; raises UsageError."""
     try:
         program = PROGRAMS.require(driver.program)
-        return program.with_changes(driver.program, driver.parameters, driver.clock)
+        return program.with_changes(driver.program, driver.model_extra or {}, driver.clock)
     except UsageError as exc:
         raise UsageError(f"[drivers.{name}]: {exc}") from exc
 
