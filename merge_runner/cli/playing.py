@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-import typer
-
-from merge_runner.cli.output import print_out, say
-from merge_runner.errors import UsageError
+from merge_runner.cli.output import agree, print_out, say
 
 if TYPE_CHECKING:
     from merge_runner.run.estimate import Estimate
@@ -95,19 +91,13 @@ def _confirm(plan: Plan, options: Options, *, yes: bool) -> Estimate | None:
     if (batch := expected.batch) is not None:
         halved = "" if batch.cost_usd is None else f"about {batch.cost_usd} USD in batches, "
         takes = f"{halved}{cost} singly, at most {batch.most_rounds} rounds of batches"
-    say(
+    agree(
         f"{expected.driver}: {expected.trials} trials, about {expected.calls} calls that are not "
-        f"recorded yet, {takes}"
+        f"recorded yet, {takes}",
+        "Go ahead?",
+        otherwise="nothing was sent",
+        yes=yes,
     )
-    if yes:
-        return expected
-    if not sys.stdin.isatty():
-        raise UsageError(
-            "this run spends money and there is no terminal to ask at: add --yes to go ahead, or "
-            "--dry-run to only see the estimate"
-        )
-    if not typer.confirm("Go ahead?", err=True):
-        raise UsageError("nothing was sent")
     return expected
 
 
