@@ -9,9 +9,9 @@ import re
 import tomllib
 from base64 import b64encode
 from collections.abc import Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 from urllib.parse import SplitResult, unquote, urlsplit
@@ -199,29 +199,22 @@ class ScenarioConfig(Frozen):
 
     @model_validator(mode="after")
     def _whole_steps(self) -> ScenarioConfig:
+        delays_s = {side: self.perception(side).delay_s for side in SIDES}
         for name, seconds, step_s in (
             ("plan_step_s", self.action_s, self.step_s),
             ("horizon_s", self.horizon_s, self.action_s),
             ("memory_s", self.memory_s, self.action_s),
             ("timeout_s", self.timeout_s, self.step_s),
             ("1 / prompt_rate_hz", 1 / self.prompt_rate_hz, self.action_s),
+            *((f"perception_{s}.delay_s", delays_s[s], self.step_s) for s in SIDES if delays_s[s]),
         ):
-            whole_steps(name, seconds, step_s)
-        for side in SIDES:
-            if delay_s := self.perception(side).delay_s:
-                self._check_delay(f"perception_{side}.delay_s", delay_s)
+            try:
+                whole_steps(name, seconds, step_s)
+            except ValueError as exc:
+                raise ValueError(f"{exc}: set step_s and plan_step_s so that it fits") from exc
         if self.executed_actions > self.plan_actions:
             raise ValueError("the horizon is shorter than the time between two prompts")
         return self
-
-    def _check_delay(self, name: str, delay_s: float) -> None:
-        try:
-            whole_steps(name, delay_s, self.step_s)
-        except ValueError as exc:
-            raise ValueError(
-                f"{exc}: set step_s under [scenario] so that it fits, and plan_step_s = "
-                f"{self.action_s:g} to leave a language model's plan as it is"
-            ) from exc
 
 
 class Price(Frozen):
@@ -309,6 +302,7 @@ class Provider:
     if_nobody: str = "check the network"
 
 
+_half = partial(BatchTerms, price_factor=0.5)
 PROVIDERS: Registry[Provider] = Registry("provider")
 for _name, _provider in {
     "openai": Provider(
@@ -316,7 +310,7 @@ for _name, _provider in {
         "OPENAI_BASE_URL",
         ("OPENAI_API_KEY",),
         error_members=frozenset({"message", "type", "code"}),
-        batch=BatchTerms(price_factor=0.5, source="platform.openai.com/docs/guides/batch, 2026-11"),
+        batch=_half(source="platform.openai.com/docs/guides/batch, 2026-11"),
     ),
     "gemini": Provider(
         "https://generativelanguage.googleapis.com",
@@ -325,9 +319,7 @@ for _name, _provider in {
         ("GOOGLE_API_KEY", "GEMINI_API_KEY"),
         auth="x-goog-api-key",
         error_members=frozenset({"message", "code", "status"}),
-        batch=BatchTerms(
-            price_factor=0.5, source="ai.google.dev/gemini-api/docs/batch-api, 2026-11"
-        ),
+        batch=_half(source="ai.google.dev/gemini-api/docs/batch-api, 2026-11"),
     ),
     "anthropic": Provider(
         "https://api.anthropic.com",
@@ -335,9 +327,8 @@ for _name, _provider in {
         ("ANTHROPIC_API_KEY",),
         auth="x-api-key",
         error_members=frozenset({"message", "type"}),
-        batch=BatchTerms(
-            price_factor=0.5,
-            source="platform.claude.com/docs/en/build-with-claude/batch-processing, 2026-11",
+        batch=_half(
+            source="platform.claude.com/docs/en/build-with-claude/batch-processing, 2026-11"
         ),
     ),
     "openrouter": Provider(
@@ -364,7 +355,7 @@ for _name, _provider in {
         "EMULATOR_BASE_URL",
         key_needed=False,
         parameters=PLANTED,
-        batch=BatchTerms(price_factor=0.5, source="as the providers that it stands in for"),
+        batch=_half(source="as the providers that it stands in for"),
         if_nobody="start it with `merge-runner emulate`",
     ),
 }.items():
@@ -383,10 +374,7 @@ class Endpoint:
     provider: str
     identity: str
     base_url: str
-    auth_headers: Mapping[str, str]
-
-    def __repr__(self) -> str:
-        return f"Endpoint({self.provider}, {self.identity})"
+    auth_headers: Mapping[str, str] = field(repr=False)
 
     @property
     def is_emulator(self) -> bool:
@@ -401,7 +389,7 @@ def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.e
     """
     provider = PROVIDERS.require(entry.provider)
     key_envs = (entry.key_env,) if entry.key_env else provider.key_envs
-    key = next((env[variable] for variable in key_envs if env.get(variable)), None)
+    key = next(filter(None, map(env.get, key_envs)), None)
     if key is None and provider.key_needed:
         raise UsageError(
             f"{name} needs a key: set {' or '.join(key_envs)}. Without one: `merge-runner "
@@ -580,11 +568,10 @@ def proxy_secrets(env: Mapping[str, str] = os.environ) -> Iterator[str]:
         if variable.lower() not in PROXY_VARIABLES:
             continue
         try:
-            info = urlsplit(value if "://" in value else f"http://{value}").netloc.rpartition("@")[
-                0
-            ]
+            parts = urlsplit(value if "://" in value else f"http://{value}")
         except ValueError:  # it is no URL, and nothing goes there
             continue
+        info = parts.netloc.rpartition("@")[0]
         for given in {info, unquote(info)}:
             yield from (given, given.partition(":")[2], b64encode(given.encode()).decode())
 
@@ -606,11 +593,6 @@ def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
     """The variables of this environment that say where the entries' providers are reached."""
     variables = {PROVIDERS.require(entry.provider).base_url_env for entry in entries.values()}
     return {v: os.environ[v] for v in variables if v is not None and os.environ.get(v)}
-
-
-def with_base_urls(urls: Mapping[str, str]) -> dict[str, str]:
-    """The environment of this process, with the base URLs that another process has found."""
-    return {**os.environ, **urls}
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -647,20 +629,18 @@ def url_origin(url: str) -> str:
     return f"{parts.scheme}://{parts.netloc}"
 
 
-def _explain(exc: ValidationError, model: type[BaseModel]) -> list[str]:
-    lines = []
+def _explain(exc: ValidationError, model: type[BaseModel]) -> Iterator[str]:
     for error in exc.errors():
         place = ".".join(str(part) for part in error["loc"])
         if error["type"] == "extra_forbidden":
             owner = model
             for part in error["loc"][:-1]:
-                field = owner.model_fields.get(str(part))
-                owner = (field and model_in(field.annotation)) or owner
-            lines.append(str(unknown_name("key", place, owner.model_fields)))
+                known = owner.model_fields.get(str(part))
+                owner = (known and model_in(known.annotation)) or owner
+            yield str(unknown_name("key", place, owner.model_fields))
         else:
             text = error["msg"].removeprefix("Value error, ")
-            lines.append(f"{place}: {text}" if place else text)
-    return lines
+            yield f"{place}: {text}" if place else text
 
 
 def model_in(annotation: object) -> type[BaseModel] | None:

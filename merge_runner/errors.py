@@ -1,22 +1,4 @@
-"""Everything that can go wrong, as one tree.
-
-MergeRunnerError
-├── UsageError             wrong usage or configuration, a missing key          exit 2
-├── CallFailed             one call has no answer: its trial becomes a row      exit 1
-│   └── ReplayMiss         no recorded reply for a call of a sealed replay      exit 4
-├── SweepStopped           the sweep cannot go on; what is done is kept
-│   ├── EndpointRefused    bad key, unknown or retired model                    exit 2
-│   ├── QuotaExhausted     the account has nothing left                         exit 3
-│   ├── ProviderDown       nobody listens, or nothing is answered any more      exit 1
-│   ├── ModelSwapped       --strict-model, and another model answers            exit 1
-│   ├── NoValidDecision    a model answers nothing that can be driven           exit 1
-│   ├── ClusterFailed      the cluster that plays cannot go on                  exit 1
-│   └── CacheFailed        replies cannot be kept or read                       exit 1
-├── TrialSuspended         --max-cost cannot pay for the trial to go on         exit 3
-├── StoreError             the database cannot be written or read               exit 1
-│   └── StoreLocked        another program holds the database
-└── RecordingError         a recording is damaged or not one of ours            exit 1
-"""
+"""Everything that can go wrong, as one tree of exceptions."""
 
 from __future__ import annotations
 

@@ -5,15 +5,9 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import socket
 import stat
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-
-FROM_TERMINAL = (signal.SIGINT, signal.SIGHUP)
-# A query that is about to begin forgets that it was to end.
-AGAIN_S = 0.1
 
 
 @contextmanager
@@ -55,41 +49,3 @@ def _leave_terminal() -> None:
         if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty is false once it is closed
             os.dup2(nowhere, stream)
     os.close(nowhere)
-
-
-@contextmanager
-def at_signals(act: Callable[[], object]) -> Iterator[None]:
-    """Call ``act`` from a thread at a signal, although the main thread is not in Python.
-
-    It is called again and again until the block ends. DuckDB looks at no signal while more than one
-    of its threads work on a query.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # signals are the main thread's
-        return
-
-    def listen() -> None:
-        while _stays_open(heard):
-            act()
-            heard.settimeout(AGAIN_S)
-
-    heard, told = socket.socketpair()
-    told.setblocking(False)
-    listener = threading.Thread(target=listen, daemon=True)
-    before = signal.set_wakeup_fd(told.fileno())
-    listener.start()
-    try:
-        yield
-    finally:
-        signal.set_wakeup_fd(before)
-        told.close()
-        listener.join()
-        heard.close()
-
-
-def _stays_open(heard: socket.socket) -> bool:
-    """Wait for a signal, or for as long as the socket waits."""
-    try:
-        return bool(heard.recv(1))
-    except TimeoutError:
-        return True

@@ -24,28 +24,19 @@ def models(as_json: JsonOption = False) -> None:
     from merge_runner.records import Usage
     from merge_runner.results.query_output import write_json
 
-    million = 1_000_000
     entries = load_models()
     rows: list[Row] = []
     for name, entry in entries.items():
-        costs = [
-            cost_usd(entry, Usage(input_tokens=i, output_tokens=o))
-            for i, o in ((1000, 0), (0, 1000))
-        ]
-        usd = ["unknown" if c is None else round(c * million / 1000, 6) for c in costs]
-        source = entry.price.source if isinstance(entry.price, Price) else entry.price
-        rows.append(
-            (
-                name,
-                entry.provider,
-                key_status(name, entry),
-                *usd,
-                str(entry.shutdown or ""),
-                entry.id,
-                source,
-                entry.note,
-            )
+        thousand = (
+            Usage(input_tokens=1000, output_tokens=0),
+            Usage(input_tokens=0, output_tokens=1000),
         )
+        costs = [cost_usd(entry, tokens) for tokens in thousand]
+        usd = ["unknown" if cost is None else round(cost * 1000, 6) for cost in costs]
+        closes = str(entry.shutdown or "")
+        source = entry.price.source if isinstance(entry.price, Price) else entry.price
+        key = key_status(name, entry)
+        rows.append((name, entry.provider, key, *usd, closes, entry.id, source, entry.note))
     for name, program in PROGRAMS.items():
         rows.append((name, "program", "not needed", 0, 0, "", "", "", program.described))
     if as_json:

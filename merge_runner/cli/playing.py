@@ -3,31 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
-import sys
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
-from merge_runner.cli.output import print_out, say
-from merge_runner.errors import UsageError
+from merge_runner.cli.output import agree, print_out, say
 
 if TYPE_CHECKING:
     from merge_runner.run.estimate import Estimate
     from merge_runner.run.plan import Options, Plan
     from merge_runner.run.sweep import Outcome
-
-
-def check_money_and_replay(
-    max_cost: float | None, recording: list[Path] | None, *, replay: bool
-) -> None:
-    """Raise UsageError for a cap that is no number, and a recording without a replay."""
-    if max_cost is not None and not math.isfinite(max_cost):
-        raise UsageError("--max-cost is a number of USD")
-    if recording and not replay:
-        raise UsageError("--recording goes with a replay; to keep its replies: recording import")
 
 
 def play(
@@ -42,19 +26,17 @@ def play(
     from merge_runner.llm.models import shutdown_notes
     from merge_runner.run.sweep import unsent
 
-    for note in plan.notes():
-        say(note)
-    if not options.replay:
-        asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
-        for note in shutdown_notes(asked, datetime.now(UTC).date()):
-            say(note)
-        options = plan.within_budget(options)
-    else:
+    notes = [*plan.notes()]
+    if options.replay:
         from merge_runner.run.recorded_plan import replayed
 
-        plan, options, notes = replayed(plan, options, whole=whole)
-        for note in notes:
-            say(note)
+        plan, options, more = replayed(plan, options, whole=whole)
+    else:
+        asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
+        more = [*shutdown_notes(asked, datetime.now(UTC).date())]
+        options = plan.within_budget(options)
+    for note in (*notes, *more):
+        say(note)
     if dry_run:
         _print_estimate(asyncio.run(unsent(plan, options, say=say)), as_json=as_json)
         return 0
@@ -109,19 +91,13 @@ def _confirm(plan: Plan, options: Options, *, yes: bool) -> Estimate | None:
     if (batch := expected.batch) is not None:
         halved = "" if batch.cost_usd is None else f"about {batch.cost_usd} USD in batches, "
         takes = f"{halved}{cost} singly, at most {batch.most_rounds} rounds of batches"
-    say(
+    agree(
         f"{expected.driver}: {expected.trials} trials, about {expected.calls} calls that are not "
-        f"recorded yet, {takes}"
+        f"recorded yet, {takes}",
+        "Go ahead?",
+        otherwise="nothing was sent",
+        yes=yes,
     )
-    if yes:
-        return expected
-    if not sys.stdin.isatty():
-        raise UsageError(
-            "this run spends money and there is no terminal to ask at: add --yes to go ahead, or "
-            "--dry-run to only see the estimate"
-        )
-    if not typer.confirm("Go ahead?", err=True):
-        raise UsageError("nothing was sent")
     return expected
 
 

@@ -13,18 +13,23 @@ from merge_runner.errors import UsageError
 if TYPE_CHECKING:
     from merge_runner.emulator.faults import FaultPlan
 
+FaultRateOption = Annotated[
+    float,
+    typer.Option(metavar="P", help="Emulator only: share of attempts with a transient fault."),
+]
+FaultsOption = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Emulator only: a TOML file of faults.")
+]
+SeedOption = Annotated[int, typer.Option(metavar="N", help="Emulator only: seed of the faults.")]
+
 
 def emulate(
     port: Annotated[
         int, typer.Option(metavar="N", help="0: any free port.", min=0, max=65535)
     ] = 8765,
-    fault_rate: Annotated[
-        float, typer.Option(metavar="P", help="Share of attempts with a fault.")
-    ] = 0.0,
-    faults: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A TOML file of faults.")
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the faults.")] = 0,
+    fault_rate: FaultRateOption = 0.0,
+    faults: FaultsOption = None,
+    seed: SeedOption = 0,
     batch_delay: Annotated[
         float | None,
         typer.Option(metavar="S", help="Seconds until a batch has its results.", min=0),

@@ -6,6 +6,7 @@ import shlex
 import sys
 from dataclasses import replace
 from functools import wraps
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,8 +26,8 @@ from merge_runner.cli.options import (
     listed,
 )
 from merge_runner.cli.output import print_out, say
-from merge_runner.cli.playing import check_money_and_replay, play
-from merge_runner.cli.stand_in import faults_of
+from merge_runner.cli.playing import play
+from merge_runner.cli.stand_in import FaultRateOption, FaultsOption, SeedOption, faults_of
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 
@@ -144,14 +145,9 @@ def sweep(
             help="Also replay from this file, without importing it; may be repeated.",
         ),
     ] = None,
-    fault_rate: Annotated[
-        float,
-        typer.Option(metavar="P", help="Emulator only: share of attempts with a transient fault."),
-    ] = 0.0,
-    faults: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Emulator only: a file of faults.")
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", help="Emulator only: seed of the faults.")] = 0,
+    fault_rate: FaultRateOption = 0.0,
+    faults: FaultsOption = None,
+    seed: SeedOption = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -159,13 +155,21 @@ def sweep(
     from merge_runner.run.plan import Options, make_plan
     from merge_runner.run.seat import first_situations, grid_conditions
 
-    check_money_and_replay(max_cost, recording, replay=replay)
-    if dask is not None and replay:
-        raise UsageError("a replay needs no cluster: leave --dask out")
-    if grid is not None and not first:
-        raise UsageError("--grid goes with --first")
-    if grid is not None and conditions is not None:
-        raise UsageError("--grid takes the place of --conditions: give one of them")
+    for refused, advice in (
+        (not isfinite(max_cost or 0), "--max-cost is a number of USD"),
+        (
+            recording and not replay,
+            "--recording goes with a replay; to keep its replies: recording import",
+        ),
+        (dask is not None and replay, "a replay needs no cluster: leave --dask out"),
+        (grid is not None and not first, "--grid goes with --first"),
+        (
+            None not in (grid, conditions),
+            "--grid takes the place of --conditions: give one of them",
+        ),
+    ):
+        if refused:
+            raise UsageError(advice)
     options = Options(
         db=db,
         cache=cache,

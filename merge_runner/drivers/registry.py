@@ -141,20 +141,16 @@ class Program:
 
     @property
     def source(self) -> str:
-        """The hash of its source, as ``source_digest`` says.
-
-        The world and the records, which it shares with language models, are covered by the version
-        of the spec.
-        """
+        """The hash of its source; see ``source_digest``."""
         assert isinstance(self.driver, type)
         return source_digest(self.driver)
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
-        """See MakeDriver."""
+        """Return the driver of one side of a trial."""
         return self.driver(self.seat(scenario, spec, side))
 
     def seat(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> ProgramSeat:
-        """The seat of a side of a trial."""
+        """Return the seat of one side of a trial."""
         pace = program_pace(scenario, self.rate_hz)
         seeds = {each: take_seat(scenario, spec, each, pace).seed for each in SIDES}
         return ProgramSeat(
@@ -169,7 +165,7 @@ class Program:
         )
 
     def in_spec(self, name: str) -> dict[str, object]:
-        """What the spec of its trials says of it."""
+        """What the spec of its trials says of it; its version covers what all drivers share."""
         return {
             "program": name,
             "parameters": self.values,

@@ -57,20 +57,6 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Unreadable:
-    """A prompt that does not say in these words what the driver needs to know."""
-
-    lacking: list[str]
-
-    def __str__(self) -> str:
-        return (
-            "I am the emulator, a scripted driver and no language model, and cannot read this "
-            f"prompt: it does not say {', '.join(f'`{words}`' for words in self.lacking)}, with "
-            "a number for N. The model `random` answers any prompt."
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class Temper:
     """What is drawn for a trial: who goes first, the gap aimed at, and who does how much.
 
@@ -86,8 +72,8 @@ class Temper:
 def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) -> str:
     """The reply's text for a prompt; without a slot it depends on the prompt alone."""
     seen = read_prompt(prompt)
-    if isinstance(seen, Unreadable):
-        return str(seen)
+    if isinstance(seen, str):
+        return seen
     temper = temper_for(seen, slot, None if effect is None else effect.before(prompt))
     if not seen.other_seen:
         action, why = 0.0, "I do not see the other car, and keep my speed."
@@ -103,8 +89,8 @@ def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) 
     return f"{token}{why}\n\n```python\n[{plan}]\n```"
 
 
-def read_prompt(prompt: str) -> Seen | Unreadable:
-    """The situation that a prompt describes, if it does so in the words that the driver knows."""
+def read_prompt(prompt: str) -> Seen | str:
+    """The situation that a prompt describes, or an answer that says which words it lacks."""
     own = _quantity("Your speed", "m/s", prompt)
     other = _quantity("Speed of the other car", "m/s", prompt)
     relative = _quantity("Relative distance .*?", "m", prompt)
@@ -114,7 +100,12 @@ def read_prompt(prompt: str) -> Seen | Unreadable:
         other, relative = own, -FAR_BEHIND_M
     if own is None or other is None or relative is None or actions is None:
         needed = zip(NEEDED, (own, other, relative, actions), strict=True)
-        return Unreadable([words for words, number in needed if number is None])
+        lacking = ", ".join(f"`{words}`" for words, number in needed if number is None)
+        return (
+            "I am the emulator, a scripted driver and no language model, and cannot read this "
+            f"prompt: it does not say {lacking}, with a number for N. The model `random` answers "
+            "any prompt."
+        )
     return Seen(
         own_speed=own,
         other_speed=other,

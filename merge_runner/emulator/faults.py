@@ -5,12 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from merge_runner.chance import draw, draw_between
 from merge_runner.config import read_toml, validated
@@ -36,18 +31,10 @@ FAULTS: tuple[Fault, ...] = get_args(Fault)
 # ends like one without.
 OUTCOMES: frozenset[Fault] = frozenset({"empty", "refused", "malformed"})
 # The faults that are replies.
-STATUS_FAULTS = {
-    "request_timeout": 408,
-    "conflict": 409,
-    "server_error": 500,
-    "overloaded": 503,
-}
+STATUS_FAULTS = {"request_timeout": 408, "conflict": 409, "server_error": 500, "overloaded": 503}
 TRANSIENT: tuple[Fault, ...] = tuple(fault for fault in FAULTS if fault not in OUTCOMES)
 
-
 Rate = Annotated[float, Field(ge=0, le=1)]
-
-
 Seconds = Annotated[float, Field(ge=0)]
 
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from merge_runner.chance import draw_index
 
 CREATED = 1_760_000_000
+REFUSAL = "I cannot help with that."
 Turn = Any
 """A message as a client sent it: a text, or parts with texts."""
 Envelope = tuple[dict[str, Any], dict[str, str]]
@@ -125,10 +126,8 @@ class _Chat(_OpenAI):
                     "message": {
                         "role": "assistant",
                         "content": None if refused else said.text,
-                        "refusal": "I cannot help with that." if refused else None,
-                        "annotations": [],
+                        "refusal": REFUSAL if refused else None,
                     },
-                    "logprobs": None,
                     "finish_reason": "stop",
                 }
             ],
@@ -136,14 +135,9 @@ class _Chat(_OpenAI):
                 "prompt_tokens": said.tokens_in,
                 "completion_tokens": said.output,
                 "total_tokens": said.tokens_in + said.output,
-                "prompt_tokens_details": {"cached_tokens": 0, "audio_tokens": 0},
-                "completion_tokens_details": {
-                    "reasoning_tokens": said.reasoning,
-                    "audio_tokens": 0,
-                },
+                "prompt_tokens_details": {"cached_tokens": 0},
+                "completion_tokens_details": {"reasoning_tokens": said.reasoning},
             },
-            "service_tier": "default",
-            "system_fingerprint": None,
         }
 
 
@@ -156,7 +150,7 @@ class _Responses(_OpenAI):
 
     def answer(self, said: Said) -> dict[str, Any]:
         part = (
-            {"type": "refusal", "refusal": "I cannot help with that."}
+            {"type": "refusal", "refusal": REFUSAL}
             if said.refused
             else {"type": "output_text", "text": said.text, "annotations": []}
         )
@@ -168,8 +162,6 @@ class _Responses(_OpenAI):
             "model": said.model,
             "error": None,
             "incomplete_details": None,
-            "instructions": None,
-            "metadata": {},
             "parallel_tool_calls": True,
             "tool_choice": "auto",
             "tools": [],
@@ -190,8 +182,6 @@ class _Responses(_OpenAI):
                 "output_tokens_details": {"reasoning_tokens": said.reasoning},
                 "total_tokens": said.tokens_in + said.output,
             },
-            "temperature": 1.0,
-            "top_p": 1.0,
         }
 
 
@@ -281,7 +271,6 @@ class _Anthropic(ServedFormat):
                 "cache_read_input_tokens": 0,
                 "output_tokens": said.output,
                 "output_tokens_details": {"thinking_tokens": said.reasoning},
-                "service_tier": "standard",
             },
         }
 

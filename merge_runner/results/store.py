@@ -6,6 +6,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -39,12 +40,12 @@ from merge_runner.results.first_looks import FIRST_LOOKS
 from merge_runner.results.rows import Row, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.served_model import other_models, sql_of
-from merge_runner.signals import at_signals
 from merge_runner.text_safety import first_line
 
 # Columns that differ from run to run: whether the run made an attempt itself, and when.
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
 SWEEPS = "FROM sweeps ORDER BY started_at"
+AGAIN_S = 0.1  # after which a query that has not ended is told so again
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +211,6 @@ def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
     # The settings hold for a whole instance, and cannot be taken back.
     with (
         read_database(path, Instance()) as connection,
-        at_signals(connection.interrupt),
         answering(connection, sql) as result,
     ):
         yield result
@@ -236,7 +236,8 @@ def answering(
                 "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
                 "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
             )
-        yield connection.execute(statements[0])
+        _execute(connection, statements[0])
+        yield connection
     except duckdb.IOException:
         raise  # a query reaches no file but the database, so it is the database that is damaged
     except duckdb.OutOfMemoryException as exc:
@@ -248,6 +249,22 @@ def answering(
         if "pytz" in str(exc):
             raise UsageError("cast times with a zone, as in now()::TIMESTAMP") from exc
         raise UsageError(f"the query failed: {exc}") from exc
+
+
+def _execute(connection: duckdb.DuckDBPyConnection, statement: duckdb.Statement) -> None:
+    """Run a statement in a thread, so that Ctrl-C ends it.
+
+    DuckDB looks at no signal while several of its threads work on a query.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(connection.execute, statement)
+        try:
+            running.result()
+        except KeyboardInterrupt:
+            while not running.done():  # a query that is about to begin forgets that it was to end
+                connection.interrupt()
+                wait([running], AGAIN_S)
+            raise
 
 
 def _reads(statement: duckdb.Statement) -> bool:

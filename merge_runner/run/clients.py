@@ -16,7 +16,6 @@ from merge_runner.config import (
     driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
-    with_base_urls,
 )
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
@@ -180,7 +179,7 @@ def live_clients(
 def _endpoint(plan: Plan, name: str, urls: Mapping[str, str]) -> Endpoint:
     if plan.is_rehearsal:
         return rehearsal_endpoint(plan.entries[name])
-    return resolve_endpoint(name, plan.entries[name], with_base_urls(urls))
+    return resolve_endpoint(name, plan.entries[name], {**os.environ, **urls})
 
 
 def _batches(

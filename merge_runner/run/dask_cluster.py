@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from merge_runner.errors import UsageError
-from merge_runner.signals import FROM_TERMINAL
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -103,7 +102,9 @@ def _for_children() -> Iterator[None]:
     name = "PYTHONSAFEPATH"
     kept = os.environ.get(name)
     os.environ[name] = "1"
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, FROM_TERMINAL)  # children inherit it
+    before = signal.pthread_sigmask(
+        signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP)
+    )  # children inherit it
     try:
         yield
     finally:

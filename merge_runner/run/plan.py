@@ -478,8 +478,7 @@ def _read_humans(arms: Iterable[Arm], db: Path) -> None:
 
 
 def _conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
-    listed = None if file.conditions is None else [each.name for each in file.conditions]
-    wanted = next(c for c in (chosen, listed, HUMAN_CONDITIONS) if c is not None)
+    wanted = next(c for c in (chosen, file.conditions, HUMAN_CONDITIONS) if c is not None)
     conditions = tuple(
         dict.fromkeys(
             name

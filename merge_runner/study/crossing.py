@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -122,7 +121,10 @@ def cross(
         except UsageError as exc:
             if not file.factors:
                 raise
-            raise UsageError(f"{exc}; {_hint(exc, levels)}") from exc
+            here = ", ".join(f"{name} = {json.dumps(level)}" for name, level in levels.items())
+            raise UsageError(
+                f"{exc}; to leave such crossings out, write above [factors]: skip = [{{ {here} }}]"
+            ) from exc
         both_ways = arm.is_mixed and (mirror or file.mirror)
         arms += [arm, arm.turned()] if both_ways else [arm]
     if not arms:
@@ -240,18 +242,6 @@ def driver_names(file: StudyFile, models: Iterable[str]) -> set[str]:
     return {name for pair in pairs for name in both_sides(pair).values()}
 
 
-def _hint(error: UsageError, levels: Levels) -> str:
-    """How to leave out the crossings that cannot be: by those levels that the error names."""
-    text = str(error)
-    named = [
-        name
-        for name in levels
-        if name == MODEL or re.search(rf"\b({'|'.join((name, *SET_BY.get(name, ())))})\b", text)
-    ]
-    where = ", ".join(f"{name} = {json.dumps(levels[name])}" for name in named)
-    return f"to leave such crossings out, write above [factors]: skip = [{{ {where} }}]"
-
-
 def _once(arms: Iterable[Arm], *, mirrored: bool) -> Iterator[Arm]:
     """The arms, but one of two ``mirrored`` pairs that are each other's mirror image.
 
@@ -266,8 +256,7 @@ def _once(arms: Iterable[Arm], *, mirrored: bool) -> Iterator[Arm]:
         elif not (mirrored and arm.is_mixed and arm.asked == twin.asked):
             raise UsageError(
                 f"the crossings {twin.label!r} and {arm.label!r} are the same trials: leave one "
-                f'out, by skip = [{{ model = "{arm.sides[arm.ego]}", '
-                f'opponent = "{arm.factors.get(OPPONENT, SELF)}" }}]'
+                "out, by skip"
             )
 
 
@@ -284,17 +273,16 @@ def _arm(
     registry: Mapping[str, ModelEntry],
     varying: Sequence[str],
 ) -> Arm:
-    scenario = _scenario(file, levels)
     sides = _sides(str(levels[MODEL]), str(levels.get(OPPONENT, SELF)))
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
     programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
-    scenario = _perceived(file, _with_world_step(scenario, programs), levels)
+    scenario = _scenario(file, levels, programs)
     for name, program in programs.items():
         _refuse_hurry(name, program, scenario)
         pace_of(scenario, program.in_spec(name))
     parameters = {name: level for name, level in levels.items() if _is_parameter(name)}
-    changed = set(both_sides(str(levels[MODEL])).values())
+    changed = {*both_sides(str(levels[MODEL])).values()}
     refused = [name for name, level in parameters.items() if level != DEFAULT]
     if refused and not changed & {*registry}:
         raise UsageError(
@@ -327,24 +315,36 @@ def _arm(
     )
 
 
-def _with_world_step(scenario: ScenarioConfig, programs: Mapping[str, Program]) -> ScenarioConfig:
-    """The scenario with the largest step of which every program's interval is a whole number.
+def _scenario(file: StudyFile, levels: Levels, programs: Mapping[str, Program]) -> ScenarioConfig:
+    """The scenario with the switches of these levels, for these programs; raises UsageError."""
+    fields = ScenarioConfig.model_fields.keys() - SET_BY.keys()
+    given = file.scenario.model_dump(exclude_unset=True)
+    given |= {name: levels[name] for name in levels if name in fields}
+    step = _world_step(validated(ScenarioConfig, given, "factors"), programs)
+    known = {PERFECT_ONE: PERFECT, **file.perception}
+    hint = f"define another one as [{PERCEPTION}.NAME]"
+    for factor in SET_BY.keys() & levels.keys():
+        level = level_text(levels[factor])
+        perception = require(known, f"level of the factor {factor}:", level, hint)
+        given |= dict.fromkeys(SET_BY[factor], perception.model_dump())
+    return validated(ScenarioConfig, {**given, **step}, "factors")
+
+
+def _world_step(scenario: ScenarioConfig, programs: Mapping[str, Program]) -> dict[str, float]:
+    """The largest step of which every program's interval is a whole number; empty for the usual.
 
     A language model's plan keeps its actions, of which each then lasts several steps. A ``step_s``
-    that a study gives stays: what does not fit it is refused (``drivers.pace``). Raises UsageError.
+    that a study gives stays: what does not fit it is refused (``drivers.pace``).
     """
+    if "step_s" in scenario.model_fields_set:
+        return {}
     rates_hz = [program.rate_hz for program in programs.values() if program.rate_hz is not None]
-    if "step_s" in scenario.model_fields_set or not rates_hz:
-        return scenario
     times_s = [scenario.step_s, scenario.action_s, *(1 / rate_hz for rate_hz in rates_hz)]
     exact = [Fraction(time_s).limit_denominator(FINEST) for time_s in times_s]
     whole = math.lcm(*(time.denominator for time in exact))
     step_s = math.gcd(*(int(time * whole) for time in exact)) / whole
-    if step_s == scenario.step_s:
-        return scenario
-    given = scenario.model_dump(exclude_unset=True)
-    fine = {**given, "step_s": step_s, "plan_step_s": scenario.action_s}
-    return validated(ScenarioConfig, fine, f"a world for {', '.join(programs)}")
+    usual = step_s == scenario.step_s
+    return {} if usual else {"step_s": step_s, "plan_step_s": scenario.action_s}
 
 
 def _refuse_hurry(name: str, program: Program, scenario: ScenarioConfig) -> None:
@@ -415,32 +415,3 @@ def _entry(
             changed.append(f"{parameter}={level_text(level)}")
         entry = with_it
     return " ".join([name, *changed]), entry
-
-
-def _scenario(file: StudyFile, levels: Levels) -> ScenarioConfig:
-    fields = ScenarioConfig.model_fields.keys() - SET_BY.keys()
-    return _switched(file.scenario, {name: levels[name] for name in levels if name in fields})
-
-
-def _perceived(file: StudyFile, scenario: ScenarioConfig, levels: Levels) -> ScenarioConfig:
-    """The scenario with the perceptions of these levels, whose delays suit the world's step."""
-    switches: dict[str, JsonValue] = {}
-    for factor in SET_BY.keys() & levels.keys():
-        perception = _perception(file, factor, level_text(levels[factor]))
-        switches.update(dict.fromkeys(SET_BY[factor], perception))
-    return _switched(scenario, switches)
-
-
-def _switched(scenario: ScenarioConfig, switches: Levels) -> ScenarioConfig:
-    """The scenario with other switches; raises UsageError."""
-    if not switches:
-        return scenario
-    given = scenario.model_dump(exclude_unset=True)
-    return validated(ScenarioConfig, {**given, **switches}, "factors")
-
-
-def _perception(file: StudyFile, factor: str, level: str) -> dict[str, JsonValue]:
-    """The perception that a level names; raises UsageError."""
-    known = {PERFECT_ONE: PERFECT, **file.perception}
-    hint = f"define another one as [{PERCEPTION}.NAME]"
-    return require(known, f"level of the factor {factor}:", level, hint).model_dump()

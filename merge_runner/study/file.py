@@ -16,30 +16,44 @@ from merge_runner.config import (
     NotNegative,
     Perception,
     Positive,
-    Rate,
     ScenarioConfig,
     experiments,
     read_toml,
     validated,
 )
 from merge_runner.errors import UsageError, unknown_name
-from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
+from merge_runner.scenarios.merge.conditions import Condition
 
 BASELINE = "baseline"
 EVERY_PROMPT = "every prompt"
 """Stands for a single number of repetitions in ``StudyFile.repetitions``."""
 EVERY_CONDITION = "all"
 """In the list of conditions: the scenario's own ones."""
+ONE_OF_EACH = "give it a block, a text, or merge and straight"
 
 
 def _texts(value: object) -> object:
     return {"merge": value, "straight": value} if isinstance(value, str) else value
 
 
-def _named(value: object) -> object:
-    if not isinstance(value, list):
+def _added(value: object) -> object:
+    if not isinstance(value, dict) or "text" not in value:
         return value
-    return tuple({"name": each} if isinstance(each, str) else each for each in value)
+    if value.keys() & {"block", "merge", "straight"}:
+        raise ValueError(ONE_OF_EACH)
+    rest = {key: each for key, each in value.items() if key != "text"}
+    return {**rest, "merge": value["text"], "straight": value["text"]}
+
+
+def _by_name(value: object) -> object:
+    by_name: dict[str, object] = {}
+    for each in value if isinstance(value, list) else [None]:
+        numbers = dict(each) if isinstance(each, dict) else {"name": each}
+        name = numbers.pop("name", None)
+        if not isinstance(name, str) or (numbers and by_name.get(name)):
+            raise ValueError("it should be a list of names, or of tables with a name of their own")
+        by_name[name] = numbers or by_name.get(name)
+    return by_name
 
 
 def _for_every_prompt(value: object) -> object:
@@ -59,29 +73,21 @@ class RoadTexts(Frozen):
 class AddedText(RoadTexts):
     """A paragraph that a prompt adds ``before`` or ``after`` a block; else it stands last.
 
-    ``text`` stands for both roads. ``block`` names a registered one, which has a place of its own.
+    In a file ``text`` stands for both roads. ``block`` names a registered one, which has a place of
+    its own.
     """
 
     block: str | None = None
-    text: str | None = None
     before: str | None = None
     after: str | None = None
 
     @model_validator(mode="after")
     def _one_of_each(self) -> AddedText:
-        of_roads = self.merge is not None or self.straight is not None
-        if (self.block is not None) + (self.text is not None) + of_roads != 1:
-            raise ValueError("give it a block, a text, or merge and straight")
+        if (self.block is not None) == (self.merge is not None or self.straight is not None):
+            raise ValueError(ONE_OF_EACH)
         if self.before is not None and self.after is not None:
             raise ValueError("before or after, not both")
         return self
-
-    @property
-    def texts(self) -> RoadTexts:
-        """Its templates where it is no registered block."""
-        if self.text is None:
-            return self
-        return RoadTexts(merge=self.text, straight=self.text)
 
 
 class StudyPrompt(Frozen):
@@ -93,31 +99,8 @@ class StudyPrompt(Frozen):
     based_on: str = BASELINE
     remove: tuple[str, ...] = ()
     replace: dict[str, Annotated[RoadTexts, BeforeValidator(_texts)]] = Field(default_factory=dict)
-    add: tuple[AddedText, ...] = ()
+    add: tuple[Annotated[AddedText, BeforeValidator(_added)], ...] = ()
     title: str = ""
-
-
-class StudyCondition(Frozen):
-    """A condition: by its name alone one that is known, else one of the study's own."""
-
-    name: str
-    projected_headway_m: Annotated[float, Field(allow_inf_nan=False)] | None = None
-    relative_velocity_mps: Annotated[float, Field(allow_inf_nan=False)] | None = None
-    mean_speed_mps: Rate = MEAN_SPEED_MPS
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """Those of a condition of the study's own; empty for one that is known."""
-        return self.model_dump(exclude={"name"}, exclude_unset=True)
-
-    @model_validator(mode="after")
-    def _whole(self) -> StudyCondition:
-        numbers = self.projected_headway_m, self.relative_velocity_mps
-        if self.numbers and None in numbers:
-            raise ValueError(
-                "a condition of your own needs projected_headway_m and relative_velocity_mps"
-            )
-        return self
 
 
 class BudgetTerms(Frozen):
@@ -137,11 +120,6 @@ class StudyDriver(Frozen):
     program: str
     clock: Positive | None = None
 
-    @property
-    def parameters(self) -> dict[str, object]:
-        """The parameters that it sets."""
-        return dict(self.model_extra or {})
-
 
 class Plugins(Frozen):
     """Python files that register drivers, prompt blocks, metrics and so on, beside the study."""
@@ -152,6 +130,7 @@ class Plugins(Frozen):
 class StudyFile(Frozen):
     """One study. ``repetitions`` are per condition, for each prompt or for all of them.
 
+    ``conditions`` are by name; one without numbers is known already.
     ``factors`` are crossed with each other, with the ``models`` and with the conditions; ``skip``
     leaves crossings out: each row names levels, or lists of them. Tables compare the levels of a
     factor with its first one, or with that which ``reference`` names. With ``mirror`` two different
@@ -164,7 +143,7 @@ class StudyFile(Frozen):
     repetitions: Annotated[
         dict[str, Annotated[Count, Field(le=MOST_REPETITIONS)]], BeforeValidator(_for_every_prompt)
     ]
-    conditions: Annotated[tuple[StudyCondition, ...], BeforeValidator(_named)] | None = None
+    conditions: Annotated[dict[str, Condition | None], BeforeValidator(_by_name)] | None = None
     scenario: ScenarioConfig = ScenarioConfig()
     factors: dict[str, tuple[Json, ...]] = Field(default_factory=dict)
     skip: tuple[dict[str, Json], ...] = ()
@@ -191,9 +170,8 @@ class StudySource:
     def is_own(self) -> bool:
         """Whether it holds more than names of what there is."""
         file = self.file
-        own_conditions = any(condition.numbers for condition in file.conditions or ())
-        own_parts = file.prompts or file.drivers or file.plugins.files or own_conditions
-        return bool(file.factors or own_parts)
+        own_parts = file.prompts or file.drivers or file.plugins.files or file.factors
+        return bool(own_parts) or any((file.conditions or {}).values())
 
 
 def study_files() -> dict[str, Path]:

@@ -30,7 +30,7 @@ from merge_runner.prompts.blocks import (
     blocks_of,
 )
 from merge_runner.registry import FAULTS, Catalogue, collecting, use
-from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.crossing import chosen_models, driver_names
 from merge_runner.study.file import (
     AddedText,
@@ -71,9 +71,9 @@ def catalogue_of(file: StudyFile, text: str, plugins: Mapping[str, str]) -> Cata
     _import_others(plugins.values())
     with collecting(Catalogue(text, plugins)) as catalogue:
         _run_plugins(plugins)
-        for condition in file.conditions or ():
-            if condition.numbers:
-                CONDITIONS.register(condition.name, Condition(**condition.numbers))
+        for name, condition in (file.conditions or {}).items():
+            if condition is not None:
+                CONDITIONS.register(name, condition)
         for name, prompt in _by_dependence(file.prompts).items():
             VARIANTS.register(name, _variant(name, prompt))
         for name, driver in file.drivers.items():
@@ -112,18 +112,13 @@ def _run_plugins(sources: Mapping[str, str]) -> None:
     """Run plug-ins, given by file name and source, as the modules of one package."""
     for name in [name for name in sys.modules if name.startswith(f"{PACKAGE}.")]:
         del sys.modules[name]
-    loaders = {_module(file): _Source(file, source) for file, source in sources.items()}
-    if len(loaders) < len(sources):
-        raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
     package = sys.modules[PACKAGE] = ModuleType(PACKAGE)
     package.__path__ = []
-    for name, loader in loaders.items():
-        _run(name, loader)
-
-
-def _module(file: str) -> str:
-    stem = re.sub(r"[^A-Za-z0-9_]", "_", Path(file).stem)
-    return f"{PACKAGE}.{stem}"
+    for file, source in sources.items():
+        name = f"{PACKAGE}.{re.sub('[^A-Za-z0-9_]', '_', Path(file).stem)}"
+        if name in sys.modules:
+            raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
+        _run(name, _Source(file, source))
 
 
 def _by_dependence(prompts: Mapping[str, StudyPrompt]) -> dict[str, StudyPrompt]:
@@ -171,7 +166,7 @@ def _program(name: str, driver: StudyDriver) -> Program:
     """The program that a driver of a study is; raises UsageError."""
     try:
         program = PROGRAMS.require(driver.program)
-        return program.with_changes(driver.program, driver.parameters, driver.clock)
+        return program.with_changes(driver.program, driver.model_extra or {}, driver.clock)
     except UsageError as exc:
         raise UsageError(f"[drivers.{name}]: {exc}") from exc
 
@@ -208,8 +203,8 @@ def _with_added(
         name = added.block
         block = BLOCKS.require(name, f"the prompt {prompt} adds it")
     else:
-        name, texts = f"{prompt}.{number}", added.texts
-        block = Block(f"added by {prompt}", texts.merge, texts.straight, before=None)
+        name = f"{prompt}.{number}"
+        block = Block(f"added by {prompt}", added.merge, added.straight, before=None)
     if name in blocks:
         raise UsageError(f"the prompt {prompt} adds the block {name!r}, which it has already")
     anchor = added.before or added.after or _own_place(block, blocks)

@@ -7,7 +7,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from math import isfinite
+from typing import ClassVar
 
+from pydantic import ConfigDict
+
+from merge_runner.config import Rate
 from merge_runner.errors import UsageError
 from merge_runner.registry import Registry
 from merge_runner.scenarios.merge.geometry import Track
@@ -25,9 +29,11 @@ class Condition:
     Raises UsageError where a vehicle would stand still or drive backwards.
     """
 
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")  # of one that a study's file has
+
     projected_headway_m: float
     relative_velocity_mps: float
-    mean_speed_mps: float = MEAN_SPEED_MPS
+    mean_speed_mps: Rate = MEAN_SPEED_MPS
 
     def __post_init__(self) -> None:
         if not isfinite(self.projected_headway_m) or not all(v > 0 for v in self.speeds_mps):
