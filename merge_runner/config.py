@@ -9,7 +9,7 @@ import re
 import tomllib
 from base64 import b64encode
 from collections.abc import Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import date
 from functools import cached_property, partial
 from pathlib import Path
@@ -632,19 +632,24 @@ def url_origin(url: str) -> str:
 def _explain(exc: ValidationError, model: type[BaseModel]) -> Iterator[str]:
     for error in exc.errors():
         place = ".".join(str(part) for part in error["loc"])
-        if error["type"] == "extra_forbidden":
-            owner = model
+        if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+            owner: Any = model
             for part in error["loc"][:-1]:
-                known = owner.model_fields.get(str(part))
+                known = getattr(owner, "model_fields", {}).get(str(part))
                 owner = (known and model_in(known.annotation)) or owner
-            yield str(unknown_name("key", place, owner.model_fields))
+            keys = (
+                [each.name for each in fields(owner)] if is_dataclass(owner) else owner.model_fields
+            )
+            yield str(unknown_name("key", place, keys))
         else:
             text = error["msg"].removeprefix("Value error, ")
             yield f"{place}: {text}" if place else text
 
 
-def model_in(annotation: object) -> type[BaseModel] | None:
-    """The model that a field holds, also in a list or a table of them."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def model_in(annotation: object) -> type | None:
+    """Return the model or data class that a field holds, also in a list or a table of them."""
+    if isinstance(annotation, type) and (
+        issubclass(annotation, BaseModel) or is_dataclass(annotation)
+    ):
         return annotation
     return next(filter(None, map(model_in, get_args(annotation))), None)

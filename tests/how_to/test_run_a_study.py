@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import fields, is_dataclass
 
 import pytest
-from pydantic import BaseModel
 
 from merge_runner.config import ScenarioConfig, model_in
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
@@ -22,8 +22,11 @@ PAGE = (PROJECT / "docs/how-to/run-a-study.md").read_text()
 EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n+```toml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
 
 
-def keys(model: type[BaseModel]):
+def keys(model: type):
     """The keys of a table of the file, and of those within it but the scenario's."""
+    if is_dataclass(model):
+        yield from (field.name for field in fields(model))
+        return
     yield from model.model_fields
     for field in model.model_fields.values():
         inner = model_in(field.annotation)

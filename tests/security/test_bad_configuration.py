@@ -139,6 +139,10 @@ def test_a_registry_that_is_wrong(program, tmp_path, content, says):
         (sweep("conditions = 'N_0_0'"), "conditions: it should be a list of names"),
         (sweep("conditions = [1]"), "conditions: it should be a list of names"),
         (sweep("conditions = ['X']"), f"unknown condition 'X'; valid: {', '.join(CONDITIONS)}"),
+        (
+            sweep("conditions = [{ name = 'near', headway = 1.0 }]"),
+            "unknown key 'conditions.near.headway'; valid: projected_headway_m, relative_",
+        ),
         (sweep("conditions = []"), f"no condition is left; valid: {', '.join(CONDITIONS)}"),
         (sweep(repetitions="'3'"), "repetitions: Input should be a valid dictionary"),
         (sweep(repetitions="0"), "repetitions.every prompt: Input should be greater than 0"),
