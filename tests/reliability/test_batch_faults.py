@@ -17,8 +17,7 @@ from aiohttp import web
 from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import Options, make_plan
-from merge_runner.run.sweep import Sweep
-from tests.harness import watched
+from tests.harness import run_sweep, watched
 
 FORMATS = {"openai": "openai-chat", "anthropic": "anthropic", "gemini": "gemini"}
 REGISTRY = """
@@ -227,9 +226,8 @@ def play(tmp_path, monkeypatch):
             monkeypatch.setenv("GOOGLE_GEMINI_BASE_URL", server.url)
             plan = make_plan(str(tmp_path / "study.toml"), "model", trust=True)
             db = tmp_path / f"{len([*tmp_path.iterdir()])}.duckdb"
-            outcome = await Sweep(
-                plan, Options(db, db.with_suffix(""), quiet=True, **options), say=said.append
-            ).run()
+            settings = Options(db, db.with_suffix(""), quiet=True, **options)
+            outcome = await run_sweep(plan, settings, say=said.append)
             async with httpx.AsyncClient() as client:
                 counts = (await client.get(f"{server.url}/emulator/answered")).json()
         assert outcome.exit_code == 0, outcome.messages

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from merge_runner.llm.batch.service import (
@@ -11,7 +11,6 @@ from merge_runner.llm.batch.service import (
     BatchService,
     BatchStatus,
     LineResult,
-    Unreadable,
     as_reply,
     as_word,
     id_of,
@@ -72,15 +71,12 @@ class AnthropicBatches(BatchService):
             batch=batch,
         )
 
-    async def lines(
-        self, batch_id: str, batch: Mapping[str, Any]
-    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
         """See BatchService."""
         if batch.get("archived_at"):
             raise BatchFailed("lost", "the results of the batch are no longer kept")
         # Not at the URL that the batch names: the key goes to the configured host alone.
-        async for line in self._lines(f"{BATCHES}/{batch_id}/results"):
-            yield line
+        return [f"{BATCHES}/{batch_id}/results"]
 
     def read(self, line: dict[str, Any]) -> LineResult:
         """See BatchService."""

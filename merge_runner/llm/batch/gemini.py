@@ -7,7 +7,7 @@ has the key of its request. Results of both kinds are read.
 from __future__ import annotations
 
 import re
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any, Literal
 from urllib.parse import urlsplit
@@ -19,7 +19,6 @@ from merge_runner.llm.batch.service import (
     BatchService,
     BatchStatus,
     LineResult,
-    Unreadable,
     as_message,
     as_reply,
     as_word,
@@ -142,20 +141,19 @@ class GeminiBatches(BatchService):
             batch=batch,
         )
 
-    async def lines(
-        self, batch_id: str, batch: Mapping[str, Any]
-    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
-        """The results, in a file or beside the state."""
-        metadata = as_dict(batch.get("metadata"))
-        output = as_dict(metadata.get("output")) or as_dict(batch.get("response"))
-        if not output and _word(metadata).upper().endswith("SUCCEEDED"):
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """See BatchService."""
+        output = _output(batch)
+        if not output and _word(as_dict(batch.get("metadata"))).upper().endswith("SUCCEEDED"):
             raise BatchFailed("again", "the results are not there yet")
-        for result in as_dicts(as_dict(output.get("inlinedResponses")).get("inlinedResponses")):
-            yield {"key": as_dict(result.get("metadata")).get("key"), **result}
-        if output.get("responsesFile"):
-            name = id_of(output, "responsesFile")
-            async for line in self._lines(f"{API}/{name}:download?alt=media"):
-                yield line
+        if not output.get("responsesFile"):
+            return []
+        return [f"{API}/{id_of(output, 'responsesFile')}:download?alt=media"]
+
+    def inline_results(self, batch: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """See BatchService."""
+        results = as_dicts(as_dict(_output(batch).get("inlinedResponses")).get("inlinedResponses"))
+        return [{"key": as_dict(each.get("metadata")).get("key"), **each} for each in results]
 
     def read(self, line: dict[str, Any]) -> LineResult:
         """See BatchService."""
@@ -175,6 +173,11 @@ class GeminiBatches(BatchService):
     async def cancel(self, batch_id: str) -> None:
         """See BatchService."""
         await self._cancel(f"{API}/batches/{batch_id}:cancel")
+
+
+def _output(batch: Mapping[str, Any]) -> dict[str, Any]:
+    metadata = as_dict(batch.get("metadata"))
+    return as_dict(metadata.get("output")) or as_dict(batch.get("response"))
 
 
 def _next_page(page: dict[str, Any]) -> str | None:

@@ -57,6 +57,13 @@ class Line:
         """That of its call."""
         return self.line.key
 
+    @property
+    def submitted_at(self) -> str | None:
+        """When its batch was submitted, in UTC; None: it was in none."""
+        if self.open is None:
+            return None
+        return self.open.batch.submitted_at.isoformat(timespec="milliseconds")
+
     def ends(self, end: LineEnd) -> None:
         """Give its end to the call that waits for it."""
         if not self.end.done():
@@ -100,7 +107,7 @@ class Batches:
                         self.money.attempt(call.order, key, asked)
                     )
             else:
-                ledger = self.rounds.ledger_of(opened)
+                ledger = opened.batch.ledger
                 paid = await stack.enter_async_context(
                     self.money.going_on(call.order, key, asked, ledger)
                 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -15,7 +15,6 @@ from merge_runner.llm.batch.service import (
     BatchService,
     BatchStatus,
     LineResult,
-    Unreadable,
     as_message,
     as_reply,
     as_word,
@@ -116,21 +115,10 @@ class OpenAIBatches(BatchService):
             batch=batch,
         )
 
-    async def lines(
-        self, batch_id: str, batch: Mapping[str, Any]
-    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
-        """The lines of both files; where one cannot be read, those of the other all the same."""
-        failure: BatchFailed | None = None
-        for name in ("output_file_id", "error_file_id"):
-            if not batch.get(name):
-                continue
-            try:
-                async for line in self._lines(f"/files/{id_of(batch, name)}/content"):
-                    yield line
-            except BatchFailed as exc:
-                failure = failure or exc
-        if failure is not None:
-            raise failure
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """Return those of its files of answers and of errors."""
+        names = [name for name in ("output_file_id", "error_file_id") if batch.get(name)]
+        return [f"/files/{id_of(batch, name)}/content" for name in names]
 
     def read(self, line: dict[str, Any]) -> LineResult:
         """See BatchService."""

@@ -6,6 +6,7 @@ import json
 import re
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import aclosing
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -42,6 +43,8 @@ ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
 # By how much a server's clock may be behind ours.
 CLOCK_SLACK = timedelta(hours=1)
 MOST_PAGES, LONGEST_CURSOR = 100, 2000
+# A file of results with more lines than that is none, and may have no end.
+MOST_LINES_OF_A_CALL = 3
 LONGEST_MESSAGE, LONGEST_NAME = 500, 80
 
 FailureKind = Literal["again", "smaller", "single", "quota", "refused", "lost"]
@@ -162,10 +165,12 @@ class BatchService(ABC):
         """Return the state of a batch."""
 
     @abstractmethod
-    def lines(
-        self, batch_id: str, batch: Mapping[str, Any]
-    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
-        """Yield the lines of the results of a batch that has ended, in any order."""
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """Return where the results of a batch that has ended are: JSONL, in any order."""
+
+    def inline_results(self, batch: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """Return results that stand beside the state of a batch."""
+        return []
 
     @abstractmethod
     def read(self, line: dict[str, Any]) -> LineResult:
@@ -179,17 +184,30 @@ class BatchService(ABC):
         """
 
     async def results(
-        self, batch_id: str, status: BatchStatus
+        self, batch_id: str, status: BatchStatus, calls: int
     ) -> AsyncIterator[LineResult | Unreadable]:
-        """Yield the results of a batch that has ended, or why one cannot be read.
+        """Yield the results of a batch of so many calls that has ended, or why one cannot be read.
 
-        Raises BatchFailed with the kind ``again`` where they can be read from the beginning.
+        Where one file cannot be read, those of the other come all the same. Raises BatchFailed with
+        the kind ``again`` where they can be read from the beginning.
         """
-        async for line in self.lines(batch_id, status.batch):
+        for line in self.inline_results(status.batch):
+            yield self._result(line)
+        failure: BatchFailed | None = None
+        for path in self.result_paths(batch_id, status.batch):
             try:
-                yield line if isinstance(line, Unreadable) else self.read(line)
-            except Unreadable as exc:
-                yield exc
+                async for text in self._lines(path, MOST_LINES_OF_A_CALL * calls):
+                    yield self._result(text)
+            except BatchFailed as exc:
+                failure = failure or exc
+        if failure is not None:
+            raise failure
+
+    def _result(self, line: dict[str, Any] | Unreadable) -> LineResult | Unreadable:
+        try:
+            return line if isinstance(line, Unreadable) else self.read(line)
+        except Unreadable as exc:
+            return exc
 
     def failure_of(self, error: ServerError) -> FailureKind:
         """Return what to do with lines whose batch is not created, or fails as a whole."""
@@ -229,18 +247,21 @@ class BatchService(ABC):
         if not _is_success(raw) and raw.status not in ENDED_ALREADY:
             raise self._unread(raw)
 
-    async def _lines(self, path: str) -> AsyncIterator[dict[str, Any] | Unreadable]:
-        """Yield the objects of a JSONL file.
+    async def _lines(self, path: str, most: int) -> AsyncIterator[dict[str, Any] | Unreadable]:
+        """Yield the objects of a JSONL file of at most so many lines, blank ones included.
 
         One that is not there is asked for again: it belongs to a batch that is there.
         """
         number = 0
         try:
-            async for line in self._transport.lines(
-                path, self._wire.headers, timeout_s=TRANSFER_TIMEOUT_S
-            ):
-                number += 1
-                yield _parsed(number, line)
+            body = self._transport.lines(path, self._wire.headers, timeout_s=TRANSFER_TIMEOUT_S)
+            async with aclosing(body) as lines:
+                async for line in lines:
+                    number += 1
+                    if number > most:
+                        raise BatchFailed("single", f"there are more than {most} lines of results")
+                    if line:
+                        yield _parsed(number, line)
         except ErrorReply as exc:
             if exc.raw.status == 404:
                 raise self._failed("again", exc.raw) from exc

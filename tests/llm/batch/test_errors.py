@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gzip
 import json
 import socket
@@ -151,7 +152,7 @@ def jsonl(*parts):
 
 async def results_of(service):
     status = await service.status("b1")
-    return [each async for each in service.results("b1", status)]
+    return [each async for each in service.results("b1", status, 10)]
 
 
 async def read(service):
@@ -159,7 +160,7 @@ async def read(service):
     status = await service.status("b1")
     keys, broken = [], []
     try:
-        async for result in service.results("b1", status):
+        async for result in service.results("b1", status, 10):
             if isinstance(result, Unreadable):
                 broken.append(str(result))
             else:
@@ -215,6 +216,24 @@ async def test_results_that_break_off_can_be_read_again(server, service_at):
     assert (keys, failed.kind) == (["a"], "again")
     results_at(server, (200, jsonl(succeeded("a"), succeeded("b"))))
     assert await read(service) == (["a", "b"], [], None)
+
+
+async def test_results_without_an_end_are_not_read_for_ever(server, service_at):
+    """Blank lines are lines too: whatever comes in place of results, the reading ends."""
+
+    async def endless(request):
+        response = web.StreamResponse()
+        await response.prepare(request)
+        await response.write(json.dumps(succeeded("a")).encode())
+        with contextlib.suppress(ConnectionError):
+            while True:
+                await response.write(b"\n" * 5)
+        return response
+
+    results_at(server, endless)
+    keys, broken, failed = await asyncio.wait_for(read(service_at(server.url, "anthropic")), 10)
+    assert (keys, broken, failed.kind) == (["a"], [], "single")
+    assert str(failed) == "there are more than 30 lines of results"
 
 
 async def test_packed_results_are_read(server, service_at):

@@ -9,7 +9,6 @@ import random
 import re
 import tempfile
 from collections import Counter
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -99,7 +98,7 @@ class Memory:
             raise step
         return step
 
-    async def results(self, batch_id, status):
+    async def results(self, batch_id, status, calls):
         for line in reversed(self.batches[batch_id]):
             repetition = line.request.slot.repetition
             fates = self.fates.get(repetition, [])
@@ -414,7 +413,7 @@ async def test_a_single_line_that_finds_no_room_is_asked_alone_after_a_few_tries
 @in_virtual_time
 async def test_what_a_cancelled_batch_answered_unreadably_stays_set_aside(cache):
     class Broken(Memory):
-        async def results(self, batch_id, status):
+        async def results(self, batch_id, status, calls):
             yield Unreadable("line 1 is no JSON")
             yield Unreadable("line 2 is no JSON")
 
@@ -458,9 +457,9 @@ async def test_results_that_are_broken_or_fewer_than_the_provider_counts_are_rea
         async def status(self, batch_id):
             return BatchStatus("ended", "completed", results=3)
 
-        async def results(self, batch_id, status):
+        async def results(self, batch_id, status, calls):
             self.looks += 1
-            whole = [each async for each in super().results(batch_id, status)]
+            whole = [each async for each in super().results(batch_id, status, calls)]
             for result in whole if self.looks > 1 else [whole[0], *shown]:
                 yield result
 
@@ -471,7 +470,7 @@ async def test_results_that_are_broken_or_fewer_than_the_provider_counts_are_rea
 
 
 class WithoutResults(Memory):
-    async def results(self, batch_id, status):
+    async def results(self, batch_id, status, calls):
         raise BatchFailed("again", "HTTP 503")
         yield
 
@@ -493,10 +492,10 @@ async def note(cache, **known):
     """Change what the journal knows of its only batch."""
     journal = Journal(cache)
     (batch,) = journal.batches()
-    await journal.note(replace(batch, **known))
+    await journal.note(batch.model_copy(update=known))
 
 
-HOURS_AGO = (datetime.now(UTC) - timedelta(hours=5)).isoformat()
+HOURS_AGO = datetime.now(UTC) - timedelta(hours=5)
 
 
 class Endless(Memory):
@@ -607,7 +606,7 @@ async def test_a_batch_is_cancelled_two_hours_after_its_submission_and_what_it_h
     service = Memory()
     await left_behind(cache, service, repetitions=2)
     submitted_at = datetime.now(UTC) - timedelta(hours=hours)
-    await note(cache, submitted_at=submitted_at.isoformat())
+    await note(cache, submitted_at=submitted_at)
     service.states = [BatchStatus("waiting", "in_progress")] * 3
     service.fates = {2: [None]}
     run = Run(cache, service)
@@ -767,8 +766,8 @@ class Dear(Memory):
         self.chance = random.Random(seed)
         self.bill_usd = 0.0
 
-    async def results(self, batch_id, status):
-        async for result in super().results(batch_id, status):
+    async def results(self, batch_id, status, calls):
+        async for result in super().results(batch_id, status, calls):
             read = 10
             written = self.chance.randint(0, 100)
             kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])

@@ -110,7 +110,7 @@ async def uses(service):
     async def results():
         return [
             judge(each.raw, FORMATS["gemini"])
-            async for each in service.results("b1", await service.status("b1"))
+            async for each in service.results("b1", await service.status("b1"), 10)
             if not isinstance(each, Unreadable) and each.raw
         ]
 
