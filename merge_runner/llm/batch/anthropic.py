@@ -59,11 +59,9 @@ class AnthropicBatches(BatchService):
         batch = await self._get(f"{BATCHES}/{batch_id}")
         counts = as_dict(batch.get("request_counts"))
         total = sum(as_count(count) or 0 for count in counts.values())
-        word = as_word(batch.get("processing_status"))
-        ended = word.lower() == "ended"
+        ended = as_word(batch.get("processing_status")) == "ENDED"
         return BatchStatus(
             state="ended" if ended else "waiting",
-            word=word,
             # While a batch is in progress all its requests count as such.
             done=total - (as_count(counts.get("processing")) or 0) if ended else None,
             total=total or None,

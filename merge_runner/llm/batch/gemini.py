@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from datetime import datetime
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
@@ -19,13 +18,13 @@ from merge_runner.llm.batch.service import (
     BatchService,
     BatchStatus,
     LineResult,
+    Listed,
     as_message,
     as_reply,
     as_word,
     id_of,
     json_object,
     key_of,
-    leads_back,
     moment_of,
     unreadable,
 )
@@ -64,6 +63,8 @@ class GeminiBatches(BatchService):
 
     # A file may have 2 GB, but this one is held in memory.
     most_bytes = 200_000_000
+    # A page has few batches, since one may come with all its results.
+    list_path, cursor = f"{API}/batches?pageSize=10", "pageToken"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
@@ -80,7 +81,7 @@ class GeminiBatches(BatchService):
         batch = {"displayName": mark, "inputConfig": {"fileName": name}}
         path = lines[0].request.path.replace(METHOD, BATCH_METHOD)
         created = await self._post(path, canonical_json({"batch": batch}).encode())
-        return _number(id_of(json_object(created), "name"))
+        return self.batch_id_of(json_object(created))
 
     async def _upload(self, content: bytes, mark: str) -> str:
         """Return the name of a file with these lines."""
@@ -108,31 +109,28 @@ class GeminiBatches(BatchService):
             raise BatchFailed("again", "the reply names no URL for the upload")
         return f"{path}?{parts.query}"
 
-    async def find(self, mark: str, since: datetime) -> str | None:
-        """By the mark, which is its display name."""
-        # A page has few batches, since one may come with all its results.
-        async for page in self._pages(f"{API}/batches?pageSize=10", "pageToken", _next_page):
-            batches = as_dicts(page.get("operations"))
-            metadata = [as_dict(batch.get("metadata")) for batch in batches]
-            for batch, its in zip(batches, metadata, strict=True):
-                if its.get("displayName") == mark:
-                    return _number(id_of(batch, "name"))
-            if leads_back([moment_of(its.get("createTime")) for its in metadata], since):
-                break
-        return None
+    def page_of(self, page: dict[str, Any]) -> tuple[list[Listed], str | None]:
+        """See BatchService; the mark is the display name."""
+        listed = []
+        for batch in as_dicts(page.get("operations")):
+            metadata = as_dict(batch.get("metadata"))
+            created = moment_of(metadata.get("createTime"))
+            listed.append(Listed(metadata.get("displayName"), created, batch))
+        return listed, as_text(page.get("nextPageToken")) or None
+
+    def batch_id_of(self, batch: dict[str, Any]) -> str:
+        """Return the id in the name ``batches/ID``."""
+        return id_of(batch, "name").rpartition("/")[2]
 
     async def status(self, batch_id: str) -> BatchStatus:
         """See BatchService."""
         batch = await self._get(f"{API}/batches/{batch_id}", TRANSFER_TIMEOUT_S)
-        metadata, error = as_dict(batch.get("metadata")), as_dict(batch.get("error"))
-        word = _word(metadata)
-        stats = as_dict(metadata.get("batchStats"))
+        state, error = _state(batch), as_dict(batch.get("error"))
+        stats = as_dict(as_dict(batch.get("metadata")).get("batchStats"))
         total, pending = _count(stats, "requestCount"), _count(stats, "pendingRequestCount")
-        state = _state(word, batch)
         why = read_error(_status_of(error)[0] if error else 400, {}, "", batch)
         return BatchStatus(
             state=state,
-            word=word,
             done=None if total is None else max(0, total - (pending or 0)),
             total=total,
             results=_count(stats, "successfulRequestCount") or 0,
@@ -144,7 +142,7 @@ class GeminiBatches(BatchService):
     def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
         """See BatchService."""
         output = _output(batch)
-        if not output and _word(as_dict(batch.get("metadata"))).upper().endswith("SUCCEEDED"):
+        if not output and _word(batch).endswith("SUCCEEDED"):
             raise BatchFailed("again", "the results are not there yet")
         if not output.get("responsesFile"):
             return []
@@ -180,26 +178,17 @@ def _output(batch: Mapping[str, Any]) -> dict[str, Any]:
     return as_dict(metadata.get("output")) or as_dict(batch.get("response"))
 
 
-def _next_page(page: dict[str, Any]) -> str | None:
-    return as_text(page.get("nextPageToken")) or None
-
-
-def _number(name: str) -> str:
-    """The id of a batch, by its name ``batches/ID``."""
-    return name.rpartition("/")[2]
-
-
-def _word(metadata: dict[str, Any]) -> str:
+def _word(batch: Mapping[str, Any]) -> str:
     """The provider's word, whether it says JOB_STATE_ or BATCH_STATE_ before it."""
-    return re.sub("^.*_state_", "", as_word(metadata.get("state")), flags=re.IGNORECASE)
+    return as_word(as_dict(batch.get("metadata")).get("state")).rpartition("_STATE_")[2]
 
 
-def _state(word: str, batch: dict[str, Any]) -> Literal["waiting", "ended", "failed"]:
+def _state(batch: dict[str, Any]) -> Literal["waiting", "ended", "failed"]:
     """What a word means; of an operation that is done, it may be one that nobody knows."""
-    done = batch.get("done") is True
-    if word.upper() in ENDED:
+    word, done = _word(batch), batch.get("done") is True
+    if word in ENDED:
         return "ended"
-    if word.upper() == "FAILED" or (done and batch.get("error")):
+    if word == "FAILED" or (done and batch.get("error")):
         return "failed"
     return "ended" if done else "waiting"
 

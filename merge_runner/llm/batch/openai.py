@@ -15,13 +15,13 @@ from merge_runner.llm.batch.service import (
     BatchService,
     BatchStatus,
     LineResult,
+    Listed,
     as_message,
     as_reply,
     as_word,
     id_of,
     json_object,
     key_of,
-    leads_back,
     unreadable,
 )
 from merge_runner.llm.content_hashes import canonical_json
@@ -41,7 +41,7 @@ API = "/v1"
 MARK = "merge_runner_mark"
 # What OpenAI itself does with input files.
 KEPT_S = 30 * 86400
-ENDED = frozenset({"completed", "expired", "cancelled"})
+ENDED = frozenset({"COMPLETED", "EXPIRED", "CANCELLED"})
 NOT_ASKED = frozenset({"batch_expired", "batch_cancelled"})
 
 
@@ -49,6 +49,7 @@ class OpenAIBatches(BatchService):
     """``/files`` and ``/batches``; see BatchService."""
 
     most_bytes = 200_000_000
+    list_path, cursor = "/batches?limit=100", "after"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
@@ -83,16 +84,17 @@ class OpenAIBatches(BatchService):
             exc.sent = False  # a file is no batch yet
             raise
 
-    async def find(self, mark: str, since: datetime) -> str | None:
-        """By the mark among its metadata."""
-        async for page in self._pages("/batches?limit=100", "after", _last_id):
-            batches = as_dicts(page.get("data"))
-            for batch in batches:
-                if as_dict(batch.get("metadata")).get(MARK) == mark:
-                    return id_of(batch)
-            if leads_back([_created(batch) for batch in batches], since):
-                break
-        return None
+    def page_of(self, page: dict[str, Any]) -> tuple[list[Listed], str | None]:
+        """See BatchService; the mark is among the metadata."""
+        batches = as_dicts(page.get("data"))
+        last = as_text(page.get("last_id")) or next(
+            (as_text(batch.get("id")) for batch in reversed(batches)), None
+        )
+        listed = [
+            Listed(as_dict(batch.get("metadata")).get(MARK), _created(batch), batch)
+            for batch in batches
+        ]
+        return listed, last if page.get("has_more") else None
 
     async def status(self, batch_id: str) -> BatchStatus:
         """See BatchService."""
@@ -103,10 +105,9 @@ class OpenAIBatches(BatchService):
         error = first_of(as_dict(batch.get("errors")).get("data"))
         why = read_error(400, {}, "", {"error": error})
         why = replace(why, status=status_within(why) if why.names else 400)
-        failed = word.lower() == "failed"
+        failed = word == "FAILED"
         return BatchStatus(
-            state="failed" if failed else "ended" if word.lower() in ENDED else "waiting",
-            word=word,
+            state="failed" if failed else "ended" if word in ENDED else "waiting",
             done=answered + (as_count(counts.get("failed")) or 0) if counts else None,
             total=as_count(counts.get("total")) or None,
             results=answered,
@@ -142,11 +143,3 @@ class OpenAIBatches(BatchService):
 def _created(batch: dict[str, Any]) -> datetime | None:
     created_s = as_count(batch.get("created_at"))
     return None if created_s is None else datetime.fromtimestamp(created_s, UTC)
-
-
-def _last_id(page: dict[str, Any]) -> str | None:
-    """The id after which the next page begins; None: this one is the last."""
-    ids = [as_text(batch.get("id")) for batch in as_dicts(page.get("data"))]
-    if not page.get("has_more"):
-        return None
-    return as_text(page.get("last_id")) or (ids[-1] if ids else None)

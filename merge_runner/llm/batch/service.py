@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
@@ -57,6 +57,9 @@ same actions of an AttemptOutcome say. ``lost``: what became of the batch cannot
 server no longer has it, or answers with what cannot be read; its lines may have been charged.
 """
 
+# What the judgement of a single call means here.
+JUDGED: dict[str, FailureKind] = {"quota": "quota", "refused": "refused", "retry": "again"}
+
 
 class BatchFailed(MergeRunnerError):
     """A batch mode did not do what it was asked.
@@ -99,12 +102,11 @@ class BatchStatus:
     ``ended``: there are results to fetch, perhaps not of all lines; also of one that expired or was
     cancelled. ``failed``: no line was asked and nothing is charged; ``failure`` says what to do.
     ``done`` of ``total`` lines have ended, None where the provider does not say; there are at least
-    ``results`` of them. ``word`` is the provider's own for the state, ``message`` what it says
-    beside it, ``batch`` all that it says.
+    ``results`` of them. ``message`` is what the provider says beside the state, ``batch`` all that
+    it says.
     """
 
     state: Literal["waiting", "ended", "failed"]
-    word: str
     done: int | None = None
     total: int | None = None
     results: int = 0
@@ -127,15 +129,27 @@ class LineResult:
     message: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """A batch in the list of all batches: its mark, its beginning, and all that is said of it."""
+
+    mark: object
+    created: datetime | None
+    said: dict[str, Any]
+
+
 class BatchService(ABC):
     """The batch mode of one model at one endpoint; every request raises BatchFailed.
 
     A batch has at most ``most_bytes`` of lines. Where it takes no mark, one whose id was lost
-    cannot be found.
+    cannot be found. A page of the list of all batches is at ``list_path``, the one after it at the
+    same path with the query ``cursor``.
     """
 
     most_bytes: ClassVar[int]
     takes_mark: ClassVar[bool] = True
+    list_path: ClassVar[str]
+    cursor: ClassVar[str]
 
     def __init__(self, transport: HttpTransport, endpoint: Endpoint, wire: WireFormat) -> None:
         self._transport = transport
@@ -158,7 +172,29 @@ class BatchService(ABC):
 
         Raises BatchFailed with the kind ``lost`` where there are too many to look through.
         """
+        cursor: str | None = ""
+        seen: set[str] = set()
+        while cursor is not None and cursor not in seen:  # ends where a server knows no pages
+            if len(seen) == MOST_PAGES or len(cursor) > LONGEST_CURSOR:
+                raise BatchFailed("lost", "the list of batches cannot be read to its end")
+            seen.add(cursor)
+            after = f"&{self.cursor}={quote(cursor, safe='')}" if cursor else ""
+            page = await self._get(self.list_path + after, TRANSFER_TIMEOUT_S)
+            listed, cursor = self.page_of(page)
+            for batch in listed:
+                if batch.mark == mark:
+                    return self.batch_id_of(batch.said)
+            if _leads_back([batch.created for batch in listed], since):
+                break
+        return None
+
+    def page_of(self, page: dict[str, Any]) -> tuple[list[Listed], str | None]:
+        """Return the batches of a page of the list, and the cursor of the next one, if any."""
         raise NotImplementedError
+
+    def batch_id_of(self, batch: dict[str, Any]) -> str:
+        """Return the id of a batch as its server describes it; raises BatchFailed."""
+        return id_of(batch)
 
     @abstractmethod
     async def status(self, batch_id: str) -> BatchStatus:
@@ -211,13 +247,12 @@ class BatchService(ABC):
 
     def failure_of(self, error: ServerError) -> FailureKind:
         """Return what to do with lines whose batch is not created, or fails as a whole."""
-        if "token_limit_exceeded" in error.names or "enqueued" in error.message.lower():
-            return "smaller"
-        if error.status == 413:
+        enqueued = "token_limit_exceeded" in error.names or "enqueued" in error.message.lower()
+        if enqueued or error.status == 413:
             return "smaller"
         if error.status in NO_BATCH_MODE:
             return "single"
-        return self._judged(error) or "single"
+        return JUDGED.get(judge_error(error, self._wire).action, "single")
 
     def slot_members(self, line: BatchLine) -> str:
         """Return what our own emulator alone is told of a line, as members of its JSON object."""
@@ -269,21 +304,6 @@ class BatchService(ABC):
         except TransportFailure as exc:
             raise _unanswered(exc, reads=True) from exc
 
-    async def _pages(
-        self, path: str, cursor_name: str, cursor_of: Callable[[dict[str, Any]], str | None]
-    ) -> AsyncIterator[dict[str, Any]]:
-        """Yield the pages of a list, each found by the cursor of the one before."""
-        cursor: str | None = ""
-        seen: set[str] = set()
-        while cursor is not None and cursor not in seen:  # ends where a server knows no pages
-            if len(seen) == MOST_PAGES or len(cursor) > LONGEST_CURSOR:
-                raise BatchFailed("lost", "the list of batches cannot be read to its end")
-            seen.add(cursor)
-            after = f"&{cursor_name}={quote(cursor, safe='')}" if cursor else ""
-            page = await self._get(path + after, TRANSFER_TIMEOUT_S)
-            yield page
-            cursor = cursor_of(page)
-
     async def _ask(
         self,
         method: str,
@@ -306,18 +326,7 @@ class BatchService(ABC):
         """Return the failure where a batch exists, or may exist, whatever its server says now."""
         if raw.status in GONE:
             return self._failed("lost", raw)
-        return self._failed(self._judged(raw.error) or "again", raw)
-
-    def _judged(self, error: ServerError) -> FailureKind | None:
-        """Return what the judgement of single calls means here; None: nothing."""
-        match judge_error(error, self._wire).action:
-            case "quota":
-                return "quota"
-            case "refused":
-                return "refused"
-            case "retry":
-                return "again"
-        return None
+        return self._failed(JUDGED.get(judge_error(raw.error, self._wire).action, "again"), raw)
 
     def _failed(self, kind: FailureKind, raw: RawReply) -> BatchFailed:
         delay_s = judge_error(raw.error, self._wire).delay_s
@@ -330,7 +339,7 @@ class BatchService(ABC):
         return BatchFailed(kind, message, delay_s=delay_s, sent=maybe_done)
 
 
-def leads_back(created: Sequence[datetime | None], since: datetime) -> bool:
+def _leads_back(created: Sequence[datetime | None], since: datetime) -> bool:
     """Whether a page of batches is older than a moment, and the next one older still."""
     known = [each for each in created if each is not None]
     return bool(known) and known[0] > known[-1] and max(known) < since - CLOCK_SLACK
@@ -355,8 +364,8 @@ def as_message(value: object, longest: int = LONGEST_MESSAGE) -> str:
 
 
 def as_word(value: object) -> str:
-    """Return a provider's word for a state."""
-    return as_message(value, LONGEST_NAME) or "unknown"
+    """Return a provider's word for a state, in capitals."""
+    return (as_text(value) or "").upper()
 
 
 def key_of(line: dict[str, Any], member: str) -> str:

@@ -93,7 +93,7 @@ class Memory:
     async def status(self, batch_id):
         if batch_id not in self.batches:
             raise BatchFailed("lost", "HTTP 404: no such batch", sent=False)
-        step = self.states.pop(0) if self.states else BatchStatus("ended", "completed")
+        step = self.states.pop(0) if self.states else BatchStatus("ended")
         if isinstance(step, BatchFailed):
             raise step
         return step
@@ -295,7 +295,7 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cac
 @in_virtual_time
 async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
     service = Memory()
-    service.states = [BatchStatus("failed", "failed", message="enqueued", failure="smaller")]
+    service.states = [BatchStatus("failed", message="enqueued", failure="smaller")]
     run = Run(cache, service)
     replies = await run.ask(4)
     assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
@@ -345,7 +345,7 @@ async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache,
 
 async def left_behind(cache, service, repetitions=1, **options):
     """A run that is interrupted while a batch waits."""
-    service.states = [BatchStatus("waiting", "in_progress")] * 1000
+    service.states = [BatchStatus("waiting")] * 1000
     run = Run(cache, service, **options)
     asking = asyncio.create_task(run.ask(repetitions))
     await asyncio.sleep(5)
@@ -366,7 +366,7 @@ def no_patience(monkeypatch):
 async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
     class Slow(Memory):
         async def status(self, batch_id):
-            return BatchStatus("waiting" if batch_id == "batch-0" else "ended", "its word")
+            return BatchStatus("waiting" if batch_id == "batch-0" else "ended")
 
     service = Slow()
     service.creations = [None, BatchFailed("again", "HTTP 504")]
@@ -418,7 +418,7 @@ async def test_what_a_cancelled_batch_answered_unreadably_stays_set_aside(cache)
             yield Unreadable("line 2 is no JSON")
 
     service = Broken()
-    service.states = [BatchStatus("waiting", "in_progress")]
+    service.states = [BatchStatus("waiting")]
     run = Run(cache, service)
     (reply,) = await run.ask()
     assert service.cancelled == ["batch-0"]
@@ -455,7 +455,7 @@ async def test_results_that_are_broken_or_fewer_than_the_provider_counts_are_rea
         looks = 0
 
         async def status(self, batch_id):
-            return BatchStatus("ended", "completed", results=3)
+            return BatchStatus("ended", results=3)
 
         async def results(self, batch_id, status, calls):
             self.looks += 1
@@ -503,7 +503,7 @@ class Endless(Memory):
 
     async def status(self, batch_id):
         self.looks += 1
-        return BatchStatus("waiting", "in_progress")
+        return BatchStatus("waiting")
 
 
 @in_virtual_time
@@ -607,7 +607,7 @@ async def test_a_batch_is_cancelled_two_hours_after_its_submission_and_what_it_h
     await left_behind(cache, service, repetitions=2)
     submitted_at = datetime.now(UTC) - timedelta(hours=hours)
     await note(cache, submitted_at=submitted_at)
-    service.states = [BatchStatus("waiting", "in_progress")] * 3
+    service.states = [BatchStatus("waiting")] * 3
     service.fates = {2: [None]}
     run = Run(cache, service)
     assert texts(await run.ask(2)) == ["batched 1", "alone 2"]
@@ -641,7 +641,7 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
         async def status(self, batch_id):
             if not died.is_set():
                 died.set()
-                return BatchStatus("waiting", "in_progress")
+                return BatchStatus("waiting")
             return await super().status(batch_id)
 
     died = asyncio.Event()
@@ -803,7 +803,7 @@ def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
 @in_virtual_time
 async def test_what_is_pending_is_told_by_round_model_and_batch(cache):
     service = Memory()
-    service.states = [BatchStatus("waiting", "in_progress", done=1, total=3)] * 10**4
+    service.states = [BatchStatus("waiting", done=1, total=3)] * 10**4
     run = Run(cache, service)
     asking = asyncio.create_task(run.ask(3, decision=6))
     while not (told := run.rounds.standing()) or "done" not in told[0]:
