@@ -20,7 +20,6 @@ from merge_runner.llm.batch.service import (
 )
 from merge_runner.llm.formats.base import as_count, as_dict, as_text
 
-BATCHES = "/v1/messages/batches"
 # The status with which the plain endpoint sends an error, by its type: a result has none.
 STATUSES = {
     "invalid_request_error": 400,
@@ -43,6 +42,7 @@ class AnthropicBatches(BatchService):
     # Of 256 MB; the rest is for what stands around the lines.
     most_bytes = 255_000_000
     takes_mark = False
+    path = "/v1/messages/batches"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
@@ -52,11 +52,10 @@ class AnthropicBatches(BatchService):
     async def create(self, lines: Sequence[BatchLine], mark: str) -> str:
         """See BatchService; a batch takes no name, so that the mark is not sent."""
         body = b'{"requests":[' + b",".join(map(self.line, lines)) + b"]}"
-        return id_of(json_object(await self._post(BATCHES, body)))
+        return id_of(json_object(await self._post(self.path, body)))
 
-    async def status(self, batch_id: str) -> BatchStatus:
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        batch = await self._get(f"{BATCHES}/{batch_id}")
         counts = as_dict(batch.get("request_counts"))
         total = sum(as_count(count) or 0 for count in counts.values())
         ended = as_word(batch.get("processing_status")) == "ENDED"
@@ -74,7 +73,7 @@ class AnthropicBatches(BatchService):
         if batch.get("archived_at"):
             raise BatchFailed("lost", "the results of the batch are no longer kept")
         # Not at the URL that the batch names: the key goes to the configured host alone.
-        return [f"{BATCHES}/{batch_id}/results"]
+        return [f"{self.path}/{batch_id}/results"]
 
     def read(self, line: dict[str, Any]) -> LineResult:
         """See BatchService."""
@@ -91,7 +90,3 @@ class AnthropicBatches(BatchService):
                 message = f"the batch {'has expired' if why == 'expired' else why}"
                 return LineResult(key, None, message)
         raise unreadable(key, "is of no known type")
-
-    async def cancel(self, batch_id: str) -> None:
-        """See BatchService."""
-        await self._cancel(f"{BATCHES}/{batch_id}/cancel")

@@ -1,7 +1,7 @@
 """Gemini's batchGenerateContent, with the requests in a file.
 
 They could also stand in the body of the creation; a file has room for more, and each of its results
-has the key of its request. Results of both kinds are read.
+has the key of its request.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from merge_runner.llm.batch.service import (
-    TRANSFER_TIMEOUT_S,
     BatchFailed,
     BatchLine,
     BatchService,
@@ -64,7 +63,8 @@ class GeminiBatches(BatchService):
     # A file may have 2 GB, but this one is held in memory.
     most_bytes = 200_000_000
     # A page has few batches, since one may come with all its results.
-    list_path, cursor = f"{API}/batches?pageSize=10", "pageToken"
+    path, pages, cursor = f"{API}/batches", "pageSize=10", "pageToken"
+    cancel_suffix = ":cancel"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
@@ -122,9 +122,8 @@ class GeminiBatches(BatchService):
         """Return the id in the name ``batches/ID``."""
         return id_of(batch, "name").rpartition("/")[2]
 
-    async def status(self, batch_id: str) -> BatchStatus:
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        batch = await self._get(f"{API}/batches/{batch_id}", TRANSFER_TIMEOUT_S)
         state, error = _state(batch), as_dict(batch.get("error"))
         stats = as_dict(as_dict(batch.get("metadata")).get("batchStats"))
         total, pending = _count(stats, "requestCount"), _count(stats, "pendingRequestCount")
@@ -141,17 +140,13 @@ class GeminiBatches(BatchService):
 
     def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
         """See BatchService."""
-        output = _output(batch)
+        metadata = as_dict(batch.get("metadata"))
+        output = as_dict(metadata.get("output")) or as_dict(batch.get("response"))
         if not output and _word(batch).endswith("SUCCEEDED"):
             raise BatchFailed("again", "the results are not there yet")
         if not output.get("responsesFile"):
             return []
         return [f"{API}/{id_of(output, 'responsesFile')}:download?alt=media"]
-
-    def inline_results(self, batch: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """See BatchService."""
-        results = as_dicts(as_dict(_output(batch).get("inlinedResponses")).get("inlinedResponses"))
-        return [{"key": as_dict(each.get("metadata")).get("key"), **each} for each in results]
 
     def read(self, line: dict[str, Any]) -> LineResult:
         """See BatchService."""
@@ -167,15 +162,6 @@ class GeminiBatches(BatchService):
         return LineResult(
             key, as_reply(status, {"error": {**error, "code": status, "status": name}})
         )
-
-    async def cancel(self, batch_id: str) -> None:
-        """See BatchService."""
-        await self._cancel(f"{API}/batches/{batch_id}:cancel")
-
-
-def _output(batch: Mapping[str, Any]) -> dict[str, Any]:
-    metadata = as_dict(batch.get("metadata"))
-    return as_dict(metadata.get("output")) or as_dict(batch.get("response"))
 
 
 def _word(batch: Mapping[str, Any]) -> str:

@@ -49,7 +49,7 @@ class OpenAIBatches(BatchService):
     """``/files`` and ``/batches``; see BatchService."""
 
     most_bytes = 200_000_000
-    list_path, cursor = "/batches?limit=100", "after"
+    path, pages, cursor = "/batches", "limit=100", "after"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
@@ -67,7 +67,7 @@ class OpenAIBatches(BatchService):
         }
         if is_own_host("openai", self._endpoint.identity):  # others may not know the member
             batch["output_expires_after"] = {"anchor": "created_at", "seconds": KEPT_S}
-        return id_of(json_object(await self._post("/batches", canonical_json(batch).encode())))
+        return id_of(json_object(await self._post(self.path, canonical_json(batch).encode())))
 
     async def _upload(self, content: bytes) -> str:
         """Return the id of a file with these lines."""
@@ -96,9 +96,8 @@ class OpenAIBatches(BatchService):
         ]
         return listed, last if page.get("has_more") else None
 
-    async def status(self, batch_id: str) -> BatchStatus:
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        batch = await self._get(f"/batches/{batch_id}")
         word = as_word(batch.get("status"))
         counts = as_dict(batch.get("request_counts"))
         answered = as_count(counts.get("completed")) or 0
@@ -134,10 +133,6 @@ class OpenAIBatches(BatchService):
         if error:
             return LineResult(key, as_reply(500, {"error": error}), message)
         raise unreadable(key, "has neither a response nor an error")
-
-    async def cancel(self, batch_id: str) -> None:
-        """See BatchService."""
-        await self._cancel(f"/batches/{batch_id}/cancel")
 
 
 def _created(batch: dict[str, Any]) -> datetime | None:

@@ -142,13 +142,15 @@ class BatchService(ABC):
     """The batch mode of one model at one endpoint; every request raises BatchFailed.
 
     A batch has at most ``most_bytes`` of lines. Where it takes no mark, one whose id was lost
-    cannot be found. A page of the list of all batches is at ``list_path``, the one after it at the
-    same path with the query ``cursor``.
+    cannot be found. Batches are at ``path``, where ``pages`` is the query for a page of their list,
+    and ``cursor`` that for the one after it.
     """
 
     most_bytes: ClassVar[int]
     takes_mark: ClassVar[bool] = True
-    list_path: ClassVar[str]
+    path: ClassVar[str]
+    cancel_suffix: ClassVar[str] = "/cancel"
+    pages: ClassVar[str]
     cursor: ClassVar[str]
 
     def __init__(self, transport: HttpTransport, endpoint: Endpoint, wire: WireFormat) -> None:
@@ -179,7 +181,7 @@ class BatchService(ABC):
                 raise BatchFailed("lost", "the list of batches cannot be read to its end")
             seen.add(cursor)
             after = f"&{self.cursor}={quote(cursor, safe='')}" if cursor else ""
-            page = await self._get(self.list_path + after, TRANSFER_TIMEOUT_S)
+            page = await self._get(f"{self.path}?{self.pages}{after}", TRANSFER_TIMEOUT_S)
             listed, cursor = self.page_of(page)
             for batch in listed:
                 if batch.mark == mark:
@@ -196,28 +198,31 @@ class BatchService(ABC):
         """Return the id of a batch as its server describes it; raises BatchFailed."""
         return id_of(batch)
 
-    @abstractmethod
     async def status(self, batch_id: str) -> BatchStatus:
         """Return the state of a batch."""
+        return self.status_of(await self._get(f"{self.path}/{batch_id}", TIMEOUT_S))
 
-    @abstractmethod
-    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
-        """Return where the results of a batch that has ended are: JSONL, in any order."""
-
-    def inline_results(self, batch: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return results that stand beside the state of a batch."""
-        return []
-
-    @abstractmethod
-    def read(self, line: dict[str, Any]) -> LineResult:
-        """Return the result in a line; raises Unreadable."""
-
-    @abstractmethod
     async def cancel(self, batch_id: str) -> None:
         """Ask for the end of a batch, which then ends with the results that it has.
 
         One that has ended already stays as it is.
         """
+        path = f"{self.path}/{batch_id}{self.cancel_suffix}"
+        raw = await self._ask("POST", path, timeout_s=TIMEOUT_S)
+        if not _is_success(raw) and raw.status not in ENDED_ALREADY:
+            raise self._unread(raw)
+
+    @abstractmethod
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
+        """Return the state of a batch as its server describes it."""
+
+    @abstractmethod
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """Return where the results of a batch that has ended are: JSONL, in any order."""
+
+    @abstractmethod
+    def read(self, line: dict[str, Any]) -> LineResult:
+        """Return the result in a line; raises Unreadable."""
 
     async def results(
         self, batch_id: str, status: BatchStatus, calls: int
@@ -227,23 +232,18 @@ class BatchService(ABC):
         Where one file cannot be read, those of the other come all the same. Raises BatchFailed with
         the kind ``again`` where they can be read from the beginning.
         """
-        for line in self.inline_results(status.batch):
-            yield self._result(line)
         failure: BatchFailed | None = None
         for path in self.result_paths(batch_id, status.batch):
             try:
-                async for text in self._lines(path, MOST_LINES_OF_A_CALL * calls):
-                    yield self._result(text)
+                async for line in self._lines(path, MOST_LINES_OF_A_CALL * calls):
+                    try:
+                        yield line if isinstance(line, Unreadable) else self.read(line)
+                    except Unreadable as exc:
+                        yield exc
             except BatchFailed as exc:
                 failure = failure or exc
         if failure is not None:
             raise failure
-
-    def _result(self, line: dict[str, Any] | Unreadable) -> LineResult | Unreadable:
-        try:
-            return line if isinstance(line, Unreadable) else self.read(line)
-        except Unreadable as exc:
-            return exc
 
     def failure_of(self, error: ServerError) -> FailureKind:
         """Return what to do with lines whose batch is not created, or fails as a whole."""
@@ -261,7 +261,7 @@ class BatchService(ABC):
         slot = canonical_json(line.request.slot.as_dict())
         return f',"{SLOT_HEADER}":{slot},"{ATTEMPT_HEADER}":{line.attempt}'
 
-    async def _get(self, path: str, timeout_s: float = TIMEOUT_S) -> dict[str, Any]:
+    async def _get(self, path: str, timeout_s: float) -> dict[str, Any]:
         """Return the JSON object at a path."""
         raw = await self._ask("GET", path, timeout_s=timeout_s)
         if not _is_success(raw):
@@ -276,11 +276,6 @@ class BatchService(ABC):
         if not _is_success(raw):
             raise self._failed(self.failure_of(raw.error), raw)
         return raw
-
-    async def _cancel(self, path: str) -> None:
-        raw = await self._ask("POST", path, timeout_s=TIMEOUT_S)
-        if not _is_success(raw) and raw.status not in ENDED_ALREADY:
-            raise self._unread(raw)
 
     async def _lines(self, path: str, most: int) -> AsyncIterator[dict[str, Any] | Unreadable]:
         """Yield the objects of a JSONL file of at most so many lines, blank ones included.

@@ -288,9 +288,9 @@ async def test_a_line_of_openai_is_a_reply_or_was_not_asked(server, service_at, 
     ("code", "status"), [(3, 400), (8, 429), (13, 500), (14, 503), (99, 500), (429, 429), (1, None)]
 )
 async def test_an_error_of_gemini_has_the_status_of_its_code(server, service_at, code, status):
-    responses = [{"metadata": {"key": "a"}, "error": {"code": code, "message": "m"}}]
-    output = {"inlinedResponses": {"inlinedResponses": responses}}
-    server.replies[BATCH["gemini"]] = (200, {"done": True, "response": output})
+    server.replies[BATCH["gemini"]] = (200, {"done": True, "response": {"responsesFile": "f1"}})
+    line = {"key": "a", "error": {"code": code, "message": "m"}}
+    server.replies["GET /v1beta/f1:download"] = (200, jsonl(line))
     (result,) = await results_of(service_at(server.url, "gemini"))
     assert (result.raw and result.raw.status) == status
 

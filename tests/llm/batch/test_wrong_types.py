@@ -52,7 +52,7 @@ BATCHES = {
         "name": "batches/b1",
         "done": True,
         "error": {"code": 13, "message": "m", "details": []},
-        "response": {"inlinedResponses": {"inlinedResponses": LINES["gemini"]}},
+        "response": {"responsesFile": "files/f1"},
         "metadata": {
             "state": "BATCH_STATE_FAILED",
             "displayName": MARK,
