@@ -15,8 +15,6 @@ from merge_runner.llm.batch.service import (
     as_word,
     id_of,
     json_object,
-    key_of,
-    unreadable,
 )
 from merge_runner.llm.formats.base import as_count, as_dict, as_text
 
@@ -75,9 +73,8 @@ class AnthropicBatches(BatchService):
         # Not at the URL that the batch names: the key goes to the configured host alone.
         return [f"{self.path}/{batch_id}/results"]
 
-    def read(self, line: dict[str, Any]) -> LineResult:
+    def read(self, key: str, line: dict[str, Any]) -> LineResult | None:
         """See BatchService."""
-        key = key_of(line, "custom_id")
         result = as_dict(line.get("result"))
         match result.get("type"):
             case "succeeded":
@@ -89,4 +86,4 @@ class AnthropicBatches(BatchService):
             case "expired" | "canceled" as why:
                 message = f"the batch {'has expired' if why == 'expired' else why}"
                 return LineResult(key, None, message)
-        raise unreadable(key, "is of no known type")
+        return None

@@ -23,9 +23,7 @@ from merge_runner.llm.batch.service import (
     as_word,
     id_of,
     json_object,
-    key_of,
     moment_of,
-    unreadable,
 )
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import as_count, as_dict, as_dicts, as_text, read_error
@@ -64,7 +62,7 @@ class GeminiBatches(BatchService):
     most_bytes = 200_000_000
     # A page has few batches, since one may come with all its results.
     path, pages, cursor = f"{API}/batches", "pageSize=10", "pageToken"
-    cancel_suffix = ":cancel"
+    cancel_suffix, key_member = ":cancel", "key"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
@@ -148,14 +146,13 @@ class GeminiBatches(BatchService):
             return []
         return [f"{API}/{id_of(output, 'responsesFile')}:download?alt=media"]
 
-    def read(self, line: dict[str, Any]) -> LineResult:
+    def read(self, key: str, line: dict[str, Any]) -> LineResult | None:
         """See BatchService."""
-        key = key_of(line, "key")
         response, error = line.get("response"), as_dict(line.get("error"))
         if isinstance(response, dict):
             return LineResult(key, as_reply(200, response))
         if not error:
-            raise unreadable(key, "has neither a response nor an error")
+            return None
         status, name = _status_of(error)
         if name in NOT_ASKED:
             return LineResult(key, None, as_message(error.get("message")))

@@ -21,8 +21,6 @@ from merge_runner.llm.batch.service import (
     as_word,
     id_of,
     json_object,
-    key_of,
-    unreadable,
 )
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import (
@@ -120,9 +118,8 @@ class OpenAIBatches(BatchService):
         names = [name for name in ("output_file_id", "error_file_id") if batch.get(name)]
         return [f"/files/{id_of(batch, name)}/content" for name in names]
 
-    def read(self, line: dict[str, Any]) -> LineResult:
+    def read(self, key: str, line: dict[str, Any]) -> LineResult | None:
         """See BatchService."""
-        key = key_of(line, "custom_id")
         response, error = as_dict(line.get("response")), as_dict(line.get("error"))
         status, body = as_count(response.get("status_code")), response.get("body")
         if status and status <= LARGEST_STATUS and isinstance(body, dict):
@@ -132,7 +129,7 @@ class OpenAIBatches(BatchService):
             return LineResult(key, None, message)
         if error:
             return LineResult(key, as_reply(500, {"error": error}), message)
-        raise unreadable(key, "has neither a response nor an error")
+        return None
 
 
 def _created(batch: dict[str, Any]) -> datetime | None:

@@ -477,7 +477,7 @@ class Rounds:
         results = self.services[note.model].results(note.batch_id, status, len(note.lines))
         async for result in results:
             if isinstance(result, Unreadable):
-                wrong.append(str(result))
+                wrong.append(result.why)
             else:
                 foreign += not batch.take(result)
         if foreign:

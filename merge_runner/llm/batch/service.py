@@ -78,8 +78,11 @@ class BatchFailed(MergeRunnerError):
         self.sent = sent
 
 
-class Unreadable(ValueError):
-    """A line of results that cannot be used; the message says why."""
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """A line of results that cannot be used."""
+
+    why: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,13 +146,14 @@ class BatchService(ABC):
 
     A batch has at most ``most_bytes`` of lines. Where it takes no mark, one whose id was lost
     cannot be found. Batches are at ``path``, where ``pages`` is the query for a page of their list,
-    and ``cursor`` that for the one after it.
+    and ``cursor`` that for the one after it. A result has the key of its request as ``key_member``.
     """
 
     most_bytes: ClassVar[int]
     takes_mark: ClassVar[bool] = True
     path: ClassVar[str]
     cancel_suffix: ClassVar[str] = "/cancel"
+    key_member: ClassVar[str] = "custom_id"
     pages: ClassVar[str]
     cursor: ClassVar[str]
 
@@ -221,8 +225,8 @@ class BatchService(ABC):
         """Return where the results of a batch that has ended are: JSONL, in any order."""
 
     @abstractmethod
-    def read(self, line: dict[str, Any]) -> LineResult:
-        """Return the result in a line; raises Unreadable."""
+    def read(self, key: str, line: dict[str, Any]) -> LineResult | None:
+        """Return the result in a line, None where it has no known form."""
 
     async def results(
         self, batch_id: str, status: BatchStatus, calls: int
@@ -235,11 +239,8 @@ class BatchService(ABC):
         failure: BatchFailed | None = None
         for path in self.result_paths(batch_id, status.batch):
             try:
-                async for line in self._lines(path, MOST_LINES_OF_A_CALL * calls):
-                    try:
-                        yield line if isinstance(line, Unreadable) else self.read(line)
-                    except Unreadable as exc:
-                        yield exc
+                async for result in self._lines(path, MOST_LINES_OF_A_CALL * calls):
+                    yield result
             except BatchFailed as exc:
                 failure = failure or exc
         if failure is not None:
@@ -277,8 +278,8 @@ class BatchService(ABC):
             raise self._failed(self.failure_of(raw.error), raw)
         return raw
 
-    async def _lines(self, path: str, most: int) -> AsyncIterator[dict[str, Any] | Unreadable]:
-        """Yield the objects of a JSONL file of at most so many lines, blank ones included.
+    async def _lines(self, path: str, most: int) -> AsyncIterator[LineResult | Unreadable]:
+        """Yield the results of a JSONL file of at most so many lines, blank ones included.
 
         One that is not there is asked for again: it belongs to a batch that is there.
         """
@@ -291,13 +292,29 @@ class BatchService(ABC):
                     if number > most:
                         raise BatchFailed("single", f"there are more than {most} lines of results")
                     if line:
-                        yield _parsed(number, line)
+                        yield self._result(number, line)
         except ErrorReply as exc:
             if exc.raw.status == 404:
                 raise self._failed("again", exc.raw) from exc
             raise self._unread(exc.raw) from exc
         except TransportFailure as exc:
             raise _unanswered(exc, reads=True) from exc
+
+    def _result(self, number: int, line: str | TransportFailure) -> LineResult | Unreadable:
+        """Return the result in a line."""
+        if isinstance(line, TransportFailure):
+            return Unreadable(f"line {number}: {line}")
+        try:
+            value = json.loads(line)
+        except ValueError:
+            return Unreadable(f"line {number} is no JSON")
+        if not isinstance(value, dict):
+            return Unreadable(f"line {number} is no JSON object")
+        key = as_text(value.get(self.key_member))
+        if not key:
+            return Unreadable(f"line {number} has no {self.key_member}")
+        name = as_message(key, LONGEST_NAME)
+        return self.read(key, value) or Unreadable(f"the result of {name} is of no known form")
 
     async def _ask(
         self,
@@ -363,19 +380,6 @@ def as_word(value: object) -> str:
     return (as_text(value) or "").upper()
 
 
-def key_of(line: dict[str, Any], member: str) -> str:
-    """Return the key of a result; raises Unreadable."""
-    key = as_text(line.get(member))
-    if not key:
-        raise Unreadable(f"it has no {member}")
-    return key
-
-
-def unreadable(key: str, why: str) -> Unreadable:
-    """Return the error of a result whose key is known."""
-    return Unreadable(f"the result of {as_message(key, LONGEST_NAME)} {why}")
-
-
 def id_of(reply: Mapping[str, Any], member: str = "id") -> str:
     """Return an id, which can stand in a path; raises BatchFailed."""
     value = reply.get(member)
@@ -395,16 +399,6 @@ def moment_of(text: object) -> datetime | None:
 
 def _is_success(raw: RawReply) -> bool:
     return 200 <= raw.status < 300
-
-
-def _parsed(number: int, line: str | TransportFailure) -> dict[str, Any] | Unreadable:
-    if isinstance(line, TransportFailure):
-        return Unreadable(f"line {number}: {line}")
-    try:
-        value = json.loads(line)
-    except ValueError:
-        return Unreadable(f"line {number} is no JSON")
-    return value if isinstance(value, dict) else Unreadable(f"line {number} is no JSON object")
 
 
 def _unanswered(failure: TransportFailure, *, reads: bool) -> BatchFailed:

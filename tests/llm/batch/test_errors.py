@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gzip
 import json
 import socket
 from datetime import UTC, datetime, timedelta
@@ -162,7 +161,7 @@ async def read(service):
     try:
         async for result in service.results("b1", status, 10):
             if isinstance(result, Unreadable):
-                broken.append(str(result))
+                broken.append(result.why)
             else:
                 keys.append(result.key)
     except BatchFailed as exc:
@@ -176,9 +175,9 @@ async def read(service):
         (b'{"custom_id": "b", "res', "line 2 is no JSON"),
         (b"[1, 2]", "line 2 is no JSON object"),
         (b'"text"', "line 2 is no JSON object"),
-        (b'{"result": {"type": "succeeded"}}', "it has no custom_id"),
-        (b'{"custom_id": 7, "result": {}}', "it has no custom_id"),
-        (b'{"custom_id": "b", "result": {"type": "strange"}}', "of b is of no known type"),
+        (b'{"result": {"type": "succeeded"}}', "line 2 has no custom_id"),
+        (b'{"custom_id": 7, "result": {}}', "line 2 has no custom_id"),
+        (b'{"custom_id": "b", "result": {"type": "strange"}}', "of b is of no known form"),
         (
             jsonl(succeeded("b", "x" * 5000)),
             "line 2: the reply is refused: it is longer than 0.004",
@@ -234,21 +233,6 @@ async def test_results_without_an_end_are_not_read_for_ever(server, service_at):
     keys, broken, failed = await asyncio.wait_for(read(service_at(server.url, "anthropic")), 10)
     assert (keys, broken, failed.kind) == (["a"], [], "single")
     assert str(failed) == "there are more than 30 lines of results"
-
-
-async def test_packed_results_are_read(server, service_at):
-    async def packed(request):
-        body = gzip.compress(jsonl(succeeded("a"), succeeded("b")))
-        return web.Response(body=body, headers={"content-encoding": "gzip"})
-
-    results_at(server, packed)
-    assert await read(service_at(server.url, "anthropic")) == (["a", "b"], [], None)
-
-
-async def test_results_that_are_refused_say_what_to_do(server, service_at):
-    results_at(server, (503, error("busy")))
-    _, _, failed = await read(service_at(server.url, "anthropic"))
-    assert (failed.kind, str(failed)) == ("again", "HTTP 503: busy")
 
 
 async def test_a_key_goes_to_no_other_host_than_the_configured_one(server, service_at):
@@ -358,19 +342,6 @@ async def test_a_list_that_turns_in_a_circle_ends(server, service_at):
     service = service_at(server.url, "openai-chat")
     assert await service.find("mark", datetime.now(UTC)) is None
     assert len(server.asked) == 2
-
-
-async def test_a_failed_batch_says_why_and_what_to_do(server, service_at):
-    errors = {"data": [{"code": "model_not_found", "message": "no such model", "line": 1}]}
-    server.replies[BATCH["openai-chat"]] = (200, {"status": "failed", "errors": errors})
-    status = await service_at(server.url, "openai-chat").status("b1")
-    assert (status.failure, status.message) == ("refused", "no such model")
-    server.replies[BATCH["gemini"]] = (
-        200,
-        {"metadata": {"state": "BATCH_STATE_FAILED"}, "error": {"code": 3, "message": "odd"}},
-    )
-    status = await service_at(server.url, "gemini").status("b1")
-    assert (status.failure, status.message) == ("single", "odd")
 
 
 async def used(service, what):
@@ -541,6 +512,7 @@ async def test_every_request_has_the_headers_of_its_format(server, service_at, f
         ("openai-chat", {"code": "rate_limit_exceeded"}, "again"),
         ("openai-chat", {"code": "token_limit_exceeded"}, "smaller"),
         ("openai-chat", {"code": "invalid_json_line"}, "single"),
+        ("openai-chat", {"code": "model_not_found"}, "refused"),
         ("gemini", {"code": 8}, "again"),
         ("gemini", {"code": 8, "message": "Enqueued token limit reached"}, "smaller"),
         ("gemini", {"code": 13}, "again"),
@@ -551,13 +523,12 @@ async def test_every_request_has_the_headers_of_its_format(server, service_at, f
         ("gemini", {"code": 7}, "refused"),
     ],
 )
-async def test_a_batch_that_failed_for_a_while_is_submitted_again(
-    server, service_at, form, batch, kind
-):
+async def test_a_failed_batch_says_why_and_what_to_do(server, service_at, form, batch, kind):
     told = {
         "openai-chat": {"status": "failed", "errors": {"data": [batch]}},
         "gemini": {"metadata": {"state": "BATCH_STATE_FAILED"}, "error": batch},
     }
+    batch.setdefault("message", "odd")
     server.replies[BATCH[form]] = (200, told[form])
     status = await service_at(server.url, form).status("b1")
-    assert (status.state, status.failure) == ("failed", kind)
+    assert (status.state, status.failure, status.message) == ("failed", kind, batch["message"])
