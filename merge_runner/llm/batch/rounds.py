@@ -223,51 +223,46 @@ class Rounds:
             parts = [*_parts(lines, self.services[model], most)]
             now, later = (parts[:1], parts[1:]) if crowd else (parts, [])
             for part in now:
-                self._start(self._begin(part), part)
+                batch = _batch_of(part)
+                self._start(self._begin(batch), batch)
             self._forming += itertools.chain.from_iterable(later)
 
-    def _start(self, work: Coroutine[Any, Any, None], lines: Iterable[Line]) -> None:
-        """Do something in a task of its own; what it raises is raised for these lines."""
+    def _start(self, work: Coroutine[Any, Any, None], batch: Batch) -> None:
+        """Do something for a batch in a task of its own; what it raises is raised for its lines."""
 
         async def do() -> None:
             try:
                 await work
+            except BatchFailed as exc:
+                self._lost(batch, exc)
             except Exception as error:  # noqa: BLE001 # it reaches the calls
-                for line in [*lines]:
-                    line.fails(error)
+                batch.fail(error)
 
         task = asyncio.create_task(do())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _begin(self, lines: Sequence[Line]) -> None:
-        """Note a batch of those lines that may begin, and submit it."""
-        by_key = {line.key: line for line in lines if not line.end.done()}
-        if not by_key:
-            return
-        note = OpenBatch(
-            mark=secrets.token_hex(16),
-            model=lines[0].model,
-            ledger=lines[0].ledger,
-            number=1 + max(line.line.request.slot.decision for line in lines),
-            submitted_at=datetime.now(UTC),
-            lines={key: line.line.attempt for key, line in by_key.items()},
-        )
+    async def _begin(self, batch: Batch) -> None:
+        """Note a batch with those of its lines that may begin, and submit it."""
+        lines = batch.lines
 
         def begins(key: str) -> bool:
-            line = by_key[key]
+            line = lines[key]
+            if line.end.done():  # nobody waits for it any more
+                return False
             return line.open is not None or line.money.set_aside(line.attempts)
 
-        note = await self._journal.begin(note, begins)
-        begun = {key: by_key.pop(key) for key in note.lines}
-        for line in by_key.values():
-            line.fails(TrialSuspended("another run spends from the same cap, and has used it up"))
-        for line in begun.values():
+        batch.note = note = await self._journal.begin(batch.note, begins)
+        for key, line in [*lines.items()]:
+            if key not in note.lines:
+                why = "another run spends from the same cap, and has used it up"
+                lines.pop(key).fails(TrialSuspended(why))
+                continue
             if line.open is None and not line.end.done():
                 line.money.begun()
             line.open = OpenLine(note, line.line.attempt)
-        if begun:
-            batch = self._batches[note.mark] = Batch(note, begun)
+        if lines:
+            self._batches[note.mark] = batch
             await self._submit(batch)
 
     async def _submit(self, batch: Batch) -> None:
@@ -359,7 +354,7 @@ class Rounds:
         batch = self._batches.get(note.mark)
         if batch is None:  # until it was looked at, its results may be there
             batch = self._batches[note.mark] = Batch(note, state="reading")
-            self._start(self._take_up(batch), batch.lines.values())
+            self._start(self._take_up(batch), batch)
         batch.lines[line.key] = line
         if batch.state == "never":
             self._form_anew(batch)
@@ -370,16 +365,12 @@ class Rounds:
 
     async def _take_up(self, batch: Batch) -> None:
         """Go on with a batch that an earlier run has submitted, or was about to."""
-        try:
-            if not batch.note.batch_id and not self.services[batch.note.model].takes_mark:
-                why = "the run ended before its id was known"
-                batch.end("batch_lost", why, unclear=True)
-            elif batch.note.batch_id or await self._arrived(batch):
-                await self._follow(batch)
-            else:
-                self._form_anew(batch)
-        except BatchFailed as exc:
-            self._lost(batch, exc)
+        if not batch.note.batch_id and not self.services[batch.note.model].takes_mark:
+            batch.end("batch_lost", "the run ended before its id was known", unclear=True)
+        elif batch.note.batch_id or await self._arrived(batch):
+            await self._follow(batch)
+        else:
+            self._form_anew(batch)
 
     def _form_anew(self, batch: Batch) -> None:
         """The lines of a batch that was never created go with the next round."""
@@ -406,22 +397,26 @@ class Rounds:
 
     async def _follow(self, batch: Batch) -> None:
         """Wait for the end of a batch, and hand its results out."""
-        try:
-            status = await self._ended(batch)
-            if status.state == "ended":
-                await self._hand_out(batch)
-            elif status.state == "failed":
-                failure = BatchFailed(status.failure or "again", status.message)
-                await self._not_asked(batch, failure, "batch_failed")
-        except BatchFailed as exc:
-            self._lost(batch, exc)
+        status = await self._ended(batch)
+        if status.state == "ended":
+            await self._hand_out(batch)
+        elif status.state == "failed":
+            failure = BatchFailed(status.failure or "again", status.message)
+            await self._not_asked(batch, failure, "batch_failed")
 
     async def _ended(self, batch: Batch) -> BatchStatus:
         """Wait for the end of a batch, which is cancelled in time; not for ever after that."""
+        service = self.services[batch.note.model]
         while (status := await self._look(batch)).state == "waiting":
             cancelled_at = batch.note.cancelled_at
             if cancelled_at is None and batch.age_s >= ROUND_DEADLINE_S:
-                await self._cancel(batch)
+                await self._patiently(batch, partial(service.cancel, batch.note.batch_id))
+                await self._note(batch, cancelled_at=datetime.now(UTC))
+                self._say(
+                    f"{batch.note.model}: batch {batch.note.batch_id} has waited for "
+                    f"{_duration(batch.age_s)} and is cancelled: what it has answered is taken, "
+                    "the rest is asked singly"
+                )
             elif cancelled_at and _s_ago(cancelled_at) > ENDING_S:
                 why = f"the batch was cancelled at {cancelled_at:%F %T} UTC and does not end"
                 self._say(f"{batch.note.model}: {why}: its calls are asked singly")
@@ -439,16 +434,6 @@ class Rounds:
             batch.status = status
         batch.state = "reading" if batch.status.state == "ended" else "waiting"
         return batch.status
-
-    async def _cancel(self, batch: Batch) -> None:
-        note = batch.note
-        cancel = partial(self.services[note.model].cancel, note.batch_id)
-        await self._patiently(batch, cancel)
-        await self._note(batch, cancelled_at=datetime.now(UTC))
-        self._say(
-            f"{note.model}: batch {note.batch_id} has waited for {_duration(batch.age_s)} and is "
-            "cancelled: what it has answered is taken, the rest is asked singly"
-        )
 
     async def _hand_out(self, batch: Batch) -> None:
         """Read the results of a batch until there is one for each call, or no more can be had."""
@@ -551,6 +536,19 @@ class Rounds:
             f"round {note.number} of at most {most}: {_counted(len(note.lines))} of {note.model} "
             f"{where} since {note.submitted_at:%H:%M:%S} UTC ({_duration(batch.age_s)}){done}"
         )
+
+
+def _batch_of(lines: Sequence[Line]) -> Batch:
+    """A new batch of lines of one model, whose money is in one ledger."""
+    note = OpenBatch(
+        mark=secrets.token_hex(16),
+        model=lines[0].model,
+        ledger=lines[0].ledger,
+        number=1 + max(line.line.request.slot.decision for line in lines),
+        submitted_at=datetime.now(UTC),
+        lines={line.key: line.line.attempt for line in lines},
+    )
+    return Batch(note, {line.key: line for line in lines})
 
 
 def _parts(lines: Iterable[Line], service: BatchService, most: int) -> Iterator[list[Line]]:
