@@ -393,12 +393,6 @@ async def test_to_cancel_a_batch_that_has_ended_is_no_error(server, service_at, 
     await service_at(server.url, form).cancel("b1")
 
 
-async def test_a_body_that_may_be_long_may_hold_many_values(server, service_at):
-    large = {"processing_status": "ended", "x": [0] * 1_100_000}
-    server.replies[BATCH["anthropic"]] = (200, large)
-    assert (await service_at(server.url, "anthropic").status("b1")).state == "ended"
-
-
 @pytest.mark.parametrize(("status", "kind"), [(404, "again"), (410, "lost"), (500, "again")])
 async def test_a_file_of_answers_that_is_not_there_hides_no_file_of_errors(
     server, service_at, status, kind
@@ -477,13 +471,6 @@ async def test_nobody_looks_behind_a_page_from_which_a_list_goes_back_in_time(
     server.replies[LISTS[form]] = paged(form, old[:2], [old[2]])
     assert await service_at(server.url, form).find("mark", NOW) is None
     assert len(server.asked) == 1
-
-
-@pytest.mark.parametrize("form", LISTS)
-async def test_a_batch_is_found_behind_a_page_of_later_ones(server, service_at, form):
-    told = [listed(form, "other", NOW + timedelta(days=n), f"b{n}") for n in (3, 2, 1, 0)]
-    server.replies[LISTS[form]] = paged(form, told[:2], told[2:], [listed(form, "mark", NOW)])
-    assert await service_at(server.url, form).find("mark", NOW) == "b1"
 
 
 @pytest.mark.parametrize("form", LISTS)
