@@ -210,7 +210,8 @@ class BatchMode(ABC):
     """A provider's batch mode: its addresses, and how it puts what it says.
 
     Its batches are at ``path``. ``creation``, ``uploads`` and ``results`` are patterns of paths. A
-    page of its list is asked for by the queries ``cursor`` and ``size``.
+    line has its id as ``key`` and its request as ``body``. A page of the list is asked for by the
+    queries ``cursor`` and ``size``.
     """
 
     wire: ServedFormat
@@ -219,8 +220,8 @@ class BatchMode(ABC):
     creation: str
     uploads = ""
     results: str
-    cursor = "after"
-    size = "limit"
+    key, body = "custom_id", "body"
+    cursor, size = "after", "limit"
 
     def __init__(self, batches: Batches) -> None:
         self._batches = batches
@@ -314,6 +315,21 @@ class BatchMode(ABC):
     def _upload(self, request: Request) -> Response:
         raise NotThere
 
+    def _asked(
+        self, line: dict[str, Any], wire: ServedFormat, path: str, model: str | None = None
+    ) -> Asked:
+        """A line as the request that it stands for, in canonical JSON like one of our client."""
+        slot = line.get(SLOT_HEADER)
+        return Asked(
+            wire=wire,
+            path=path,
+            raw=canonical_json(line[self.body]).encode(),
+            model=model,
+            slot=None if slot is None else canonical_json(slot),
+            attempt=str(line.get(ATTEMPT_HEADER, "")),
+            custom_id=line[self.key],
+        )
+
     def _file(self, content: bytes) -> str:
         """Keep an uploaded file; returns its id."""
         name = f"file-{len(self._batches.files):06x}"
@@ -340,7 +356,7 @@ class OpenAIMode(BatchMode):
         lines = self._uploaded(told["input_file_id"])
         if told["completion_window"] != "24h" or any(line["url"] != endpoint for line in lines):
             raise UsageError("A line is for another endpoint, or the completion_window is not 24h.")
-        return [_asked(wire, endpoint, each["body"], each["custom_id"], each) for each in lines]
+        return [self._asked(line, wire, endpoint) for line in lines]
 
     def shown(self, batch: Batch) -> dict[str, Any]:
         """See BatchMode."""
@@ -392,14 +408,11 @@ class AnthropicMode(BatchMode):
 
     wire, prefix, path = MESSAGES, "msgbatch_", "/v1/messages/batches"
     creation, results = path, f"{path}/{ID}/results"
-    cursor = "after_id"
+    body, cursor = "params", "after_id"
 
     def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
         """See BatchMode."""
-        return [
-            _asked(MESSAGES, MESSAGES.path, line["params"], line["custom_id"], line)
-            for line in told["requests"]
-        ]
+        return [self._asked(line, MESSAGES, MESSAGES.path) for line in told["requests"]]
 
     def shown(self, batch: Batch) -> dict[str, Any]:
         """See BatchMode."""
@@ -439,6 +452,7 @@ class GeminiMode(BatchMode):
     wire, prefix, path = GEMINI, "g", "/v1beta/batches"
     creation = "/v1beta/models/(?P<model>[^/]+?):batchGenerateContent"
     uploads, results = "/upload/v1beta/files", f"/v1beta/files/{ID}:download"
+    key, body = "key", "request"
     cursor, size = "pageToken", "pageSize"
 
     def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
@@ -446,10 +460,7 @@ class GeminiMode(BatchMode):
         model = request.named["model"]
         name = told["batch"]["inputConfig"]["fileName"].removeprefix("files/")
         path = f"/v1beta/models/{model}:generateContent"
-        return [
-            _asked(GEMINI, path, line["request"], line["key"], line, model)
-            for line in self._uploaded(name)
-        ]
+        return [self._asked(line, GEMINI, path, model) for line in self._uploaded(name)]
 
     def shown(self, batch: Batch) -> dict[str, Any]:
         """See BatchMode."""
@@ -502,27 +513,6 @@ class GeminiMode(BatchMode):
         message = result.body["error"]["message"]
         error = {"code": GRPC_CODES[result.status], "message": message}
         return {"key": result.custom_id, "error": error}
-
-
-def _asked(
-    wire: ServedFormat,
-    path: str,
-    body: Any,  # noqa: ANN401 # whatever stands there is read like the body of a request
-    custom_id: str,
-    line: dict[str, Any],
-    model: str | None = None,
-) -> Asked:
-    """A line as the request that it stands for: in canonical JSON, as our own client sends it."""
-    slot = line.get(SLOT_HEADER)
-    return Asked(
-        wire=wire,
-        path=path,
-        raw=canonical_json(body).encode(),
-        model=model,
-        slot=None if slot is None else canonical_json(slot),
-        attempt=str(line.get(ATTEMPT_HEADER, "")),
-        custom_id=custom_id,
-    )
 
 
 def _rfc3339(moment_s: float) -> str:
