@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
-from pydantic import AwareDatetime, BaseModel, ValidationError
+from pydantic import AwareDatetime, BaseModel, BeforeValidator, ValidationError
 
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
@@ -18,6 +19,8 @@ from merge_runner.records import Attempt
 
 # The prefix of names in the cache.
 _BATCH = "batch "
+# Notes of earlier versions have an empty text for None: their batches may be open yet.
+Moment = Annotated[AwareDatetime | None, BeforeValidator(lambda value: value or None)]
 
 
 class OpenBatch(BaseModel, frozen=True):
@@ -37,8 +40,8 @@ class OpenBatch(BaseModel, frozen=True):
     submitted_at: AwareDatetime
     lines: dict[str, int]
     batch_id: str = ""
-    cancelled_at: AwareDatetime | None = None
-    ended_at: AwareDatetime | None = None
+    cancelled_at: Moment = None
+    ended_at: Moment = None
 
 
 @dataclass(frozen=True, slots=True)

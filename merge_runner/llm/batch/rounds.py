@@ -418,7 +418,8 @@ class Rounds:
                     "the rest is asked singly"
                 )
             elif cancelled_at and _s_ago(cancelled_at) > ENDING_S:
-                why = f"the batch was cancelled at {cancelled_at:%F %T} UTC and does not end"
+                moment = f"{cancelled_at:%Y-%m-%d %H:%M:%S} UTC"
+                why = f"the batch was cancelled at {moment} and does not end"
                 self._say(f"{batch.note.model}: {why}: its calls are asked singly")
                 batch.end("no_result", why, unclear=True)
                 break

@@ -24,7 +24,7 @@ from merge_runner.errors import (
     ProviderDown,
     QuotaExhausted,
 )
-from merge_runner.llm.batch.journal import Journal
+from merge_runner.llm.batch.journal import Journal, OpenBatch
 from merge_runner.llm.batch.lines import Batches
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.service import BatchFailed, BatchStatus, LineResult, Unreadable
@@ -495,6 +495,15 @@ async def note(cache, **known):
     await journal.note(batch.model_copy(update=known))
 
 
+def test_a_batch_that_an_earlier_version_has_noted_is_read():
+    told = {"mark": "k", "model": "m", "ledger": "l", "number": 1, "lines": {"key": 1}}
+    times = {"submitted_at": NOON, "cancelled_at": "", "ended_at": ""}
+    batch = OpenBatch.model_validate_json(json.dumps({**told, **times, "batch_id": "b"}))
+    assert batch.submitted_at == datetime.fromisoformat(NOON)
+    assert (batch.cancelled_at, batch.ended_at) == (None, None)
+
+
+NOON = "2026-11-22T12:00:00.000+00:00"
 HOURS_AGO = datetime.now(UTC) - timedelta(hours=5)
 
 
