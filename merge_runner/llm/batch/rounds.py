@@ -485,11 +485,11 @@ class Rounds:
 
     def _lost(self, batch: Batch, exc: BatchFailed) -> None:
         """End a batch that cannot be read: what was set aside for it stays so."""
-        note, free = batch.note, batch.note.model in self._free
+        note = batch.note
         # A key that is refused is another account's, perhaps: there the batch goes on.
         gives_up = not self.submits and exc.kind not in ("refused", "quota")
-        if free or gives_up:
-            batch.end("batch_lost", str(exc), unclear=not free)
+        if note.model in self._free or gives_up:
+            batch.end("batch_lost", str(exc), unclear=True)
             return
         error = EndpointRefused(
             f"{note.model}: {note.batch_id} is refused to this key ({exc}): set the key of the "

@@ -138,9 +138,7 @@ def cache(tmp_path):
 class Run:
     """A run's client, and the rounds that it asks in."""
 
-    def __init__(
-        self, cache, service, *, cap=None, price=PRICE, scope="test", free=False, submits=True
-    ):
+    def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", submits=True):
         self.said = []
         self.alone = Alone()
         self.rounds = Rounds(
@@ -148,7 +146,7 @@ class Run:
             {"m": service},
             submits=submits,
             most_rounds=30,
-            free={"m"} if free or price == "free" else set(),
+            free={"m"} if price == "free" else set(),
             say=self.said.append,
         )
         self.ledger = Ledger(cache, scope)
@@ -735,9 +733,9 @@ async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind)
 @in_virtual_time
 async def test_a_batch_that_is_gone_is_asked_anew_and_costs_nothing_where_nobody_charges(cache):
     service = Memory()
-    await left_behind(cache, service, free=True)
+    await left_behind(cache, service, price="free")
     service.batches.clear()
-    again = Run(cache, service, free=True)
+    again = Run(cache, service, price="free")
     (reply,) = await again.ask()
     assert [attempt.outcome for attempt in reply.attempts] == ["batch_lost", "ok"]
     assert again.ledger.read().open_attempts == 0
