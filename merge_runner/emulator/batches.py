@@ -25,7 +25,7 @@ ID = "(?P<id>[^/]+?)"
 FAILURES = (429, 500, 503)
 GRPC_CODES = {400: 3, 429: 8, 500: 13, 503: 14}
 Handler = Callable[[Request], Response]
-Outcome = Literal["answered", "failed", "expired"]
+Outcome = Literal["answered", "failed", "not asked"]
 
 
 class NotThere(Exception):
@@ -45,8 +45,13 @@ class Result:
     """A status and a body as the plain endpoint would reply; 0 for a line that was not asked."""
 
     custom_id: str
-    status: int = 0
-    body: dict[str, Any] | None = None
+    status: int
+    body: dict[str, Any]
+
+    @property
+    def kind(self) -> Outcome:
+        """What became of the line."""
+        return "answered" if self.status == 200 else "failed" if self.status else "not asked"
 
 
 @dataclass(slots=True, eq=False)
@@ -69,11 +74,6 @@ class Batch:
     results: list[Result] | None = None
 
     @property
-    def due_s(self) -> float:
-        """When the last line ends."""
-        return self.began_s + max(fate.after_s for fate in self.fates)
-
-    @property
     def tokens(self) -> int:
         """About how many tokens its requests have."""
         return sum(len(line.raw) for line in self.lines) // 4
@@ -86,10 +86,9 @@ class Batch:
             return in_time
         return min(in_time, len(self.lines) * self.polls // self.least_polls)
 
-    def count(self, *kinds: str) -> int:
-        """Return how many lines were ``answered``, ``failed`` or ``not asked``."""
-        results = self.results or ()
-        return sum(_kind(result) in kinds for result in results)
+    def count(self, *kinds: Outcome) -> int:
+        """Return how many lines ended so."""
+        return sum(result.kind in kinds for result in self.results or ())
 
     @property
     def why_not(self) -> str:
@@ -172,7 +171,7 @@ class Batches:
         if chance < plan.failed:
             return Fate(after_s, "failed")
         if chance < plan.failed + plan.expired:
-            return Fate(plan.delay_s, "expired")
+            return Fate(plan.delay_s, "not asked")
         return Fate(after_s, "answered")
 
     def _settle(self, batch: Batch) -> None:
@@ -182,21 +181,25 @@ class Batches:
             return
         fates = sorted(zip(batch.fates, batch.lines, strict=True), key=lambda pair: pair[0].after_s)
         batch.results = [
-            self._result(line, fate.kind if number < finished else "expired")
+            self._result(line, fate.kind if number < finished else "not asked")
             for number, (fate, line) in enumerate(fates)
         ]
 
     def _result(self, line: Asked, kind: Outcome) -> Result:
         assert line.custom_id is not None
-        if kind == "expired":
-            return Result(line.custom_id)
+        if kind == "not asked":
+            return Result(line.custom_id, 0, {})
+
+        def failed(status: int, message: str) -> Result:
+            return Result(line.custom_id or "", status, marked(line.wire.error(status, message)[0]))
+
         if kind == "failed":
             status = FAILURES[draw_index(3, "failure", self.faults.seed, line.where)]
-            return Result(line.custom_id, status, _error(line.wire, status, "An emulated fault."))
+            return failed(status, "An emulated fault.")
         try:
             question = self._replies.question(line)
         except UsageError as exc:
-            return Result(line.custom_id, 400, _error(line.wire, 400, str(exc)))
+            return failed(400, str(exc))
         attempt = self._replies.attempt(line)
         fault = self.faults.fault(line.where, attempt)
         answer = self._replies.answer(question, attempt, fault if fault in OUTCOMES else None)
@@ -206,32 +209,34 @@ class Batches:
 class BatchMode(ABC):
     """A provider's batch mode: its addresses, and how it puts what it says.
 
-    A page of its list is asked for by the queries ``cursor`` and ``size``.
+    Its batches are at ``path``. ``creation``, ``uploads`` and ``results`` are patterns of paths. A
+    line has its id as ``key`` and its request as ``body``. A page of the list is asked for by the
+    queries ``cursor`` and ``size``.
     """
 
     wire: ServedFormat
     prefix: str
     path: str
-    cursor = "after"
-    size = "limit"
+    creation: str
+    uploads = ""
+    results: str
+    key, body = "custom_id", "body"
+    cursor, size = "after", "limit"
 
     def __init__(self, batches: Batches) -> None:
         self._batches = batches
 
     def routes(self) -> list[tuple[str, str, Handler]]:
         """Return the method, the pattern of paths and the handler of each address."""
-        return [
-            (method, path, partial(self._guarded, handler))
-            for method, path, handler in self._addresses()
-        ]
-
-    def _addresses(self) -> list[tuple[str, str, Handler]]:
-        return [
-            ("POST", self.path, self._create),
+        handlers: list[tuple[str, str, Handler]] = [
+            ("POST", self.creation, self._create),
+            ("POST", self.uploads, self._upload),
             ("GET", self.path, self._list),
             ("GET", f"{self.path}/{ID}", self._status),
-            ("POST", f"{self.path}/{ID}/cancel", self._cancel),
+            ("POST", f"{self.path}/{ID}[:/]cancel", self._cancel),
+            ("GET", self.results, self._results),
         ]
+        return [(method, path, partial(self._guarded, each)) for method, path, each in handlers]
 
     @abstractmethod
     def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
@@ -240,6 +245,10 @@ class BatchMode(ABC):
     @abstractmethod
     def shown(self, batch: Batch) -> dict[str, Any]:
         """Return a batch as its state is told."""
+
+    @abstractmethod
+    def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
+        """Return a line of results; None: it is in no such ``part`` of them."""
 
     def page(self, batches: Sequence[Batch], more: bool) -> dict[str, Any]:
         """Return a page of the list."""
@@ -293,6 +302,34 @@ class BatchMode(ABC):
             batch.cancelled_s = self._batches.now_s()  # it ends at the next look
         return as_json(self.shown(batch))
 
+    def _results(self, request: Request) -> Response:
+        """Show a file of results, whose name holds the id of its batch."""
+        name = request.named["id"]
+        batch_id, _, part = name.removeprefix("file-").partition("-")
+        batch = self._batches.poll(batch_id)
+        if batch.results is None:
+            raise NotThere
+        lines = [self.line(batch, result, part) for result in batch.results]
+        return self._batches.shown(name, [line for line in lines if line])
+
+    def _upload(self, request: Request) -> Response:
+        raise NotThere
+
+    def _asked(
+        self, line: dict[str, Any], wire: ServedFormat, path: str, model: str | None = None
+    ) -> Asked:
+        """A line as the request that it stands for, in canonical JSON like one of our client."""
+        slot = line.get(SLOT_HEADER)
+        return Asked(
+            wire=wire,
+            path=path,
+            raw=canonical_json(line[self.body]).encode(),
+            model=model,
+            slot=None if slot is None else canonical_json(slot),
+            attempt=str(line.get(ATTEMPT_HEADER, "")),
+            custom_id=line[self.key],
+        )
+
     def _file(self, content: bytes) -> str:
         """Keep an uploaded file; returns its id."""
         name = f"file-{len(self._batches.files):06x}"
@@ -310,13 +347,7 @@ class OpenAIMode(BatchMode):
     """``/v1/files`` and ``/v1/batches``."""
 
     wire, prefix, path = CHAT, "batch_", "/v1/batches"
-
-    def _addresses(self) -> list[tuple[str, str, Handler]]:
-        return [
-            *super()._addresses(),
-            ("POST", "/v1/files", self._upload),
-            ("GET", f"/v1/files/{ID}/content", self._content),
-        ]
+    creation, uploads, results = path, "/v1/files", f"/v1/files/{ID}/content"
 
     def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
         """See BatchMode."""
@@ -325,7 +356,7 @@ class OpenAIMode(BatchMode):
         lines = self._uploaded(told["input_file_id"])
         if told["completion_window"] != "24h" or any(line["url"] != endpoint for line in lines):
             raise UsageError("A line is for another endpoint, or the completion_window is not 24h.")
-        return [_asked(wire, endpoint, each["body"], each["custom_id"], each) for each in lines]
+        return [self._asked(line, wire, endpoint) for line in lines]
 
     def shown(self, batch: Batch) -> dict[str, Any]:
         """See BatchMode."""
@@ -362,16 +393,10 @@ class OpenAIMode(BatchMode):
             raise UsageError("A file and the purpose batch are needed.")
         return as_json(marked({"id": self._file(form["file"]), "object": "file"}))
 
-    def _content(self, request: Request) -> Response:
-        name = request.named["id"]
-        _, batch_id, kind = name.split("-")
-        batch = self._batches.poll(batch_id)
-        chosen = [
-            each for each in batch.results or () if (each.status == 200) == (kind == "output")
-        ]
-        return self._batches.shown(name, [self._line(batch, each) for each in chosen])
-
-    def _line(self, batch: Batch, result: Result) -> dict[str, Any]:
+    def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
+        """See BatchMode."""
+        if (result.kind == "answered") != (part == "output"):
+            return None
         line: dict[str, Any] = {"custom_id": result.custom_id, "response": None, "error": None}
         if result.status:
             return line | {"response": {"status_code": result.status, "body": result.body}}
@@ -382,17 +407,12 @@ class AnthropicMode(BatchMode):
     """``/v1/messages/batches``."""
 
     wire, prefix, path = MESSAGES, "msgbatch_", "/v1/messages/batches"
-    cursor = "after_id"
-
-    def _addresses(self) -> list[tuple[str, str, Handler]]:
-        return [*super()._addresses(), ("GET", f"{self.path}/{ID}/results", self._results)]
+    creation, results = path, f"{path}/{ID}/results"
+    body, cursor = "params", "after_id"
 
     def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
         """See BatchMode."""
-        return [
-            _asked(MESSAGES, MESSAGES.path, line["params"], line["custom_id"], line)
-            for line in told["requests"]
-        ]
+        return [self._asked(line, MESSAGES, MESSAGES.path) for line in told["requests"]]
 
     def shown(self, batch: Batch) -> dict[str, Any]:
         """See BatchMode."""
@@ -416,47 +436,31 @@ class AnthropicMode(BatchMode):
             }
         )
 
-    def _results(self, request: Request) -> Response:
-        batch = self._batches.poll(request.named["id"])
-        if batch.results is None:
-            raise NotThere
-        not_asked = {"type": "expired" if batch.cancelled_s is None else "canceled"}
-        lines = []
-        for result in batch.results:
-            told = {
-                "answered": {"type": "succeeded", "message": result.body},
-                "failed": {"type": "errored", "error": result.body},
-                "not asked": not_asked,
-            }
-            lines.append({"custom_id": result.custom_id, "result": told[_kind(result)]})
-        return self._batches.shown(batch.id, lines)
+    def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
+        """See BatchMode."""
+        told = {
+            "answered": {"type": "succeeded", "message": result.body},
+            "failed": {"type": "errored", "error": result.body},
+            "not asked": {"type": "expired" if batch.cancelled_s is None else "canceled"},
+        }
+        return {"custom_id": result.custom_id, "result": told[result.kind]}
 
 
 class GeminiMode(BatchMode):
     """``models/MODEL:batchGenerateContent`` and ``batches``, with requests and results in files."""
 
     wire, prefix, path = GEMINI, "g", "/v1beta/batches"
+    creation = "/v1beta/models/(?P<model>[^/]+?):batchGenerateContent"
+    uploads, results = "/upload/v1beta/files", f"/v1beta/files/{ID}:download"
+    key, body = "key", "request"
     cursor, size = "pageToken", "pageSize"
-
-    def _addresses(self) -> list[tuple[str, str, Handler]]:
-        return [
-            ("POST", "/v1beta/models/(?P<model>[^/]+?):batchGenerateContent", self._create),
-            ("GET", self.path, self._list),
-            ("GET", f"{self.path}/{ID}", self._status),
-            ("POST", f"{self.path}/{ID}:cancel", self._cancel),
-            ("POST", "/upload/v1beta/files", self._upload),
-            ("GET", f"/v1beta/files/{ID}:download", self._content),
-        ]
 
     def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
         """See BatchMode."""
         model = request.named["model"]
         name = told["batch"]["inputConfig"]["fileName"].removeprefix("files/")
         path = f"/v1beta/models/{model}:generateContent"
-        return [
-            _asked(GEMINI, path, line["request"], line["key"], line, model)
-            for line in self._uploaded(name)
-        ]
+        return [self._asked(line, GEMINI, path, model) for line in self._uploaded(name)]
 
     def shown(self, batch: Batch) -> dict[str, Any]:
         """See BatchMode."""
@@ -482,7 +486,7 @@ class GeminiMode(BatchMode):
         }
         operation: dict[str, Any] = {"name": f"batches/{batch.id}", "metadata": metadata}
         if ended:
-            output = {"responsesFile": f"files/batch-{batch.id}"}
+            output = {"responsesFile": f"files/{batch.id}"}
             metadata["output"] = output
             operation |= {"done": True, "response": output}
         return marked(operation)
@@ -500,51 +504,15 @@ class GeminiMode(BatchMode):
         file = {"name": f"files/{self._file(request.body)}", "sizeBytes": str(len(request.body))}
         return as_json(marked({"file": file}), {"x-goog-upload-status": "final"})
 
-    def _content(self, request: Request) -> Response:
-        """The file of responses; a line that was not asked has none."""
-        batch = self._batches.poll(request.named["id"].removeprefix("batch-"))
-        if batch.results is None:
-            raise NotThere
-        lines = []
-        for result in batch.results:
-            told: dict[str, Any] = {"key": result.custom_id}
-            if result.status == 200:
-                lines.append(told | {"response": result.body})
-            elif result.body is not None:
-                message = result.body["error"]["message"]
-                lines.append(
-                    told | {"error": {"code": GRPC_CODES[result.status], "message": message}}
-                )
-        return self._batches.shown(batch.id, lines)
-
-
-def _asked(
-    wire: ServedFormat,
-    path: str,
-    body: Any,  # noqa: ANN401 # whatever stands there is read like the body of a request
-    custom_id: str,
-    line: dict[str, Any],
-    model: str | None = None,
-) -> Asked:
-    """A line as the request that it stands for: in canonical JSON, as our own client sends it."""
-    slot = line.get(SLOT_HEADER)
-    return Asked(
-        wire=wire,
-        path=path,
-        raw=canonical_json(body).encode(),
-        model=model,
-        slot=None if slot is None else canonical_json(slot),
-        attempt=str(line.get(ATTEMPT_HEADER, "")),
-        custom_id=custom_id,
-    )
-
-
-def _kind(result: Result) -> str:
-    return {200: "answered", 0: "not asked"}.get(result.status, "failed")
-
-
-def _error(wire: ServedFormat, status: int, message: str) -> dict[str, Any]:
-    return marked(wire.error(status, message)[0])
+    def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
+        """See BatchMode."""
+        if result.kind == "not asked":
+            return None
+        if result.kind == "answered":
+            return {"key": result.custom_id, "response": result.body}
+        message = result.body["error"]["message"]
+        error = {"code": GRPC_CODES[result.status], "message": message}
+        return {"key": result.custom_id, "error": error}
 
 
 def _rfc3339(moment_s: float) -> str:

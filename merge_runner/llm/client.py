@@ -436,7 +436,7 @@ class LlmClient:
                 usd = 0.0  # no line that failed is charged
             record = replace(
                 record,
-                started_at=batches.rounds.submitted_at(line),
+                started_at=line.submitted_at,
                 cost_usd=None if usd is None else usd * batches.price_factor,
                 batch_id=end.batch_id,
             )

@@ -8,7 +8,7 @@ import re
 import select
 import ssl
 import zlib
-from collections.abc import AsyncIterator, Awaitable, Iterable, Iterator, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -184,7 +184,7 @@ class HttpTransport:
 
     async def lines(
         self, path: str, headers: Mapping[str, str], *, timeout_s: float
-    ) -> AsyncIterator[str | TransportFailure]:
+    ) -> AsyncGenerator[str | TransportFailure]:
         """Get a body of lines, each up to ``most_bytes`` long, or why it is refused.
 
         Nothing may be late by more than ``timeout_s``. Raises ErrorReply where the status is not
@@ -199,7 +199,7 @@ class HttpTransport:
                 async for line in split_lines(chunks, self._most_bytes):
                     if line is None:
                         yield _too_long(self._most_bytes)
-                    elif line:
+                    else:
                         yield self._mask(_decoded(line))
             finally:
                 await reply.aclose()

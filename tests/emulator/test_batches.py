@@ -51,17 +51,15 @@ def test_a_batch_ends_on_the_clock_with_its_last_line(clock, driving_prompt):
         clock.now_s += 10
     assert counts == sorted(counts)
     assert counts[0] == 0 < counts[5] < 20
-    assert 1020 < batch.due_s <= clock.now_s <= 1110
+    assert 1020 < 1000 + max(fate.after_s for fate in batch.fates) <= clock.now_s <= 1110
     assert [each.custom_id for each in batch.results] != [each.custom_id for each in batch.lines]
 
 
 def test_a_slow_line_keeps_its_batch_waiting(clock, driving_prompt):
-    usual = batches_of(clock, delay_s=100.0).create("b", some(driving_prompt), {})
     tailed = batches_of(clock, delay_s=100.0, slow=0.1, slow_factor=50.0)
     slow = tailed.create("b", some(driving_prompt), {})
     late = [fate.after_s for fate in slow.fates if fate.after_s > 100]
     assert 0 < len(late) < 10
-    assert slow.due_s > usual.due_s
 
 
 def test_the_fate_of_a_line_is_a_function_of_the_seed_and_of_how_often_it_was_submitted(
@@ -80,7 +78,7 @@ def test_each_kind_of_line_occurs_at_its_rate(clock, driving_prompt):
     batches = batches_of(clock, failed=0.1, expired=0.05)
     kinds = [fate.kind for fate in batches.create("b", some("x", 4000), {}).fates]
     assert kinds.count("failed") == pytest.approx(400, abs=80)
-    assert kinds.count("expired") == pytest.approx(200, abs=60)
+    assert kinds.count("not asked") == pytest.approx(200, abs=60)
 
 
 def test_tokens_wait_until_their_batch_has_ended(clock, driving_prompt):

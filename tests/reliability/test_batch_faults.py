@@ -226,9 +226,8 @@ def play(tmp_path, monkeypatch):
             monkeypatch.setenv("GOOGLE_GEMINI_BASE_URL", server.url)
             plan = make_plan(str(tmp_path / "study.toml"), "model", trust=True)
             db = tmp_path / f"{len([*tmp_path.iterdir()])}.duckdb"
-            outcome = await run_sweep(
-                plan, Options(db, db.with_suffix(""), quiet=True, **options), say=said.append
-            )
+            settings = Options(db, db.with_suffix(""), quiet=True, **options)
+            outcome = await run_sweep(plan, settings, say=said.append)
             async with httpx.AsyncClient() as client:
                 counts = (await client.get(f"{server.url}/emulator/answered")).json()
         assert outcome.exit_code == 0, outcome.messages

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from merge_runner.llm.batch.service import (
@@ -11,17 +11,13 @@ from merge_runner.llm.batch.service import (
     BatchService,
     BatchStatus,
     LineResult,
-    Unreadable,
     as_reply,
     as_word,
     id_of,
     json_object,
-    key_of,
-    unreadable,
 )
 from merge_runner.llm.formats.base import as_count, as_dict, as_text
 
-BATCHES = "/v1/messages/batches"
 # The status with which the plain endpoint sends an error, by its type: a result has none.
 STATUSES = {
     "invalid_request_error": 400,
@@ -44,6 +40,7 @@ class AnthropicBatches(BatchService):
     # Of 256 MB; the rest is for what stands around the lines.
     most_bytes = 255_000_000
     takes_mark = False
+    path = "/v1/messages/batches"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
@@ -53,18 +50,15 @@ class AnthropicBatches(BatchService):
     async def create(self, lines: Sequence[BatchLine], mark: str) -> str:
         """See BatchService; a batch takes no name, so that the mark is not sent."""
         body = b'{"requests":[' + b",".join(map(self.line, lines)) + b"]}"
-        return id_of(json_object(await self._post(BATCHES, body)))
+        return id_of(json_object(await self._post(self.path, body)))
 
-    async def status(self, batch_id: str) -> BatchStatus:
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        batch = await self._get(f"{BATCHES}/{batch_id}")
         counts = as_dict(batch.get("request_counts"))
         total = sum(as_count(count) or 0 for count in counts.values())
-        word = as_word(batch.get("processing_status"))
-        ended = word.lower() == "ended"
+        ended = as_word(batch.get("processing_status")) == "ENDED"
         return BatchStatus(
             state="ended" if ended else "waiting",
-            word=word,
             # While a batch is in progress all its requests count as such.
             done=total - (as_count(counts.get("processing")) or 0) if ended else None,
             total=total or None,
@@ -72,19 +66,15 @@ class AnthropicBatches(BatchService):
             batch=batch,
         )
 
-    async def lines(
-        self, batch_id: str, batch: Mapping[str, Any]
-    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
         """See BatchService."""
         if batch.get("archived_at"):
             raise BatchFailed("lost", "the results of the batch are no longer kept")
         # Not at the URL that the batch names: the key goes to the configured host alone.
-        async for line in self._lines(f"{BATCHES}/{batch_id}/results"):
-            yield line
+        return [f"{self.path}/{batch_id}/results"]
 
-    def read(self, line: dict[str, Any]) -> LineResult:
+    def read(self, key: str, line: dict[str, Any]) -> LineResult | None:
         """See BatchService."""
-        key = key_of(line, "custom_id")
         result = as_dict(line.get("result"))
         match result.get("type"):
             case "succeeded":
@@ -96,8 +86,4 @@ class AnthropicBatches(BatchService):
             case "expired" | "canceled" as why:
                 message = f"the batch {'has expired' if why == 'expired' else why}"
                 return LineResult(key, None, message)
-        raise unreadable(key, "is of no known type")
-
-    async def cancel(self, batch_id: str) -> None:
-        """See BatchService."""
-        await self._cancel(f"{BATCHES}/{batch_id}/cancel")
+        return None

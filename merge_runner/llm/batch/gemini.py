@@ -1,34 +1,29 @@
 """Gemini's batchGenerateContent, with the requests in a file.
 
 They could also stand in the body of the creation; a file has room for more, and each of its results
-has the key of its request. Results of both kinds are read.
+has the key of its request.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import AsyncIterator, Mapping, Sequence
-from datetime import datetime
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from merge_runner.llm.batch.service import (
-    TRANSFER_TIMEOUT_S,
     BatchFailed,
     BatchLine,
     BatchService,
     BatchStatus,
     LineResult,
-    Unreadable,
+    Listed,
     as_message,
     as_reply,
     as_word,
     id_of,
     json_object,
-    key_of,
-    leads_back,
     moment_of,
-    unreadable,
 )
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import as_count, as_dict, as_dicts, as_text, read_error
@@ -65,6 +60,9 @@ class GeminiBatches(BatchService):
 
     # A file may have 2 GB, but this one is held in memory.
     most_bytes = 200_000_000
+    # A page has few batches, since one may come with all its results.
+    path, pages, cursor = f"{API}/batches", "pageSize=10", "pageToken"
+    cancel_suffix, key_member = ":cancel", "key"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
@@ -81,7 +79,7 @@ class GeminiBatches(BatchService):
         batch = {"displayName": mark, "inputConfig": {"fileName": name}}
         path = lines[0].request.path.replace(METHOD, BATCH_METHOD)
         created = await self._post(path, canonical_json({"batch": batch}).encode())
-        return _number(id_of(json_object(created), "name"))
+        return self.batch_id_of(json_object(created))
 
     async def _upload(self, content: bytes, mark: str) -> str:
         """Return the name of a file with these lines."""
@@ -109,31 +107,27 @@ class GeminiBatches(BatchService):
             raise BatchFailed("again", "the reply names no URL for the upload")
         return f"{path}?{parts.query}"
 
-    async def find(self, mark: str, since: datetime) -> str | None:
-        """By the mark, which is its display name."""
-        # A page has few batches, since one may come with all its results.
-        async for page in self._pages(f"{API}/batches?pageSize=10", "pageToken", _next_page):
-            batches = as_dicts(page.get("operations"))
-            metadata = [as_dict(batch.get("metadata")) for batch in batches]
-            for batch, its in zip(batches, metadata, strict=True):
-                if its.get("displayName") == mark:
-                    return _number(id_of(batch, "name"))
-            if leads_back([moment_of(its.get("createTime")) for its in metadata], since):
-                break
-        return None
+    def page_of(self, page: dict[str, Any]) -> tuple[list[Listed], str | None]:
+        """See BatchService; the mark is the display name."""
+        listed = []
+        for batch in as_dicts(page.get("operations")):
+            metadata = as_dict(batch.get("metadata"))
+            created = moment_of(metadata.get("createTime"))
+            listed.append(Listed(metadata.get("displayName"), created, batch))
+        return listed, as_text(page.get("nextPageToken")) or None
 
-    async def status(self, batch_id: str) -> BatchStatus:
+    def batch_id_of(self, batch: dict[str, Any]) -> str:
+        """Return the id in the name ``batches/ID``."""
+        return id_of(batch, "name").rpartition("/")[2]
+
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        batch = await self._get(f"{API}/batches/{batch_id}", TRANSFER_TIMEOUT_S)
-        metadata, error = as_dict(batch.get("metadata")), as_dict(batch.get("error"))
-        word = _word(metadata)
-        stats = as_dict(metadata.get("batchStats"))
+        state, error = _state(batch), as_dict(batch.get("error"))
+        stats = as_dict(as_dict(batch.get("metadata")).get("batchStats"))
         total, pending = _count(stats, "requestCount"), _count(stats, "pendingRequestCount")
-        state = _state(word, batch)
         why = read_error(_status_of(error)[0] if error else 400, {}, "", batch)
         return BatchStatus(
             state=state,
-            word=word,
             done=None if total is None else max(0, total - (pending or 0)),
             total=total,
             results=_count(stats, "successfulRequestCount") or 0,
@@ -142,29 +136,23 @@ class GeminiBatches(BatchService):
             batch=batch,
         )
 
-    async def lines(
-        self, batch_id: str, batch: Mapping[str, Any]
-    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
-        """The results, in a file or beside the state."""
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """See BatchService."""
         metadata = as_dict(batch.get("metadata"))
         output = as_dict(metadata.get("output")) or as_dict(batch.get("response"))
-        if not output and _word(metadata).upper().endswith("SUCCEEDED"):
+        if not output and _word(batch).endswith("SUCCEEDED"):
             raise BatchFailed("again", "the results are not there yet")
-        for result in as_dicts(as_dict(output.get("inlinedResponses")).get("inlinedResponses")):
-            yield {"key": as_dict(result.get("metadata")).get("key"), **result}
-        if output.get("responsesFile"):
-            name = id_of(output, "responsesFile")
-            async for line in self._lines(f"{API}/{name}:download?alt=media"):
-                yield line
+        if not output.get("responsesFile"):
+            return []
+        return [f"{API}/{id_of(output, 'responsesFile')}:download?alt=media"]
 
-    def read(self, line: dict[str, Any]) -> LineResult:
+    def read(self, key: str, line: dict[str, Any]) -> LineResult | None:
         """See BatchService."""
-        key = key_of(line, "key")
         response, error = line.get("response"), as_dict(line.get("error"))
         if isinstance(response, dict):
             return LineResult(key, as_reply(200, response))
         if not error:
-            raise unreadable(key, "has neither a response nor an error")
+            return None
         status, name = _status_of(error)
         if name in NOT_ASKED:
             return LineResult(key, None, as_message(error.get("message")))
@@ -172,31 +160,18 @@ class GeminiBatches(BatchService):
             key, as_reply(status, {"error": {**error, "code": status, "status": name}})
         )
 
-    async def cancel(self, batch_id: str) -> None:
-        """See BatchService."""
-        await self._cancel(f"{API}/batches/{batch_id}:cancel")
 
-
-def _next_page(page: dict[str, Any]) -> str | None:
-    return as_text(page.get("nextPageToken")) or None
-
-
-def _number(name: str) -> str:
-    """The id of a batch, by its name ``batches/ID``."""
-    return name.rpartition("/")[2]
-
-
-def _word(metadata: dict[str, Any]) -> str:
+def _word(batch: Mapping[str, Any]) -> str:
     """The provider's word, whether it says JOB_STATE_ or BATCH_STATE_ before it."""
-    return re.sub("^.*_state_", "", as_word(metadata.get("state")), flags=re.IGNORECASE)
+    return as_word(as_dict(batch.get("metadata")).get("state")).rpartition("_STATE_")[2]
 
 
-def _state(word: str, batch: dict[str, Any]) -> Literal["waiting", "ended", "failed"]:
+def _state(batch: dict[str, Any]) -> Literal["waiting", "ended", "failed"]:
     """What a word means; of an operation that is done, it may be one that nobody knows."""
-    done = batch.get("done") is True
-    if word.upper() in ENDED:
+    word, done = _word(batch), batch.get("done") is True
+    if word in ENDED:
         return "ended"
-    if word.upper() == "FAILED" or (done and batch.get("error")):
+    if word == "FAILED" or (done and batch.get("error")):
         return "failed"
     return "ended" if done else "waiting"
 

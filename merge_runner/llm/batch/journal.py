@@ -8,10 +8,10 @@ cache, so that it knows all rows of its models once it has read them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import dataclass
+from typing import Annotated
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import AwareDatetime, BaseModel, BeforeValidator, ValidationError
 
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
@@ -19,48 +19,41 @@ from merge_runner.records import Attempt
 
 # The prefix of names in the cache.
 _BATCH = "batch "
+# Notes of earlier versions have an empty text for None: their batches may be open yet.
+Moment = Annotated[AwareDatetime | None, BeforeValidator(lambda value: value or None)]
 
 
-@dataclass(frozen=True, slots=True)
-class OpenLine:
-    """Where a call waits: the mark of its batch, and the number of the attempt that it is there."""
-
-    mark: str
-    attempt: int
-
-    def goes_on(self, attempts: Iterable[Attempt]) -> bool:
-        """Whether that attempt, as far as these tell, has not ended."""
-        return all(each.number != self.attempt or each.outcome == "unknown" for each in attempts)
-
-
-@dataclass(frozen=True, slots=True)
-class OpenBatch:
+class OpenBatch(BaseModel, frozen=True):
     """A batch that was created, or is about to be.
 
     ``mark`` is its name at the provider, ``batch_id`` its id, empty until the provider has told it.
     ``lines`` has the number of the attempt by the key of each call. ``model`` is its name in the
     registry, ``ledger`` that of the money. ``number`` is the round: which decision its trials wait
-    for at most, counted from 1. ``submitted_at``, ``cancelled_at`` and ``ended_at`` are UTC in
-    ISO 8601; empty: it was not asked to end, or not seen to have ended.
+    for at most, counted from 1. The times are UTC; None: it was not asked to end, or not seen to
+    have ended.
     """
 
     mark: str
     model: str
     ledger: str
     number: int
-    submitted_at: str
+    submitted_at: AwareDatetime
     lines: dict[str, int]
     batch_id: str = ""
-    cancelled_at: str = ""
-    ended_at: str = ""
-
-    @property
-    def since(self) -> datetime:
-        """When it was submitted."""
-        return datetime.fromisoformat(self.submitted_at)
+    cancelled_at: Moment = None
+    ended_at: Moment = None
 
 
-_OPEN_BATCH = TypeAdapter(OpenBatch)
+@dataclass(frozen=True, slots=True)
+class OpenLine:
+    """The batch in which a call waits, and the number of the attempt that it is there."""
+
+    batch: OpenBatch
+    attempt: int
+
+    def goes_on(self, attempts: Iterable[Attempt]) -> bool:
+        """Whether that attempt, as far as these tell, has not ended."""
+        return all(each.number != self.attempt or each.outcome == "unknown" for each in attempts)
 
 
 class Journal:
@@ -76,15 +69,11 @@ class Journal:
         """Return all open batches, the oldest first."""
         return [*self._open.values()]
 
-    def batch(self, mark: str) -> OpenBatch:
-        """Return an open batch."""
-        return self._open[mark]
-
     def line(self, key: str) -> OpenLine | None:
         """Return where a call was submitted last; None: nowhere."""
         for batch in reversed(self._open.values()):
             if key in batch.lines:
-                return OpenLine(batch.mark, batch.lines[key])
+                return OpenLine(batch, batch.lines[key])
         return None
 
     def waits(self, batch: OpenBatch) -> bool:
@@ -100,7 +89,7 @@ class Journal:
         def operation() -> OpenBatch:
             with self._cache.money.transaction():
                 begun = {key: attempt for key, attempt in batch.lines.items() if begins(key)}
-            taken = replace(batch, lines=begun)
+            taken = batch.model_copy(update={"lines": begun})
             if begun:
                 self._write(taken)
             return taken
@@ -136,14 +125,9 @@ class Journal:
     def _read(self, name: str) -> OpenBatch | None:
         """Return the batch in a row; a damaged one is none."""
         try:
-            return _OPEN_BATCH.validate_json(self._cache.read(name) or "")
+            return OpenBatch.model_validate_json(self._cache.read(name) or "")
         except (RecordingError, ValidationError):
             return None
 
     def _write(self, batch: OpenBatch) -> None:
-        self._cache.replace(_BATCH + batch.mark, _OPEN_BATCH.dump_json(batch).decode())
-
-
-def now() -> str:
-    """Return the present as a journal has it."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
+        self._cache.replace(_BATCH + batch.mark, batch.model_dump_json())

@@ -57,6 +57,13 @@ class Line:
         """That of its call."""
         return self.line.key
 
+    @property
+    def submitted_at(self) -> str | None:
+        """When its batch was submitted, in UTC; None: it was in none."""
+        if self.open is None:
+            return None
+        return self.open.batch.submitted_at.isoformat(timespec="milliseconds")
+
     def ends(self, end: LineEnd) -> None:
         """Give its end to the call that waits for it."""
         if not self.end.done():
@@ -90,20 +97,13 @@ class Batches:
         self, call: Call, opened: OpenLine | None
     ) -> AsyncIterator[tuple[PaidAttempt, Line]]:
         """Yield the money of a call's next attempt, and its line, which may be ``opened``."""
-        key, ledger = call.request.key, self.ledger
         asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.price_factor)
-        paid: PaidAttempt
+        who = (call.order, call.request.key, asked)
+        ledger = opened.batch.ledger if opened else self.ledger
+        money = self.money.going_on(*who, ledger) if opened else self.money.attempt(*who)
         async with AsyncExitStack() as stack:
-            if opened is None:
-                with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                    paid = await stack.enter_async_context(
-                        self.money.attempt(call.order, key, asked)
-                    )
-            else:
-                ledger = self.rounds.ledger_of(opened)
-                paid = await stack.enter_async_context(
-                    self.money.going_on(call.order, key, asked, ledger)
-                )
+            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
+                paid = await stack.enter_async_context(money)
             attempts = tuple(call.attempts)
             sent = BatchLine(call.request, len(attempts) + 1)
             yield paid, Line(sent, self.model, ledger, paid, attempts, opened)

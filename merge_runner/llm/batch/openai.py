@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
@@ -15,15 +15,12 @@ from merge_runner.llm.batch.service import (
     BatchService,
     BatchStatus,
     LineResult,
-    Unreadable,
+    Listed,
     as_message,
     as_reply,
     as_word,
     id_of,
     json_object,
-    key_of,
-    leads_back,
-    unreadable,
 )
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import (
@@ -42,7 +39,7 @@ API = "/v1"
 MARK = "merge_runner_mark"
 # What OpenAI itself does with input files.
 KEPT_S = 30 * 86400
-ENDED = frozenset({"completed", "expired", "cancelled"})
+ENDED = frozenset({"COMPLETED", "EXPIRED", "CANCELLED"})
 NOT_ASKED = frozenset({"batch_expired", "batch_cancelled"})
 
 
@@ -50,6 +47,7 @@ class OpenAIBatches(BatchService):
     """``/files`` and ``/batches``; see BatchService."""
 
     most_bytes = 200_000_000
+    path, pages, cursor = "/batches", "limit=100", "after"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
@@ -67,7 +65,7 @@ class OpenAIBatches(BatchService):
         }
         if is_own_host("openai", self._endpoint.identity):  # others may not know the member
             batch["output_expires_after"] = {"anchor": "created_at", "seconds": KEPT_S}
-        return id_of(json_object(await self._post("/batches", canonical_json(batch).encode())))
+        return id_of(json_object(await self._post(self.path, canonical_json(batch).encode())))
 
     async def _upload(self, content: bytes) -> str:
         """Return the id of a file with these lines."""
@@ -84,30 +82,29 @@ class OpenAIBatches(BatchService):
             exc.sent = False  # a file is no batch yet
             raise
 
-    async def find(self, mark: str, since: datetime) -> str | None:
-        """By the mark among its metadata."""
-        async for page in self._pages("/batches?limit=100", "after", _last_id):
-            batches = as_dicts(page.get("data"))
-            for batch in batches:
-                if as_dict(batch.get("metadata")).get(MARK) == mark:
-                    return id_of(batch)
-            if leads_back([_created(batch) for batch in batches], since):
-                break
-        return None
+    def page_of(self, page: dict[str, Any]) -> tuple[list[Listed], str | None]:
+        """See BatchService; the mark is among the metadata."""
+        batches = as_dicts(page.get("data"))
+        last = as_text(page.get("last_id")) or next(
+            (as_text(batch.get("id")) for batch in reversed(batches)), None
+        )
+        listed = [
+            Listed(as_dict(batch.get("metadata")).get(MARK), _created(batch), batch)
+            for batch in batches
+        ]
+        return listed, last if page.get("has_more") else None
 
-    async def status(self, batch_id: str) -> BatchStatus:
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        batch = await self._get(f"/batches/{batch_id}")
         word = as_word(batch.get("status"))
         counts = as_dict(batch.get("request_counts"))
         answered = as_count(counts.get("completed")) or 0
         error = first_of(as_dict(batch.get("errors")).get("data"))
         why = read_error(400, {}, "", {"error": error})
         why = replace(why, status=status_within(why) if why.names else 400)
-        failed = word.lower() == "failed"
+        failed = word == "FAILED"
         return BatchStatus(
-            state="failed" if failed else "ended" if word.lower() in ENDED else "waiting",
-            word=word,
+            state="failed" if failed else "ended" if word in ENDED else "waiting",
             done=answered + (as_count(counts.get("failed")) or 0) if counts else None,
             total=as_count(counts.get("total")) or None,
             results=answered,
@@ -116,25 +113,13 @@ class OpenAIBatches(BatchService):
             batch=batch,
         )
 
-    async def lines(
-        self, batch_id: str, batch: Mapping[str, Any]
-    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
-        """The lines of both files; where one cannot be read, those of the other all the same."""
-        failure: BatchFailed | None = None
-        for name in ("output_file_id", "error_file_id"):
-            if not batch.get(name):
-                continue
-            try:
-                async for line in self._lines(f"/files/{id_of(batch, name)}/content"):
-                    yield line
-            except BatchFailed as exc:
-                failure = failure or exc
-        if failure is not None:
-            raise failure
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """Return those of its files of answers and of errors."""
+        names = [name for name in ("output_file_id", "error_file_id") if batch.get(name)]
+        return [f"/files/{id_of(batch, name)}/content" for name in names]
 
-    def read(self, line: dict[str, Any]) -> LineResult:
+    def read(self, key: str, line: dict[str, Any]) -> LineResult | None:
         """See BatchService."""
-        key = key_of(line, "custom_id")
         response, error = as_dict(line.get("response")), as_dict(line.get("error"))
         status, body = as_count(response.get("status_code")), response.get("body")
         if status and status <= LARGEST_STATUS and isinstance(body, dict):
@@ -144,21 +129,9 @@ class OpenAIBatches(BatchService):
             return LineResult(key, None, message)
         if error:
             return LineResult(key, as_reply(500, {"error": error}), message)
-        raise unreadable(key, "has neither a response nor an error")
-
-    async def cancel(self, batch_id: str) -> None:
-        """See BatchService."""
-        await self._cancel(f"/batches/{batch_id}/cancel")
+        return None
 
 
 def _created(batch: dict[str, Any]) -> datetime | None:
     created_s = as_count(batch.get("created_at"))
     return None if created_s is None else datetime.fromtimestamp(created_s, UTC)
-
-
-def _last_id(page: dict[str, Any]) -> str | None:
-    """The id after which the next page begins; None: this one is the last."""
-    ids = [as_text(batch.get("id")) for batch in as_dicts(page.get("data"))]
-    if not page.get("has_more"):
-        return None
-    return as_text(page.get("last_id")) or (ids[-1] if ids else None)

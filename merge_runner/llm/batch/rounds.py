@@ -14,11 +14,10 @@ import math
 import secrets
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from enum import Enum, auto
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from merge_runner.errors import (
     EndpointRefused,
@@ -27,7 +26,7 @@ from merge_runner.errors import (
     QuotaExhausted,
     TrialSuspended,
 )
-from merge_runner.llm.batch.journal import Journal, OpenBatch, OpenLine, now
+from merge_runner.llm.batch.journal import Journal, OpenBatch, OpenLine
 from merge_runner.llm.batch.lines import Line, LineEnd
 from merge_runner.llm.batch.service import (
     BatchFailed,
@@ -37,6 +36,7 @@ from merge_runner.llm.batch.service import (
     LineResult,
     Unreadable,
 )
+from merge_runner.llm.http_outcome import backoff_s
 from merge_runner.records import Attempt
 
 # How often it is looked whether a round can be closed: what is seen then decides, not the time.
@@ -59,27 +59,19 @@ ENDING_S = 3600.0
 T = TypeVar("T")
 
 
-class State(Enum):
-    """What is known of a batch."""
-
-    TAKEN_UP = auto()  # an earlier run has begun it, and its provider was not asked yet
-    WAITING = auto()
-    READING = auto()  # its results are on their way to their calls
-    ENDED = auto()
-    NEVER = auto()  # it was not created: its calls go with the next round
-
-
 @dataclass(slots=True, eq=False)
 class Batch:
     """An open batch of which this process waits for ``lines``, by key.
 
-    ``results`` are those that nobody has asked for yet, ``seen`` hashes of all by key. ``rest`` is
-    the end of the calls without a result. It ``is_broken`` where one could not be used.
+    While it is "reading" results may be on their way to their calls; the calls of one that was
+    "never" created go with the next round. ``results`` are those that nobody has asked for yet,
+    ``seen`` hashes of all by key. ``rest`` is the end of the calls without a result, once the batch
+    has ended. It ``is_broken`` where a result could not be used.
     """
 
     note: OpenBatch
     lines: dict[str, Line] = field(default_factory=dict)
-    state: State = State.WAITING
+    state: Literal["waiting", "reading", "never"] = "waiting"
     status: BatchStatus | None = None
     results: dict[str, LineResult] = field(default_factory=dict)
     seen: dict[str, int] = field(default_factory=dict)
@@ -89,7 +81,7 @@ class Batch:
     @property
     def is_open(self) -> bool:
         """Whether it may bring results yet."""
-        return self.state not in (State.ENDED, State.NEVER)
+        return self.rest is None and self.state != "never"
 
     @property
     def age_s(self) -> float:
@@ -102,24 +94,28 @@ class Batch:
         if key not in self.note.lines or self.seen.setdefault(key, content) != content:
             return False
         if line := self.lines.pop(key, None):
-            line.ends(self.end_of(result))
+            expired = "expired" if result.raw is None else ""
+            line.ends(LineEnd(self.note.batch_id, result.raw, expired, result.message))
         elif key not in self.results:
             self.results[key] = result
         return True
 
-    def end_of(self, result: LineResult) -> LineEnd:
-        """Return the end of the line that has this result."""
-        expired = "expired" if result.raw is None else ""
-        return LineEnd(self.note.batch_id, result.raw, expired, result.message)
-
-    def end(self, rest: LineEnd) -> None:
-        """End the lines that have not ended yet, and those that join it."""
-        self.state, self.rest = State.ENDED, rest
+    def end(
+        self,
+        outcome: str,
+        message: str,
+        *,
+        unclear: bool = False,
+        error: MergeRunnerError | None = None,
+    ) -> None:
+        """End the lines that have not ended yet, and those that join it; see LineEnd."""
+        batch_id = self.note.batch_id or None
+        self.rest = LineEnd(batch_id, None, outcome, message, unclear, error)
         for line in self.lines.values():
-            line.ends(rest)
+            line.ends(self.rest)
         self.lines.clear()
 
-    def fail(self, error: MergeRunnerError) -> None:
+    def fail(self, error: Exception) -> None:
         """Raise an error for all who wait."""
         for line in self.lines.values():
             line.fails(error)
@@ -129,13 +125,11 @@ class Batch:
 class Crowd:
     """A model of which a batch was too large: its batches go one after the other.
 
-    The next one has at most ``calls`` calls, and is not submitted before ``after_s``, on the event
-    loop's clock. The last ``refusals`` batches were refused.
+    The next one has at most ``calls`` calls. The last ``refusals`` batches were refused.
     """
 
-    calls: int
+    calls: int = MOST_CALLS
     refusals: int = 0
-    after_s: float = 0.0
 
 
 class Rounds:
@@ -171,13 +165,9 @@ class Rounds:
     def open_line(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenLine | None:
         """Return where a call with these attempts waits; None: nowhere that can be reached."""
         line = self._journal.line(key)
-        if line is None or not line.goes_on(attempts):
+        if line is None or not line.goes_on(attempts) or line.batch.model not in self.services:
             return None
-        return line if self._journal.batch(line.mark).model in self.services else None
-
-    def ledger_of(self, line: OpenLine) -> str:
-        """Return the ledger in which the money of an open line is set aside."""
-        return self._journal.batch(line.mark).ledger
+        return line
 
     async def ask(self, line: Line) -> LineEnd:
         """Wait for the end of a line, in the next round or where it waits already."""
@@ -185,27 +175,24 @@ class Rounds:
         if line.open is None:
             self._forming.append(line)
         else:
-            self._join(line, line.open.mark)
-        try:
-            return await line.end
-        finally:
-            if line in self._forming:
-                self._forming.remove(line)
-
-    def submitted_at(self, line: Line) -> str | None:
-        """Return when the batch of a line was submitted, in UTC; None: it was in none."""
-        return None if line.open is None else self._journal.batch(line.open.mark).submitted_at
+            self._join(line, line.open.batch)
+        return await line.end
 
     async def watch(self, is_idle: Callable[[], bool]) -> None:
         """Close each round when nothing else goes on; ``is_idle`` says whether that is so."""
         while True:
             await asyncio.sleep(LOOK_S)
-            if self._forming and await _is_settled(lambda: is_idle() and not self._hands_out):
+            for _ in range(LOOKS):
+                await asyncio.sleep(0)
+                reading = any(batch.state == "reading" for batch in self._open())
+                if not self._forming or reading or not is_idle():
+                    break
+            else:
                 self._close_round()
 
     def standing(self) -> list[str]:
         """Return which batches are waited for, a line each."""
-        return [self._described(batch) for batch in self._batches.values() if batch.is_open]
+        return [self._described(batch) for batch in self._open()]
 
     async def close(self) -> None:
         """End the waiting; batches that are being created get their ids noted first."""
@@ -214,73 +201,68 @@ class Rounds:
         await asyncio.gather(*self._tasks, *self._creations, return_exceptions=True)
         await self._journal.tidy()
 
-    @property
-    def _hands_out(self) -> bool:
-        """Whether results are on their way to lines: those of a batch, or of one not looked at."""
-        states = (State.TAKEN_UP, State.READING)
-        return any(batch.state in states for batch in self._batches.values())
+    def _open(self, model: str | None = None) -> list[Batch]:
+        """Return the batches that may bring results yet: they take room at their provider."""
+        return [
+            batch
+            for batch in self._batches.values()
+            if batch.is_open and model in (None, batch.note.model)
+        ]
 
     def _close_round(self) -> None:
-        forming, self._forming = self._forming, []
-        groups: defaultdict[tuple[str, str], dict[str, Line]] = defaultdict(dict)
-        for line in forming:
-            groups[line.model, line.ledger][line.key] = line
+        groups: defaultdict[tuple[str, str], list[Line]] = defaultdict(list)
+        for line in self._forming:
+            groups[line.model, line.ledger].append(line)
+        self._forming = []
         for (model, _), lines in groups.items():
-            if (crowd := self._crowds.get(model)) is None:
-                parts = [*_parts(lines.values(), self.services[model], MOST_CALLS)]
-            elif _loop_s() < crowd.after_s or self._has_open(model):
-                parts = []
-            else:
-                parts = [next(_parts(lines.values(), self.services[model], crowd.calls))]
-            for part in parts:
-                self._start(self._begin(part), part)
-                for line in part:
-                    del lines[line.key]
-            self._forming += lines.values()
+            crowd = self._crowds.get(model)
+            if crowd and self._open(model):
+                self._forming += lines
+                continue
+            most = crowd.calls if crowd else MOST_CALLS
+            parts = [*_parts(lines, self.services[model], most)]
+            now, later = (parts[:1], parts[1:]) if crowd else (parts, [])
+            for part in now:
+                batch = _batch_of(part)
+                self._start(self._begin(batch), batch)
+            self._forming += itertools.chain.from_iterable(later)
 
-    def _start(self, work: Coroutine[Any, Any, None], lines: Iterable[Line]) -> None:
-        """Do something in a task of its own; what it raises is raised for these lines."""
+    def _start(self, work: Coroutine[Any, Any, None], batch: Batch) -> None:
+        """Do something for a batch in a task of its own; what it raises is raised for its lines."""
 
         async def do() -> None:
             try:
                 await work
+            except BatchFailed as exc:
+                self._lost(batch, exc)
             except Exception as error:  # noqa: BLE001 # it reaches the calls
-                for line in [*lines]:
-                    line.fails(error)
+                batch.fail(error)
 
         task = asyncio.create_task(do())
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _begin(self, lines: Sequence[Line]) -> None:
-        """Note a batch of those lines that may begin, and submit it."""
-        by_key = {line.key: line for line in lines if not line.end.done()}
-        if not by_key:
-            return
-        first = lines[0]
-        note = OpenBatch(
-            mark=secrets.token_hex(16),
-            model=first.model,
-            ledger=first.ledger,
-            number=1 + max(line.line.request.slot.decision for line in lines),
-            submitted_at=now(),
-            lines={key: line.line.attempt for key, line in by_key.items()},
-        )
+    async def _begin(self, batch: Batch) -> None:
+        """Note a batch with those of its lines that may begin, and submit it."""
+        lines = batch.lines
 
         def begins(key: str) -> bool:
-            line = by_key[key]
+            line = lines[key]
+            if line.end.done():  # nobody waits for it any more
+                return False
             return line.open is not None or line.money.set_aside(line.attempts)
 
-        note = await self._journal.begin(note, begins)
-        begun = {key: by_key.pop(key) for key in note.lines}
-        for line in by_key.values():
-            line.fails(TrialSuspended("another run spends from the same cap, and has used it up"))
-        for line in begun.values():
+        batch.note = note = await self._journal.begin(batch.note, begins)
+        for key, line in [*lines.items()]:
+            if key not in note.lines:
+                why = "another run spends from the same cap, and has used it up"
+                lines.pop(key).fails(TrialSuspended(why))
+                continue
             if line.open is None and not line.end.done():
                 line.money.begun()
-            line.open = OpenLine(note.mark, line.line.attempt)
-        if begun:
-            batch = self._batches[note.mark] = Batch(note, begun)
+            line.open = OpenLine(note, line.line.attempt)
+        if lines:
+            self._batches[note.mark] = batch
             await self._submit(batch)
 
     async def _submit(self, batch: Batch) -> None:
@@ -291,7 +273,7 @@ class Rounds:
             await self._patiently(batch, partial(self._create, batch), patience_s)
         except BatchFailed as exc:
             if exc.kind == "lost" and not self.services[model].takes_mark:
-                batch.end(LineEnd(outcome="batch_lost", message=str(exc), unclear=True))
+                batch.end("batch_lost", str(exc), unclear=True)
             elif exc.kind in ("again", "lost"):
                 # It may be there all the same: the next run looks for it, and nothing is settled.
                 why = (
@@ -301,36 +283,37 @@ class Rounds:
                 batch.fail(ProviderDown(why))
             elif exc.kind == "single" and model not in self._reached:
                 why = f"{model}: there is no batch mode there ({exc}): leave --batch out"
-                batch.end(LineEnd(outcome="not_created", message=why, error=EndpointRefused(why)))
+                batch.end("not_created", why, error=EndpointRefused(why))
             else:
-                self._not_asked(batch, exc, "not_created")
+                await self._not_asked(batch, exc, "not_created")
             return
         self._reached.add(model)
         await self._follow(batch)
 
     async def _create(self, batch: Batch) -> None:
         """Create a batch; where its answer is lost, look for it."""
-        creation = asyncio.create_task(self._create_once(batch))
+        service = self.services[batch.note.model]
+
+        async def create() -> None:
+            lines = [line.line for line in batch.lines.values()]
+            await self._note(batch, batch_id=await service.create(lines, batch.note.mark))
+
+        creation = asyncio.create_task(create())
         self._creations.add(creation)
         creation.add_done_callback(self._creations.discard)
         try:
             await asyncio.shield(creation)  # its id is noted even if the run ends now
         except BatchFailed as exc:
-            if exc.sent and not self.services[batch.note.model].takes_mark:
+            if exc.sent and not service.takes_mark:
                 raise BatchFailed("lost", f"whether it was created is not known ({exc})") from exc
             if not (exc.sent and await self._arrived(batch)):
                 raise
 
-    async def _create_once(self, batch: Batch) -> None:
-        note = batch.note
-        lines = [line.line for line in batch.lines.values()]
-        await self._note(batch, batch_id=await self.services[note.model].create(lines, note.mark))
-
-    async def _note(self, batch: Batch, **known: str) -> None:
-        batch.note = replace(batch.note, **known)  # type: ignore[arg-type] # texts all of them
+    async def _note(self, batch: Batch, **known: object) -> None:
+        batch.note = batch.note.model_copy(update=known)
         await self._journal.note(batch.note)
 
-    def _not_asked(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
+    async def _not_asked(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
         """End a batch of which the provider asks no line, or let its lines go in smaller ones."""
         model, lines = batch.note.model, len(batch.note.lines)
         error: MergeRunnerError | None = None
@@ -342,13 +325,13 @@ class Rounds:
                 )
             case "refused":
                 error = EndpointRefused(f"{model}: its batch mode refuses: {exc}")
-            case "smaller" | "again" if self._try_smaller(batch, exc):
+            case "smaller" | "again" if await self._try_smaller(batch, exc):
                 return
             case _:
                 self._say(f"{model}: asked singly, at the full price: {_counted(lines)} ({exc})")
-        batch.end(LineEnd(batch.note.batch_id or None, None, outcome, str(exc), error=error))
+        batch.end(outcome, str(exc), error=error)
 
-    def _try_smaller(self, batch: Batch, exc: BatchFailed) -> bool:
+    async def _try_smaller(self, batch: Batch, exc: BatchFailed) -> bool:
         """Let the lines of a batch go in the next ones, when there may be room for them.
 
         Returns False where one line was refused so often that there seems to be none.
@@ -356,53 +339,42 @@ class Rounds:
         model, lines = batch.note.model, len(batch.note.lines)
         if model not in self._crowds:
             self._say(f"{model}: {_counted(lines)} go in smaller batches: {exc}")
-        crowd = self._crowds.setdefault(model, Crowd(MOST_CALLS))
-        batch.state = State.NEVER
-        if not self._has_open(model):
+        crowd = self._crowds.setdefault(model, Crowd())
+        if self._open(model) == [batch]:
             crowd.refusals += 1
             crowd.calls = max(1, lines // 2)
-            crowd.after_s = _loop_s() + max(exc.delay_s or 0.0, _backoff_s(crowd.refusals))
-        if lines == 1 and crowd.refusals >= MOST_REFUSALS:
-            return False
+            if lines == 1 and crowd.refusals >= MOST_REFUSALS:
+                return False
+            # It counts as open, so that no other one is submitted meanwhile.
+            await asyncio.sleep(max(exc.delay_s or 0.0, backoff_s(crowd.refusals)))
         self._form_anew(batch)
         return True
 
-    def _has_open(self, model: str) -> bool:
-        """Whether a batch of the model takes room at its provider, or is about to."""
-        return any(each.is_open and each.note.model == model for each in self._batches.values())
-
-    def _join(self, line: Line, mark: str) -> None:
-        batch = self._batches.get(mark)
-        if batch is None:
-            batch = Batch(self._journal.batch(mark), state=State.TAKEN_UP)
-            self._batches[mark] = batch
-            self._start(self._take_up(batch), batch.lines.values())
+    def _join(self, line: Line, note: OpenBatch) -> None:
+        batch = self._batches.get(note.mark)
+        if batch is None:  # until it was looked at, its results may be there
+            batch = self._batches[note.mark] = Batch(note, state="reading")
+            self._start(self._take_up(batch), batch)
         batch.lines[line.key] = line
-        if batch.state is State.NEVER:
+        if batch.state == "never":
             self._form_anew(batch)
         elif line.key in batch.results:
             batch.take(batch.results.pop(line.key))
         elif batch.rest is not None:
-            batch.end(batch.rest)
+            batch.lines.pop(line.key).ends(batch.rest)
 
     async def _take_up(self, batch: Batch) -> None:
         """Go on with a batch that an earlier run has submitted, or was about to."""
-        try:
-            if batch.note.batch_id:
-                await self._follow(batch)
-            elif not self.services[batch.note.model].takes_mark:
-                why = "the run ended before its id was known"
-                batch.end(LineEnd(outcome="batch_lost", message=why, unclear=True))
-            elif await self._arrived(batch):
-                await self._follow(batch)
-            else:
-                batch.state = State.NEVER
-                self._form_anew(batch)
-        except BatchFailed as exc:
-            self._lost(batch, exc)
+        if not batch.note.batch_id and not self.services[batch.note.model].takes_mark:
+            batch.end("batch_lost", "the run ended before its id was known", unclear=True)
+        elif batch.note.batch_id or await self._arrived(batch):
+            await self._follow(batch)
+        else:
+            self._form_anew(batch)
 
     def _form_anew(self, batch: Batch) -> None:
         """The lines of a batch that was never created go with the next round."""
+        batch.state = "never"
         lines, batch.lines = batch.lines, {}
         for line in lines.values():
             if self.submits:
@@ -413,7 +385,7 @@ class Rounds:
     async def _arrived(self, batch: Batch) -> bool:
         """Look for a batch until its creation, if it was ever sent, must be in effect."""
         note, waited_s = batch.note, 0.0
-        find = partial(self.services[note.model].find, note.mark, note.since)
+        find = partial(self.services[note.model].find, note.mark, note.submitted_at)
         while (batch_id := await self._patiently(batch, find)) is None:
             if waited_s >= ARRIVAL_S:
                 return False
@@ -425,31 +397,33 @@ class Rounds:
 
     async def _follow(self, batch: Batch) -> None:
         """Wait for the end of a batch, and hand its results out."""
-        try:
-            status = await self._ended(batch)
-            if status.state == "ended":
-                await self._hand_out(batch)
-            elif status.state == "failed":
-                failure = BatchFailed(status.failure or "again", status.message)
-                self._not_asked(batch, failure, "batch_failed")
-        except BatchFailed as exc:
-            self._lost(batch, exc)
+        status = await self._ended(batch)
+        if status.state == "ended":
+            await self._hand_out(batch)
+        elif status.state == "failed":
+            failure = BatchFailed(status.failure or "again", status.message)
+            await self._not_asked(batch, failure, "batch_failed")
 
     async def _ended(self, batch: Batch) -> BatchStatus:
         """Wait for the end of a batch, which is cancelled in time; not for ever after that."""
+        service = self.services[batch.note.model]
         while (status := await self._look(batch)).state == "waiting":
-            note = batch.note
-            if note.cancelled_at and _s_ago(note.cancelled_at) > ENDING_S:
-                why = f"the batch was cancelled at {note.cancelled_at} and does not end"
-                self._say(f"{note.model}: {why}: its calls are asked singly")
-                batch.end(self._no_result(batch, why))
+            cancelled_at = batch.note.cancelled_at
+            if cancelled_at is None and batch.age_s >= ROUND_DEADLINE_S:
+                await self._patiently(batch, partial(service.cancel, batch.note.batch_id))
+                await self._note(batch, cancelled_at=datetime.now(UTC))
+                self._say(
+                    f"{batch.note.model}: batch {batch.note.batch_id} has waited for "
+                    f"{_duration(batch.age_s)} and is cancelled: what it has answered is taken, "
+                    "the rest is asked singly"
+                )
+            elif cancelled_at and _s_ago(cancelled_at) > ENDING_S:
+                moment = f"{cancelled_at:%Y-%m-%d %H:%M:%S} UTC"
+                why = f"the batch was cancelled at {moment} and does not end"
+                self._say(f"{batch.note.model}: {why}: its calls are asked singly")
+                batch.end("no_result", why, unclear=True)
                 break
-            left_s = ROUND_DEADLINE_S - batch.age_s
-            if left_s <= 0 and not note.cancelled_at:
-                await self._cancel(batch)
             pause_s = min(LONGEST_POLL_S, POLL_SHARE * batch.age_s)
-            if not batch.note.cancelled_at:
-                pause_s = min(pause_s, left_s)
             await asyncio.sleep(max(SHORTEST_POLL_S, pause_s))
         return status
 
@@ -459,24 +433,14 @@ class Rounds:
         status = await self._patiently(batch, partial(service.status, batch.note.batch_id))
         if batch.status is None or batch.status.state == "waiting" or status.state == "ended":
             batch.status = status
-        batch.state = State.READING if batch.status.state == "ended" else State.WAITING
+        batch.state = "reading" if batch.status.state == "ended" else "waiting"
         return batch.status
-
-    async def _cancel(self, batch: Batch) -> None:
-        note = batch.note
-        cancel = partial(self.services[note.model].cancel, note.batch_id)
-        await self._patiently(batch, cancel)
-        await self._note(batch, cancelled_at=now())
-        self._say(
-            f"{note.model}: batch {note.batch_id} has waited for {_duration(batch.age_s)} and is "
-            "cancelled: what it has answered is taken, the rest is asked singly"
-        )
 
     async def _hand_out(self, batch: Batch) -> None:
         """Read the results of a batch until there is one for each call, or no more can be had."""
-        if not batch.note.ended_at:
-            await self._note(batch, ended_at=now())
-        why, patience_s = "", max(0.0, ENDING_S - _s_ago(batch.note.ended_at))
+        ended_at = batch.note.ended_at or datetime.now(UTC)
+        await self._note(batch, ended_at=ended_at)
+        why, patience_s = "", max(0.0, ENDING_S - _s_ago(ended_at))
         try:
             await self._patiently(batch, partial(self._read, batch), patience_s)
         except BatchFailed as exc:
@@ -484,7 +448,11 @@ class Rounds:
                 raise
             why = str(exc)
             self._say(f"{batch.note.model}: {why}")
-        batch.end(self._no_result(batch, why))
+        # What a cancelled batch does not tell of was not asked, if all was read.
+        unclear = bool(why) or batch.note.cancelled_at is None
+        batch.end(
+            "no_result", why or "the batch has ended without a result for it", unclear=unclear
+        )
         if crowd := self._crowds.get(batch.note.model):
             crowd.calls, crowd.refusals = max(crowd.calls, 2 * len(batch.note.lines)), 0
 
@@ -492,9 +460,10 @@ class Rounds:
         """Give each result to its call; raises BatchFailed where there should be others."""
         note, status = batch.note, await self._look(batch)
         foreign, wrong = 0, []
-        async for result in self.services[note.model].results(note.batch_id, status):
+        results = self.services[note.model].results(note.batch_id, status, len(note.lines))
+        async for result in results:
             if isinstance(result, Unreadable):
-                wrong.append(str(result))
+                wrong.append(result.why)
             else:
                 foreign += not batch.take(result)
         if foreign:
@@ -514,23 +483,13 @@ class Rounds:
                 "again", f"{len(batch.seen)} of the {status.results} results are there"
             )
 
-    def _no_result(self, batch: Batch, why: str) -> LineEnd:
-        return LineEnd(
-            batch.note.batch_id,
-            outcome="no_result",
-            message=why or "the batch has ended without a result for it",
-            # What a cancelled batch does not tell of was not asked, if all was read.
-            unclear=bool(why) or not batch.note.cancelled_at,
-        )
-
     def _lost(self, batch: Batch, exc: BatchFailed) -> None:
         """End a batch that cannot be read: what was set aside for it stays so."""
-        note, free = batch.note, batch.note.model in self._free
+        note = batch.note
         # A key that is refused is another account's, perhaps: there the batch goes on.
         gives_up = not self.submits and exc.kind not in ("refused", "quota")
-        if free or gives_up:
-            end = LineEnd(note.batch_id, outcome="batch_lost", message=str(exc), unclear=not free)
-            batch.end(end)
+        if note.model in self._free or gives_up:
+            batch.end("batch_lost", str(exc), unclear=True)
             return
         error = EndpointRefused(
             f"{note.model}: {note.batch_id} is refused to this key ({exc}): set the key of the "
@@ -549,18 +508,19 @@ class Rounds:
 
         A batch waits for a day: whoever waits for it can wait for its provider.
         """
-        began_s = _loop_s()
+        clock_s = asyncio.get_running_loop().time
+        began_s = clock_s()
         for tries in itertools.count(1):
             try:
                 return await ask()
             except BatchFailed as exc:
-                if exc.kind != "again" or _loop_s() - began_s > patience_s:
+                if exc.kind != "again" or clock_s() - began_s > patience_s:
                     raise
                 # Meanwhile nothing of the batch is on its way.
-                state, batch.state = batch.state, State.WAITING
+                state, batch.state = batch.state, "waiting"
                 if tries == 1:
                     self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
-                await asyncio.sleep(max(exc.delay_s or 0.0, _backoff_s(tries)))
+                await asyncio.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
                 batch.state = state
         raise AssertionError("unreachable: it counts for ever")
 
@@ -575,8 +535,21 @@ class Rounds:
         where = f"in batch {note.batch_id}" if note.batch_id else "in a batch that is submitted"
         return (
             f"round {note.number} of at most {most}: {_counted(len(note.lines))} of {note.model} "
-            f"{where} since {note.since:%H:%M:%S} UTC ({_duration(batch.age_s)}){done}"
+            f"{where} since {note.submitted_at:%H:%M:%S} UTC ({_duration(batch.age_s)}){done}"
         )
+
+
+def _batch_of(lines: Sequence[Line]) -> Batch:
+    """A new batch of lines of one model, whose money is in one ledger."""
+    note = OpenBatch(
+        mark=secrets.token_hex(16),
+        model=lines[0].model,
+        ledger=lines[0].ledger,
+        number=1 + max(line.line.request.slot.decision for line in lines),
+        submitted_at=datetime.now(UTC),
+        lines={line.key: line.line.attempt for line in lines},
+    )
+    return Batch(note, {line.key: line for line in lines})
 
 
 def _parts(lines: Iterable[Line], service: BatchService, most: int) -> Iterator[list[Line]]:
@@ -594,25 +567,8 @@ def _parts(lines: Iterable[Line], service: BatchService, most: int) -> Iterator[
         yield part
 
 
-async def _is_settled(is_idle: Callable[[], bool]) -> bool:
-    """Whether nothing goes on, and does not begin to when the loop comes round a few times."""
-    for _ in range(LOOKS):
-        if not is_idle():
-            return False
-        await asyncio.sleep(0)
-    return is_idle()
-
-
-def _loop_s() -> float:
-    return asyncio.get_running_loop().time()
-
-
-def _s_ago(moment: str) -> float:
-    return (datetime.now(UTC) - datetime.fromisoformat(moment)).total_seconds()
-
-
-def _backoff_s(tries: int) -> float:
-    return min(LONGEST_POLL_S, 0.5 * 2.0 ** min(tries, 10))
+def _s_ago(moment: datetime) -> float:
+    return (datetime.now(UTC) - moment).total_seconds()
 
 
 def _counted(calls: int) -> str:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import aclosing
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -42,6 +43,8 @@ ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
 # By how much a server's clock may be behind ours.
 CLOCK_SLACK = timedelta(hours=1)
 MOST_PAGES, LONGEST_CURSOR = 100, 2000
+# A file of results with more lines than that is none, and may have no end.
+MOST_LINES_OF_A_CALL = 3
 LONGEST_MESSAGE, LONGEST_NAME = 500, 80
 
 FailureKind = Literal["again", "smaller", "single", "quota", "refused", "lost"]
@@ -53,6 +56,9 @@ no batch mode for them. ``quota`` and ``refused``: nothing at this endpoint will
 same actions of an AttemptOutcome say. ``lost``: what became of the batch cannot be known, since its
 server no longer has it, or answers with what cannot be read; its lines may have been charged.
 """
+
+# What the judgement of a single call means here.
+JUDGED: dict[str, FailureKind] = {"quota": "quota", "refused": "refused", "retry": "again"}
 
 
 class BatchFailed(MergeRunnerError):
@@ -72,8 +78,11 @@ class BatchFailed(MergeRunnerError):
         self.sent = sent
 
 
-class Unreadable(ValueError):
-    """A line of results that cannot be used; the message says why."""
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """A line of results that cannot be used."""
+
+    why: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,12 +105,11 @@ class BatchStatus:
     ``ended``: there are results to fetch, perhaps not of all lines; also of one that expired or was
     cancelled. ``failed``: no line was asked and nothing is charged; ``failure`` says what to do.
     ``done`` of ``total`` lines have ended, None where the provider does not say; there are at least
-    ``results`` of them. ``word`` is the provider's own for the state, ``message`` what it says
-    beside it, ``batch`` all that it says.
+    ``results`` of them. ``message`` is what the provider says beside the state, ``batch`` all that
+    it says.
     """
 
     state: Literal["waiting", "ended", "failed"]
-    word: str
     done: int | None = None
     total: int | None = None
     results: int = 0
@@ -124,15 +132,30 @@ class LineResult:
     message: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """A batch in the list of all batches: its mark, its beginning, and all that is said of it."""
+
+    mark: object
+    created: datetime | None
+    said: dict[str, Any]
+
+
 class BatchService(ABC):
     """The batch mode of one model at one endpoint; every request raises BatchFailed.
 
     A batch has at most ``most_bytes`` of lines. Where it takes no mark, one whose id was lost
-    cannot be found.
+    cannot be found. Batches are at ``path``, where ``pages`` is the query for a page of their list,
+    and ``cursor`` that for the one after it. A result has the key of its request as ``key_member``.
     """
 
     most_bytes: ClassVar[int]
     takes_mark: ClassVar[bool] = True
+    path: ClassVar[str]
+    cancel_suffix: ClassVar[str] = "/cancel"
+    key_member: ClassVar[str] = "custom_id"
+    pages: ClassVar[str]
+    cursor: ClassVar[str]
 
     def __init__(self, transport: HttpTransport, endpoint: Endpoint, wire: WireFormat) -> None:
         self._transport = transport
@@ -155,51 +178,82 @@ class BatchService(ABC):
 
         Raises BatchFailed with the kind ``lost`` where there are too many to look through.
         """
+        cursor: str | None = ""
+        seen: set[str] = set()
+        while cursor is not None and cursor not in seen:  # ends where a server knows no pages
+            if len(seen) == MOST_PAGES or len(cursor) > LONGEST_CURSOR:
+                raise BatchFailed("lost", "the list of batches cannot be read to its end")
+            seen.add(cursor)
+            after = f"&{self.cursor}={quote(cursor, safe='')}" if cursor else ""
+            page = await self._get(f"{self.path}?{self.pages}{after}", TRANSFER_TIMEOUT_S)
+            listed, cursor = self.page_of(page)
+            for batch in listed:
+                if batch.mark == mark:
+                    return self.batch_id_of(batch.said)
+            if _leads_back([batch.created for batch in listed], since):
+                break
+        return None
+
+    def page_of(self, page: dict[str, Any]) -> tuple[list[Listed], str | None]:
+        """Return the batches of a page of the list, and the cursor of the next one, if any."""
         raise NotImplementedError
 
-    @abstractmethod
+    def batch_id_of(self, batch: dict[str, Any]) -> str:
+        """Return the id of a batch as its server describes it; raises BatchFailed."""
+        return id_of(batch)
+
     async def status(self, batch_id: str) -> BatchStatus:
         """Return the state of a batch."""
+        return self.status_of(await self._get(f"{self.path}/{batch_id}", TIMEOUT_S))
 
-    @abstractmethod
-    def lines(
-        self, batch_id: str, batch: Mapping[str, Any]
-    ) -> AsyncIterator[dict[str, Any] | Unreadable]:
-        """Yield the lines of the results of a batch that has ended, in any order."""
-
-    @abstractmethod
-    def read(self, line: dict[str, Any]) -> LineResult:
-        """Return the result in a line; raises Unreadable."""
-
-    @abstractmethod
     async def cancel(self, batch_id: str) -> None:
         """Ask for the end of a batch, which then ends with the results that it has.
 
         One that has ended already stays as it is.
         """
+        path = f"{self.path}/{batch_id}{self.cancel_suffix}"
+        raw = await self._ask("POST", path, timeout_s=TIMEOUT_S)
+        if not _is_success(raw) and raw.status not in ENDED_ALREADY:
+            raise self._unread(raw)
+
+    @abstractmethod
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
+        """Return the state of a batch as its server describes it."""
+
+    @abstractmethod
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """Return where the results of a batch that has ended are: JSONL, in any order."""
+
+    @abstractmethod
+    def read(self, key: str, line: dict[str, Any]) -> LineResult | None:
+        """Return the result in a line, None where it has no known form."""
 
     async def results(
-        self, batch_id: str, status: BatchStatus
+        self, batch_id: str, status: BatchStatus, calls: int
     ) -> AsyncIterator[LineResult | Unreadable]:
-        """Yield the results of a batch that has ended, or why one cannot be read.
+        """Yield the results of a batch of so many calls that has ended, or why one cannot be read.
 
-        Raises BatchFailed with the kind ``again`` where they can be read from the beginning.
+        Where one file cannot be read, those of the other come all the same. Raises BatchFailed with
+        the kind ``again`` where they can be read from the beginning.
         """
-        async for line in self.lines(batch_id, status.batch):
+        failure: BatchFailed | None = None
+        for path in self.result_paths(batch_id, status.batch):
             try:
-                yield line if isinstance(line, Unreadable) else self.read(line)
-            except Unreadable as exc:
-                yield exc
+                async for result in self._lines(path, MOST_LINES_OF_A_CALL * calls):
+                    yield result
+            except BatchFailed as exc:
+                failure = failure or exc
+        if failure is not None:
+            raise failure
 
     def failure_of(self, error: ServerError) -> FailureKind:
         """Return what to do with lines whose batch is not created, or fails as a whole."""
-        if "token_limit_exceeded" in error.names or "enqueued" in error.message.lower():
-            return "smaller"
-        if error.status == 413:
+        enqueued = "token_limit_exceeded" in error.names or "enqueued" in error.message.lower()
+        if enqueued or error.status == 413:
             return "smaller"
         if error.status in NO_BATCH_MODE:
             return "single"
-        return self._judged(error) or "single"
+        return JUDGED.get(judge_error(error, self._wire).action, "single")
 
     def slot_members(self, line: BatchLine) -> str:
         """Return what our own emulator alone is told of a line, as members of its JSON object."""
@@ -208,7 +262,7 @@ class BatchService(ABC):
         slot = canonical_json(line.request.slot.as_dict())
         return f',"{SLOT_HEADER}":{slot},"{ATTEMPT_HEADER}":{line.attempt}'
 
-    async def _get(self, path: str, timeout_s: float = TIMEOUT_S) -> dict[str, Any]:
+    async def _get(self, path: str, timeout_s: float) -> dict[str, Any]:
         """Return the JSON object at a path."""
         raw = await self._ask("GET", path, timeout_s=timeout_s)
         if not _is_success(raw):
@@ -224,23 +278,21 @@ class BatchService(ABC):
             raise self._failed(self.failure_of(raw.error), raw)
         return raw
 
-    async def _cancel(self, path: str) -> None:
-        raw = await self._ask("POST", path, timeout_s=TIMEOUT_S)
-        if not _is_success(raw) and raw.status not in ENDED_ALREADY:
-            raise self._unread(raw)
-
-    async def _lines(self, path: str) -> AsyncIterator[dict[str, Any] | Unreadable]:
-        """Yield the objects of a JSONL file.
+    async def _lines(self, path: str, most: int) -> AsyncIterator[LineResult | Unreadable]:
+        """Yield the results of a JSONL file of at most so many lines, blank ones included.
 
         One that is not there is asked for again: it belongs to a batch that is there.
         """
         number = 0
         try:
-            async for line in self._transport.lines(
-                path, self._wire.headers, timeout_s=TRANSFER_TIMEOUT_S
-            ):
-                number += 1
-                yield _parsed(number, line)
+            body = self._transport.lines(path, self._wire.headers, timeout_s=TRANSFER_TIMEOUT_S)
+            async with aclosing(body) as lines:
+                async for line in lines:
+                    number += 1
+                    if number > most:
+                        raise BatchFailed("single", f"there are more than {most} lines of results")
+                    if line:
+                        yield self._result(number, line)
         except ErrorReply as exc:
             if exc.raw.status == 404:
                 raise self._failed("again", exc.raw) from exc
@@ -248,20 +300,21 @@ class BatchService(ABC):
         except TransportFailure as exc:
             raise _unanswered(exc, reads=True) from exc
 
-    async def _pages(
-        self, path: str, cursor_name: str, cursor_of: Callable[[dict[str, Any]], str | None]
-    ) -> AsyncIterator[dict[str, Any]]:
-        """Yield the pages of a list, each found by the cursor of the one before."""
-        cursor: str | None = ""
-        seen: set[str] = set()
-        while cursor is not None and cursor not in seen:  # ends where a server knows no pages
-            if len(seen) == MOST_PAGES or len(cursor) > LONGEST_CURSOR:
-                raise BatchFailed("lost", "the list of batches cannot be read to its end")
-            seen.add(cursor)
-            after = f"&{cursor_name}={quote(cursor, safe='')}" if cursor else ""
-            page = await self._get(path + after, TRANSFER_TIMEOUT_S)
-            yield page
-            cursor = cursor_of(page)
+    def _result(self, number: int, line: str | TransportFailure) -> LineResult | Unreadable:
+        """Return the result in a line."""
+        if isinstance(line, TransportFailure):
+            return Unreadable(f"line {number}: {line}")
+        try:
+            value = json.loads(line)
+        except ValueError:
+            return Unreadable(f"line {number} is no JSON")
+        if not isinstance(value, dict):
+            return Unreadable(f"line {number} is no JSON object")
+        key = as_text(value.get(self.key_member))
+        if not key:
+            return Unreadable(f"line {number} has no {self.key_member}")
+        name = as_message(key, LONGEST_NAME)
+        return self.read(key, value) or Unreadable(f"the result of {name} is of no known form")
 
     async def _ask(
         self,
@@ -285,18 +338,7 @@ class BatchService(ABC):
         """Return the failure where a batch exists, or may exist, whatever its server says now."""
         if raw.status in GONE:
             return self._failed("lost", raw)
-        return self._failed(self._judged(raw.error) or "again", raw)
-
-    def _judged(self, error: ServerError) -> FailureKind | None:
-        """Return what the judgement of single calls means here; None: nothing."""
-        match judge_error(error, self._wire).action:
-            case "quota":
-                return "quota"
-            case "refused":
-                return "refused"
-            case "retry":
-                return "again"
-        return None
+        return self._failed(JUDGED.get(judge_error(raw.error, self._wire).action, "again"), raw)
 
     def _failed(self, kind: FailureKind, raw: RawReply) -> BatchFailed:
         delay_s = judge_error(raw.error, self._wire).delay_s
@@ -309,7 +351,7 @@ class BatchService(ABC):
         return BatchFailed(kind, message, delay_s=delay_s, sent=maybe_done)
 
 
-def leads_back(created: Sequence[datetime | None], since: datetime) -> bool:
+def _leads_back(created: Sequence[datetime | None], since: datetime) -> bool:
     """Whether a page of batches is older than a moment, and the next one older still."""
     known = [each for each in created if each is not None]
     return bool(known) and known[0] > known[-1] and max(known) < since - CLOCK_SLACK
@@ -334,21 +376,8 @@ def as_message(value: object, longest: int = LONGEST_MESSAGE) -> str:
 
 
 def as_word(value: object) -> str:
-    """Return a provider's word for a state."""
-    return as_message(value, LONGEST_NAME) or "unknown"
-
-
-def key_of(line: dict[str, Any], member: str) -> str:
-    """Return the key of a result; raises Unreadable."""
-    key = as_text(line.get(member))
-    if not key:
-        raise Unreadable(f"it has no {member}")
-    return key
-
-
-def unreadable(key: str, why: str) -> Unreadable:
-    """Return the error of a result whose key is known."""
-    return Unreadable(f"the result of {as_message(key, LONGEST_NAME)} {why}")
+    """Return a provider's word for a state, in capitals."""
+    return (as_text(value) or "").upper()
 
 
 def id_of(reply: Mapping[str, Any], member: str = "id") -> str:
@@ -370,16 +399,6 @@ def moment_of(text: object) -> datetime | None:
 
 def _is_success(raw: RawReply) -> bool:
     return 200 <= raw.status < 300
-
-
-def _parsed(number: int, line: str | TransportFailure) -> dict[str, Any] | Unreadable:
-    if isinstance(line, TransportFailure):
-        return Unreadable(f"line {number}: {line}")
-    try:
-        value = json.loads(line)
-    except ValueError:
-        return Unreadable(f"line {number} is no JSON")
-    return value if isinstance(value, dict) else Unreadable(f"line {number} is no JSON object")
 
 
 def _unanswered(failure: TransportFailure, *, reads: bool) -> BatchFailed:

@@ -36,7 +36,7 @@ async def ended(service, batch_id):
 
 async def results_of(service, batch_id):
     status = await ended(service, batch_id)
-    return [result async for result in service.results(batch_id, status)]
+    return [result async for result in service.results(batch_id, status, 50)]
 
 
 async def answered_by(url):

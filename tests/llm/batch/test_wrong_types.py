@@ -52,7 +52,7 @@ BATCHES = {
         "name": "batches/b1",
         "done": True,
         "error": {"code": 13, "message": "m", "details": []},
-        "response": {"inlinedResponses": {"inlinedResponses": LINES["gemini"]}},
+        "response": {"responsesFile": "files/f1"},
         "metadata": {
             "state": "BATCH_STATE_FAILED",
             "displayName": MARK,
@@ -110,7 +110,7 @@ async def uses(service):
     async def results():
         return [
             judge(each.raw, FORMATS["gemini"])
-            async for each in service.results("b1", await service.status("b1"))
+            async for each in service.results("b1", await service.status("b1"), 10)
             if not isinstance(each, Unreadable) and each.raw
         ]
 
