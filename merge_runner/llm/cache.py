@@ -99,22 +99,9 @@ class _Stored:
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 
 
-@dataclass(frozen=True, slots=True)
-class KnownCall:
-    """The record of a call: its entry, or the attempts of earlier runs.
-
-    ``damaged`` names what was found damaged and is in quarantine now.
-    """
-
-    entry: CachedCall | None
-    attempts: tuple[Attempt, ...]
-    damaged: tuple[str, ...] = ()
-
-
 class ResponseCache:
     """The cache folder. Reads are direct; writes are batched in a thread and awaited.
 
-    Whoever makes a call has claimed it, so that no other trial or worker of its run makes it too.
     ``locks`` keep other live runs from asking the same model; ``money`` is the ledger's file.
     """
 
@@ -133,7 +120,6 @@ class ResponseCache:
         self.folder = folder
         self.locks = ModelLocks(folder)
         self.money = LedgerFile(folder)
-        self._claimed: set[str] = set()
         self._read_overlay = overlay
         self._disk = TextDisk(str(folder))
         self._texts: diskcache.Cache | None = None
@@ -174,25 +160,6 @@ class ResponseCache:
     def get(self, key: str) -> CachedCall | None:
         """Return the entry of a call key; raises RecordingError where it is damaged or made up."""
         return self._overlay.get(key) or self._kept(key)
-
-    async def claim(self, key: str) -> KnownCall | None:
-        """Claim a call and learn what is recorded of it; None while another one holds it.
-
-        What is damaged goes to quarantine.
-        """
-        if key in self._claimed:
-            return None
-        try:
-            known = KnownCall(self.get(key), self.unanswered(key))
-        except RecordingError:
-            damaged = tuple(self.set_damage_aside(key))
-            known = KnownCall(self.get(key), self.unanswered(key), damaged)
-        self._claimed.add(key)  # what cannot be read is not claimed
-        return known
-
-    def release(self, key: str) -> None:
-        """Give a claim up."""
-        self._claimed.discard(key)
 
     async def put(self, entry: CachedCall) -> CachedCall:
         """Keep an entry; returns the one that is kept when it is durable.

@@ -62,8 +62,6 @@ from merge_runner.served_model import own_names
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
 
-# Beside a call that takes seconds this delay is nothing.
-CLAIM_POLL_S = 0.1
 # A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
 
@@ -72,14 +70,16 @@ LONG_WAIT_S = 5.0
 class LlmClient:
     """Answers prompts of one model.
 
-    ``endpoint`` is the identity that enters the keys. A call that is under way is shared by all
-    who ask for the same key, and goes on when they are cancelled, so that what is paid for is
-    kept; ``drain`` waits for it. ``budget`` is None for a model that costs nothing. ``first`` is
-    the run's first call to the endpoint, which goes alone. ``sealed`` says that nothing may be
-    asked anew, so that there is no ``transport``; ``strict`` that an answer of another model stops
-    the sweep. ``model`` is its name in the registry where ``name`` also tells its parameters.
-    ``batches`` are those in which it may be asked, or where its calls may wait already. ``driver``
-    is its name, with the endpoint where that is not the provider's own.
+    ``endpoint`` is the identity that enters the keys. ``budget`` is None for a model that costs
+    nothing. ``first`` is the run's first call to the endpoint, which goes alone. ``sealed`` says
+    that nothing may be asked anew, so that there is no ``transport``; ``strict`` that an answer of
+    another model stops the sweep. ``model`` is its name in the registry where ``name`` also tells
+    its parameters. ``batches`` are those in which it may be asked, or where its calls may wait
+    already. ``driver`` is its name, with the endpoint where that is not the provider's own.
+
+    ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
+    its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
+    for it.
     """
 
     name: str
@@ -94,13 +94,13 @@ class LlmClient:
     model: str = ""
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
     batches: Batches | None = None
+    under_way: dict[str, Call] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter)
     driver: str = field(init=False)
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
     _money: Budget = field(init=False)
     _consequences: Consequences = field(init=False)
-    _calls: dict[str, Call] = field(default_factory=dict)
     _stopping: bool = False
 
     def __post_init__(self) -> None:
@@ -139,8 +139,8 @@ class LlmClient:
             raise ReplayMiss("no recorded reply", request)
         if reply is None:
             # The attempts are counted once, for whoever asked first.
-            shared = request.key in self._calls
-            call = self._calls[request.key] if shared else self._start(request, order)
+            shared = request.key in self.under_way
+            call = self.under_way[request.key] if shared else self._start(request, order)
             with call.asked_by_one():
                 # Shielded: the call may be paid for already when its trial is cancelled.
                 reply = await asyncio.shield(call.task)
@@ -160,9 +160,10 @@ class LlmClient:
     async def drain(self) -> None:
         """Let attempts in flight end and be saved, and give up calls that wait for one."""
         self._stopping = True
-        for call in self._calls.values():
+        calls = self._calls
+        for call in calls:
             call.stop()
-        tasks = [call.task for call in self._calls.values()]
+        tasks = [call.task for call in calls]
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def leave(self, order: int) -> None:
@@ -172,18 +173,23 @@ class LlmClient:
     @property
     def in_flight_calls(self) -> int:
         """Number of calls in flight or being saved."""
-        return sum(call.wait is None for call in self._calls.values())
+        return sum(call.wait is None for call in self._calls)
 
     @property
     def waits(self) -> list[Wait]:
         """The waits of all other calls."""
-        return [call.wait for call in self._calls.values() if call.wait is not None]
+        return [call.wait for call in self._calls if call.wait is not None]
 
     @property
     def idle_askers(self) -> int:
         """Number of trials that wait for calls that are blocked on another call."""
-        calls = self._calls.values()
+        calls = self._calls
         return sum(call.asking for call in calls if call.wait is not None and call.wait.idle)
+
+    @property
+    def _calls(self) -> list[Call]:
+        """The calls of this client that are under way."""
+        return [call for call in self.under_way.values() if call.asked.driver == self.driver]
 
     def _known(self, request: ChatRequest) -> ChatReply | None:
         """Return the recorded reply; a damaged one is None, and in a replay raises CallFailed."""
@@ -220,10 +226,10 @@ class LlmClient:
         asked = Asked(self.driver, slot_text(request.slot), worst_usd, self.model or self.name)
         call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._call(call))
-        self._calls[request.key] = call
+        self.under_way[request.key] = call
 
         def forget(done: asyncio.Task[ChatReply]) -> None:
-            del self._calls[request.key]
+            del self.under_way[request.key]
             if not done.cancelled():
                 done.exception()  # retrieved, since all who asked may be gone by now
 
@@ -232,7 +238,6 @@ class LlmClient:
 
     async def _call(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
-        # Both before the claim: else another worker would wait for a call that waits here.
         opened = self.batches is not None and self.batches.takes_up(call)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
@@ -241,7 +246,8 @@ class LlmClient:
             with call.waiting(f"for the first answer of {self.driver}"):
                 alone = await self.first.turn()
         try:
-            return await self._claimed(call)
+            self._resume(call)
+            return await self._attempts(call)
         except SweepStopped:
             stopped = True  # the next call would only be refused in the same way
             raise
@@ -249,30 +255,21 @@ class LlmClient:
             if alone and not stopped:
                 self.first.give_turn()
 
-    async def _claimed(self, call: Call) -> ChatReply:
-        """Claim a call, and make it unless it is recorded by now."""
+    def _resume(self, call: Call) -> None:
+        """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
         key = call.request.key
-        while (known := await self.cache.claim(key)) is None:
-            with call.waiting("for the same call, which is being made already", idle=True):
-                await asyncio.sleep(CLAIM_POLL_S)
-        try:
-            for name in known.damaged:
-                self.meter.damaged.append(name)
-                self.meter.notes.append(
-                    f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set "
-                    f"aside in the cache as 'damaged {name}', and asked again"
-                )
-            if known.entry:  # whoever held the claim before has made the call
-                return self._read(known.entry, len(known.entry.attempts))
-            call.attempts = list(known.attempts)
-            if self.batches is not None:
-                call.open = self.batches.rounds.open_line(key, known.attempts)
-            if call.open is not None:  # the attempt that has begun there is the one that goes on
-                call.attempts = [each for each in call.attempts if each.number < call.open.attempt]
-            call.earlier = len(call.attempts)
-            return await self._attempts(call)
-        finally:
-            self.cache.release(key)
+        for name in self.cache.set_damage_aside(key):
+            self.meter.damaged.append(name)
+            self.meter.notes.append(
+                f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set aside "
+                f"in the cache as 'damaged {name}', and asked again"
+            )
+        earlier = self.cache.unanswered(key)
+        if self.batches is not None:
+            call.open = self.batches.rounds.open_line(key, earlier)
+        opened = call.open  # the attempt that has begun there is the one that goes on
+        call.attempts = [each for each in earlier if not opened or each.number < opened.attempt]
+        call.earlier = len(call.attempts)
 
     async def _attempts(self, call: Call) -> ChatReply:
         """Make attempts until one brings an answer, which is kept together with all of them."""

@@ -26,6 +26,7 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
 from merge_runner.llm.budget import Budget, Unpaid
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call import Call
 from merge_runner.llm.call_totals import CallTotals
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
@@ -141,7 +142,8 @@ def live_clients(
 
         in_process = InProcess(Emulator(endpoint_plan.emulator))
     transports: dict[str, HttpTransport] = {}
-    clients = {}
+    clients: dict[str, LlmClient] = {}
+    under_way: dict[str, Call] = {}  # two names of one model may ask the same
     for name, entry in plan.entries.items():
         model = plan.registered[name]
         if model not in transports:
@@ -173,6 +175,7 @@ def live_clients(
                 known=name in endpoint_plan.known,
             ),
             batches=_batches(model, entry, budget, cache, rounds),
+            under_way=under_way,
         )
     return clients
 
