@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from contextlib import AsyncExitStack
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -23,7 +23,7 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.batch.lines import Batches
-from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid
+from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Call, Wait, slot_text
 from merge_runner.llm.content_hashes import make_request
@@ -42,7 +42,7 @@ from merge_runner.llm.http_outcome import (
     judge,
     may_be_charged,
 )
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import cost_usd
@@ -108,7 +108,7 @@ class LlmClient:
         self.driver = driver_name(self.name, self.endpoint)
         self._wire = FORMATS[self.entry.format]
         self._own_names = own_names(self.entry.id, self.entry.aliases)
-        self._money = self.budget or Unpaid(self.cache)
+        self._money = self.budget or Budget(Ledger(self.cache, ""))  # a ledger that keeps nothing
         provider = self.entry.provider
         self._consequences = Consequences(
             self.name,
@@ -300,11 +300,9 @@ class LlmClient:
         """Make one attempt; return its answer, which is kept, or raise what follows from it."""
         if self.batches is not None and (call.open or self._goes_in_batch(call)):
             return await self._attempt_in_batch(call, self.batches)
-        async with AsyncExitStack() as stack:
-            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid: PaidAttempt = await stack.enter_async_context(
-                    self._money.attempt(call.order, call.request.key, call.asked)
-                )
+        with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
+            paid = await self._money.set_aside(call.order, call.request.key, call.asked)
+        with closing(paid):
             # A turn must be used as soon as it is given, or the limits do not hold.
             with call.waiting("for a turn under the rate limits"):
                 # As a provider counts when it admits a request: its text, of which about four bytes

@@ -24,7 +24,7 @@ from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.lines import Batches
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
-from merge_runner.llm.budget import Budget, Unpaid
+from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Call
 from merge_runner.llm.call_totals import CallTotals
@@ -193,7 +193,7 @@ def _batches(
     terms = batch_terms(entry)
     if rounds is None or terms is None:
         return None
-    money = Unpaid(cache) if entry.price == "free" else budget
+    money = Budget(Ledger(cache, "")) if entry.price == "free" else budget
     return Batches(rounds, model, budget.ledger.scope, money, terms.price_factor)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -92,18 +92,14 @@ class Batches:
         """Yield the money of a call's next attempt, and its line, which may be ``opened``."""
         key, ledger = call.request.key, self.ledger
         asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.price_factor)
-        paid: PaidAttempt
-        async with AsyncExitStack() as stack:
+        with ExitStack() as stack:
             if opened is None:
                 with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                    paid = await stack.enter_async_context(
-                        self.money.attempt(call.order, key, asked)
-                    )
+                    paid = await self.money.set_aside(call.order, key, asked)
             else:
                 ledger = self.rounds.ledger_of(opened)
-                paid = await stack.enter_async_context(
-                    self.money.going_on(call.order, key, asked, ledger)
-                )
+                paid = self.money.going_on(call.order, key, asked, ledger)
+            stack.callback(paid.close)
             attempts = tuple(call.attempts)
             sent = BatchLine(call.request, len(attempts) + 1)
             yield paid, Line(sent, self.model, ledger, paid, attempts, opened)
