@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from merge_runner.config import ModelEntry, driver_name, is_own_host
 from merge_runner.errors import (
     CallFailed,
+    MergeRunnerError,
     ModelSwapped,
     ProviderDown,
     RecordingError,
@@ -141,9 +142,12 @@ class LlmClient:
             # The attempts are counted once, for whoever asked first.
             shared = request.key in self.under_way
             call = self.under_way[request.key] if shared else self._start(request, order)
-            with call.asked_by_one():
+            call.asking += 1
+            try:
                 # Shielded: the call may be paid for already when its trial is cancelled.
                 reply = await asyncio.shield(call.task)
+            finally:
+                call.asking -= 1
             if shared:
                 reply = replace(reply, earlier=len(reply.attempts))
         self._count(reply)
@@ -298,8 +302,9 @@ class LlmClient:
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; return its answer, which is kept, or raise what follows from it."""
-        if self.batches is not None and (call.open or self._goes_in_batch(call)):
-            return await self._attempt_in_batch(call, self.batches)
+        batches = self.batches
+        if batches and (call.open or (batches.rounds.submits and not call.singly)):
+            return await self._attempt_in_batch(call, batches)
         with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
             paid = await self._money.set_aside(call.order, call.request.key, call.asked)
         with closing(paid):
@@ -343,18 +348,16 @@ class LlmClient:
         outcome: AttemptOutcome,
         raw: RawReply | None,
         record: Attempt,
+        error: MergeRunnerError | None = None,
     ) -> ChatReply:
         """Keep an attempt and return its answer, or raise why there is none."""
         call.attempts.append(record)
         self.meter.count_attempt(record)
         self._tell_overrun(call, paid.aside_usd)
-        error = self._consequences.error(call, outcome, raw)
+        error = error or self._consequences.error(call, outcome, raw)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
-            if kept.attempts[-1] != record:  # an import was first
-                return self._read(kept, call.earlier)
-            text = outcome.reading.text
-            return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
+            return self._read(kept, call.earlier)  # another one where an import was first
         if (pause_s := self._consequences.pause_s(call, outcome)) is not None:
             self.limiter.pause(pause_s)
             until = datetime.now(UTC) + timedelta(seconds=pause_s)
@@ -412,10 +415,6 @@ class LlmClient:
         charged = may_be_charged(raw, self._consequences.own_host) and not stray
         return None if charged else 0.0
 
-    def _goes_in_batch(self, call: Call) -> bool:
-        """Return whether the next attempt at a call goes with the next round."""
-        return self.batches is not None and self.batches.rounds.submits and not call.singly
-
     async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""
         opened, call.open = call.open, None
@@ -436,9 +435,4 @@ class LlmClient:
                 batch_id=end.batch_id,
             )
             call.singly = True
-            if end.error is None:
-                return await self._concluded(call, paid, outcome, end.raw, record)
-            call.attempts.append(record)
-            self.meter.count_attempt(record)
-            await paid.settle(call.attempts)
-            raise end.error
+            return await self._concluded(call, paid, outcome, end.raw, record, end.error)

@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 from urllib.parse import urlsplit
 
 from merge_runner.config import PROVIDERS, ModelEntry
@@ -305,47 +305,42 @@ class Deadline:
         # Only now, since it costs time and memory that most calls need not spend.
         from tenacity import AsyncRetrying, retry_if_exception_type
 
+        async def next_attempt() -> T:
+            if failed:
+                raise failed.pop()
+            return await attempt()
+
         def wait_s(state: RetryCallState) -> float:
+            error = state.outcome.exception() if state.outcome else None
+            assert isinstance(error, TryAgain)
             # The jitter lets calls that failed together, as when a server restarts, not return
             # together.
             jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
             backoff = min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
-            return max(_failure(state).delay_s or 0.0, backoff)
+            return max(error.delay_s or 0.0, backoff)
 
-        def count_wait(state: RetryCallState) -> None:
-            self._used_s += state.upcoming_sleep
+        async def wait(seconds: float) -> None:
+            self._used_s += seconds
+            await sleep(seconds)
 
-        async for again in AsyncRetrying(
+        again = AsyncRetrying(
             retry=retry_if_exception_type(TryAgain),
             wait=wait_s,
             stop=lambda state: self._used_s + state.upcoming_sleep >= self._seconds,
-            before_sleep=count_wait,
-            sleep=sleep,
-            retry_error_callback=self._give_up,
-        ):
-            with again:
-                if failed:
-                    raise failed.pop()
-                return await attempt()
-        raise AssertionError("unreachable: the loop returns or raises")
-
-    def _give_up(self, state: RetryCallState) -> NoReturn:
-        last = _failure(state)
-        # Where the server's own wish made the wait too long, that is what to tell.
-        asked_s = last.delay_s
-        if asked_s is None or asked_s < self._seconds:
-            raise OutOfTime(f"no answer within {self._seconds:.0f} s") from last
-        raise OutOfTime(
-            f"the server asks to wait {asked_s:.0f} s, longer than a call's deadline of "
-            f"{self._seconds:.0f} s: run the same command again after that"
-        ) from last
-
-
-def _failure(state: RetryCallState) -> TryAgain:
-    """Return the error of the last attempt: tenacity calls its hooks after a TryAgain alone."""
-    error = state.outcome.exception() if state.outcome else None
-    assert isinstance(error, TryAgain)
-    return error
+            sleep=wait,
+            reraise=True,
+        )
+        try:
+            return await again(next_attempt)
+        except TryAgain as exc:
+            # Where the server's own wish made the wait too long, that is what to tell.
+            why = f"no answer within {self._seconds:.0f} s"
+            if exc.delay_s is not None and exc.delay_s >= self._seconds:
+                why = (
+                    f"the server asks to wait {exc.delay_s:.0f} s, longer than a call's deadline "
+                    f"of {self._seconds:.0f} s: run the same command again after that"
+                )
+            raise OutOfTime(why) from exc
 
 
 class FirstCall:
