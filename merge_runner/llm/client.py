@@ -39,6 +39,7 @@ from merge_runner.llm.http_outcome import (
     RawReply,
     RequestFailed,
     TransportFailure,
+    TryAgain,
     is_web_page,
     judge,
     may_be_charged,
@@ -358,12 +359,12 @@ class LlmClient:
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
             return self._read(kept, call.earlier)  # another one where an import was first
-        if (pause_s := self._consequences.pause_s(call, outcome)) is not None:
-            self.limiter.pause(pause_s)
-            until = datetime.now(UTC) + timedelta(seconds=pause_s)
+        if isinstance(error, TryAgain) and error.pause_s is not None:
+            self.limiter.pause(error.pause_s)
+            until = datetime.now(UTC) + timedelta(seconds=error.pause_s)
             self.meter.notes.append(
-                f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
-                f"{outcome.message or outcome.name}"
+                f"{self.driver}: all its calls wait {error.pause_s:.1f} s, until "
+                f"{until:%H:%M:%S} UTC: {error}"
             )
         await paid.settle(call.attempts)  # before the error, which may end the whole run
         raise error

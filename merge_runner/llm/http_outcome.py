@@ -246,11 +246,17 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
 
 
 class TryAgain(MergeRunnerError):
-    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for."""
+    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for.
 
-    def __init__(self, message: str, delay_s: float | None = None) -> None:
+    All calls to the endpoint wait for ``pause_s``, where there is one.
+    """
+
+    def __init__(
+        self, message: str, delay_s: float | None = None, pause_s: float | None = None
+    ) -> None:
         super().__init__(message)
         self.delay_s = delay_s
+        self.pause_s = pause_s
 
 
 class RequestFailed(MergeRunnerError):
@@ -385,15 +391,17 @@ class Consequences:
         if not self.first.passed and (stop := self._end_of_run(call, outcome, raw)):
             return stop
         message = outcome.message or outcome.name
-        if self._is_too_long(outcome):
+        delay_s = outcome.delay_s or 0.0
+        if outcome.pause and delay_s > self.entry.deadline_s:
             return QuotaExhausted(
-                f"{self.driver}: the provider asks to wait {outcome.delay_s:.0f} s, longer than a "
+                f"{self.driver}: the provider asks to wait {delay_s:.0f} s, longer than a "
                 f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
                 "is saved; run the same command again later to go on."
             )
         match outcome.action:
             case "retry":
-                return TryAgain(message, outcome.delay_s)
+                pause_s = (delay_s or backoff_s(len(call.own_attempts))) if outcome.pause else None
+                return TryAgain(message, outcome.delay_s, pause_s)
             case "fail":
                 which = "reply" if outcome.name == "reply_refused" else "request"
                 return RequestFailed(f"the {which} was rejected")
@@ -410,15 +418,6 @@ class Consequences:
             return None
         empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
         return TryAgain("empty answer") if empty <= EMPTY_RETRIES else None
-
-    def pause_s(self, call: Call, outcome: AttemptOutcome) -> float | None:
-        """Return for how many s all calls to the endpoint wait; None: they go on."""
-        if not outcome.pause or self._is_too_long(outcome):
-            return None
-        return outcome.delay_s or backoff_s(len(call.own_attempts))
-
-    def _is_too_long(self, outcome: AttemptOutcome) -> bool:
-        return outcome.pause and (outcome.delay_s or 0.0) > self.entry.deadline_s
 
     def _end_of_run(
         self, call: Call, outcome: AttemptOutcome, raw: RawReply | None
