@@ -246,7 +246,7 @@ class LlmClient:
         opened = self.batches is not None and self.batches.takes_up(call)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
-        alone, stopped = False, False
+        alone = False
         if not self.first.passed and not opened:  # nobody waits for an answer that may take hours
             with call.waiting(f"for the first answer of {self.driver}"):
                 alone = await self.first.turn()
@@ -254,10 +254,10 @@ class LlmClient:
             self._resume(call)
             return await self._attempts(call)
         except SweepStopped:
-            stopped = True  # the next call would only be refused in the same way
+            alone = False  # the next call would only be refused in the same way
             raise
         finally:
-            if alone and not stopped:
+            if alone:
                 self.first.give_turn()
 
     def _resume(self, call: Call) -> None:
@@ -318,36 +318,31 @@ class LlmClient:
             await paid.begin(call.attempts)
             started_at, started = datetime.now(UTC), time.perf_counter()
             with deadline.attempt() as seconds_left:
-                outcome, raw, record = await self._send(call, seconds_left)
+                outcome = await self._send(call, seconds_left)
             record = replace(
-                record,
+                self._record(call, outcome),
                 started_at=started_at.isoformat(timespec="milliseconds"),
                 latency_s=round(time.perf_counter() - started, 4),
             )
             if record.usage.output_tokens is not None:
                 settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
-            return await self._concluded(call, paid, outcome, raw, record)
+            return await self._concluded(call, paid, outcome, record)
 
-    async def _send(
-        self, call: Call, seconds_left: float
-    ) -> tuple[AttemptOutcome, RawReply | None, Attempt]:
-        """Send the request once; return its outcome, the reply, and the attempt for the record."""
+    async def _send(self, call: Call, seconds_left: float) -> AttemptOutcome:
+        """Send the request once."""
         assert self.transport is not None, "a sealed client asks nothing"
         number, timeout_s = len(call.attempts) + 1, min(self.entry.timeout_s, seconds_left)
         try:
             raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
         except TransportFailure as exc:
-            outcome = AttemptOutcome(exc.action, exc.outcome, str(exc))
-            return outcome, None, self._record(call, outcome, None, charged=exc.sent)
-        outcome = judge(raw, self._wire)
-        return outcome, raw, self._record(call, outcome, raw)
+            return AttemptOutcome(exc.action, exc.outcome, str(exc), charged=exc.sent)
+        return judge(raw, self._wire)
 
     async def _concluded(
         self,
         call: Call,
         paid: PaidAttempt,
         outcome: AttemptOutcome,
-        raw: RawReply | None,
         record: Attempt,
         error: MergeRunnerError | None = None,
     ) -> ChatReply:
@@ -355,7 +350,7 @@ class LlmClient:
         call.attempts.append(record)
         self.meter.count_attempt(record)
         self._tell_overrun(call, paid.aside_usd)
-        error = error or self._consequences.error(call, outcome, raw)
+        error = error or self._consequences.error(call, outcome)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
             return self._read(kept, call.earlier)  # another one where an import was first
@@ -380,13 +375,11 @@ class LlmClient:
             f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
         )
 
-    def _record(
-        self, call: Call, outcome: AttemptOutcome, raw: RawReply | None, *, charged: bool = True
-    ) -> Attempt:
-        """Return an attempt as it is recorded; without a reply it may have been ``charged``."""
-        number = len(call.attempts) + 1
+    def _record(self, call: Call, outcome: AttemptOutcome) -> Attempt:
+        """Return an attempt as it is recorded."""
+        number, raw = len(call.attempts) + 1, outcome.raw
         if raw is None:
-            cost = None if charged and self.entry.price != "free" else 0.0
+            cost = None if outcome.charged and self.entry.price != "free" else 0.0
             return Attempt(number, outcome.name, error=outcome.message, cost_usd=cost)
         return Attempt(
             number=number,
@@ -422,10 +415,10 @@ class LlmClient:
         async with batches.attempt(call, opened) as (paid, line):
             with call.waiting(f"for batches of {batches.model}", idle=True):
                 end = await batches.rounds.ask(line)
-            outcome = AttemptOutcome("retry", end.outcome, end.message)
+            outcome = AttemptOutcome("retry", end.outcome, end.message, charged=end.unclear)
             if end.raw is not None:  # no limit of single calls is meant, and no call waits for one
                 outcome = replace(judge(end.raw, self._wire), pause=False, delay_s=None)
-            record = self._record(call, outcome, end.raw, charged=end.unclear)
+            record = self._record(call, outcome)
             usd = record.cost_usd
             if end.raw is not None and end.raw.status != 200 and record.usage == Usage():
                 usd = 0.0  # no line that failed is charged
@@ -436,4 +429,4 @@ class LlmClient:
                 batch_id=end.batch_id,
             )
             call.singly = True
-            return await self._concluded(call, paid, outcome, end.raw, record, end.error)
+            return await self._concluded(call, paid, outcome, record, end.error)

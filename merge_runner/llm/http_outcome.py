@@ -153,7 +153,8 @@ class AttemptOutcome:
     ``accept`` it as the answer, ``retry`` after ``delay_s`` (all calls of the key wait where
     ``pause``), ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the
     endpoint ``refused`` the key or the model. ``name`` is its outcome in the calls table.
-    ``of_prompt`` says that a failure is of this prompt alone.
+    ``of_prompt`` says that a failure is of this prompt alone. Without a ``raw`` reply the attempt
+    may have been ``charged`` all the same.
     """
 
     action: Action
@@ -163,6 +164,8 @@ class AttemptOutcome:
     delay_s: float | None = None
     pause: bool = False
     of_prompt: bool = False
+    raw: RawReply | None = None
+    charged: bool = True
 
 
 def may_be_charged(raw: RawReply, provider: str | None) -> bool:
@@ -193,11 +196,11 @@ def _in_its_form(provider: str, raw: RawReply) -> bool:
 def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     """Classify a reply by the rules of docs/reference/providers.md."""
     if raw.status == 200:
-        return _judge_success(raw, wire)
+        return replace(_judge_success(raw, wire), raw=raw)
     outcome = judge_error(raw.error, wire)
     # The usage that an error states is billed.
     usage = wire.read(as_dict(raw.first)).usage
-    return replace(outcome, reading=replace(outcome.reading, usage=usage))
+    return replace(outcome, reading=replace(outcome.reading, usage=usage), raw=raw)
 
 
 def _judge_success(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
@@ -384,11 +387,9 @@ class Consequences:
     own_host: str | None
     first: FirstCall
 
-    def error(
-        self, call: Call, outcome: AttemptOutcome, raw: RawReply | None
-    ) -> MergeRunnerError | None:
+    def error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
-        if not self.first.passed and (stop := self._end_of_run(call, outcome, raw)):
+        if not self.first.passed and (stop := self._end_of_run(call, outcome)):
             return stop
         message = outcome.message or outcome.name
         delay_s = outcome.delay_s or 0.0
@@ -419,18 +420,16 @@ class Consequences:
         empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
         return TryAgain("empty answer") if empty <= EMPTY_RETRIES else None
 
-    def _end_of_run(
-        self, call: Call, outcome: AttemptOutcome, raw: RawReply | None
-    ) -> SweepStopped | None:
+    def _end_of_run(self, call: Call, outcome: AttemptOutcome) -> SweepStopped | None:
         """Return the error that ends a run whose other calls would fare no better."""
-        if raw is None:
+        if outcome.raw is None:
             # A server that is just starting is waited for, but only for seconds.
             waited_s = asyncio.get_running_loop().time() - call.began_s
             if outcome.name != "no_connection" or waited_s < NOBODY_S:
                 return None
             advice = if_nobody(self.name, self.entry)
             return ProviderDown(f"{self.driver}: {call.last_failure}: {advice}")
-        why = self._refusal(raw, outcome)
+        why = self._refusal(outcome.raw, outcome)
         if why is None:
             return None
         # An endpoint that has answered before may mean this prompt alone; several refusals mean the

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 FILE = "ledger.db"
 BUSY_S = 600.0
 TOLERANCE_USD = 1e-9  # sums of floats
-IN_FLIGHT = "in flight"
 Rows = list[tuple[Any, ...]]
 Query = Callable[..., Rows]
 TABLES = """
@@ -258,8 +257,9 @@ class Ledger:
             committed_usd = money.spending(self.scope, money.write).committed_usd
             if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
                 return False
-            place = (asked.driver, asked.slot, asked.honest_usd or usd, _now(), IN_FLIGHT)
-            money.write(_RESERVE, self.scope, key, number, usd, *place)
+            worst_usd, since = asked.honest_usd or usd, datetime.now(UTC)
+            place = (asked.driver, asked.slot, worst_usd, since.isoformat(timespec="milliseconds"))
+            money.write(_RESERVE, self.scope, key, number, usd, *place, "in flight")
         return True
 
     def aside_usd(self, key: str) -> float:
@@ -294,15 +294,12 @@ class Ledger:
         No other run may ask these drivers meanwhile.
         """
         money = self.cache.money
-        for key, number, driver in money.read(_IN_FLIGHT, self.scope):
+        rows = money.read(_IN_FLIGHT, self.scope)
+        for key, number, driver in (row for row in rows if row[2] in drivers):
             with contextlib.suppress(RecordingError):
                 entry = self.cache.get(key)
                 for attempt in entry.attempts if entry else self.cache.unanswered(key):
-                    if (
-                        driver in drivers
-                        and attempt.number == number
-                        and attempt.outcome != "unknown"
-                    ):
+                    if attempt.number == number and attempt.outcome != "unknown":
                         money.run_now([partial(self._settled, key, attempt, driver)])
 
     def rows(self) -> tuple[Rows, Rows]:
@@ -334,7 +331,3 @@ class Ledger:
         money = self.cache.money
         money.run_now([lambda: money.write("DELETE FROM open WHERE scope = ?", self.scope)])
         self.read()
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
