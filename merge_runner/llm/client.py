@@ -353,7 +353,10 @@ class LlmClient:
         error = error or self._consequences.error(call, outcome)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
-            return self._read(kept, call.earlier)  # another one where an import was first
+            if kept.attempts[-1] != record:  # an import was first
+                return self._read(kept, call.earlier)
+            text = outcome.reading.text
+            return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
         if isinstance(error, TryAgain) and error.pause_s is not None:
             self.limiter.pause(error.pause_s)
             until = datetime.now(UTC) + timedelta(seconds=error.pause_s)
