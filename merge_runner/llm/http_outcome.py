@@ -32,7 +32,6 @@ from merge_runner.llm.formats.base import (
     ServerError,
     WireFormat,
     as_dict,
-    is_answer,
     read_error,
 )
 from merge_runner.llm.formats.delays import server_delay_s
@@ -207,7 +206,8 @@ def _judge_success(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if not isinstance(raw.payload, dict):
         return AttemptOutcome("retry", "bad_body", "the body is not a JSON object")
     reading = wire.read(raw.payload)
-    if reading.outcome == "empty" and not is_answer(raw.payload, wire.members):
+    parts = [raw.payload.get(name) for name in wire.members]
+    if reading.outcome == "empty" and all(part in (None, [], {}) for part in parts):
         return AttemptOutcome("retry", "bad_body", "the body has nothing of an answer", reading)
     if reading.outcome != "error":
         return AttemptOutcome("accept", reading.outcome, reading=reading)
