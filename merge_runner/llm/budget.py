@@ -22,9 +22,9 @@ import asyncio
 import bisect
 import contextlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter
+from operator import itemgetter
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.cache import CachedCall
@@ -106,18 +106,6 @@ class PaidAttempt:
         self.budget.wake()
 
 
-@dataclass(slots=True, eq=False)
-class _Waiting:
-    """An entry of the priority queue, the lowest ``place`` first.
-
-    Attempts come before trials that wait to begin, and older trials, of a lower order, before
-    younger ones.
-    """
-
-    place: tuple[bool, int]
-    changed: asyncio.Event = field(default_factory=asyncio.Event)
-
-
 class Budget:
     """Spending under a cap in USD; without one nothing is refused, and all of it recorded.
 
@@ -138,7 +126,9 @@ class Budget:
         self._asked: set[str] = set()
         self._charged_usd: dict[int, float] = {}  # by trial that has begun, with reservations
         self._left: set[int] = set()
-        self._queue: list[_Waiting] = []
+        # The lowest place first: attempts come before trials that wait to begin, and older trials,
+        # of a lower order, before younger ones.
+        self._queue: list[tuple[tuple[bool, int], asyncio.Event]] = []
 
     async def admit(self, trial: int) -> None:
         """Wait until a trial may begin; raises TrialSuspended when no trial's end can let it."""
@@ -190,8 +180,8 @@ class Budget:
 
     def wake(self) -> None:
         """Let the first in the queue see whether it may go on by now."""
-        for waiting in self._queue[:1]:
-            waiting.changed.set()
+        for _, changed in self._queue[:1]:
+            changed.set()
 
     def _begins(self, trial: int) -> bool:
         """Begin a trial if there is money for it beside all that have begun."""
@@ -238,17 +228,17 @@ class Budget:
 
     async def _in_turn(self, place: tuple[bool, int], may_go: Callable[[float], bool]) -> None:
         """Wait in the queue until ``may_go``, which is told for how many s this waits, is True."""
-        own, loop = _Waiting(place), asyncio.get_running_loop()
-        began_s = loop.time()
-        bisect.insort(self._queue, own, key=attrgetter("place"))
+        changed, loop = asyncio.Event(), asyncio.get_running_loop()
+        own, began_s = (place, changed), loop.time()
+        bisect.insort(self._queue, own, key=itemgetter(0))
         try:
             while self._queue[0] is not own or not may_go(loop.time() - began_s):
-                own.changed.clear()
+                changed.clear()
                 # For ever it could be that an older trial waits for a call of ours, or that the run
                 # of another model, which spends under the same cap, frees money.
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(PATIENCE_S):
-                        await own.changed.wait()
+                        await changed.wait()
         finally:
             self._queue.remove(own)
             self.wake()
