@@ -1,8 +1,8 @@
 """A cap on what a sweep spends, over all its runs, that holds whatever happens.
 
 The worst case of an attempt is reserved when it queues for its turn, and durably, in the ledger,
-right before it is sent. ``async with budget.attempt(...)`` surrounds all that; PaidAttempt says
-where the money goes when the attempt ends, however it ends.
+right before it is sent. PaidAttempt says where the money goes when the attempt ends, however it
+ends.
 
 So that money finishes trials instead of beginning ever more of them, a trial begins only where what
 it is expected to cost (trial_costs.py) fits beside what the trials that have begun are still
@@ -21,13 +21,13 @@ from __future__ import annotations
 import asyncio
 import bisect
 import contextlib
-from collections.abc import AsyncIterator, Callable, Iterable, Sequence
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 
 from merge_runner.errors import TrialSuspended
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger, Spending
 from merge_runner.llm.trial_costs import TrialCosts
 from merge_runner.records import Attempt
@@ -35,12 +35,11 @@ from merge_runner.records import Attempt
 # An older trial that has money kept for it may wait for a call of a younger one, which waits for
 # money: after this long, with nothing in flight, it is no longer counted on.
 PATIENCE_S = 90.0
-NOTHING_EXPECTED = TrialCosts(str, {}, {})
 
 
 @dataclass(slots=True)
 class PaidAttempt:
-    """The money of one attempt, from its reservation to the end of the attempt.
+    """The money of one attempt, from its reservation to ``close``, the end of the attempt.
 
     ``aside_usd`` is reserved in this process, and from ``begin`` on in the ledger. An attempt that
     ends
@@ -58,7 +57,7 @@ class PaidAttempt:
     trial: int
     key: str
     asked: Asked
-    aside_usd: float = 0.0
+    aside_usd: float
     queued: bool = True
     cost_usd: float | None = None
 
@@ -72,9 +71,7 @@ class PaidAttempt:
     def set_aside(self, attempts: Sequence[Attempt]) -> bool:
         """Do the durable part of ``begin`` in this thread; False if the cap is used up."""
         number, cap_usd = len(attempts) + 1, self.budget.cap_usd
-        return not self.ledger.scope or self.ledger.reserve(
-            self.key, number, self.aside_usd, cap_usd, self.asked
-        )
+        return self.ledger.reserve(self.key, number, self.aside_usd, cap_usd, self.asked)
 
     def begun(self) -> None:
         """Count the reservation no longer here: ``set_aside`` has made it durable."""
@@ -83,28 +80,30 @@ class PaidAttempt:
 
     async def settle(self, attempts: Sequence[Attempt]) -> None:
         """Settle the attempt, the last of these, which brought no answer."""
-        await self.ledger.settle(self.key, attempts, self.asked)
-        self.cost_usd = attempts[-1].cost_usd
+        await self.ledger.cache.put_unanswered(self.key, tuple(attempts))
+        await self._pay(attempts[-1])
 
     async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer that the attempt brought, then settle what it cost."""
-        kept = await self.ledger.keep(entry, self.asked)
-        self.cost_usd = entry.attempts[-1].cost_usd
+        kept = await self.ledger.cache.put(entry)
+        await self._pay(entry.attempts[-1])
         if self.cost_usd is not None:
-            self.budget.costs.learn(self.asked.model, self.cost_usd)
+            self.budget.costs.answers[self.asked.model].add(self.cost_usd)
         return kept
 
+    async def _pay(self, attempt: Attempt) -> None:
+        await self.ledger.settle(self.key, attempt, self.asked.driver)
+        self.cost_usd = attempt.cost_usd
+
     def close(self) -> None:
-        """End the attempt."""
-        self.budget.end(self)
-
-
-@dataclass(slots=True, eq=False)
-class _Waiting:
-    """An entry of a priority queue; the oldest trial, with the lowest order, comes first."""
-
-    trial: int
-    changed: asyncio.Event = field(default_factory=asyncio.Event)
+        """Give back what the attempt, which has ended, did not spend."""
+        self.budget.in_flight -= 1
+        if self.queued:
+            self.budget.queued_usd -= self.aside_usd
+            self.budget.charge(self.trial, -self.aside_usd)
+        elif self.cost_usd is not None:
+            self.budget.charge(self.trial, self.cost_usd - self.aside_usd)
+        self.budget.wake()
 
 
 class Budget:
@@ -115,14 +114,11 @@ class Budget:
     """
 
     def __init__(
-        self,
-        ledger: Ledger,
-        cap_usd: float | None = None,
-        costs: TrialCosts = NOTHING_EXPECTED,
+        self, ledger: Ledger, cap_usd: float | None = None, costs: TrialCosts | None = None
     ) -> None:
         self.ledger = ledger
         self.cap_usd = cap_usd
-        self.costs = costs
+        self.costs = costs or TrialCosts(lambda _: {})
         self.in_flight = 0
         self.queued_usd = 0.0
         self._largest_usd = 0.0
@@ -130,16 +126,14 @@ class Budget:
         self._asked: set[str] = set()
         self._charged_usd: dict[int, float] = {}  # by trial that has begun, with reservations
         self._left: set[int] = set()
-        self._trials: list[_Waiting] = []
-        self._attempts: list[_Waiting] = []
+        # The lowest place first: attempts come before trials that wait to begin, and older trials,
+        # of a lower order, before younger ones.
+        self._queue: list[tuple[tuple[bool, int], asyncio.Event]] = []
 
     async def admit(self, trial: int) -> None:
         """Wait until a trial may begin; raises TrialSuspended when no trial's end can let it."""
-        if self.cap_usd is None or trial in self._charged_usd:
-            return
-        if trial in self._left:
-            raise TrialSuspended("its trial is suspended")
-        await self._in_queue(self._trials, trial, lambda first, _: self._begins(trial, first))
+        if self.cap_usd is not None and trial not in self._charged_usd:
+            await self._in_turn((True, trial), lambda _: self._begins(trial))
 
     def begin_anew(self, trial: int) -> None:
         """Admit a trial at once: it goes on where an earlier run has asked for it."""
@@ -150,66 +144,55 @@ class Budget:
         """Free the money of a trial that has ended or is suspended."""
         self._left.add(trial)
         if self._charged_usd.pop(trial, None) is not None:
-            self._wake()
-
-    @asynccontextmanager
-    async def attempt(self, trial: int, key: str, asked: Asked) -> AsyncIterator[PaidAttempt]:
-        """Yield the money of one attempt; waits for it as ``set_aside`` does."""
-        paid = await self.set_aside(trial, key, asked)
-        try:
-            yield paid
-        finally:
-            paid.close()
+            self.wake()
 
     async def set_aside(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
         """Reserve an attempt's worst case, more where its server ignores the output cap.
 
         Waits while other attempts or older trials may free money, then raises TrialSuspended. The
-        caller closes what is returned; ``attempt`` does so by itself.
+        caller closes what is returned.
         """
-        paid = PaidAttempt(self, self.ledger, trial, key, asked)
-        if self.cap_usd is None:
-            self._take(paid, self._worst_usd(asked))
-        else:
-            await self._in_queue(
-                self._attempts, trial, lambda first, waited_s: first and self._taken(paid, waited_s)
-            )
-        return paid
+        if self.cap_usd is not None:
+            await self._in_turn((False, trial), partial(self._pays, trial, asked))
+        usd = self._worst_usd(asked)
+        self.in_flight += 1
+        self.queued_usd += usd
+        self._largest_usd = max(self._largest_usd, usd)
+        self._asked.add(asked.model)
+        self.charge(trial, usd)
+        return PaidAttempt(self, self.ledger, trial, key, asked, usd)
 
-    @asynccontextmanager
-    async def going_on(
-        self, trial: int, key: str, asked: Asked, scope: str
-    ) -> AsyncIterator[PaidAttempt]:
-        """Yield the money of an attempt that an earlier run has begun under a ledger's name."""
+    def going_on(self, trial: int, key: str, asked: Asked, scope: str) -> PaidAttempt:
+        """Return the money of an attempt that an earlier run has begun under a ledger's name.
+
+        The caller closes it.
+        """
         ledger = Ledger(self.ledger.cache, scope) if self.ledger.scope else self.ledger
         paid = PaidAttempt(self, ledger, trial, key, asked, ledger.aside_usd(key), queued=False)
         self.in_flight += 1
-        self._charge(trial, paid.aside_usd)
-        try:
-            yield paid
-        finally:
-            paid.close()
+        self.charge(trial, paid.aside_usd)
+        return paid
 
-    def end(self, paid: PaidAttempt) -> None:
-        """Give back what an attempt that has ended did not spend."""
-        self.in_flight -= 1
-        if paid.queued:
-            self.queued_usd -= paid.aside_usd
-            self._charge(paid.trial, -paid.aside_usd)
-        elif paid.cost_usd is not None:
-            self._charge(paid.trial, paid.cost_usd - paid.aside_usd)
-        self._wake()
+    def charge(self, trial: int, usd: float) -> None:
+        """Count what a trial that has begun spends or sets aside, or gives back."""
+        if trial in self._charged_usd:
+            self._charged_usd[trial] += usd
 
-    def _begins(self, trial: int, first: bool) -> bool:
+    def wake(self) -> None:
+        """Let the first in the queue see whether it may go on by now."""
+        for _, changed in self._queue[:1]:
+            changed.set()
+
+    def _begins(self, trial: int) -> bool:
         """Begin a trial if there is money for it beside all that have begun."""
+        if trial in self._left:
+            raise TrialSuspended("its trial is suspended")
         if trial in self._charged_usd:  # its other driver stood in the queue, too
             return True
-        if not first:
-            return False
         needed_usd, spending = self.costs.usd(trial), self.ledger.read()
         left_usd = self._left_usd(spending) - needed_usd + TOLERANCE_USD
         if left_usd < 0 and not self._charged_usd and not self.in_flight:
-            if self._spent_before or not self._asked.isdisjoint(self.costs.models(trial)):
+            if self._spent_before or not self._asked.isdisjoint(self.costs.calls(trial)):
                 raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD", spending)
             # The first one of a model shows what a trial costs; each attempt must still fit.
         elif left_usd < self._needed_usd(self._charged_usd):
@@ -217,33 +200,19 @@ class Budget:
         self._charged_usd[trial] = 0.0
         return True
 
-    def _taken(self, paid: PaidAttempt, waited_s: float) -> bool:
-        """Take the money for an attempt if there is any."""
-        worst_usd, spending = self._worst_usd(paid.asked), self.ledger.read()
+    def _pays(self, trial: int, asked: Asked, waited_s: float) -> bool:
+        """Return whether there is money for an attempt."""
+        spending = self.ledger.read()
+        worst_usd = self._worst_usd(asked)
         left_usd = self._left_usd(spending) - worst_usd + TOLERANCE_USD
         if left_usd < 0 and not self.in_flight:
             raise self._suspended(f"the next call may cost {worst_usd:.4f} USD", spending)
         counted_on = self.in_flight or waited_s < PATIENCE_S
-        older = (trial for trial in self._charged_usd if trial < paid.trial and counted_on)
+        older = (each for each in self._charged_usd if each < trial and counted_on)
         # A server that ignores the output cap is known only by its first expensive reply, when the
         # others are sent already: all in flight may cost twice as much.
         twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
-        if left_usd < max(self._needed_usd(older), twice_usd if self.in_flight else 0.0):
-            return False
-        self._take(paid, worst_usd)
-        return True
-
-    def _take(self, paid: PaidAttempt, usd: float) -> None:
-        self.in_flight += 1
-        self.queued_usd += usd
-        self._largest_usd = max(self._largest_usd, usd)
-        self._asked.add(paid.asked.model)
-        paid.aside_usd = usd
-        self._charge(paid.trial, usd)
-
-    def _charge(self, trial: int, usd: float) -> None:
-        if trial in self._charged_usd:
-            self._charged_usd[trial] += usd
+        return left_usd >= max(self._needed_usd(older), twice_usd if self.in_flight else 0.0)
 
     def _worst_usd(self, asked: Asked) -> float:
         """Return the worst case, scaled by this driver's largest observed cost overrun."""
@@ -257,55 +226,33 @@ class Budget:
         """Return what these begun trials are still expected to cost."""
         return sum(max(0.0, self.costs.usd(each) - self._charged_usd[each]) for each in trials)
 
-    async def _in_queue(
-        self, queue: list[_Waiting], trial: int, serve: Callable[[bool, float], bool]
-    ) -> None:
-        """Wait until ``serve`` says True.
-
-        It is told whether this trial is the first in the queue, and how long it has waited, in s.
-        """
-        own, loop = _Waiting(trial), asyncio.get_running_loop()
-        began_s = loop.time()
-        bisect.insort(queue, own, key=lambda waiting: waiting.trial)
+    async def _in_turn(self, place: tuple[bool, int], may_go: Callable[[float], bool]) -> None:
+        """Wait in the queue until ``may_go``, which is told for how many s this waits, is True."""
+        changed, loop = asyncio.Event(), asyncio.get_running_loop()
+        own, began_s = (place, changed), loop.time()
+        bisect.insort(self._queue, own, key=itemgetter(0))
         try:
-            while not serve(queue[0] is own, loop.time() - began_s):
-                own.changed.clear()
+            while self._queue[0] is not own or not may_go(loop.time() - began_s):
+                changed.clear()
                 # For ever it could be that an older trial waits for a call of ours, or that the run
                 # of another model, which spends under the same cap, frees money.
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(PATIENCE_S):
-                        await own.changed.wait()
+                        await changed.wait()
         finally:
-            queue.remove(own)
-            self._wake()
-
-    def _wake(self) -> None:
-        """Wake those who are first in their queues, or may go on anyway."""
-        for waiting in (*self._trials[:1], *self._attempts[:1]):
-            waiting.changed.set()
-        for waiting in self._trials:
-            if waiting.trial in self._charged_usd:
-                waiting.changed.set()
+            self._queue.remove(own)
+            self.wake()
 
     def _suspended(self, what: str, spending: Spending) -> TrialSuspended:
         reserved_usd = spending.reserved_usd + self.queued_usd
         kept_usd = self._needed_usd(self._charged_usd)
+        set_aside = (
+            f", {reserved_usd:.4f} set aside for {spending.open_attempts} attempts whose cost is "
+            "not known: `merge-runner ledger`"
+        )
+        kept = f"; {kept_usd:.4f} more are kept for the trials that have begun"
         return TrialSuspended(
             f"{what}, and {spending.spent_usd + reserved_usd:.4f} of {self.cap_usd:g} USD are "
             f"spent or set aside ({spending.spent_usd:.4f} spent"
-            + (
-                f", {reserved_usd:.4f} set aside for {spending.open_attempts} attempts whose cost "
-                "is not known: `merge-runner ledger`"
-                if reserved_usd > TOLERANCE_USD
-                else ""
-            )
-            + ")"
-            + (f"; {kept_usd:.4f} more are kept for the trials that have begun" if kept_usd else "")
+            f"{set_aside if reserved_usd > TOLERANCE_USD else ''}){kept if kept_usd else ''}"
         )
-
-
-class Unpaid(Budget):
-    """The budget of a model that costs nothing: only replies and attempts are kept."""
-
-    def __init__(self, cache: ResponseCache) -> None:
-        super().__init__(Ledger(cache, ""))  # no money is asked of it

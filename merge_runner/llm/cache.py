@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import operator
 import os
 import sqlite3
 import tempfile
@@ -99,22 +100,9 @@ class _Stored:
 _STORED: TypeAdapter[_Stored] = TypeAdapter(_Stored)
 
 
-@dataclass(frozen=True, slots=True)
-class KnownCall:
-    """The record of a call: its entry, or the attempts of earlier runs.
-
-    ``damaged`` names what was found damaged and is in quarantine now.
-    """
-
-    entry: CachedCall | None
-    attempts: tuple[Attempt, ...]
-    damaged: tuple[str, ...] = ()
-
-
 class ResponseCache:
     """The cache folder. Reads are direct; writes are batched in a thread and awaited.
 
-    Whoever makes a call has claimed it, so that no other trial or worker of its run makes it too.
     ``locks`` keep other live runs from asking the same model; ``money`` is the ledger's file.
     """
 
@@ -133,7 +121,6 @@ class ResponseCache:
         self.folder = folder
         self.locks = ModelLocks(folder)
         self.money = LedgerFile(folder)
-        self._claimed: set[str] = set()
         self._read_overlay = overlay
         self._disk = TextDisk(str(folder))
         self._texts: diskcache.Cache | None = None
@@ -175,25 +162,6 @@ class ResponseCache:
         """Return the entry of a call key; raises RecordingError where it is damaged or made up."""
         return self._overlay.get(key) or self._kept(key)
 
-    async def claim(self, key: str) -> KnownCall | None:
-        """Claim a call and learn what is recorded of it; None while another one holds it.
-
-        What is damaged goes to quarantine.
-        """
-        if key in self._claimed:
-            return None
-        try:
-            known = KnownCall(self.get(key), self.unanswered(key))
-        except RecordingError:
-            damaged = tuple(self.set_damage_aside(key))
-            known = KnownCall(self.get(key), self.unanswered(key), damaged)
-        self._claimed.add(key)  # what cannot be read is not claimed
-        return known
-
-    def release(self, key: str) -> None:
-        """Give a claim up."""
-        self._claimed.discard(key)
-
     async def put(self, entry: CachedCall) -> CachedCall:
         """Keep an entry; returns the one that is kept when it is durable.
 
@@ -208,28 +176,29 @@ class ResponseCache:
         entries = list(entries)
         for entry in entries:
             self.set_damage_aside(entry.request.key)
-        kept = self.run_now([partial(self._keep, entry) for entry in entries])
-        return [each for each in kept if each is not None]
+        return self.run_now([partial(self._keep, entry) for entry in entries])
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
         """Keep the entries that the cache lacks; returns (added, already there)."""
-        added = there = 0
+        added = seen = 0
         waiting = iter(entries)
         while batch := list(islice(waiting, BATCH)):
-            new = [entry for entry in batch if not self._holds(entry.request.key)]
-            self.put_now(new)
-            added += len(new)
-            there += len(batch) - len(new)
-        return added, there
+            added += sum(map(operator.is_, self.put_now(batch), batch))
+            seen += len(batch)
+        return added, seen - added
 
     def set_damage_aside(self, key: str) -> list[str]:
         """Move a damaged entry, or list of attempts, to quarantine, byte for byte.
 
         Returns the names of what was moved.
         """
-        checks = {key: self._kept, _UNANSWERED + key: self._tried}
-        damaged = [name for name, check in checks.items() if _is_damaged(check, key)]
-        for name in damaged:
+        damaged = []
+        for name, check in ((key, self._kept), (_UNANSWERED + key, self._tried)):
+            try:
+                check(key)
+                continue
+            except RecordingError:
+                damaged.append(name)
             taken, free, number = set(self.names(_DAMAGED + name)), _DAMAGED + name, 2
             while free in taken:
                 free, number = f"{_DAMAGED}{name} {number}", number + 1
@@ -308,24 +277,15 @@ class ResponseCache:
         yield from self._own_entries([] if left_out is None else left_out)
         yield from self._overlay.values()
 
-    def recorded_endpoints(self, model: str) -> Iterator[str]:
-        """Yield the endpoints of a model's replies: the recording's, else the folder's."""
-        found = set[str]()
+    def recorded(self, fits: Callable[[ChatRequest], bool]) -> Iterator[ChatRequest]:
+        """Yield the requests that fit and have a reply: the recording's, else the folder's."""
         for entries in (self._overlay.values(), self._own_entries([])):
-            for request in (entry.request for entry in entries):
-                if request.model == model and request.endpoint not in found:
-                    found.add(request.endpoint)
-                    yield request.endpoint
+            found = False
+            for request in filter(fits, (each.request for each in entries)):
+                found = True
+                yield request
             if found:
                 return
-
-    def recorded_models(self, provider: str) -> list[str]:
-        """Return the models of a provider that have replied: the recording's, else the folder's."""
-        for entries in (self._overlay.values(), self._own_entries([])):
-            requests = (entry.request for entry in entries)
-            if models := {r.model for r in requests if r.provider == provider}:
-                return sorted(models)
-        return []
 
     def close(self) -> None:
         """Close the folder, and free its locks."""
@@ -350,12 +310,6 @@ class ResponseCache:
         with contextlib.suppress(RecordingError):
             return self._kept(key)
         return None
-
-    def _holds(self, key: str) -> bool:
-        try:
-            return self.get(key) is not None
-        except RecordingError:
-            return False  # a damaged one goes to quarantine when another is kept in its place
 
     def _kept(self, key: str) -> CachedCall | None:
         text = self._text(key)
@@ -484,11 +438,3 @@ def _checked(text: str) -> str:
     if text != _behind_checksum(content):
         raise RecordingError("the recorded reply is damaged: its checksum is wrong")
     return content
-
-
-def _is_damaged(check: Callable[[str], object], key: str) -> bool:
-    try:
-        check(key)
-    except RecordingError:
-        return True
-    return False

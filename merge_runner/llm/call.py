@@ -66,15 +66,6 @@ class Call:
         return last.error or last.outcome
 
     @contextmanager
-    def asked_by_one(self) -> Iterator[None]:
-        """Count one more who waits for the answer while this lasts."""
-        self.asking += 1
-        try:
-            yield
-        finally:
-            self.asking -= 1
-
-    @contextmanager
     def waiting(
         self, what: str, until: datetime | None = None, *, idle: bool = False
     ) -> Iterator[Wait]:

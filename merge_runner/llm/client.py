@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from contextlib import AsyncExitStack
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from merge_runner.config import ModelEntry, driver_name, is_own_host
 from merge_runner.errors import (
     CallFailed,
+    MergeRunnerError,
     ModelSwapped,
     ProviderDown,
     RecordingError,
@@ -23,7 +24,7 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.batch.lines import Batches
-from merge_runner.llm.budget import Budget, PaidAttempt, Unpaid
+from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Call, Wait, slot_text
 from merge_runner.llm.content_hashes import make_request
@@ -38,11 +39,12 @@ from merge_runner.llm.http_outcome import (
     RawReply,
     RequestFailed,
     TransportFailure,
+    TryAgain,
     is_web_page,
     judge,
     may_be_charged,
 )
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import cost_usd
@@ -62,8 +64,6 @@ from merge_runner.served_model import own_names
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
 
-# Beside a call that takes seconds this delay is nothing.
-CLAIM_POLL_S = 0.1
 # A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
 
@@ -72,14 +72,16 @@ LONG_WAIT_S = 5.0
 class LlmClient:
     """Answers prompts of one model.
 
-    ``endpoint`` is the identity that enters the keys. A call that is under way is shared by all
-    who ask for the same key, and goes on when they are cancelled, so that what is paid for is
-    kept; ``drain`` waits for it. ``budget`` is None for a model that costs nothing. ``first`` is
-    the run's first call to the endpoint, which goes alone. ``sealed`` says that nothing may be
-    asked anew, so that there is no ``transport``; ``strict`` that an answer of another model stops
-    the sweep. ``model`` is its name in the registry where ``name`` also tells its parameters.
-    ``batches`` are those in which it may be asked, or where its calls may wait already. ``driver``
-    is its name, with the endpoint where that is not the provider's own.
+    ``endpoint`` is the identity that enters the keys. ``budget`` is None for a model that costs
+    nothing. ``first`` is the run's first call to the endpoint, which goes alone. ``sealed`` says
+    that nothing may be asked anew, so that there is no ``transport``; ``strict`` that an answer of
+    another model stops the sweep. ``model`` is its name in the registry where ``name`` also tells
+    its parameters. ``batches`` are those in which it may be asked, or where its calls may wait
+    already. ``driver`` is its name, with the endpoint where that is not the provider's own.
+
+    ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
+    its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
+    for it.
     """
 
     name: str
@@ -94,13 +96,13 @@ class LlmClient:
     model: str = ""
     first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
     batches: Batches | None = None
+    under_way: dict[str, Call] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter)
     driver: str = field(init=False)
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
     _money: Budget = field(init=False)
     _consequences: Consequences = field(init=False)
-    _calls: dict[str, Call] = field(default_factory=dict)
     _stopping: bool = False
 
     def __post_init__(self) -> None:
@@ -108,7 +110,7 @@ class LlmClient:
         self.driver = driver_name(self.name, self.endpoint)
         self._wire = FORMATS[self.entry.format]
         self._own_names = own_names(self.entry.id, self.entry.aliases)
-        self._money = self.budget or Unpaid(self.cache)
+        self._money = self.budget or Budget(Ledger(self.cache, ""))  # a ledger that keeps nothing
         provider = self.entry.provider
         self._consequences = Consequences(
             self.name,
@@ -139,11 +141,14 @@ class LlmClient:
             raise ReplayMiss("no recorded reply", request)
         if reply is None:
             # The attempts are counted once, for whoever asked first.
-            shared = request.key in self._calls
-            call = self._calls[request.key] if shared else self._start(request, order)
-            with call.asked_by_one():
+            shared = request.key in self.under_way
+            call = self.under_way[request.key] if shared else self._start(request, order)
+            call.asking += 1
+            try:
                 # Shielded: the call may be paid for already when its trial is cancelled.
                 reply = await asyncio.shield(call.task)
+            finally:
+                call.asking -= 1
             if shared:
                 reply = replace(reply, earlier=len(reply.attempts))
         self._count(reply)
@@ -160,9 +165,10 @@ class LlmClient:
     async def drain(self) -> None:
         """Let attempts in flight end and be saved, and give up calls that wait for one."""
         self._stopping = True
-        for call in self._calls.values():
+        calls = self._calls
+        for call in calls:
             call.stop()
-        tasks = [call.task for call in self._calls.values()]
+        tasks = [call.task for call in calls]
         await asyncio.gather(*tasks, return_exceptions=True)
 
     def leave(self, order: int) -> None:
@@ -172,18 +178,23 @@ class LlmClient:
     @property
     def in_flight_calls(self) -> int:
         """Number of calls in flight or being saved."""
-        return sum(call.wait is None for call in self._calls.values())
+        return sum(call.wait is None for call in self._calls)
 
     @property
     def waits(self) -> list[Wait]:
         """The waits of all other calls."""
-        return [call.wait for call in self._calls.values() if call.wait is not None]
+        return [call.wait for call in self._calls if call.wait is not None]
 
     @property
     def idle_askers(self) -> int:
         """Number of trials that wait for calls that are blocked on another call."""
-        calls = self._calls.values()
+        calls = self._calls
         return sum(call.asking for call in calls if call.wait is not None and call.wait.idle)
+
+    @property
+    def _calls(self) -> list[Call]:
+        """The calls of this client that are under way."""
+        return [call for call in self.under_way.values() if call.asked.driver == self.driver]
 
     def _known(self, request: ChatRequest) -> ChatReply | None:
         """Return the recorded reply; a damaged one is None, and in a replay raises CallFailed."""
@@ -220,10 +231,10 @@ class LlmClient:
         asked = Asked(self.driver, slot_text(request.slot), worst_usd, self.model or self.name)
         call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._call(call))
-        self._calls[request.key] = call
+        self.under_way[request.key] = call
 
         def forget(done: asyncio.Task[ChatReply]) -> None:
-            del self._calls[request.key]
+            del self.under_way[request.key]
             if not done.cancelled():
                 done.exception()  # retrieved, since all who asked may be gone by now
 
@@ -232,47 +243,38 @@ class LlmClient:
 
     async def _call(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
-        # Both before the claim: else another worker would wait for a call that waits here.
         opened = self.batches is not None and self.batches.takes_up(call)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
-        alone, stopped = False, False
+        alone = False
         if not self.first.passed and not opened:  # nobody waits for an answer that may take hours
             with call.waiting(f"for the first answer of {self.driver}"):
                 alone = await self.first.turn()
         try:
-            return await self._claimed(call)
+            self._resume(call)
+            return await self._attempts(call)
         except SweepStopped:
-            stopped = True  # the next call would only be refused in the same way
+            alone = False  # the next call would only be refused in the same way
             raise
         finally:
-            if alone and not stopped:
+            if alone:
                 self.first.give_turn()
 
-    async def _claimed(self, call: Call) -> ChatReply:
-        """Claim a call, and make it unless it is recorded by now."""
+    def _resume(self, call: Call) -> None:
+        """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
         key = call.request.key
-        while (known := await self.cache.claim(key)) is None:
-            with call.waiting("for the same call, which is being made already", idle=True):
-                await asyncio.sleep(CLAIM_POLL_S)
-        try:
-            for name in known.damaged:
-                self.meter.damaged.append(name)
-                self.meter.notes.append(
-                    f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set "
-                    f"aside in the cache as 'damaged {name}', and asked again"
-                )
-            if known.entry:  # whoever held the claim before has made the call
-                return self._read(known.entry, len(known.entry.attempts))
-            call.attempts = list(known.attempts)
-            if self.batches is not None:
-                call.open = self.batches.rounds.open_line(key, known.attempts)
-            if call.open is not None:  # the attempt that has begun there is the one that goes on
-                call.attempts = [each for each in call.attempts if each.number < call.open.attempt]
-            call.earlier = len(call.attempts)
-            return await self._attempts(call)
-        finally:
-            self.cache.release(key)
+        for name in self.cache.set_damage_aside(key):
+            self.meter.damaged.append(name)
+            self.meter.notes.append(
+                f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set aside "
+                f"in the cache as 'damaged {name}', and asked again"
+            )
+        earlier = self.cache.unanswered(key)
+        if self.batches is not None:
+            call.open = self.batches.rounds.open_line(key, earlier)
+        opened = call.open  # the attempt that has begun there is the one that goes on
+        call.attempts = [each for each in earlier if not opened or each.number < opened.attempt]
+        call.earlier = len(call.attempts)
 
     async def _attempts(self, call: Call) -> ChatReply:
         """Make attempts until one brings an answer, which is kept together with all of them."""
@@ -301,13 +303,12 @@ class LlmClient:
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; return its answer, which is kept, or raise what follows from it."""
-        if self.batches is not None and (call.open or self._goes_in_batch(call)):
-            return await self._attempt_in_batch(call, self.batches)
-        async with AsyncExitStack() as stack:
-            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid: PaidAttempt = await stack.enter_async_context(
-                    self._money.attempt(call.order, call.request.key, call.asked)
-                )
+        batches = self.batches
+        if batches and (call.open or (batches.rounds.submits and not call.singly)):
+            return await self._attempt_in_batch(call, batches)
+        with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
+            paid = await self._money.set_aside(call.order, call.request.key, call.asked)
+        with closing(paid):
             # A turn must be used as soon as it is given, or the limits do not hold.
             with call.waiting("for a turn under the rate limits"):
                 # As a provider counts when it admits a request: its text, of which about four bytes
@@ -317,55 +318,51 @@ class LlmClient:
             await paid.begin(call.attempts)
             started_at, started = datetime.now(UTC), time.perf_counter()
             with deadline.attempt() as seconds_left:
-                outcome, raw, record = await self._send(call, seconds_left)
+                outcome = await self._send(call, seconds_left)
             record = replace(
-                record,
+                self._record(call, outcome),
                 started_at=started_at.isoformat(timespec="milliseconds"),
                 latency_s=round(time.perf_counter() - started, 4),
             )
             if record.usage.output_tokens is not None:
                 settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
-            return await self._concluded(call, paid, outcome, raw, record)
+            return await self._concluded(call, paid, outcome, record)
 
-    async def _send(
-        self, call: Call, seconds_left: float
-    ) -> tuple[AttemptOutcome, RawReply | None, Attempt]:
-        """Send the request once; return its outcome, the reply, and the attempt for the record."""
+    async def _send(self, call: Call, seconds_left: float) -> AttemptOutcome:
+        """Send the request once."""
         assert self.transport is not None, "a sealed client asks nothing"
         number, timeout_s = len(call.attempts) + 1, min(self.entry.timeout_s, seconds_left)
         try:
             raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
         except TransportFailure as exc:
-            outcome = AttemptOutcome(exc.action, exc.outcome, str(exc))
-            return outcome, None, self._record(call, outcome, None, charged=exc.sent)
-        outcome = judge(raw, self._wire)
-        return outcome, raw, self._record(call, outcome, raw)
+            return AttemptOutcome(exc.action, exc.outcome, str(exc), charged=exc.sent)
+        return judge(raw, self._wire)
 
     async def _concluded(
         self,
         call: Call,
         paid: PaidAttempt,
         outcome: AttemptOutcome,
-        raw: RawReply | None,
         record: Attempt,
+        error: MergeRunnerError | None = None,
     ) -> ChatReply:
         """Keep an attempt and return its answer, or raise why there is none."""
         call.attempts.append(record)
         self.meter.count_attempt(record)
         self._tell_overrun(call, paid.aside_usd)
-        error = self._consequences.error(call, outcome, raw)
+        error = error or self._consequences.error(call, outcome)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
             if kept.attempts[-1] != record:  # an import was first
                 return self._read(kept, call.earlier)
             text = outcome.reading.text
             return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
-        if (pause_s := self._consequences.pause_s(call, outcome)) is not None:
-            self.limiter.pause(pause_s)
-            until = datetime.now(UTC) + timedelta(seconds=pause_s)
+        if isinstance(error, TryAgain) and error.pause_s is not None:
+            self.limiter.pause(error.pause_s)
+            until = datetime.now(UTC) + timedelta(seconds=error.pause_s)
             self.meter.notes.append(
-                f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
-                f"{outcome.message or outcome.name}"
+                f"{self.driver}: all its calls wait {error.pause_s:.1f} s, until "
+                f"{until:%H:%M:%S} UTC: {error}"
             )
         await paid.settle(call.attempts)  # before the error, which may end the whole run
         raise error
@@ -381,13 +378,11 @@ class LlmClient:
             f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
         )
 
-    def _record(
-        self, call: Call, outcome: AttemptOutcome, raw: RawReply | None, *, charged: bool = True
-    ) -> Attempt:
-        """Return an attempt as it is recorded; without a reply it may have been ``charged``."""
-        number = len(call.attempts) + 1
+    def _record(self, call: Call, outcome: AttemptOutcome) -> Attempt:
+        """Return an attempt as it is recorded."""
+        number, raw = len(call.attempts) + 1, outcome.raw
         if raw is None:
-            cost = None if charged and self.entry.price != "free" else 0.0
+            cost = None if outcome.charged and self.entry.price != "free" else 0.0
             return Attempt(number, outcome.name, error=outcome.message, cost_usd=cost)
         return Attempt(
             number=number,
@@ -417,20 +412,16 @@ class LlmClient:
         charged = may_be_charged(raw, self._consequences.own_host) and not stray
         return None if charged else 0.0
 
-    def _goes_in_batch(self, call: Call) -> bool:
-        """Return whether the next attempt at a call goes with the next round."""
-        return self.batches is not None and self.batches.rounds.submits and not call.singly
-
     async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""
         opened, call.open = call.open, None
         async with batches.attempt(call, opened) as (paid, line):
             with call.waiting(f"for batches of {batches.model}", idle=True):
                 end = await batches.rounds.ask(line)
-            outcome = AttemptOutcome("retry", end.outcome, end.message)
+            outcome = AttemptOutcome("retry", end.outcome, end.message, charged=end.unclear)
             if end.raw is not None:  # no limit of single calls is meant, and no call waits for one
                 outcome = replace(judge(end.raw, self._wire), pause=False, delay_s=None)
-            record = self._record(call, outcome, end.raw, charged=end.unclear)
+            record = self._record(call, outcome)
             usd = record.cost_usd
             if end.raw is not None and end.raw.status != 200 and record.usage == Usage():
                 usd = 0.0  # no line that failed is charged
@@ -441,9 +432,4 @@ class LlmClient:
                 batch_id=end.batch_id,
             )
             call.singly = True
-            if end.error is None:
-                return await self._concluded(call, paid, outcome, end.raw, record)
-            call.attempts.append(record)
-            self.meter.count_attempt(record)
-            await paid.settle(call.attempts)
-            raise end.error
+            return await self._concluded(call, paid, outcome, record, end.error)

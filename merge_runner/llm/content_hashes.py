@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from functools import cache
 
 from pydantic import JsonValue
 
@@ -59,19 +58,11 @@ def make_request(
 
 def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, slot: Slot) -> str:
     """Return the SHA-256 of the canonical JSON of all parts; ``body`` is canonical already."""
-    middle = between_body_and_slot(endpoint, path, tuple(headers.items()))
-    text = f'{{"body":{body},{middle}{canonical_json(slot.as_dict())}}}'
+    # "body" sorts before the other names and "slot" after them, so that the whole is canonical.
+    parts = {"endpoint": endpoint, "headers": headers, "key_version": KEY_VERSION, "path": path}
+    between = canonical_json(parts)[1:-1]
+    text = f'{{"body":{body},{between},"slot":{canonical_json(slot.as_dict())}}}'
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-@cache
-def between_body_and_slot(endpoint: str, path: str, headers: tuple[tuple[str, str], ...]) -> str:
-    """Return the text of a key between body and slot: the same for all calls of a model.
-
-    "body" sorts before the other names and "slot" after them, so that the whole is canonical.
-    """
-    parts = {"endpoint": endpoint, "headers": dict(headers), "key_version": KEY_VERSION}
-    return canonical_json({**parts, "path": path})[1:-1] + ',"slot":'
 
 
 def without_prompt(body: str) -> str:

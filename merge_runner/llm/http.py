@@ -9,7 +9,7 @@ import select
 import ssl
 import zlib
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.request import getproxies, proxy_bypass
@@ -141,6 +141,7 @@ class HttpTransport:
         carrier: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._endpoint = endpoint
+        self._base = httpx.URL(endpoint.base_url)
         self._most_bytes = most_bytes
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}
@@ -272,18 +273,19 @@ class HttpTransport:
     def _url(self, path: str) -> httpx.URL:
         """Return the URL of a path at the configured host, which alone may get the key."""
         if path not in self._urls:
-            try:
+            with suppress(httpx.InvalidURL):
                 url = httpx.URL(self._endpoint.base_url + path)
-            except httpx.InvalidURL as exc:
-                raise _no_path(path) from exc
-            if url.netloc != httpx.URL(self._endpoint.base_url).netloc:
-                raise _no_path(path)
-            self._urls[path] = url
+                if url.netloc == self._base.netloc:
+                    self._urls[path] = url
+        if path not in self._urls:
+            raise UsageError(
+                f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml"
+            )
         return self._urls[path]
 
     def _network(self, connections: int) -> AiohttpTransport:
         """Return the connections, by the proxies and certificates of the environment."""
-        url = httpx.URL(self._endpoint.base_url)
+        url = self._base
         # An empty one where there is no TLS, since to load the certificates takes long.
         trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
@@ -313,10 +315,6 @@ def _proxy(url: httpx.URL) -> httpx.Proxy | None:
     if named is None or url.host in LOOPBACK or proxy_bypass(url.netloc.decode()):
         return None
     return httpx.Proxy(named if "://" in named else f"http://{named}")
-
-
-def _no_path(path: str) -> UsageError:
-    return UsageError(f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml")
 
 
 def _too_long(most_bytes: int) -> TransportFailure:

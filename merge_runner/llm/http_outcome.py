@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 from urllib.parse import urlsplit
 
 from merge_runner.config import PROVIDERS, ModelEntry
@@ -32,7 +32,6 @@ from merge_runner.llm.formats.base import (
     ServerError,
     WireFormat,
     as_dict,
-    is_answer,
     read_error,
 )
 from merge_runner.llm.formats.delays import server_delay_s
@@ -153,7 +152,8 @@ class AttemptOutcome:
     ``accept`` it as the answer, ``retry`` after ``delay_s`` (all calls of the key wait where
     ``pause``), ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the
     endpoint ``refused`` the key or the model. ``name`` is its outcome in the calls table.
-    ``of_prompt`` says that a failure is of this prompt alone.
+    ``of_prompt`` says that a failure is of this prompt alone. Without a ``raw`` reply the attempt
+    may have been ``charged`` all the same.
     """
 
     action: Action
@@ -163,6 +163,8 @@ class AttemptOutcome:
     delay_s: float | None = None
     pause: bool = False
     of_prompt: bool = False
+    raw: RawReply | None = None
+    charged: bool = True
 
 
 def may_be_charged(raw: RawReply, provider: str | None) -> bool:
@@ -193,18 +195,19 @@ def _in_its_form(provider: str, raw: RawReply) -> bool:
 def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     """Classify a reply by the rules of docs/reference/providers.md."""
     if raw.status == 200:
-        return _judge_success(raw, wire)
+        return replace(_judge_success(raw, wire), raw=raw)
     outcome = judge_error(raw.error, wire)
     # The usage that an error states is billed.
     usage = wire.read(as_dict(raw.first)).usage
-    return replace(outcome, reading=replace(outcome.reading, usage=usage))
+    return replace(outcome, reading=replace(outcome.reading, usage=usage), raw=raw)
 
 
 def _judge_success(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if not isinstance(raw.payload, dict):
         return AttemptOutcome("retry", "bad_body", "the body is not a JSON object")
     reading = wire.read(raw.payload)
-    if reading.outcome == "empty" and not is_answer(raw.payload, wire.members):
+    parts = [raw.payload.get(name) for name in wire.members]
+    if reading.outcome == "empty" and all(part in (None, [], {}) for part in parts):
         return AttemptOutcome("retry", "bad_body", "the body has nothing of an answer", reading)
     if reading.outcome != "error":
         return AttemptOutcome("accept", reading.outcome, reading=reading)
@@ -246,11 +249,17 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
 
 
 class TryAgain(MergeRunnerError):
-    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for."""
+    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for.
 
-    def __init__(self, message: str, delay_s: float | None = None) -> None:
+    All calls to the endpoint wait for ``pause_s``, where there is one.
+    """
+
+    def __init__(
+        self, message: str, delay_s: float | None = None, pause_s: float | None = None
+    ) -> None:
         super().__init__(message)
         self.delay_s = delay_s
+        self.pause_s = pause_s
 
 
 class RequestFailed(MergeRunnerError):
@@ -305,47 +314,42 @@ class Deadline:
         # Only now, since it costs time and memory that most calls need not spend.
         from tenacity import AsyncRetrying, retry_if_exception_type
 
+        async def next_attempt() -> T:
+            if failed:
+                raise failed.pop()
+            return await attempt()
+
         def wait_s(state: RetryCallState) -> float:
+            error = state.outcome.exception() if state.outcome else None
+            assert isinstance(error, TryAgain)
             # The jitter lets calls that failed together, as when a server restarts, not return
             # together.
             jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
             backoff = min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
-            return max(_failure(state).delay_s or 0.0, backoff)
+            return max(error.delay_s or 0.0, backoff)
 
-        def count_wait(state: RetryCallState) -> None:
-            self._used_s += state.upcoming_sleep
+        async def wait(seconds: float) -> None:
+            self._used_s += seconds
+            await sleep(seconds)
 
-        async for again in AsyncRetrying(
+        again = AsyncRetrying(
             retry=retry_if_exception_type(TryAgain),
             wait=wait_s,
             stop=lambda state: self._used_s + state.upcoming_sleep >= self._seconds,
-            before_sleep=count_wait,
-            sleep=sleep,
-            retry_error_callback=self._give_up,
-        ):
-            with again:
-                if failed:
-                    raise failed.pop()
-                return await attempt()
-        raise AssertionError("unreachable: the loop returns or raises")
-
-    def _give_up(self, state: RetryCallState) -> NoReturn:
-        last = _failure(state)
-        # Where the server's own wish made the wait too long, that is what to tell.
-        asked_s = last.delay_s
-        if asked_s is None or asked_s < self._seconds:
-            raise OutOfTime(f"no answer within {self._seconds:.0f} s") from last
-        raise OutOfTime(
-            f"the server asks to wait {asked_s:.0f} s, longer than a call's deadline of "
-            f"{self._seconds:.0f} s: run the same command again after that"
-        ) from last
-
-
-def _failure(state: RetryCallState) -> TryAgain:
-    """Return the error of the last attempt: tenacity calls its hooks after a TryAgain alone."""
-    error = state.outcome.exception() if state.outcome else None
-    assert isinstance(error, TryAgain)
-    return error
+            sleep=wait,
+            reraise=True,
+        )
+        try:
+            return await again(next_attempt)
+        except TryAgain as exc:
+            # Where the server's own wish made the wait too long, that is what to tell.
+            why = f"no answer within {self._seconds:.0f} s"
+            if exc.delay_s is not None and exc.delay_s >= self._seconds:
+                why = (
+                    f"the server asks to wait {exc.delay_s:.0f} s, longer than a call's deadline "
+                    f"of {self._seconds:.0f} s: run the same command again after that"
+                )
+            raise OutOfTime(why) from exc
 
 
 class FirstCall:
@@ -383,22 +387,22 @@ class Consequences:
     own_host: str | None
     first: FirstCall
 
-    def error(
-        self, call: Call, outcome: AttemptOutcome, raw: RawReply | None
-    ) -> MergeRunnerError | None:
+    def error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
-        if not self.first.passed and (stop := self._end_of_run(call, outcome, raw)):
+        if not self.first.passed and (stop := self._end_of_run(call, outcome)):
             return stop
         message = outcome.message or outcome.name
-        if self._is_too_long(outcome):
+        delay_s = outcome.delay_s or 0.0
+        if outcome.pause and delay_s > self.entry.deadline_s:
             return QuotaExhausted(
-                f"{self.driver}: the provider asks to wait {outcome.delay_s:.0f} s, longer than a "
+                f"{self.driver}: the provider asks to wait {delay_s:.0f} s, longer than a "
                 f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
                 "is saved; run the same command again later to go on."
             )
         match outcome.action:
             case "retry":
-                return TryAgain(message, outcome.delay_s)
+                pause_s = (delay_s or backoff_s(len(call.own_attempts))) if outcome.pause else None
+                return TryAgain(message, outcome.delay_s, pause_s)
             case "fail":
                 which = "reply" if outcome.name == "reply_refused" else "request"
                 return RequestFailed(f"the {which} was rejected")
@@ -416,27 +420,16 @@ class Consequences:
         empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
         return TryAgain("empty answer") if empty <= EMPTY_RETRIES else None
 
-    def pause_s(self, call: Call, outcome: AttemptOutcome) -> float | None:
-        """Return for how many s all calls to the endpoint wait; None: they go on."""
-        if not outcome.pause or self._is_too_long(outcome):
-            return None
-        return outcome.delay_s or backoff_s(len(call.own_attempts))
-
-    def _is_too_long(self, outcome: AttemptOutcome) -> bool:
-        return outcome.pause and (outcome.delay_s or 0.0) > self.entry.deadline_s
-
-    def _end_of_run(
-        self, call: Call, outcome: AttemptOutcome, raw: RawReply | None
-    ) -> SweepStopped | None:
+    def _end_of_run(self, call: Call, outcome: AttemptOutcome) -> SweepStopped | None:
         """Return the error that ends a run whose other calls would fare no better."""
-        if raw is None:
+        if outcome.raw is None:
             # A server that is just starting is waited for, but only for seconds.
             waited_s = asyncio.get_running_loop().time() - call.began_s
             if outcome.name != "no_connection" or waited_s < NOBODY_S:
                 return None
             advice = if_nobody(self.name, self.entry)
             return ProviderDown(f"{self.driver}: {call.last_failure}: {advice}")
-        why = self._refusal(raw, outcome)
+        why = self._refusal(outcome.raw, outcome)
         if why is None:
             return None
         # An endpoint that has answered before may mean this prompt alone; several refusals mean the

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -22,12 +22,11 @@ from merge_runner.llm.write_batcher import BatchWriter, Operation
 from merge_runner.records import Attempt
 
 if TYPE_CHECKING:
-    from merge_runner.llm.cache import CachedCall, ResponseCache
+    from merge_runner.llm.cache import ResponseCache
 
 FILE = "ledger.db"
 BUSY_S = 600.0
 TOLERANCE_USD = 1e-9  # sums of floats
-IN_FLIGHT = "in flight"
 Rows = list[tuple[Any, ...]]
 Query = Callable[..., Rows]
 TABLES = """
@@ -127,16 +126,18 @@ class LedgerFile:
         self._file = folder / FILE
         self._connections: dict[str, sqlite3.Connection] = {}
         self._one_at_a_time = RLock()
-        self._in_transaction = False
         self._made = False
         self.writer = BatchWriter(self.run_now)
 
     def read(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises UsageError where the file is damaged."""
         with self._told():
-            if not self._made:  # another process may be making it
-                self._made = self._file.exists() and bool(self._execute("ro", _MADE))
-            return self._execute("ro", sql, *values) if self._made else []
+            if not self._made:
+                if not self._file.exists():
+                    return []
+                # Another process may be making it.
+                self._made = bool(self._connection("ro").execute(_MADE).fetchall())
+            return self._connection("ro").execute(sql, values).fetchall() if self._made else []
 
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
         """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
@@ -160,19 +161,13 @@ class LedgerFile:
     def transaction(self) -> Iterator[None]:
         """Make what is written within it, in this thread, one durable transaction."""
         with self._told(), self._one_at_a_time:
-            if self._in_transaction:  # a part of the one around it
+            connection = self._connection("rwc")
+            if connection.in_transaction:  # a part of the one around it
                 yield
                 return
-            self.write("BEGIN IMMEDIATE")
-            self._in_transaction = True
-            try:
+            with connection:
+                connection.execute("BEGIN IMMEDIATE")
                 yield
-                self.write("COMMIT")
-            except BaseException:
-                self.write("ROLLBACK")
-                raise
-            finally:
-                self._in_transaction = False
 
     def spending(self, scope: str, query: Query | None = None) -> Spending:
         """Return the sums of a sweep; raises UsageError where they cannot be."""
@@ -187,14 +182,14 @@ class LedgerFile:
 
     def write(self, sql: str, *values: object) -> Rows:
         """Execute a statement within the transaction of ``run_now``, and return its rows."""
-        return self._execute("rwc", sql, *values)
+        return self._connection("rwc").execute(sql, values).fetchall()
 
     def close(self) -> None:
         """Close the file."""
         while self._connections:
             self._connections.popitem()[1].close()
 
-    def _execute(self, mode: str, sql: str, *values: object) -> Rows:
+    def _connection(self, mode: str) -> sqlite3.Connection:
         if mode not in self._connections:
             self._connections[mode] = connection = sqlite3.connect(
                 f"{self._file.absolute().as_uri()}?mode={mode}",
@@ -207,7 +202,7 @@ class LedgerFile:
                 connection.execute("PRAGMA journal_mode = wal")
                 connection.execute("PRAGMA synchronous = full")  # it survives a power cut
                 connection.executescript(TABLES)
-        return self._connections[mode].execute(sql, values).fetchall()
+        return self._connections[mode]
 
     @contextlib.contextmanager
     def _told(self) -> Iterator[None]:
@@ -255,13 +250,16 @@ class Ledger:
         self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
     ) -> bool:
         """Reserve the worst case of an attempt at a call; False if that exceeds the cap."""
+        if not self.scope:
+            return True
         money = self.cache.money
         with money.transaction():
             committed_usd = money.spending(self.scope, money.write).committed_usd
             if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
                 return False
-            place = (asked.driver, asked.slot, asked.honest_usd or usd, _now(), IN_FLIGHT)
-            money.write(_RESERVE, self.scope, key, number, usd, *place)
+            worst_usd, since = asked.honest_usd or usd, datetime.now(UTC)
+            place = (asked.driver, asked.slot, worst_usd, since.isoformat(timespec="milliseconds"))
+            money.write(_RESERVE, self.scope, key, number, usd, *place, "in flight")
         return True
 
     def aside_usd(self, key: str) -> float:
@@ -270,21 +268,10 @@ class Ledger:
         rows = self.cache.money.read(sql, self.scope, key) if self.scope else []
         return float(rows[0][0]) if rows else 0.0
 
-    async def settle(self, key: str, attempts: Sequence[Attempt], asked: Asked) -> None:
-        """Settle the last of a call's attempts, without an answer; its cost may be unknown."""
-        await self.cache.put_unanswered(key, tuple(attempts))
-        await self._settle(key, attempts[-1], asked)
-
-    async def keep(self, entry: CachedCall, asked: Asked) -> CachedCall:
-        """Keep an answered call, then settle its last attempt; see also ``settle_kept``."""
-        kept = await self.cache.put(entry)
-        await self._settle(entry.request.key, entry.attempts[-1], asked)
-        return kept
-
-    async def _settle(self, key: str, attempt: Attempt, asked: Asked) -> None:
+    async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
+        """Settle an attempt at a call, whose cost may be unknown; see also ``settle_kept``."""
         if self.scope:
-            operation = partial(self._settled, key, attempt, asked.driver)
-            await self.cache.money.writer.write(operation)
+            await self.cache.money.writer.write(partial(self._settled, key, attempt, driver))
             self.read()
 
     def _settled(self, key: str, attempt: Attempt, driver: str) -> None:
@@ -307,15 +294,12 @@ class Ledger:
         No other run may ask these drivers meanwhile.
         """
         money = self.cache.money
-        for key, number, driver in money.read(_IN_FLIGHT, self.scope):
+        rows = money.read(_IN_FLIGHT, self.scope)
+        for key, number, driver in (row for row in rows if row[2] in drivers):
             with contextlib.suppress(RecordingError):
                 entry = self.cache.get(key)
                 for attempt in entry.attempts if entry else self.cache.unanswered(key):
-                    if (
-                        driver in drivers
-                        and attempt.number == number
-                        and attempt.outcome != "unknown"
-                    ):
+                    if attempt.number == number and attempt.outcome != "unknown":
                         money.run_now([partial(self._settled, key, attempt, driver)])
 
     def rows(self) -> tuple[Rows, Rows]:
@@ -347,7 +331,3 @@ class Ledger:
         money = self.cache.money
         money.run_now([lambda: money.write("DELETE FROM open WHERE scope = ?", self.scope)])
         self.read()
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -7,8 +7,8 @@ case. Before anything is measured a trial is expected to cost as much as it can.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 # Trials that turn out longer, and attempts that are charged but bring no answer.
 MARGIN = 1.5
@@ -25,10 +25,15 @@ class TrialCalls:
     most: int
     worst_usd: float
 
-    def and_(self, other: TrialCalls) -> TrialCalls:
-        """Both together."""
-        worst_usd = max(self.worst_usd, other.worst_usd)
-        return TrialCalls(self.usual + other.usual, self.most + other.most, worst_usd)
+    def expected_usd(self, answers: Answers) -> float:
+        """Return what the calls cost together, if they cost as much as these answers."""
+        most_usd = self.most * self.worst_usd
+        if not answers.number:
+            return most_usd
+        # The worst case counts as one more answer: a few cheap ones prove little.
+        mean_usd = (answers.usd + self.worst_usd) / (answers.number + 1)
+        # Up to its last call a trial must be able to reserve that call's worst case.
+        return min(most_usd, MARGIN * self.usual * mean_usd + self.worst_usd)
 
 
 @dataclass(slots=True)
@@ -44,42 +49,18 @@ class Answers:
         self.usd += usd
 
 
+@dataclass(frozen=True, slots=True)
 class TrialCosts:
     """The expected costs of trials, which are named by their order in the sweep.
 
-    ``cell_of`` names a trial's cell, ``calls`` are those of a trial by cell and model, ``earlier``
-    the answers of each model to similar requests in earlier runs.
+    ``calls`` returns a trial's by model; ``answers`` are those of each model to similar requests,
+    of earlier runs, too.
     """
 
-    def __init__(
-        self,
-        cell_of: Callable[[int], str],
-        calls: Mapping[str, Mapping[str, TrialCalls]],
-        earlier: Mapping[str, Answers],
-    ) -> None:
-        self._cell_of = cell_of
-        self._calls = calls
-        self._answers = defaultdict(Answers, earlier)
+    calls: Callable[[int], Mapping[str, TrialCalls]]
+    answers: defaultdict[str, Answers] = field(default_factory=lambda: defaultdict(Answers))
 
     def usd(self, trial: int) -> float:
         """Return the USD that a trial is expected to cost."""
-        calls = self._calls.get(self._cell_of(trial), {})
-        return sum(_usd(each, self._answers[model]) for model, each in calls.items())
-
-    def models(self, trial: int) -> Collection[str]:
-        """Return the models that a trial asks."""
-        return self._calls.get(self._cell_of(trial), {})
-
-    def learn(self, model: str, usd: float) -> None:
-        """Count the cost of an answer of a model."""
-        self._answers[model].add(usd)
-
-
-def _usd(calls: TrialCalls, answers: Answers) -> float:
-    most_usd = calls.most * calls.worst_usd
-    if not answers.number:
-        return most_usd
-    # The worst case counts as one more answer: a few cheap ones prove little.
-    mean_usd = (answers.usd + calls.worst_usd) / (answers.number + 1)
-    # Up to its last call a trial must be able to reserve that call's worst case.
-    return min(most_usd, MARGIN * calls.usual * mean_usd + calls.worst_usd)
+        calls = self.calls(trial)
+        return sum(each.expected_usd(self.answers[model]) for model, each in calls.items())

@@ -23,8 +23,9 @@ from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.lines import Batches
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
-from merge_runner.llm.budget import Budget, Unpaid
+from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call import Call
 from merge_runner.llm.call_totals import CallTotals
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
@@ -140,7 +141,8 @@ def live_clients(
 
         in_process = InProcess(Emulator(endpoint_plan.emulator))
     transports: dict[str, HttpTransport] = {}
-    clients = {}
+    clients: dict[str, LlmClient] = {}
+    under_way: dict[str, Call] = {}  # two names of one model may ask the same
     for name, entry in plan.entries.items():
         model = plan.registered[name]
         if model not in transports:
@@ -172,6 +174,7 @@ def live_clients(
                 known=name in endpoint_plan.known,
             ),
             batches=_batches(model, entry, budget, cache, rounds),
+            under_way=under_way,
         )
     return clients
 
@@ -189,7 +192,7 @@ def _batches(
     terms = batch_terms(entry)
     if rounds is None or terms is None:
         return None
-    money = Unpaid(cache) if entry.price == "free" else budget
+    money = Budget(Ledger(cache, "")) if entry.price == "free" else budget
     return Batches(rounds, model, budget.ledger.scope, money, terms.price_factor)
 
 

@@ -198,7 +198,7 @@ def trial_costs(plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = Fa
             one_usd = cost_usd(plan.entries[name], _measured_usage(totals)) or 0.0
             usd = totals.measured * one_usd * parts[name]
             earlier[plan.registered[name]].add(usd, totals.measured)
-    return TrialCosts(labels.__getitem__, calls, earlier)
+    return TrialCosts(lambda order: calls[labels[order]], earlier)
 
 
 def _trial_calls(plan: Plan, arm: Arm, parts: Mapping[str, float]) -> dict[str, TrialCalls]:
@@ -218,7 +218,10 @@ def _trial_calls(plan: Plan, arm: Arm, parts: Mapping[str, float]) -> dict[str, 
         worst_usd = (cost_usd(entry, worst) or 0.0) * parts[name]
         made = TrialCalls(number * usual, number * most, worst_usd)
         other = calls.get(model := plan.registered[name])
-        calls[model] = made if other is None else made.and_(other)
+        if other is not None:
+            worst_usd = max(worst_usd, other.worst_usd)
+            made = TrialCalls(made.usual + other.usual, made.most + other.most, worst_usd)
+        calls[model] = made
     return calls
 
 

@@ -26,7 +26,7 @@ def recorded_name(name: str, entry: ModelEntry, *, cache: ResponseCache, strict:
 
     Several models are a UsageError if ``strict``, and else as good as none.
     """
-    recorded = cache.recorded_models(entry.provider)
+    recorded = sorted({r.model for r in cache.recorded(lambda r: r.provider == entry.provider)})
     if len(recorded) > 1 and strict:
         raise UsageError(
             f"replies of {name} are recorded from several models, {', '.join(recorded)}: "

@@ -539,7 +539,7 @@ def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> 
         configured += options.faults.identity
     if not options.replay:
         return configured
-    recorded = sorted(cache.recorded_endpoints(entry.id))
+    recorded = sorted({r.endpoint for r in cache.recorded(lambda r: r.model == entry.id)})
     if configured in recorded or not recorded:
         return configured
     if len(recorded) > 1:

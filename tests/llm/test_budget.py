@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import math
 import tempfile
@@ -58,7 +59,8 @@ def tried(actual, outcome="server_error"):
 async def attempt(budget, trial, worst, actual, turns=0, model="m"):
     """Spend on one attempt as a client does."""
     await budget.admit(trial)
-    async with budget.attempt(trial, f"key {model}", asked(worst, model=model)) as paid:
+    paid = await budget.set_aside(trial, f"key {model}", asked(worst, model=model))
+    with contextlib.closing(paid):
         await paid.begin([])
         for _ in range(turns):
             await asyncio.sleep(0)
@@ -191,7 +193,7 @@ async def answer(budget, trial, usd, worst=1.0, model="m"):
     """Pay for one answer as a client does."""
     await budget.admit(trial)
     key = f"key {next(KEYS)}"
-    async with budget.attempt(trial, key, asked(worst, model=model)) as paid:
+    with contextlib.closing(await budget.set_aside(trial, key, asked(worst, model=model))) as paid:
         await paid.begin([])
         request = ChatRequest(
             key, "openai", "openai", model, "/p", {}, "{}", Slot("N_0_0", 1, "left", 0, 0)
@@ -202,7 +204,7 @@ async def answer(budget, trial, usd, worst=1.0, model="m"):
 def costs(**models):
     """Trials of 20 calls, or 40 at most, by model and with this worst case of a call."""
     calls = {model: TrialCalls(20, 40, worst) for model, worst in models.items()}
-    return TrialCosts(lambda _: "cell", {"cell": calls}, {})
+    return TrialCosts(lambda _: calls)
 
 
 async def test_once_answers_are_cheap_trials_begin_that_their_worst_case_kept_waiting(ledger):
@@ -242,9 +244,8 @@ async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_fo
 
 
 async def test_the_first_trial_of_a_model_begins_though_another_model_has_spent(ledger):
-    by_trial = {1: "asked", 2: "new", 3: "new"}
-    cells = {"asked": {"m": TrialCalls(1, 1, 1.0)}, "new": {"n": TrialCalls(20, 40, 1.0)}}
-    budget = Budget(ledger, 10.0, TrialCosts(by_trial.__getitem__, cells, {}))
+    asked, new = {"m": TrialCalls(1, 1, 1.0)}, {"n": TrialCalls(20, 40, 1.0)}
+    budget = Budget(ledger, 10.0, TrialCosts({1: asked, 2: new, 3: new}.__getitem__))
     await answer(budget, 1, 0.5)
     budget.leave(1)
     await asyncio.wait_for(budget.admit(2), 1)  # or it would never be known that it costs less
@@ -341,10 +342,10 @@ O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
 async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
     for key, outcome in (("a", "timeout"), ("b", "timeout"), ("c", "server_error")):
         ledger.reserve(key, 1, 0.25, None, O3)
-        await ledger.settle(key, tried(None, outcome), O3)
+        await ledger.settle(key, *tried(None, outcome), O3.driver)
     ledger.reserve("d", 1, 0.125, None, O3)
     ledger.reserve("paid", 1, 0.25, None, O3)
-    await ledger.settle("paid", tried(0.1), O3)
+    await ledger.settle("paid", *tried(0.1), O3.driver)
     reasons = ledger.reasons()
     assert [(r["outcome"], r["attempts"], r["usd"]) for r in reasons] == [
         ("timeout", 2, 0.5),
@@ -358,11 +359,10 @@ async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
 
 async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
     for number, outcome in enumerate(("timeout", "connection_lost", "bad_body"), 1):
-        attempts = [Attempt(n, "x") for n in range(1, number)]
         ledger.reserve("key", number, 0.25, None, O3)
         actual = 0.0 if outcome == "connection_lost" else None
         last = Attempt(number, outcome, cost_usd=actual)
-        await ledger.settle("key", [*attempts, last], O3)
+        await ledger.settle("key", last, O3.driver)
     assert {r["outcome"]: r["attempts"] for r in ledger.reasons()} == {"timeout": 1, "bad_body": 1}
 
 
@@ -398,7 +398,7 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
     task = Ledger(cache, "task")
     for key in ("a", "b"):
         task.reserve(key, 1, 0.25, None, O3)
-    await task.settle("a", tried(0.5), O3)
+    await task.settle("a", *tried(0.5), O3.driver)
     ledger.reserve("task 1", 1, 2.0, None, O3)
     ledger.settle_share("task 1", *task.rows())
     assert ledger.read() == task.read()
@@ -409,14 +409,14 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
 
 async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
     budget = Budget(ledger, 10.0)
-    async with budget.attempt(1, "key", O3) as paid:
+    with contextlib.closing(await budget.set_aside(1, "key", O3)) as paid:
         await paid.begin([])
         await paid.settle(tried(0.75))
     assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
     assert ledger.spending.dearest == "o3 at gateway up to 3.00 times as much"
     next_run = Budget(Ledger(cache, ledger.scope), 10.0)
     assert (await set_aside(next_run, 2, 0.25, "another driver")).aside_usd == 0.25
-    async with next_run.attempt(1, "other", O3) as paid:
+    with contextlib.closing(await next_run.set_aside(1, "other", O3)) as paid:
         assert paid.aside_usd == 0.75
         await paid.begin([])
         # A reply within what is now set aside does not count as another overrun of it.
@@ -468,7 +468,7 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
     await budget.admit(1)
 
     async def ended():
-        async with budget.attempt(1, "key", asked(0.5)) as paid:
+        with contextlib.closing(await budget.set_aside(1, "key", asked(0.5))) as paid:
             if begun:
                 await paid.begin([])
             if attempts:

@@ -64,6 +64,10 @@ def cache(folder):
     opened.close()
 
 
+def endpoints(cache, model):
+    return sorted({each.endpoint for each in cache.recorded(lambda each: each.model == model)})
+
+
 def left_out(cache):
     """Why rows are left out where all entries are read, none of which is whole."""
     reasons = []
@@ -423,7 +427,7 @@ def test_what_is_measured_is_of_one_endpoint_and_one_way_to_ask(cache):
     assert totals["m", "openai", high].measured == 1
     assert totals["m", "http://localhost:8080", low].measured == 1
     assert ("m", "openai", manner("/responses", empty % "low")) not in totals
-    assert sorted(cache.recorded_endpoints("m")) == ["http://localhost:8080", "openai"]
+    assert endpoints(cache, "m") == ["http://localhost:8080", "openai"]
 
 
 # What SQL can make of a row, and what each says of it.
@@ -530,7 +534,7 @@ def test_any_one_changed_byte_of_any_row_never_blocks_the_rest(model_folder, dat
                 assert cache.put_now([each]) == [each]
             assert {each.request.key for each in cache.entries()} == {e.request.key for e in FULL}
             assert cache.unanswered(entry(9).request.key) in (entry(9).attempts, ())
-            assert list(cache.recorded_endpoints("m")) == ["openai"]
+            assert endpoints(cache, "m") == ["openai"]
 
 
 def change_a_byte(folder, data):
@@ -620,7 +624,7 @@ def test_an_overlay_is_read_once_and_not_before_it_is_needed(folder):
     assert readings == []
     assert cache.get(entry(2).request.key)
     assert cache.get(entry(1).request.key)
-    assert list(cache.recorded_endpoints("m")) == ["openai"]
+    assert endpoints(cache, "m") == ["openai"]
     assert len(list(cache.entries())) == 2
     assert readings == ["read"]
     cache.close()
@@ -640,8 +644,8 @@ def test_endpoints_are_listed_per_model_the_folders_where_the_overlay_has_none(f
             entry(4, model="b", endpoint="http://b/v1"),
         ]
     )
-    assert sorted(cache.recorded_endpoints("a")) == ["http://overlay/v1"]
-    assert sorted(cache.recorded_endpoints("b")) == ["http://b/v1", "openai"]
-    assert sorted(cache.recorded_endpoints("c")) == ["http://overlay/v1"]
-    assert sorted(cache.recorded_endpoints("d")) == []
+    assert endpoints(cache, "a") == ["http://overlay/v1"]
+    assert endpoints(cache, "b") == ["http://b/v1", "openai"]
+    assert endpoints(cache, "c") == ["http://overlay/v1"]
+    assert endpoints(cache, "d") == []
     cache.close()

@@ -102,7 +102,7 @@ def cache(opened):
 def make(cache):
     """A client whose server gives these replies."""
 
-    def make(*replies, limiter=None, cap=None, cache=cache, first=None, **changes):
+    def make(*replies, limiter=None, cap=None, cache=cache, first=None, under_way=None, **changes):
         fields = {
             "provider": "openai",
             "format": "openai-chat",
@@ -120,6 +120,7 @@ def make(cache):
             limiter=limiter or Limiter(),
             budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), cap),
             first=first or FirstCall(passed=True),
+            under_way={} if under_way is None else under_way,
         )
 
     return make
@@ -259,7 +260,8 @@ async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, t
 
 @in_virtual_time
 async def test_two_entries_of_one_model_that_ask_the_same_make_one_call(make):
-    clients = [make(answer(f"from {n}")) for n in range(2)]
+    under_way = {}
+    clients = [make(answer(f"from {n}"), under_way=under_way) for n in range(2)]
     replies = await asyncio.gather(*(client.ask("prompt", slot()) for client in clients))
     assert sum(len(client.transport.sent) for client in clients) == 1
     assert replies[0].text == replies[1].text

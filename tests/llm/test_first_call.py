@@ -157,7 +157,7 @@ async def test_a_first_call_that_is_given_up_lets_the_next_one_go(begin):
     client.transport.open.clear()
     asked = ask_all(client, 2)
     await ticks()
-    for call in client._calls.values():
+    for call in client._calls:
         call.task.cancel()
         break
     await ticks()

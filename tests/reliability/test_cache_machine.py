@@ -105,21 +105,18 @@ class CacheMachine(RuleBasedStateMachine):
         """
         process = self.process(question % PROCESSES)
         key = REQUESTS[question].key
-        known = self.wait(process.cache.claim(key))
         if question in process.in_flight_calls:
-            assert known is None
             return
+        process.cache.set_damage_aside(key)
+        known = process.cache.get(key)
         if question in self.answered:
-            assert known.entry == self.answered[question], "what is answered is not asked again"
-            process.cache.release(key)
+            assert known == self.answered[question], "what is answered is not asked again"
             return
-        assert known.entry is None
-        earlier = list(known.attempts)
+        assert known is None
+        earlier = list(process.cache.unanswered(key))
         if paid := self.paid_for(process, question, earlier):
             self.tried.pop(question, None)
             process.in_flight_calls[question] = paid, earlier
-        else:
-            process.cache.release(key)
 
     def paid_for(
         self, process: Process, question: int, earlier: list[Attempt]
@@ -146,10 +143,10 @@ class CacheMachine(RuleBasedStateMachine):
         except (TrialSuspended, asyncio.CancelledError):
             return None
 
-    def landed(self, number: int, data) -> tuple[Process, int, PaidAttempt, list[Attempt]]:
+    def landed(self, number: int, data) -> tuple[int, PaidAttempt, list[Attempt]]:
         process = self.running[number]
         question = data.draw(st.sampled_from(sorted(process.in_flight_calls)))
-        return process, question, *process.in_flight_calls.pop(question)
+        return question, *process.in_flight_calls.pop(question)
 
     def in_flight(self) -> list[int]:
         return [number for number, process in self.running.items() if process.in_flight_calls]
@@ -157,9 +154,7 @@ class CacheMachine(RuleBasedStateMachine):
     @precondition(in_flight)
     @rule(data=st.data(), cost=costs)
     def answer(self, data, cost):
-        process, question, paid, attempts = self.landed(
-            data.draw(st.sampled_from(self.in_flight())), data
-        )
+        question, paid, attempts = self.landed(data.draw(st.sampled_from(self.in_flight())), data)
         self.made += 1
         self.charged_usd += cost
         reply = f'{{"text": "ä {self.made}"}}'
@@ -167,7 +162,6 @@ class CacheMachine(RuleBasedStateMachine):
         entry = CachedCall(REQUESTS[question], tuple(attempts))
         kept = self.wait(paid.keep(entry))
         paid.close()
-        process.cache.release(REQUESTS[question].key)
         assert kept == entry
         self.answered[question] = entry
         self.tried[question] = ()
@@ -176,16 +170,12 @@ class CacheMachine(RuleBasedStateMachine):
     @rule(data=st.data(), cost=costs, known=st.booleans())
     def fail(self, data, cost, known):
         """An attempt brings no answer, and what it cost is told or not."""
-        process, question, paid, attempts = self.landed(
-            data.draw(st.sampled_from(self.in_flight())), data
-        )
+        question, paid, attempts = self.landed(data.draw(st.sampled_from(self.in_flight())), data)
         self.charged_usd += cost
         told = float(cost) if known else None
         attempts.append(Attempt(len(attempts) + 1, "server_error", 500, cost_usd=told))
-        key = REQUESTS[question].key
         self.wait(paid.settle(attempts))
         paid.close()
-        process.cache.release(key)
         self.tried[question] = tuple(attempts)
 
     @precondition(lambda self: self.running)

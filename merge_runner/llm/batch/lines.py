@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -100,10 +100,13 @@ class Batches:
         asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.price_factor)
         who = (call.order, call.request.key, asked)
         ledger = opened.batch.ledger if opened else self.ledger
-        money = self.money.going_on(*who, ledger) if opened else self.money.attempt(*who)
-        async with AsyncExitStack() as stack:
-            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid = await stack.enter_async_context(money)
+        with ExitStack() as stack:
+            if opened is None:
+                with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
+                    paid = await self.money.set_aside(*who)
+            else:
+                paid = self.money.going_on(*who, ledger)
+            stack.callback(paid.close)
             attempts = tuple(call.attempts)
             sent = BatchLine(call.request, len(attempts) + 1)
             yield paid, Line(sent, self.model, ledger, paid, attempts, opened)

@@ -110,11 +110,6 @@ def plain(*names: str) -> dict[str, tuple[str, ...]]:
     return {name: (name,) for name in names}
 
 
-def is_answer(payload: dict[str, Any], members: frozenset[str]) -> bool:
-    """Return whether a body of status 200 has a part of an answer, if only its frame."""
-    return any(payload.get(name) not in (None, [], {}) for name in members)
-
-
 def outcome_of(
     text: str, *, failed: object = False, truncated: bool = False, refused: bool = False
 ) -> str:

@@ -92,7 +92,8 @@ class OpenAIChat(OpenAI):
         choice = first_of(payload.get("choices"))
         message = as_dict(choice.get("message"))
         finish = as_text(choice.get("finish_reason"))
-        text = _content(message.get("content"))
+        content = message.get("content")  # a list of parts at some servers
+        text = content if isinstance(content, str) else joined(as_dicts(content))
         refusal = as_text(message.get("refusal"))
         # Routers answer 200 and put the failure of a generation into the body.
         failed = payload.get("error") or choice.get("error") or finish == "error"
@@ -170,10 +171,3 @@ def _usage(payload: dict[str, Any], read: str, written: str) -> Usage:
         output_tokens=as_count(usage.get(f"{written}_tokens")),
         reasoning_tokens=as_count(written_details.get("reasoning_tokens")),
     )
-
-
-def _content(content: object) -> str:
-    """Return the text of a message, which some servers send as a list of parts."""
-    if isinstance(content, str):
-        return content
-    return joined(as_dicts(content))
