@@ -204,10 +204,14 @@ def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
         yield from batch
 
 
+def names_of(result: duckdb.DuckDBPyConnection) -> list[str]:
+    """The names of a result's columns."""
+    return [column[0] for column in result.description or ()]
+
+
 def by_name(result: duckdb.DuckDBPyConnection) -> Iterator[dict[str, Any]]:
     """The rows of a result, each by the names of its columns."""
-    names = [column[0] for column in result.description or ()]
-    return (dict(zip(names, row, strict=True)) for row in result.fetchall())
+    return (dict(zip(names_of(result), row, strict=True)) for row in result.fetchall())
 
 
 def append(

@@ -10,7 +10,7 @@ import duckdb
 
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.results.data_dictionary import SchemaColumn, SchemaTable, tables, units
-from merge_runner.results.database import fetched, read_database
+from merge_runner.results.database import fetched, names_of, read_database
 from merge_runner.results.provenance import program
 from merge_runner.results.query_output import write_csv
 from merge_runner.results.wide_trials import (
@@ -114,7 +114,7 @@ def _write_table(
 ) -> Iterator[Path]:
     yield _write_parquet(connection, folder, name, query)
     result = connection.execute(query)
-    names = [column[0] for column in result.description or ()]
+    names = names_of(result)
     with (csv := folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as out:
         write_csv(names, fetched(result), out)
     yield csv

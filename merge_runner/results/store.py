@@ -7,9 +7,9 @@ import json
 import threading
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from datetime import datetime
-from itertools import chain
+from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,13 @@ from merge_runner.results.database import (
     check_schema,
     fetched,
     merge_small_groups,
+    names_of,
     open_database,
     read_database,
     schema_sql,
     unreadable_is_usage,
     update_measures,
 )
-from merge_runner.results.first_looks import FIRST_LOOKS
 from merge_runner.results.rows import Row, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.served_model import other_models, sql_of
@@ -93,17 +93,10 @@ class Store:
         ``factors`` are the levels of these trials, which another study may have stored without.
         """
         with self._writing() as connection:
+            columns = ", ".join(field.name for field in fields(sweep))
             connection.execute(
-                "INSERT INTO sweeps VALUES (?, ?, ?, NULL, NULL, ?, ?, ?, ?)",
-                [
-                    sweep.sweep_id,
-                    sweep.name,
-                    sweep.started_at,
-                    sweep.config,
-                    sweep.git_commit,
-                    sweep.git_dirty,
-                    sweep.versions,
-                ],
+                f"INSERT INTO sweeps ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?)",  # noqa: S608 # our fields
+                astuple(sweep),
             )
             _add_specs(connection, specs)
             append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
@@ -193,20 +186,13 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 
     It reaches no file and no network, and changes no setting.
     """
-    with answers(path, sql) as (names, rows):
-        return names, list(rows)
-
-
-@contextmanager
-def answers(path: Path, sql: str) -> Iterator[tuple[list[str], Iterator[tuple[Any, ...]]]]:
-    """The column names and the rows of a query; the database is locked until they are read."""
     with answer(path, sql) as result:
-        yield [column[0] for column in result.description or ()], fetched(result)
+        return names_of(result), result.fetchall()
 
 
 @contextmanager
 def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
-    """The result of a query, to be fetched; the database is locked until then."""
+    """The result of a query, to be fetched; the database is locked until the block ends."""
     # The settings hold for a whole instance, and cannot be taken back.
     with (
         read_database(path, Instance()) as connection,
@@ -267,7 +253,7 @@ def results_digest(path: Path) -> tuple[str, int]:
     """
     digests: dict[TrialKey, Any] = {}
     with read_database(path) as connection:
-        # The first and the third of the columns order the rows of a trial.
+        # The first and the third of these columns order the rows of a trial.
         for columns, table in (
             (
                 "pair, source, model_left, model_right, variant, condition, rep, sample_set, "
@@ -281,35 +267,14 @@ def results_digest(path: Path) -> tuple[str, int]:
                 "decisions",
             ),
         ):
-            for key, rows in _by_trial(connection, columns, table):
+            # A trial's rows lie together in the table, which is too large to be sorted.
+            sql = f"SELECT trial_id, spec_hash, {columns} FROM {table}"  # noqa: S608 # constants
+            for key, rows in groupby(fetched(connection.execute(sql)), key=itemgetter(0, 1)):
                 digest = digests.setdefault(key, hashlib.sha256(key[0].encode()))
-                for values in sorted(rows, key=itemgetter(0, 2)):
-                    digest.update(json.dumps(values).encode())
+                for values in sorted(rows, key=itemgetter(2, 4)):
+                    digest.update(json.dumps(values[2:]).encode())
     whole = hashlib.sha256("".join(sorted(d.hexdigest() for d in digests.values())).encode())
     return whole.hexdigest(), len(digests)
-
-
-def _by_trial(
-    connection: duckdb.DuckDBPyConnection, columns: str, table: str
-) -> Iterator[tuple[TrialKey, list[list[Any]]]]:
-    """The rows of each trial as soon as all of them are read.
-
-    A trial's rows lie together in the table, which is too large to be sorted.
-    """
-    counts = {
-        (trial_id, spec_hash): count
-        for trial_id, spec_hash, count in connection.execute(
-            f"SELECT trial_id, spec_hash, count(*) FROM {table} GROUP BY ALL"  # noqa: S608 # constants
-        ).fetchall()
-    }
-    begun: dict[TrialKey, list[list[Any]]] = {}
-    for trial_id, spec_hash, *values in fetched(
-        connection.execute(f"SELECT trial_id, spec_hash, {columns} FROM {table}")  # noqa: S608 # constants
-    ):
-        rows = begun.setdefault((trial_id, spec_hash), [])
-        rows.append(values)
-        if len(rows) == counts[trial_id, spec_hash]:
-            yield (trial_id, spec_hash), begun.pop((trial_id, spec_hash))
 
 
 def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str, Any]], list[str]]:
@@ -412,25 +377,33 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
                 "WHERE fate IN ('driven', 'fallback') "
                 "GROUP BY ALL HAVING bool_or(scripted) ORDER BY ALL",
             ),
-            first_looks=_first_looks(connection, sweep_id) if asked else [],
+            first_looks=list(by_name(connection.execute(FIRST_LOOKS, [sweep_id]))) if asked else [],
             decisions=decisions[0],
             invalid=decisions[1],
             fallbacks=decisions[2],
         )
 
 
-def _first_looks(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> list[dict[str, Any]]:
-    sql = f"""
-        SELECT driver, variant, model, side, velocity_mps AS relative_velocity_mps,
-            count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,
-            count(tactical) AS with_a_word,
-            count(*) FILTER (tactical = 'M') / nullif(count(tactical), 0) AS share_m,
-            avg(action_mps2) FILTER (valid) AS first_action_mps2
-        FROM ({FIRST_LOOKS}) JOIN trial_drivers USING (trial_id, spec_hash)
-        SEMI JOIN (FROM sweep_trials WHERE sweep_id = ?) USING (trial_id, spec_hash)
-        GROUP BY ALL ORDER BY ALL
-    """  # noqa: S608 # constants
-    return list(by_name(connection.execute(sql, [sweep_id])))
+# What drivers did first where they were only asked. The velocity is the driver's own, minus the
+# other's; the action is the net acceleration over the first step, of the fallback where the reply
+# was invalid.
+FIRST_LOOKS = """
+SELECT driver, variant, if(side = 'left', model_left, model_right) AS model, side,
+    if(side = 'left', 1, -1) * relative_velocity_mps + 0 AS relative_velocity_mps,
+    count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,
+    count(tactical) AS with_a_word,
+    count(*) FILTER (tactical = 'M') / nullif(count(tactical), 0) AS share_m,
+    avg(action_mps2) FILTER (valid) AS first_action_mps2
+FROM (FROM decisions WHERE decision = 0)
+JOIN (FROM trials WHERE source = 'seat' AND status <> 'failed') USING (trial_id, spec_hash)
+JOIN (
+    SELECT trial_id, spec_hash, side, min_by(acceleration_mps2, step) AS action_mps2
+    FROM states WHERE time_s > 0 GROUP BY ALL
+) USING (trial_id, spec_hash, side)
+JOIN trial_drivers USING (trial_id, spec_hash)
+SEMI JOIN (FROM sweep_trials WHERE sweep_id = ?) USING (trial_id, spec_hash)
+GROUP BY ALL ORDER BY ALL
+"""
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:
