@@ -11,7 +11,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
 from merge_runner.llm.cache import CachedCall
-from merge_runner.results.recording import opened, read_provenance, readable, sweeps_of
+from merge_runner.results.recording import opened, read_provenance, sweeps_of
 from merge_runner.text_safety import one_line
 
 
@@ -163,7 +163,7 @@ def _counted(model: str, calls: Sequence[CachedCall]) -> str:
 
 def _conditions_and_repetitions(file: Path) -> dict[str, int]:
     """Each condition of which a call is recorded, and its highest repetition."""
-    with opened(file) as connection, readable(file):
+    with opened(file) as (connection, _):
         return dict(
             connection.execute(
                 "SELECT condition, max(repetition) FROM recording GROUP BY ALL"
