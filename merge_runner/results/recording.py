@@ -102,7 +102,7 @@ def export_recording(
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with (
-            TemporaryDirectory(prefix=f".{file.name}-", dir=file.parent) as folder,
+            TemporaryDirectory(prefix=".recording-", dir=file.parent) as folder,
             in_memory(SETTINGS) as connection,
         ):
             connection.execute(f"ATTACH {quoted(f'{folder}/calls.duckdb')} AS file; USE file")
