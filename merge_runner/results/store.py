@@ -323,87 +323,79 @@ class SweepFacts:
     fallbacks: int
 
 
-# The driver that was asked, in a row of the view ``attempts`` with its spec.
-DRIVER = "driver_name(model, spec->>('$.' || side || '.endpoint'))"
-
-
-def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
-    """Count a sweep's trials, decisions and answers."""
-    of_sweep = (
-        "SEMI JOIN (SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?) "
-        "USING (trial_id, spec_hash)"
-    )
-    with read_database(path) as connection:
-
-        def rows(select: str, rest: str) -> list[tuple[Any, ...]]:
-            return connection.execute(f"{select} {of_sweep} {rest}", [sweep_id]).fetchall()
-
-        decisions = rows(
-            "SELECT count(*), count(*) FILTER (NOT valid), count(*) FILTER (fallback) "
-            "FROM decisions",
-            "",
-        )[0]
-        asked = rows("SELECT 1 FROM trials", "WHERE source = 'seat' LIMIT 1")
-        return SweepFacts(
-            outcomes=rows(
-                "SELECT variant, condition, status, merged_first, coalesce(fallen_back, false), "
-                "count(*) FROM trials LEFT JOIN (SELECT trial_id, spec_hash, "
-                "bool_or(fallback) AS fallen_back FROM decisions GROUP BY ALL) "
-                "USING (trial_id, spec_hash)",
-                "GROUP BY ALL ORDER BY ALL",
-            ),
-            levels=rows(
-                "SELECT factor, value, status, merged_first, count(*) "
-                "FROM trials JOIN trial_levels USING (trial_id, spec_hash)",
-                "GROUP BY ALL ORDER BY ALL",
-            ),
-            ledger=rows(
-                f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
-                "if(outcome = 'ok', coalesce(failure, outcome), outcome), count(*) FROM attempts "
-                "LEFT JOIN specs USING (spec_hash)",
-                "GROUP BY ALL ORDER BY ALL",
-            ),
-            failed=rows(
-                "SELECT trial_id, error FROM trials", "WHERE status = 'failed' ORDER BY ALL"
-            ),
-            others=rows(
-                "SELECT model_requested, model_served, count(*) FROM calls",
-                f"WHERE http_status = 200 AND {sql_of(other_models(connection))} "
-                "GROUP BY ALL ORDER BY ALL",
-            ),
-            stand_ins=rows(
-                f"SELECT {DRIVER}, model, provider, count(*) FILTER (scripted), count(*) "  # noqa: S608 # constants
-                "FROM attempts LEFT JOIN specs USING (spec_hash)",
-                "WHERE fate IN ('driven', 'fallback') "
-                "GROUP BY ALL HAVING bool_or(scripted) ORDER BY ALL",
-            ),
-            first_looks=list(by_name(connection.execute(FIRST_LOOKS, [sweep_id]))) if asked else [],
-            decisions=decisions[0],
-            invalid=decisions[1],
-            fallbacks=decisions[2],
-        )
-
-
-# What drivers did first where they were only asked. The velocity is the driver's own, minus the
-# other's; the action is the net acceleration over the first step, of the fallback where the reply
-# was invalid.
+PLAYED = """
+CREATE TEMP TABLE played AS
+FROM trials SEMI JOIN (FROM sweep_trials WHERE sweep_id = ?) USING (trial_id, spec_hash)
+"""
+# Their attempts, with the name of the driver that was asked.
+TRIED = """
+CREATE TEMP VIEW tried AS
+SELECT *, driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver
+FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash)
+"""
+FACTS = {
+    "outcomes": """
+        SELECT variant, condition, status, merged_first, coalesce(fallen_back, false), count(*)
+        FROM played LEFT JOIN (
+            SELECT trial_id, spec_hash, bool_or(fallback) AS fallen_back
+            FROM decisions GROUP BY ALL
+        ) USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL""",
+    "levels": """
+        SELECT factor, value, status, merged_first, count(*)
+        FROM played JOIN trial_levels USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL""",
+    "ledger": """
+        SELECT driver, variant, fate, if(outcome = 'ok', coalesce(failure, outcome), outcome),
+            count(*)
+        FROM tried GROUP BY ALL ORDER BY ALL""",
+    "failed": "SELECT trial_id, error FROM played WHERE status = 'failed' ORDER BY ALL",
+    "stand_ins": """
+        SELECT driver, model, provider, count(*) FILTER (scripted), count(*)
+        FROM tried WHERE fate IN ('driven', 'fallback')
+        GROUP BY ALL HAVING bool_or(scripted) ORDER BY ALL""",
+}
+OTHERS = """
+SELECT model_requested, model_served, count(*) FROM calls SEMI JOIN played
+USING (trial_id, spec_hash) WHERE http_status = 200 AND {is_other} GROUP BY ALL ORDER BY ALL
+"""
+DECIDED = """
+SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
+    count(*) FILTER (fallback) AS fallbacks
+FROM decisions SEMI JOIN played USING (trial_id, spec_hash)
+"""
+# The velocity is the driver's own, minus the other's; the action is the net acceleration over the
+# first step, of the fallback where the reply was invalid.
 FIRST_LOOKS = """
+WITH asked AS (FROM played WHERE source = 'seat' AND status <> 'failed')
 SELECT driver, variant, if(side = 'left', model_left, model_right) AS model, side,
     if(side = 'left', 1, -1) * relative_velocity_mps + 0 AS relative_velocity_mps,
     count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,
     count(tactical) AS with_a_word,
     count(*) FILTER (tactical = 'M') / nullif(count(tactical), 0) AS share_m,
     avg(action_mps2) FILTER (valid) AS first_action_mps2
-FROM (FROM decisions WHERE decision = 0)
-JOIN (FROM trials WHERE source = 'seat' AND status <> 'failed') USING (trial_id, spec_hash)
+FROM asked
+JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash)
 JOIN (
     SELECT trial_id, spec_hash, side, min_by(acceleration_mps2, step) AS action_mps2
-    FROM states WHERE time_s > 0 GROUP BY ALL
+    FROM states SEMI JOIN asked USING (trial_id, spec_hash) WHERE time_s > 0 GROUP BY ALL
 ) USING (trial_id, spec_hash, side)
 JOIN trial_drivers USING (trial_id, spec_hash)
-SEMI JOIN (FROM sweep_trials WHERE sweep_id = ?) USING (trial_id, spec_hash)
 GROUP BY ALL ORDER BY ALL
 """
+
+
+def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
+    """Count a sweep's trials, decisions and answers."""
+    with read_database(path) as connection:
+        connection.execute(PLAYED, [sweep_id])
+        connection.execute(TRIED)
+        facts = next(by_name(connection.execute(DECIDED)))
+        facts |= {name: connection.execute(sql).fetchall() for name, sql in FACTS.items()}
+        others = OTHERS.format(is_other=sql_of(other_models(connection)))
+        return SweepFacts(
+            **facts,
+            others=connection.execute(others).fetchall(),
+            first_looks=list(by_name(connection.execute(FIRST_LOOKS))),
+        )
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:
