@@ -215,6 +215,20 @@ def append(
 
 
 @contextmanager
+def write_database(
+    path: Path, patience_s: float = PATIENCE_S
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open the database for one transaction, which is committed at the end; raises StoreError."""
+    with open_database(path, read_only=False, patience_s=patience_s) as connection:
+        try:
+            connection.begin()
+            yield connection
+            connection.commit()
+        except duckdb.Error as exc:
+            raise StoreError(f"{path} cannot be used: {first_line(exc)}") from exc
+
+
+@contextmanager
 def read_database(
     path: Path, instance: Instance = SHARED, patience_s: float = PATIENCE_S
 ) -> Iterator[duckdb.DuckDBPyConnection]:

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import duckdb
 
-from merge_runner.errors import StoreError, UsageError, unknown_name
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.results.comparison import PLACES
-from merge_runner.results.database import PATIENCE_S, open_database, read_database
+from merge_runner.results.database import read_database, write_database
 from merge_runner.results.progress_file import running
-from merge_runner.text_safety import first_line
 
 GOING_SWEEPS = """
 CREATE OR REPLACE TEMP TABLE going_sweeps AS
@@ -78,24 +77,17 @@ def forget(db: Path, sweeps: Sequence[str], agreed: Forgotten) -> Forgotten:
     """
     if to_forget(db, sweeps) != agreed:
         raise UsageError(f"{db} has changed meanwhile, and nothing was removed: ask again")
-    with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
-        try:
-            connection.begin()
-            gone = _mark(connection, sweeps)
-            for table in PLACES:
-                connection.execute(
-                    f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM going_trials)"  # noqa: S608 # our tables
-                )
-            for table in ("sweep_trials", "sweeps"):
-                connection.execute(
-                    f"DELETE FROM {table} WHERE sweep_id IN (FROM going_sweeps)"  # noqa: S608 # our tables
-                )
+    with write_database(db) as connection:
+        gone = _mark(connection, sweeps)
+        for table in PLACES:
             connection.execute(
-                "DELETE FROM specs WHERE spec_hash NOT IN (SELECT spec_hash FROM trials)"
+                f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM going_trials)"  # noqa: S608 # our tables
             )
-            connection.commit()
-        except duckdb.Error as exc:
-            raise StoreError(f"{db} cannot be changed: {first_line(exc)}") from exc
+        for table in ("sweep_trials", "sweeps"):
+            connection.execute(f"DELETE FROM {table} WHERE sweep_id IN (FROM going_sweeps)")  # noqa: S608 # our tables
+        connection.execute(
+            "DELETE FROM specs WHERE spec_hash NOT IN (SELECT spec_hash FROM trials)"
+        )
     return gone
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import threading
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields
@@ -16,11 +15,10 @@ from typing import Any
 
 import duckdb
 
-from merge_runner.errors import StoreError, UsageError, unknown_name
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.records import TrialRecord
 from merge_runner.results.comparison import FACTORS, PLACES, TrialKey, rows_of_trials, stored_rows
 from merge_runner.results.database import (
-    PATIENCE_S,
     SCHEMA_VERSION,
     SETTINGS,
     Instance,
@@ -30,17 +28,16 @@ from merge_runner.results.database import (
     fetched,
     merge_small_groups,
     names_of,
-    open_database,
     read_database,
     schema_sql,
     unreadable_is_usage,
     update_measures,
+    write_database,
 )
 from merge_runner.results.rows import Row, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.served_model import other_models, sql_of
 from merge_runner.signals import at_signals
-from merge_runner.text_safety import first_line
 
 # Columns that differ from run to run: whether the run made an attempt itself, and when.
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
@@ -68,12 +65,11 @@ class Store:
         self.path = path
         if path.exists() and not path.is_file():
             raise UsageError(f"{path} is not a file: name one with --db")
-        self._one_at_a_time = threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as exc:
             raise UsageError(f"{path.parent} cannot be made: {exc}") from exc
-        with unreadable_is_usage(), self._writing() as connection:
+        with unreadable_is_usage(), write_database(self.path) as connection:
             if connection.execute("SHOW TABLES").fetchall():
                 check_schema(connection, path)
                 update_measures(connection)
@@ -92,7 +88,7 @@ class Store:
 
         ``factors`` are the levels of these trials, which another study may have stored without.
         """
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
             columns = ", ".join(field.name for field in fields(sweep))
             connection.execute(
                 f"INSERT INTO sweeps ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?)",  # noqa: S608 # our fields
@@ -104,7 +100,7 @@ class Store:
 
     def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
         """Note when and how a sweep ended."""
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
             connection.execute(
                 "UPDATE sweeps SET ended_at = ?, exit_code = ? WHERE sweep_id = ?",
                 [ended_at, exit_code, sweep_id],
@@ -116,7 +112,7 @@ class Store:
         Raises UsageError where one of their conditions had other numbers when they were stored:
         the spec's hash does not cover these.
         """
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
             _refuse_other_conditions(connection, list(keys))
             return {key for key, ended in _ended(connection, list(keys)).items() if ended}
 
@@ -133,7 +129,7 @@ class Store:
                 USING (trial_id, spec_hash)
             WHERE list_contains(?, spec_hash) GROUP BY ALL
         """
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
             return connection.execute(sql, [list(spec_hashes)]).fetchall()
 
     def write(
@@ -145,7 +141,7 @@ class Store:
         """
         # Made before the lock is taken, although a trial that is stored already needs none.
         played = [(record, rows_of(record)) for record in records]
-        with self._writing(patience_s) as connection:
+        with write_database(self.path, patience_s) as connection:
             merge_small_groups(connection)
             _, differing = _add_trials(connection, played)
             keys = (_key(record) for record in records)
@@ -161,24 +157,11 @@ class Store:
         stored with other values.
         """
         played = [(record, rows_of(record)) for record in records]
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
             _add_specs(connection, specs)
             added, differing = _add_trials(connection, played)
             there = len(records) - added - len(differing)
             return added, there, [trial_id for trial_id, _ in differing]
-
-    @contextmanager
-    def _writing(self, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
-        with (
-            self._one_at_a_time,
-            open_database(self.path, read_only=False, patience_s=patience_s) as connection,
-        ):
-            try:
-                connection.begin()
-                yield connection
-                connection.commit()
-            except duckdb.Error as exc:
-                raise StoreError(f"{self.path} cannot be used: {first_line(exc)}") from exc
 
 
 def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
