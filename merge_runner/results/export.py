@@ -43,13 +43,12 @@ def export_tables(
 
     Raises UsageError where the folder holds anything but an earlier export.
     """
-    names = [*(table.name for table in (*tables(), *(table for table, _ in also))), NAME]
-    _refuse_other_content(folder, names)
     try:
         with read_database(db) as connection:
-            folder.mkdir(parents=True, exist_ok=True)
             wide = wide_trials(connection.execute(FACTORS.format(only="")).fetchall())
             known = [*tables(), *(table for table, _ in also), _described(connection, wide)]
+            _refuse_other_content(folder, [table.name for table in known])
+            folder.mkdir(parents=True, exist_ok=True)
             yield _write_readme(folder / README, db, known)
             yield _write_dictionary(folder / DICTIONARY, known)
             for table in tables():

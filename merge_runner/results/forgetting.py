@@ -24,10 +24,12 @@ SELECT trial_id, spec_hash FROM sweep_trials SEMI JOIN going_sweeps USING (sweep
 EXCEPT
 SELECT trial_id, spec_hash FROM sweep_trials ANTI JOIN going_sweeps USING (sweep_id)
 """
-# Trials that stay, although their sweep goes.
-STAYING = """
-SELECT count(DISTINCT (trial_id, spec_hash)) FROM sweep_trials SEMI JOIN going_sweeps
-USING (sweep_id) ANTI JOIN going_trials USING (trial_id, spec_hash)
+# The sweeps and the number of trials that go, and of trials that stay although their sweep goes.
+GOING = """
+SELECT (SELECT list(sweep_id ORDER BY sweep_id) FROM going_sweeps),
+    (SELECT count(*) FROM going_trials), (
+        SELECT count(DISTINCT (trial_id, spec_hash)) FROM sweep_trials
+        SEMI JOIN going_sweeps USING (sweep_id) ANTI JOIN going_trials USING (trial_id, spec_hash))
 """
 
 
@@ -95,7 +97,5 @@ def _mark(connection: duckdb.DuckDBPyConnection, sweeps: Sequence[str]) -> Forgo
     """Make the tables of what goes, and count that."""
     connection.execute(GOING_SWEEPS, [list(sweeps)])
     connection.execute(GOING_TRIALS)
-    named = connection.execute("FROM going_sweeps ORDER BY ALL").fetchall()
-    ((going,),) = connection.execute("SELECT count(*) FROM going_trials").fetchall()
-    ((staying,),) = connection.execute(STAYING).fetchall()
-    return Forgotten(tuple(name for (name,) in named), going, staying)
+    ((names, trials, staying),) = connection.execute(GOING).fetchall()
+    return Forgotten(tuple(names), trials, staying)
