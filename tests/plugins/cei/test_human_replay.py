@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import duckdb
 import pytest
-from merge_runner.audit.sweeps import audit_database
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
 from analysis.human.load import import_trials, sort_files
+from merge_runner.audit.sweeps import audit_database
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
