@@ -15,7 +15,7 @@ from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import canonical_json, spec_hash, without_prompt
 from merge_runner.results.database import SETTINGS, append, in_memory, schema_sql
 from merge_runner.results.recorded_study import RecordedSweep, described_sweeps
-from merge_runner.results.recording import BATCH, read_provenance, read_recording
+from merge_runner.results.recording import read_provenance, read_recording
 from merge_runner.results.rows import Row, call_row
 
 NO_CONFIG = "it does not say of what sweep it is: trials are not compared"
@@ -40,6 +40,7 @@ FINDINGS = """
 SELECT DISTINCT kind, text, NULL, trial_id, side, decision
 FROM (FROM call_findings UNION ALL FROM shared_findings) ORDER BY ALL
 """
+BATCH = 1_000
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 

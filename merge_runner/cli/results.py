@@ -34,14 +34,15 @@ def sql(
     as_json: JsonOption = False,
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
+    from merge_runner.results.database import fetched, names_of
     from merge_runner.results.query_output import write_csv, write_json, write_table
-    from merge_runner.results.store import answers
+    from merge_runner.results.store import answer
 
     writers = {Format.TEXT: write_table, Format.CSV: write_csv, Format.JSON: write_json}
     # A slow reader of a pipe would otherwise keep every sweep from writing meanwhile.
     with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as spooled:
-        with answers(db, query) as (names, rows):
-            writers[Format.JSON if as_json else output](names, rows, spooled)
+        with answer(db, query) as result:
+            writers[Format.JSON if as_json else output](names_of(result), fetched(result), spooled)
         spooled.seek(0)
         shutil.copyfileobj(spooled, sys.stdout)
 

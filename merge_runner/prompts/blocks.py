@@ -7,6 +7,7 @@ the baseline without some blocks and with some others, so that it changes nothin
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from string import Formatter
@@ -92,44 +93,37 @@ _APPROACHING = """\
 You drive a car towards a merge. Two roads join at a merge point and go on as a single lane. You \
 are on one of the two roads and another car is on the other one. Neither of you has the right of \
 way. You cannot steer and you cannot communicate with the other driver: you control only the \
-acceleration of your own car. You are asked for a new plan every {prompt_interval_s} s."""
+acceleration of your own car. You are asked for a new plan every {prompt_interval_s} s.
+
+Situation now:
+- Road type: merge
+- Length of each car: {vehicle_length} m
+- Your speed: {own_speed} m/s
+- Speed of the other car: {other_speed} m/s
+- Relative distance (how far the other car is ahead of you along the road; negative if it is \
+behind): {relative_distance} m
+- Your distance to the merge point: {distance_to_merge} m"""
 
 _MERGED = """\
 You drive a car on a straight road: you have passed a merge point where two roads join to a \
 single lane. Another car comes from the other road and is ahead of you or behind you. You cannot \
 steer and you cannot communicate with the other driver: you control only the acceleration of your \
-own car. You are asked for a new plan every {prompt_interval_s} s."""
+own car. You are asked for a new plan every {prompt_interval_s} s.
 
-# Quantity, value and unit.
-_STATE = (
-    ("Length of each car", "{vehicle_length}", "m"),
-    ("Your speed", "{own_speed}", "m/s"),
-    ("Speed of the other car", "{other_speed}", "m/s"),
-    (
-        "Relative distance (how far the other car is ahead of you along the road; negative if it "
-        "is behind)",
-        "{relative_distance}",
-        "m",
-    ),
-)
-_BEFORE = (
-    ("Road type", "merge", ""),
-    *_STATE,
-    ("Your distance to the merge point", "{distance_to_merge}", "m"),
-)
-_AFTER = (("Road type", "straight", ""), *_STATE)
-_Rows = tuple[tuple[str, str, str], ...]
+Situation now:
+- Road type: straight
+- Length of each car: {vehicle_length} m
+- Your speed: {own_speed} m/s
+- Speed of the other car: {other_speed} m/s
+- Relative distance (how far the other car is ahead of you along the road; negative if it is \
+behind): {relative_distance} m"""
 
 
-def _listed(introduction: str, rows: _Rows) -> str:
-    lines = "\n".join(f"- {quantity}: {value} {unit}".rstrip() for quantity, value, unit in rows)
-    return f"{introduction}\n\nSituation now:\n{lines}"
-
-
-def _tabled(introduction: str, rows: _Rows) -> str:
-    lines = "\n".join(f"| {' | '.join(row)} |" for row in rows)
-    head = "| quantity | value | unit |\n|---|---|---|"
-    return f"{introduction}\n\nSituation now:\n{head}\n{lines}"
+def _tabled(situation: str) -> str:
+    """The same with its list as a table."""
+    introduction, *items = situation.split("\n- ")
+    rows = (re.sub(r"(.*): (\S+) ?(.*)", r"| \1 | \2 | \3 |", item) for item in items)
+    return "\n".join([introduction, "| quantity | value | unit |", "|---|---|---|", *rows])
 
 
 _HISTORY = """\
@@ -162,7 +156,7 @@ Write the list in a Python code block that holds nothing but the list."""
 
 BLOCKS = Registry[Block]("prompt block")
 for _name, _meaning, _merge, _straight in (
-    (SITUATION, "situation", _listed(_APPROACHING, _BEFORE), _listed(_MERGED, _AFTER)),
+    (SITUATION, "situation", _APPROACHING, _MERGED),
     ("C1", "history", _HISTORY, _HISTORY),
     ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
     ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
@@ -185,7 +179,7 @@ _GAP = "Time gap (how long the car behind takes to where the car ahead is now): 
 _FASTER = "Relative speed: {relative_speed_in_words}"
 _KMH = "In km/h: your speed is {own_speed_kmh}, the speed of the other car {other_speed_kmh}"
 _MPH = "In mph: your speed is {own_speed_mph}, the speed of the other car {other_speed_mph}"
-_TABLES = _tabled(_APPROACHING, _BEFORE), _tabled(_MERGED, _AFTER)
+_TABLES = _tabled(_APPROACHING), _tabled(_MERGED)
 for _name, _meaning, _merge, _straight in (
     ("state.projected_headway", "projected headway", _HEADWAY, None),
     ("state.time_to_merge", "times to the merge point", _TIMES, None),

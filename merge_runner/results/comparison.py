@@ -9,6 +9,7 @@ from typing import Any
 
 import duckdb
 
+from merge_runner.results.database import names_of
 from merge_runner.results.rows import Row
 
 TrialKey = tuple[str, str]
@@ -125,7 +126,7 @@ def stored_rows(
     hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in hashed)
     columns = f"* REPLACE ({hashes})" if hashes else "*"
     result = rows_of_trials(connection, columns, table, keys, span)
-    names = tuple(column[0] for column in result.description or ())
+    names = tuple(names_of(result))
     trial_id, spec_hash = names.index("trial_id"), names.index("spec_hash")
     stored = Stored(table, names, hashed)
     for row in result.fetchall():

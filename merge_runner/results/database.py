@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import logging
 import os
 import re
@@ -93,17 +92,12 @@ class Instance:
 
     def __init__(self) -> None:
         self._connection: duckdb.DuckDBPyConnection | None = None
-        self._numbers = itertools.count()
 
     def cursor(self) -> duckdb.DuckDBPyConnection:
         """A separate connection to the instance."""
         if self._connection is None:
             self._connection = in_memory(SETTINGS)
         return self._connection.cursor()
-
-    def name(self) -> str:
-        """A unique name for a file."""
-        return f"results_{next(self._numbers)}"
 
     def drop(self) -> None:
         """Make a new instance next time."""
@@ -120,16 +114,24 @@ def open_database(
     path: Path, *, read_only: bool, patience_s: float, instance: Instance = SHARED
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open the database, waiting until others close it; raises StoreError."""
-    connection, name = _attached(path, read_only, patience_s, instance)
-    in_order = False
+    connection = instance.cursor()
+    name = f"results_{id(connection)}"  # of no other file that is open
+    mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
+    try:
+        # A name such as md:x or :memory: names a file, too.
+        attach = f"ATTACH {quoted(path.absolute())} AS {name} ({mode}); USE {name}"
+        _attach(connection, attach, path, patience_s)
+    except duckdb.Error as exc:
+        instance.drop()
+        raise StoreError(f"{path} cannot be opened as a database: {first_line(exc)}") from exc
     try:
         yield connection
-        in_order = True
+    except BaseException:
+        instance.drop()
+        raise
+    else:
+        _detach(connection, name, instance)
     finally:
-        if in_order:
-            _detach(connection, name, instance)
-        else:
-            instance.drop()
         connection.close()
 
 
@@ -142,25 +144,18 @@ def _detach(connection: duckdb.DuckDBPyConnection, name: str, instance: Instance
         instance.drop()
 
 
-def _attached(
-    path: Path, read_only: bool, patience_s: float, instance: Instance
-) -> tuple[duckdb.DuckDBPyConnection, str]:
-    connection = instance.cursor()
-    name = instance.name()
-    mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
+def _attach(
+    connection: duckdb.DuckDBPyConnection, statement: str, path: Path, patience_s: float
+) -> None:
+    """Run the statement, again and again while another one holds the file."""
     began = time.monotonic()
     told = False
     while True:
         try:
-            # A name such as md:x or :memory: names a file, too.
-            whole = quoted(path.absolute())
-            connection.execute(f"ATTACH {whole} AS {name} ({mode}); USE {name}")
+            connection.execute(statement)
         except duckdb.Error as exc:
             if not any(words in str(exc) for words in _BUSY):
-                instance.drop()
-                raise StoreError(
-                    f"{path} cannot be opened as a database: {first_line(exc)}"
-                ) from exc
+                raise
             waited_s = time.monotonic() - began
             if waited_s >= patience_s:
                 raise StoreLocked(f"{path} is held by {_holder(exc)}: close it there") from exc
@@ -171,7 +166,7 @@ def _attached(
                 )
             time.sleep(LOCK_RETRY_S)
         else:
-            return connection, name
+            return
 
 
 def _holder(exc: duckdb.Error) -> str:
@@ -185,17 +180,13 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
 
     Merging takes as much memory as the texts of a full group, and rewrites these each time.
     """
-    tasks = 100 if _bytes_of_texts(connection) <= MERGED_BYTES else 0
-    connection.execute(f"SET max_vacuum_tasks = {tasks}")
-
-
-def _bytes_of_texts(connection: duckdb.DuckDBPyConnection) -> int:
-    """How much larger the open file is than it would be with short replies."""
     (calls, path), *_ = connection.execute(
         "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
     ).fetchall()
-    return Path(path).stat().st_size - int(calls) * BYTES_OF_A_CALL
+    bytes_of_texts = Path(path).stat().st_size - int(calls) * BYTES_OF_A_CALL
+    tasks = 100 if bytes_of_texts <= MERGED_BYTES else 0
+    connection.execute(f"SET max_vacuum_tasks = {tasks}")
 
 
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
@@ -204,10 +195,14 @@ def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
         yield from batch
 
 
+def names_of(result: duckdb.DuckDBPyConnection) -> list[str]:
+    """The names of a result's columns."""
+    return [column[0] for column in result.description or ()]
+
+
 def by_name(result: duckdb.DuckDBPyConnection) -> Iterator[dict[str, Any]]:
     """The rows of a result, each by the names of its columns."""
-    names = [column[0] for column in result.description or ()]
-    return (dict(zip(names, row, strict=True)) for row in result.fetchall())
+    return (dict(zip(names_of(result), row, strict=True)) for row in result.fetchall())
 
 
 def append(
@@ -217,6 +212,20 @@ def append(
     appender = connection.appender(table)  # an INSERT would be a statement for each row
     appender.append_rows(list(rows))
     appender.flush()
+
+
+@contextmanager
+def write_database(
+    path: Path, patience_s: float = PATIENCE_S
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open the database for one transaction, which is committed at the end; raises StoreError."""
+    with open_database(path, read_only=False, patience_s=patience_s) as connection:
+        try:
+            connection.begin()
+            yield connection
+            connection.commit()
+        except duckdb.Error as exc:
+            raise StoreError(f"{path} cannot be used: {first_line(exc)}") from exc
 
 
 @contextmanager

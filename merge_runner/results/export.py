@@ -10,7 +10,7 @@ import duckdb
 
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.results.data_dictionary import SchemaColumn, SchemaTable, tables, units
-from merge_runner.results.database import fetched, read_database
+from merge_runner.results.database import fetched, names_of, read_database
 from merge_runner.results.provenance import program
 from merge_runner.results.query_output import write_csv
 from merge_runner.results.wide_trials import (
@@ -43,13 +43,12 @@ def export_tables(
 
     Raises UsageError where the folder holds anything but an earlier export.
     """
-    names = [*(table.name for table in (*tables(), *(table for table, _ in also))), NAME]
-    _refuse_other_content(folder, names)
     try:
         with read_database(db) as connection:
-            folder.mkdir(parents=True, exist_ok=True)
             wide = wide_trials(connection.execute(FACTORS.format(only="")).fetchall())
             known = [*tables(), *(table for table, _ in also), _described(connection, wide)]
+            _refuse_other_content(folder, [table.name for table in known])
+            folder.mkdir(parents=True, exist_ok=True)
             yield _write_readme(folder / README, db, known)
             yield _write_dictionary(folder / DICTIONARY, known)
             for table in tables():
@@ -114,7 +113,7 @@ def _write_table(
 ) -> Iterator[Path]:
     yield _write_parquet(connection, folder, name, query)
     result = connection.execute(query)
-    names = [column[0] for column in result.description or ()]
+    names = names_of(result)
     with (csv := folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as out:
         write_csv(names, fetched(result), out)
     yield csv

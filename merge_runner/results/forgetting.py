@@ -8,11 +8,10 @@ from pathlib import Path
 
 import duckdb
 
-from merge_runner.errors import StoreError, UsageError, unknown_name
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.results.comparison import PLACES
-from merge_runner.results.database import PATIENCE_S, open_database, read_database
+from merge_runner.results.database import read_database, write_database
 from merge_runner.results.progress_file import running
-from merge_runner.text_safety import first_line
 
 GOING_SWEEPS = """
 CREATE OR REPLACE TEMP TABLE going_sweeps AS
@@ -25,10 +24,12 @@ SELECT trial_id, spec_hash FROM sweep_trials SEMI JOIN going_sweeps USING (sweep
 EXCEPT
 SELECT trial_id, spec_hash FROM sweep_trials ANTI JOIN going_sweeps USING (sweep_id)
 """
-# Trials that stay, although their sweep goes.
-STAYING = """
-SELECT count(DISTINCT (trial_id, spec_hash)) FROM sweep_trials SEMI JOIN going_sweeps
-USING (sweep_id) ANTI JOIN going_trials USING (trial_id, spec_hash)
+# The sweeps and the number of trials that go, and of trials that stay although their sweep goes.
+GOING = """
+SELECT (SELECT list(sweep_id ORDER BY sweep_id) FROM going_sweeps),
+    (SELECT count(*) FROM going_trials), (
+        SELECT count(DISTINCT (trial_id, spec_hash)) FROM sweep_trials
+        SEMI JOIN going_sweeps USING (sweep_id) ANTI JOIN going_trials USING (trial_id, spec_hash))
 """
 
 
@@ -78,24 +79,17 @@ def forget(db: Path, sweeps: Sequence[str], agreed: Forgotten) -> Forgotten:
     """
     if to_forget(db, sweeps) != agreed:
         raise UsageError(f"{db} has changed meanwhile, and nothing was removed: ask again")
-    with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
-        try:
-            connection.begin()
-            gone = _mark(connection, sweeps)
-            for table in PLACES:
-                connection.execute(
-                    f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM going_trials)"  # noqa: S608 # our tables
-                )
-            for table in ("sweep_trials", "sweeps"):
-                connection.execute(
-                    f"DELETE FROM {table} WHERE sweep_id IN (FROM going_sweeps)"  # noqa: S608 # our tables
-                )
+    with write_database(db) as connection:
+        gone = _mark(connection, sweeps)
+        for table in PLACES:
             connection.execute(
-                "DELETE FROM specs WHERE spec_hash NOT IN (SELECT spec_hash FROM trials)"
+                f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM going_trials)"  # noqa: S608 # our tables
             )
-            connection.commit()
-        except duckdb.Error as exc:
-            raise StoreError(f"{db} cannot be changed: {first_line(exc)}") from exc
+        for table in ("sweep_trials", "sweeps"):
+            connection.execute(f"DELETE FROM {table} WHERE sweep_id IN (FROM going_sweeps)")  # noqa: S608 # our tables
+        connection.execute(
+            "DELETE FROM specs WHERE spec_hash NOT IN (SELECT spec_hash FROM trials)"
+        )
     return gone
 
 
@@ -103,7 +97,5 @@ def _mark(connection: duckdb.DuckDBPyConnection, sweeps: Sequence[str]) -> Forgo
     """Make the tables of what goes, and count that."""
     connection.execute(GOING_SWEEPS, [list(sweeps)])
     connection.execute(GOING_TRIALS)
-    named = connection.execute("FROM going_sweeps ORDER BY ALL").fetchall()
-    ((going,),) = connection.execute("SELECT count(*) FROM going_trials").fetchall()
-    ((staying,),) = connection.execute(STAYING).fetchall()
-    return Forgotten(tuple(name for (name,) in named), going, staying)
+    ((names, trials, staying),) = connection.execute(GOING).fetchall()
+    return Forgotten(tuple(names), trials, staying)

@@ -9,6 +9,7 @@ import duckdb
 import numpy as np
 import pandas as pd
 
+from merge_runner.results.comparison import PLACES
 from merge_runner.results.store import answer
 from merge_runner.results.wide_trials import FACTORS, only, wide_trials
 
@@ -22,17 +23,6 @@ DTYPES = {
     "DECIMAL": "float64",  # a number that a query writes with a point
     "TIMESTAMP": "datetime64[us]",
 }
-# The rows of one sweep, in the order of its trials' ids.
-OF_SWEEP = {
-    "states": """
-        FROM states {only} ORDER BY trial_id, step, side""",
-    "decisions": """
-        FROM decisions {only}
-        ORDER BY trial_id, decision, side""",
-    "calls": """
-        FROM calls {only}
-        ORDER BY trial_id, decision, side, attempt""",
-}
 
 
 def load(db: Path, sql: str) -> pd.DataFrame:
@@ -42,8 +32,9 @@ def load(db: Path, sql: str) -> pd.DataFrame:
 
 
 def load_of_sweep(db: Path, sweep_id: str, table: str) -> pd.DataFrame:
-    """The rows of a table (one of OF_SWEEP) that belong to the trials of a sweep."""
-    return load(db, OF_SWEEP[table].format(only=only(sweep_id)))
+    """The rows of a table that belong to the trials of a sweep, in the order of their ids."""
+    places = ", ".join(("trial_id", *PLACES[table]))
+    return load(db, f"FROM {table} {only(sweep_id)} ORDER BY {places}")
 
 
 def load_trials(db: Path, sweep_id: str) -> pd.DataFrame:

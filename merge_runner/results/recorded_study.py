@@ -6,12 +6,13 @@ import json
 import shlex
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
 from merge_runner.llm.cache import CachedCall
-from merge_runner.results.recording import opened, read_provenance, readable, sweeps_of
+from merge_runner.results.recording import opened, read_provenance, sweeps_of
 from merge_runner.text_safety import one_line
 
 
@@ -111,27 +112,20 @@ def recorded_part(
 
     It may have several ``names``.
     """
-    whole: RecordedSweep | None = None
-    for one in recorded_sweeps(files):
-        if one.name in names and (one.model, one.sample_set) == (model, sample_set):
-            whole = one if whole is None else _joined(whole, one)
-    return whole
-
-
-def _joined(one: RecordedSweep, other: RecordedSweep) -> RecordedSweep:
-    variants = dict.fromkeys([*one.repetitions, *other.repetitions])
-    repetitions = {v: max(one.repetitions.get(v, 0), other.repetitions.get(v, 0)) for v in variants}
-    conditions = tuple(dict.fromkeys([*one.conditions, *other.conditions]))
-    arms = one.arms | other.arms
-    mirror = one.mirror or other.mirror
-    return one.model_copy(
-        update={
-            "repetitions": repetitions,
-            "conditions": conditions,
-            "arms": arms,
-            "mirror": mirror,
-        }
-    )
+    parts = [
+        sweep
+        for sweep in recorded_sweeps(files)
+        if sweep.name in names and (sweep.model, sweep.sample_set) == (model, sample_set)
+    ]
+    if not parts:
+        return None
+    repetitions: dict[str, int] = {}
+    for variant, most in chain.from_iterable(part.repetitions.items() for part in parts):
+        repetitions[variant] = max(most, repetitions.get(variant, 0))
+    conditions = dict.fromkeys(chain.from_iterable(part.conditions for part in parts))
+    arms = frozenset(chain.from_iterable(part.arms for part in parts))
+    changes = {"repetitions": repetitions, "conditions": tuple(conditions), "arms": arms}
+    return parts[0].model_copy(update=changes)
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
@@ -163,7 +157,7 @@ def _counted(model: str, calls: Sequence[CachedCall]) -> str:
 
 def _conditions_and_repetitions(file: Path) -> dict[str, int]:
     """Each condition of which a call is recorded, and its highest repetition."""
-    with opened(file) as connection, readable(file):
+    with opened(file) as (connection, _):
         return dict(
             connection.execute(
                 "SELECT condition, max(repetition) FROM recording GROUP BY ALL"

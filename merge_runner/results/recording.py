@@ -30,7 +30,7 @@ from merge_runner.llm.content_hashes import KEY_VERSION, canonical_json
 from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
-from merge_runner.results.database import Settings, in_memory
+from merge_runner.results.database import Settings, fetched, in_memory
 from merge_runner.text_safety import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 2"
@@ -38,25 +38,23 @@ FORMAT = "merge-runner recording 2"
 PROVENANCE_HASH = "provenance_sha256"
 SWEEPS = "sweeps"
 """Holds the rows of several sweeps; a recording of one sweep has the columns of its row instead."""
-MEANINGS = {
-    "call_key": "SHA-256 of the parts of the call's key: endpoint, path, headers, body and slot",
-    "provider": "whose format was spoken",
-    "endpoint": "where the call went, without a key; a name for a provider's own",
-    "model": "the id that was asked for",
-    "path": "of the request, below the base URL",
-    "headers": "JSON object: those that change an answer; never a key",
-    "condition": "slot: of the experiment",
-    "repetition": "slot: from 1",
-    "side": "slot: left or right",
-    "decision": "slot: counts those of this driver from 0",
-    "sample_set": "slot: another number is a fresh set of samples",
-    "body": "the exact JSON that was sent",
-    "attempts": "JSON array: number, outcome, status, reply, tokens, cost and time of each attempt",
+COLUMNS = {
+    "call_key": "VARCHAR",
+    "provider": "VARCHAR",
+    "endpoint": "VARCHAR",
+    "model": "VARCHAR",
+    "path": "VARCHAR",
+    "headers": "VARCHAR",
+    "condition": "VARCHAR",
+    "repetition": "BIGINT",
+    "side": "VARCHAR",
+    "decision": "BIGINT",
+    "sample_set": "BIGINT",
+    "body": "VARCHAR",
+    "attempts": "VARCHAR",
 }
-"""What the columns mean, for docs/reference/recordings.md."""
+"""docs/reference/recordings.md says what they mean."""
 SLOT = ("condition", "repetition", "side", "decision", "sample_set")
-COLUMNS = dict.fromkeys(MEANINGS, "VARCHAR") | dict.fromkeys(SLOT[1::2] + SLOT[4:], "BIGINT")
-BATCH = 1_000
 HEADERS = TypeAdapter(dict[str, str])
 ROWS = TypeAdapter(list[dict[str, str]])
 # Far beyond any sweep; a file that claims more was made to do harm.
@@ -104,7 +102,7 @@ def export_recording(
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with (
-            TemporaryDirectory(prefix=f".{file.name}-", dir=file.parent) as folder,
+            TemporaryDirectory(prefix=".recording-", dir=file.parent) as folder,
             in_memory(SETTINGS) as connection,
         ):
             connection.execute(f"ATTACH {quoted(f'{folder}/calls.duckdb')} AS file; USE file")
@@ -156,11 +154,9 @@ def _collect(
 def _copy(connection: duckdb.DuckDBPyConnection, file: Path, provenance: dict[str, str]) -> None:
     """Write the table ``calls`` as a recording."""
     content, calls = hashlib.sha256(), 0
-    rows = connection.execute("SELECT call_key, attempts FROM calls")
-    while batch := rows.fetchmany(BATCH):
-        calls += len(batch)
-        for key, attempts in batch:
-            content.update(_fingerprint(key, attempts))
+    for key, attempts in fetched(connection.execute("SELECT call_key, attempts FROM calls")):
+        content.update(_fingerprint(key, attempts))
+        calls += 1
     metadata = {
         **provenance,
         "format": FORMAT,
@@ -180,8 +176,9 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
     """Yield all entries of a recording, each verified; raises RecordingError."""
     seen: set[str] = set()
     content = hashlib.sha256()
-    with opened(file) as connection:
-        for number, values in enumerate(_rows(file, connection), 1):
+    with opened(file) as (connection, told):
+        rows = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM recording")  # noqa: S608 # constants
+        for number, values in enumerate(fetched(rows), 1):
             try:
                 entry = _entry(dict(zip(COLUMNS, values, strict=True)))
             except DAMAGED as exc:
@@ -191,16 +188,11 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
             seen.add(entry.request.key)
             content.update(_fingerprint(values[0], values[-1]))
             yield entry
-        told = _metadata(file, connection)
-    if (str(len(seen)), content.hexdigest()) != (told.get("calls"), told.get("content_sha256")):
+    found = {"calls": str(len(seen)), "content_sha256": content.hexdigest()}
+    if told != told | found or told.get(PROVENANCE_HASH) != _provenance_hash(told):
         raise RecordingError(
-            f"{file} is not as it was exported: it holds {len(seen)} calls of {told.get('calls')}, "
-            "and its content has another hash"
-        )
-    if told.get(PROVENANCE_HASH) != _provenance_hash(told):
-        raise RecordingError(
-            f"{file} is not as it was exported: what it says of where it comes from has another "
-            "hash"
+            f"{file} is not as it was exported: its calls, or what it says of where it comes from, "
+            "have another hash"
         )
 
 
@@ -312,38 +304,54 @@ def _entry(row: dict[str, Any]) -> CachedCall:
     return CachedCall(request, attempts)
 
 
-def opened(file: Path) -> duckdb.DuckDBPyConnection:
-    """Return a connection with the view ``recording``, not verified; raises RecordingError."""
+@contextmanager
+def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, str]]]:
+    """Open a recording as the view ``recording``, with its metadata; raises RecordingError.
+
+    Neither is verified.
+    """
     if not file.is_file():
         raise UsageError(f"there is no recording {file}")
-    connection = in_memory(SETTINGS)
-    try:
-        connection.execute(
-            "CREATE VIEW recording AS FROM "
-            f"read_parquet({_pattern(file)}, file_row_number = true, hive_partitioning = false)"
-        )
-        columns = connection.execute("DESCRIBE recording").fetchall()
-    except duckdb.Error as exc:
-        raise RecordingError(f"{file} is not a readable Parquet file: {first_line(exc)}") from exc
-    found = {name: kind for name, kind, *_ in columns if name != "file_row_number"}
-    if found != COLUMNS:
-        raise RecordingError(
-            f"{file} is not one of our recordings: it has the columns {_listed(found)}; "
-            f"a recording has {_listed(COLUMNS)}"
-        )
-    told = _metadata(file, connection)
-    if told.get("format") != FORMAT:
-        raise RecordingError(
-            f"{file} has the format {one_line(repr(told.get('format')))}, this program reads "
-            f"{FORMAT!r}"
-        )
-    version = told.get("key_version")
-    if version != str(KEY_VERSION):
-        raise RecordingError(
-            f"{file} has keys of version {version!r}, this program reads version {KEY_VERSION}"
-        )
-    _refuse_bombs(file, connection)
-    return connection
+    # A pattern that matches the file alone, whatever its name.
+    pattern = quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))
+    with in_memory(SETTINGS) as connection:
+        try:
+            connection.execute(
+                "CREATE VIEW recording AS FROM "
+                f"read_parquet({pattern}, file_row_number = true, hive_partitioning = false)"
+            )
+            columns = connection.execute("DESCRIBE recording").fetchall()
+        except duckdb.Error as exc:
+            raise RecordingError(
+                f"{file} is not a readable Parquet file: {first_line(exc)}"
+            ) from exc
+        if {name: kind for name, kind, *_ in columns if name != "file_row_number"} != COLUMNS:
+            raise RecordingError(
+                f"{file} is not one of our recordings: it has other columns than "
+                f"{', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())}"
+            )
+        try:
+            pairs = connection.execute(
+                f"SELECT key, value FROM parquet_kv_metadata({pattern})"  # noqa: S608 # quoted
+            ).fetchall()
+            metadata = {key.decode(): value.decode() for key, value in pairs}
+            _check_versions(file, metadata)
+            _refuse_bombs(file, connection)
+            yield connection, metadata
+        except (duckdb.Error, UnicodeDecodeError) as exc:
+            raise RecordingError(f"{file} is damaged: {first_line(exc)}") from exc
+
+
+def _check_versions(file: Path, metadata: dict[str, str]) -> None:
+    for name, what, ours in (
+        ("format", "the format", FORMAT),
+        ("key_version", "keys of version", str(KEY_VERSION)),
+    ):
+        if metadata.get(name) != ours:
+            raise RecordingError(
+                f"{file} has {what} {one_line(repr(metadata.get(name)))}, this program reads "
+                f"{ours!r}"
+            )
 
 
 def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
@@ -354,10 +362,9 @@ def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
         f"SELECT sum({bytes_of_row}) FROM recording GROUP BY file_row_number // {BLOCK} "  # noqa: S608 # constants
         "ORDER BY 1 DESC"
     )
-    with readable(file):
-        (calls,) = connection.execute("SELECT count(*) FROM recording").fetchone() or (0,)
-        # What a footer claims is not there to be read.
-        row = connection.execute(blocks).fetchone() if calls <= MOST_CALLS else None
+    (calls,) = connection.execute("SELECT count(*) FROM recording").fetchone() or (0,)
+    # What a footer claims is not there to be read.
+    row = connection.execute(blocks).fetchone() if calls <= MOST_CALLS else None
     longest = row[0] if row else 0
     if calls > MOST_CALLS or longest > MOST_BLOCK_BYTES:
         raise RecordingError(
@@ -368,8 +375,8 @@ def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
 
 def read_provenance(file: Path) -> dict[str, str]:
     """Return what a recording says about its origin, not verified; raises RecordingError."""
-    with opened(file) as connection:
-        return _metadata(file, connection)
+    with opened(file) as (_, metadata):
+        return metadata
 
 
 def sweeps_of(provenance: dict[str, str]) -> list[dict[str, str]]:
@@ -388,38 +395,3 @@ def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
         {name: str(value) for name, value in row.items() if value is not None} for row in sweeps
     ]
     return rows[0] if len(rows) == 1 else {SWEEPS: canonical_json(rows)}
-
-
-def _metadata(file: Path, connection: duckdb.DuckDBPyConnection) -> dict[str, str]:
-    with readable(file):
-        rows = connection.execute(
-            f"SELECT key, value FROM parquet_kv_metadata({_pattern(file)})"  # noqa: S608 # quoted
-        ).fetchall()
-        return {key.decode(): value.decode() for key, value in rows}
-
-
-def _rows(file: Path, connection: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
-    with readable(file):
-        rows = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM recording")  # noqa: S608 # constants
-        while batch := rows.fetchmany(BATCH):
-            yield from batch
-
-
-@contextmanager
-def readable(file: Path) -> Iterator[None]:
-    """Raise RecordingError where a recording cannot be read."""
-    try:
-        yield
-    except (duckdb.Error, UnicodeDecodeError) as exc:
-        raise RecordingError(f"{file} is damaged: {first_line(exc)}") from exc
-
-
-def _listed(columns: dict[str, str]) -> str:
-    """Columns with their types; in a foreign file they may have any name."""
-    named = [f"{name[:40]} {kind[:40]}" for name, kind in columns.items()]
-    return one_line(", ".join(named[: 2 * len(COLUMNS)]))
-
-
-def _pattern(file: Path) -> str:
-    """Return the file as a quoted pattern that matches it alone, whatever its name."""
-    return quoted(re.sub(r"([*?\[])", r"[\1]", str(file.resolve())))

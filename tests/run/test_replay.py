@@ -193,7 +193,7 @@ async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, s
     for folder in ("analysis", "merge_runner", "experiments"):
         shutil.copytree(PROJECT / folder, tmp_path / "edited" / folder)
     blocks = tmp_path / "edited/merge_runner/prompts/blocks.py"
-    blocks.write_text(blocks.read_text().replace('"Your speed"', '"Your spead"'))
+    blocks.write_text(blocks.read_text().replace("- Your speed:", "- Your spead:"))
     run = await merge_runner.start(
         "replay", "baseline", "--recording", small, "--reps", 1, "--json",
         PYTHONPATH=str(tmp_path / "edited"),

@@ -249,7 +249,7 @@ def test_a_failure_a_refusal_and_a_large_sample_set_are_taken(file):
 
 
 def test_nothing_is_kept_of_a_file_whose_last_row_is_wrong(file, cache, monkeypatch):
-    monkeypatch.setattr("merge_runner.results.recording.BATCH", 1)
+    monkeypatch.setattr("merge_runner.results.database.ROWS_AT_ONCE", 1)
     assert "is damaged" in refusal(
         rewritten(file, "UPDATE calls SET attempts = '' WHERE decision = 2"), cache
     )
