@@ -13,12 +13,12 @@ from starlette.testclient import TestClient
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
 from analysis.human.load import import_trials, sort_files
-from merge_runner.audit.sweeps import audit_database
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.store import Store, query
 from merge_runner.run.plan import make_plan
+from merge_runner.run.stored_replay import audit_database
 from merge_runner.trial import play_trial
 from merge_runner_cei.human_replay import HUMAN_REPLAY, HUMANS
 from tests.analysis.recordings import drive, file
