@@ -17,7 +17,7 @@ import secrets
 import socket
 import threading
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -221,39 +221,32 @@ async def _cancel(work: asyncio.Task[None], stopping: threading.Event) -> None:
 # At the coordinator
 
 
+@dataclass(eq=False)
 class DaskTasks:
     """Plays trials on the workers of a cluster: one task for each of their threads at a time."""
 
-    def __init__(
-        self,
-        client: Client,
-        plan: Plan,
-        options: Options,
-        endpoints: EndpointPlan,
-        cache: ResponseCache,
-        ledger: Ledger,
-        first: FirstDecisions,
-    ) -> None:
-        self.meters = {name: Meter() for name in plan.entries}
-        self.waits: Sequence[Wait] = ()
-        self.first = first
-        self._client = client
-        self._plan = plan
-        self._options = options
-        self._endpoints = endpoints
-        self._cache = cache
-        self._ledger = ledger
-        self._costs = trial_costs(plan, endpoints.measured)
-        self._run = secrets.token_hex(8)
-        self._numbers = itertools.count(1)
-        self._ids: dict[str, str] = {}
-        self._threads: dict[str, int] = {}
-        self._groups: deque[list[TrialSpec]] = deque()
-        self._tasks: dict[asyncio.Task[Played | None], _Given] = {}
-        self._used: list[tuple[float, dict[str, float]]] = []
-        self._losses: Counter[int] = Counter()
-        self._is_short = False
-        self._ended: Ended | None = None
+    _client: Client
+    _plan: Plan
+    _options: Options
+    _endpoints: EndpointPlan
+    _cache: ResponseCache
+    _ledger: Ledger
+    first: FirstDecisions
+    waits: Sequence[Wait] = ()
+    _run: str = field(default_factory=lambda: secrets.token_hex(8))
+    _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(1))
+    _ids: dict[str, str] = field(default_factory=dict)
+    _threads: dict[str, int] = field(default_factory=dict)
+    _groups: deque[list[TrialSpec]] = field(default_factory=deque)
+    _tasks: dict[asyncio.Task[Played | None], _Given] = field(default_factory=dict)
+    _used: list[tuple[float, dict[str, float]]] = field(default_factory=list)
+    _losses: Counter[int] = field(default_factory=Counter)
+    _is_short: bool = False
+    _ended: Ended | None = None
+
+    def __post_init__(self) -> None:
+        self.meters = {name: Meter() for name in self._plan.entries}
+        self._costs = trial_costs(self._plan, self._endpoints.measured)
 
     @property
     def workers(self) -> int:

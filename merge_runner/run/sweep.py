@@ -48,7 +48,7 @@ from merge_runner.run.clients import (
     open_rounds,
     sealed_clients,
 )
-from merge_runner.run.estimate import Estimate, Todo, estimate
+from merge_runner.run.estimate import Estimate, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, MOST_HELD, Flusher
 from merge_runner.run.local_runner import LocalRunner
@@ -263,7 +263,8 @@ class Sweep:
         return estimate(
             self._plan,
             self._options,
-            todo={label: Todo(trials[label], calls[label]) for label in self._arms},
+            trials=trials,
+            calls=calls,
             facts=self._measured(),
             spending=self._ledger.spending,
         )
