@@ -9,6 +9,7 @@ import asyncio
 import json
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -154,10 +155,10 @@ def _audit(
         specs = _replayable(connection, plan, specs, audit, notes)
         audit.counts["replayed"] = len(specs)
         stored_replies = StoredReplies(connection, plan)
-        audit.findings += asyncio.run(_compared(connection, plan, specs, stored_replies, sweep_id))
+        audit.findings += _replay(connection, plan, specs, stored_replies, sweep_id)
         if cache is not None:
             kept.counts["trials"] += len(specs)
-            kept.findings += asyncio.run(_compared(connection, plan, specs, cache, sweep_id))
+            kept.findings += _replay(connection, plan, specs, cache, sweep_id)
     audit.notes += [
         f"not replayed: {count} trials, since {why}" for why, count in notes.items() if count
     ]
@@ -260,6 +261,20 @@ def _members(text: str) -> dict[str, object]:
         f"{side}.{name}": value for side in SIDES for name, value in spec.get(side, {}).items()
     }
     return {name: value for name, value in spec.items() if name not in SIDES} | drivers
+
+
+def _replay(
+    connection: duckdb.DuckDBPyConnection,
+    plan: Plan,
+    specs: Sequence[TrialSpec],
+    replies: StoredReplies | ResponseCache,
+    sweep_id: str,
+) -> list[Finding]:
+    """Play trials by stored replies or those of a cache, and compare their rows."""
+    # An event loop may run in the caller's thread, where no other one can.
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        played = _compared(connection, plan, specs, replies, sweep_id)
+        return thread.submit(asyncio.run, played).result()
 
 
 async def _compared(
