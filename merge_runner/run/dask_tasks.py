@@ -400,15 +400,11 @@ class DaskTasks:
         """What the cache holds of the calls of these trials, up to the first that is missing."""
         player = _Recorded(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
         unanswered: dict[str, tuple[Attempt, ...]] = {}
-
-        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            assert isinstance(record, TrialRecord)
-            for call in record.failed_calls:
+        for spec in specs:
+            for call in (await player.play_one(spec)).failed_calls:
                 with contextlib.suppress(RecordingError):  # a damaged one is asked again
                     if attempts := self._cache.unanswered(call.request.key):
                         unanswered[call.request.key] = attempts
-
-        await player.play(specs, ended)
         return list(player.found.values()), unanswered
 
     async def _collect(self) -> None:

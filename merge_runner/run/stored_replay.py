@@ -26,7 +26,6 @@ from merge_runner.errors import (
     CallFailed,
     MergeRunnerError,
     RecordingError,
-    TrialSuspended,
     unknown_name,
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
@@ -287,20 +286,14 @@ async def _compared(
     clients = sealed_clients(plan, cast(ResponseCache, replies))  # of which they only ask ``get``
     runner = LocalRunner(plan, clients, in_flight=1)
     findings: list[Finding] = []
-    records: list[TrialRecord] = []
-
-    def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-        assert isinstance(record, TrialRecord)  # what asks nobody needs no money
-        records.append(record)
-
     by_key = {(spec.trial_id, spec.spec_hash): spec for spec in specs}
     for keys, spans in in_order(connection, by_key):
         tables = {name: stored_rows(connection, name, keys, spans[name]) for name in PLACES}
         for key in keys:
             if isinstance(replies, StoredReplies):
                 replies.load(by_key[key], spans["calls"])
-            await runner.play([by_key[key]], ended)
-            findings += _findings(records.pop(), tables, replies, sweep_id)
+            record = await runner.play_one(by_key[key])
+            findings += _findings(record, tables, replies, sweep_id)
     return findings
 
 

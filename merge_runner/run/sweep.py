@@ -11,7 +11,6 @@ from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
-from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -168,16 +167,11 @@ class Sweep:
         """The first calls of all trials if none is recorded; else nothing."""
         runner = LocalRunner(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
         misses: list[Miss] = []
-
-        def none_found() -> bool:
-            return not any(meter.calls_cached for meter in runner.meters.values())
-
-        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            if isinstance(record, TrialRecord):
-                misses.extend(_misses(spec, record))
-
-        await runner.play(takewhile(lambda _: none_found(), self._todo), ended)
-        return misses if none_found() else []
+        for spec in self._todo:
+            misses += _misses(spec, await runner.play_one(spec))
+            if any(meter.calls_cached for meter in runner.meters.values()):
+                return []
+        return misses
 
     def _not_recorded(self, misses: list[Miss]) -> Outcome:
         """The outcome of a replay that stores nothing, since it has none of its calls."""
@@ -246,20 +240,17 @@ class Sweep:
                     answered = sum(row.side == side for row in decisions)
                     calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
 
-        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            if isinstance(record, TrialRecord) and record.status == "failed":
-                count(spec, record.decisions)
-
         if whole:
             for spec in [*self._stored, *self._todo]:
                 count(spec)
         else:
-            asking = [spec for spec in self._todo if self._arms[spec.arm].entries]
+            clients = sealed_clients(self._plan, self._cache)
+            runner = LocalRunner(self._plan, clients, in_flight=1)
             for spec in self._todo:
                 if not self._arms[spec.arm].entries:
                     count(spec)
-            clients = sealed_clients(self._plan, self._cache)
-            await LocalRunner(self._plan, clients, in_flight=1).play(asking, ended)
+                elif (record := await runner.play_one(spec)).status == "failed":
+                    count(spec, record.decisions)
         return estimate(
             self._plan,
             self._options,
@@ -413,11 +404,6 @@ class Sweep:
 
     async def _store_all(self, flusher: Flusher) -> None:
         """Store the trials in memory, and play those again that were dropped: without a call."""
-
-        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            assert isinstance(record, TrialRecord)  # what asks nobody needs no money
-            flusher.add(record)
-
         await flusher.close()
         if flusher.dropped:
             self._say(
@@ -427,7 +413,9 @@ class Sweep:
         while flusher.dropped:
             again, flusher.dropped = flusher.dropped[:MOST_HELD], flusher.dropped[MOST_HELD:]
             clients = sealed_clients(self._plan, self._cache)
-            await LocalRunner(self._plan, clients, in_flight=1).play(again, ended)
+            runner = LocalRunner(self._plan, clients, in_flight=1)
+            for spec in again:
+                flusher.add(await runner.play_one(spec))
             await flusher.close()
 
     def _end(self, outcome: Outcome) -> None:
