@@ -40,7 +40,7 @@ from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import WINDOW_S
 from merge_runner.llm.meter import Meter
-from merge_runner.records import Attempt, ChatReply, Slot, TrialRecord, TrialSpec
+from merge_runner.records import Attempt, TrialRecord, TrialSpec
 from merge_runner.registry import in_use, plugin_sources, use
 from merge_runner.run.clients import EndpointPlan, live_clients, sealed_clients
 from merge_runner.run.estimate import trial_costs
@@ -398,14 +398,19 @@ class DaskTasks:
         self, specs: Sequence[TrialSpec]
     ) -> tuple[list[CachedCall], dict[str, tuple[Attempt, ...]]]:
         """What the cache holds of the calls of these trials, up to the first that is missing."""
-        player = _Recorded(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
+        player = LocalRunner(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
+        recorded: dict[str, CachedCall] = {}
         unanswered: dict[str, tuple[Attempt, ...]] = {}
         for spec in specs:
-            for call in (await player.play_one(spec)).failed_calls:
+            record = await player.play_one(spec)
+            for row in record.decisions:
+                if (reply := row.decision.reply) is not None:
+                    recorded[reply.request.key] = CachedCall(reply.request, reply.attempts)
+            for call in record.failed_calls:
                 with contextlib.suppress(RecordingError):  # a damaged one is asked again
                     if attempts := self._cache.unanswered(call.request.key):
                         unanswered[call.request.key] = attempts
-        return list(player.found.values()), unanswered
+        return list(recorded.values()), unanswered
 
     async def _collect(self) -> None:
         """Wait a while for tasks, and keep what those that have ended return."""
@@ -469,18 +474,6 @@ class DaskTasks:
         next(iter(self.meters.values())).notes.append(
             f"the worker {given.address} is lost: its {len(specs)} trials go to others"
         )
-
-
-@dataclass
-class _Recorded(LocalRunner):
-    """Plays by recorded replies alone, and notes them by call key."""
-
-    found: dict[str, CachedCall] = field(default_factory=dict)
-
-    async def _ask(self, model: str, prompt: str, slot: Slot, spec: TrialSpec) -> ChatReply:
-        reply = await super()._ask(model, prompt, slot, spec)
-        self.found[reply.request.key] = CachedCall(reply.request, reply.attempts)
-        return reply
 
 
 async def _result(future: Future) -> Played | None:
