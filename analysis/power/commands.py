@@ -54,7 +54,7 @@ def power(
     from analysis.table_format import TableFormat
     from analysis.tables.formats import render
     from merge_runner.run.plan import Options, make_plan
-    from merge_runner.run.sweep import of_all
+    from merge_runner.run.sweep import unsent
 
     plan = make_plan(
         study,
@@ -65,7 +65,9 @@ def power(
         only=levels(only or (), "--only"),
         trust=trust,
     )
-    expected = asyncio.run(of_all(plan, Options(db=Path(db), cache=Path(cache)), say=say))
+    expected = asyncio.run(
+        unsent(plan, Options(db=Path(db), cache=Path(cache)), say=say, whole=True)
+    )
     played = Study(db).models if Path(db).exists() else []
     found = {
         "study": plan.name,

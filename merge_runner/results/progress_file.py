@@ -6,9 +6,8 @@ import hashlib
 import logging
 import os
 import platform
-import threading
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -81,39 +80,28 @@ class ProgressFile:
 
     db: Path
     sweep_id: str
-    _gone: bool = False
-    _newest: datetime | None = None
     _told: bool = False
-    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def write(self, standing: Standing) -> None:
         """Replace the file as a whole: a reader sees the old state or the new one, never a part."""
         path = _path(self.db, self.sweep_id)
         made = path.with_suffix(".tmp")
-        with self._lock:
-            # A slower thread may arrive with an outdated state.
-            if self._gone or (self._newest and standing.updated_at < self._newest):
-                return
-            self._newest = standing.updated_at
-            try:
-                path.parent.mkdir(exist_ok=True)
-                made.write_bytes(to_json(standing))
-                os.replace(made, path)
-            except OSError as exc:
-                if not self._told:
-                    LOG.warning("nobody else can see how far the sweep is: %s", exc)
-                self._told = True
+        try:
+            path.parent.mkdir(exist_ok=True)
+            made.write_bytes(to_json(standing))
+            os.replace(made, path)
+        except OSError as exc:
+            if not self._told:
+                LOG.warning("nobody else can see how far the sweep is: %s", exc)
+            self._told = True
 
     def remove(self) -> None:
-        """The sweep has ended normally: remove the file, and write no more."""
+        """Remove the file of a sweep that has ended normally."""
         path = _path(self.db, self.sweep_id)
-        with self._lock:
-            self._gone = True
-            for name in (path, path.with_suffix(".tmp")):
-                with suppress(OSError):
-                    name.unlink()
-            with suppress(OSError):
-                path.parent.rmdir()
+        with suppress(OSError):
+            path.with_suffix(".tmp").unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
+            path.parent.rmdir()
 
 
 def read_standing(db: Path, sweep_id: str) -> Standing | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import re
 import signal
 import sys
 from collections.abc import AsyncIterator, Iterator
@@ -12,7 +13,6 @@ from contextlib import asynccontextmanager, contextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
 
 from merge_runner.errors import UsageError
 
@@ -20,9 +20,13 @@ if TYPE_CHECKING:
     from distributed import Client
 
 CONNECT_TIMEOUT_S = 10
-SCHEMES = ("tcp", "tls")
 # What a worker imports, and a process from which all are forked imports once.
 SHARED = ["distributed", "merge_runner.run.dask_tasks", "merge_runner.llm.http"]
+_WHERE = re.compile(
+    r"local:(?P<workers>[1-9]\d*)|(?P<file>.+\.json)"
+    r"|((tcp|tls)://)?(?!local:)(\[[\da-fA-F:.]+\]|[^\s/:]+):[1-9]\d*",
+    re.ASCII,
+)
 VALID = (
     "valid: local:N (N workers on this machine), the address of a scheduler "
     "(tcp://HOST:PORT, tls://HOST:PORT), or its scheduler file (PATH.json)"
@@ -32,8 +36,7 @@ VALID = (
 @asynccontextmanager
 async def connected(where: str) -> AsyncIterator[Client]:
     """Connect to the cluster, or start it where it is local; raises UsageError."""
-    workers = _local_workers(where)
-    to = {} if workers else _scheduler(where)
+    workers, to = _parsed(where)
     try:
         import distributed
     except ModuleNotFoundError as exc:
@@ -121,35 +124,15 @@ def _silence() -> None:
             logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
-def _local_workers(where: str) -> int:
-    """How many workers to start on this machine; 0 where a scheduler is named."""
-    kind, _, number = where.partition(":")
-    if kind != "local":
-        return 0
-    if not (number.isascii() and number.isdigit() and int(number) > 0):
-        raise _unknown(where)
-    return int(number)
-
-
-def _scheduler(where: str) -> dict[str, str]:
-    """What tells the Dask client where the scheduler is: an address, or a scheduler file."""
-    if not where.endswith(".json"):
-        return {"address": _address(where)}
-    if not Path(where).is_file():
-        raise UsageError(f"there is no scheduler file {where}; {VALID}")
-    return {"scheduler_file": where}
-
-
-def _address(where: str) -> str:
-    try:
-        parts = urlsplit(where if "://" in where else f"tcp://{where}")
-        usable = parts.scheme in SCHEMES and parts.hostname and parts.port and not parts.path
-    except ValueError:
-        usable = False
-    if not usable:
-        raise _unknown(where)
-    return parts.geturl()
-
-
-def _unknown(where: str) -> UsageError:
-    return UsageError(f"--dask {where!r} names no cluster; {VALID}")
+def _parsed(where: str) -> tuple[int, dict[str, str]]:
+    """The number of workers to start, or 0 and what finds the scheduler."""
+    named = _WHERE.fullmatch(where)
+    if named is None:
+        raise UsageError(f"--dask {where!r} names no cluster; {VALID}")
+    if (file := named["file"]) is None:
+        return int(named["workers"] or 0), {
+            "address": where if "://" in where else f"tcp://{where}"
+        }
+    if not Path(file).is_file():
+        raise UsageError(f"there is no scheduler file {file}; {VALID}")
+    return 0, {"scheduler_file": file}

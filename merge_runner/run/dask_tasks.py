@@ -17,7 +17,7 @@ import secrets
 import socket
 import threading
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -40,7 +40,7 @@ from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import WINDOW_S
 from merge_runner.llm.meter import Meter
-from merge_runner.records import Attempt, ChatReply, Slot, TrialRecord, TrialSpec
+from merge_runner.records import Attempt, TrialRecord, TrialSpec
 from merge_runner.registry import in_use, plugin_sources, use
 from merge_runner.run.clients import EndpointPlan, live_clients, sealed_clients
 from merge_runner.run.estimate import trial_costs
@@ -221,39 +221,32 @@ async def _cancel(work: asyncio.Task[None], stopping: threading.Event) -> None:
 # At the coordinator
 
 
+@dataclass(eq=False)
 class DaskTasks:
     """Plays trials on the workers of a cluster: one task for each of their threads at a time."""
 
-    def __init__(
-        self,
-        client: Client,
-        plan: Plan,
-        options: Options,
-        endpoints: EndpointPlan,
-        cache: ResponseCache,
-        ledger: Ledger,
-        first: FirstDecisions,
-    ) -> None:
-        self.meters = {name: Meter() for name in plan.entries}
-        self.waits: Sequence[Wait] = ()
-        self.first = first
-        self._client = client
-        self._plan = plan
-        self._options = options
-        self._endpoints = endpoints
-        self._cache = cache
-        self._ledger = ledger
-        self._costs = trial_costs(plan, endpoints.measured)
-        self._run = secrets.token_hex(8)
-        self._numbers = itertools.count(1)
-        self._ids: dict[str, str] = {}
-        self._threads: dict[str, int] = {}
-        self._groups: deque[list[TrialSpec]] = deque()
-        self._tasks: dict[asyncio.Task[Played | None], _Given] = {}
-        self._used: list[tuple[float, dict[str, float]]] = []
-        self._losses: Counter[int] = Counter()
-        self._is_short = False
-        self._ended: Ended | None = None
+    _client: Client
+    _plan: Plan
+    _options: Options
+    _endpoints: EndpointPlan
+    _cache: ResponseCache
+    _ledger: Ledger
+    first: FirstDecisions
+    waits: Sequence[Wait] = ()
+    _run: str = field(default_factory=lambda: secrets.token_hex(8))
+    _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(1))
+    _ids: dict[str, str] = field(default_factory=dict)
+    _threads: dict[str, int] = field(default_factory=dict)
+    _groups: deque[list[TrialSpec]] = field(default_factory=deque)
+    _tasks: dict[asyncio.Task[Played | None], _Given] = field(default_factory=dict)
+    _used: list[tuple[float, dict[str, float]]] = field(default_factory=list)
+    _losses: Counter[int] = field(default_factory=Counter)
+    _is_short: bool = False
+    _ended: Ended | None = None
+
+    def __post_init__(self) -> None:
+        self.meters = {name: Meter() for name in self._plan.entries}
+        self._costs = trial_costs(self._plan, self._endpoints.measured)
 
     @property
     def workers(self) -> int:
@@ -405,18 +398,19 @@ class DaskTasks:
         self, specs: Sequence[TrialSpec]
     ) -> tuple[list[CachedCall], dict[str, tuple[Attempt, ...]]]:
         """What the cache holds of the calls of these trials, up to the first that is missing."""
-        player = _Recorded(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
+        player = LocalRunner(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
+        recorded: dict[str, CachedCall] = {}
         unanswered: dict[str, tuple[Attempt, ...]] = {}
-
-        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            assert isinstance(record, TrialRecord)
+        for spec in specs:
+            record = await player.play_one(spec)
+            for row in record.decisions:
+                if (reply := row.decision.reply) is not None:
+                    recorded[reply.request.key] = CachedCall(reply.request, reply.attempts)
             for call in record.failed_calls:
                 with contextlib.suppress(RecordingError):  # a damaged one is asked again
                     if attempts := self._cache.unanswered(call.request.key):
                         unanswered[call.request.key] = attempts
-
-        await player.play(specs, ended)
-        return list(player.found.values()), unanswered
+        return list(recorded.values()), unanswered
 
     async def _collect(self) -> None:
         """Wait a while for tasks, and keep what those that have ended return."""
@@ -480,18 +474,6 @@ class DaskTasks:
         next(iter(self.meters.values())).notes.append(
             f"the worker {given.address} is lost: its {len(specs)} trials go to others"
         )
-
-
-@dataclass
-class _Recorded(LocalRunner):
-    """Plays by recorded replies alone, and notes them by call key."""
-
-    found: dict[str, CachedCall] = field(default_factory=dict)
-
-    async def _ask(self, model: str, prompt: str, slot: Slot, spec: TrialSpec) -> ChatReply:
-        reply = await super()._ask(model, prompt, slot, spec)
-        self.found[reply.request.key] = CachedCall(reply.request, reply.attempts)
-        return reply
 
 
 async def _result(future: Future) -> Played | None:

@@ -26,17 +26,6 @@ PROMPT_MARGIN = 1.25
 
 
 @dataclass(frozen=True, slots=True)
-class Todo:
-    """What an arm has yet to do: trials that are neither stored nor recorded, and their calls.
-
-    ``calls`` is roughly how many each model has yet to answer.
-    """
-
-    trials: int
-    calls: Mapping[str, float]
-
-
-@dataclass(frozen=True, slots=True)
 class BatchEstimate:
     """What a run costs in batches in USD (None: unknown), in how many rounds, usually and at most.
 
@@ -101,43 +90,50 @@ def estimate(
     plan: Plan,
     options: Options,
     *,
-    todo: Mapping[str, Todo],
+    trials: Mapping[str, int],
+    calls: Mapping[str, Mapping[str, float]],
     facts: Mapping[str, CallTotals],
     spending: Spending,
 ) -> Estimate:
-    """The estimate for what a live run of a plan has yet to do, by the labels of its arms.
+    """The estimate for the ``trials`` that a live run of a plan has yet to play, by arm.
 
-    ``facts`` is what the cache knows about each model's earlier answers to similar requests at its
-    endpoint, ``spending`` what counts against the caps already.
+    ``calls`` is roughly how many each model has yet to answer in an arm. ``facts`` is what the
+    cache knows about each model's earlier answers to similar requests at its endpoint,
+    ``spending`` what counts against the caps already.
     """
-    arms = plan.by_label()
-    calls = [
+    todo = [
         _Calls(
             label,
             plan.registered[name],
             entry,
-            round(each.calls[name]),
-            *_per_call(plan, arms[label], entry, facts[name]),
+            round(calls[label][name]),
+            *_per_call(plan, arm, entry, facts[name]),
             price_factor(entry) if options.batch else 1.0,
         )
-        for label, each in todo.items()
-        for name, entry in arms[label].entries.items()
+        for label, arm in plan.by_label().items()
+        for name, entry in arm.entries.items()
     ]
-    trials = sum(each.trials for each in todo.values())
+    batch = None
+    if options.batch:
+        batch = BatchEstimate(
+            cost_usd=_rounded_sum(each.paid_usd for each in todo),
+            rounds=max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0),
+            most_rounds=max(map(most_prompts, plan.arms), default=0),
+        )
     return Estimate(
         plan.driver,
-        trials,
-        calls=sum(each.number for each in calls),
-        input_tokens=sum(each.number * (each.usage.input_tokens or 0) for each in calls),
-        output_tokens=sum(each.number * (each.usage.output_tokens or 0) for each in calls),
-        cost_usd=_rounded_sum(each.cost_usd for each in calls),
-        minutes=_minutes(options, trials, calls),
+        sum(trials.values()),
+        calls=sum(each.number for each in todo),
+        input_tokens=sum(each.number * (each.usage.input_tokens or 0) for each in todo),
+        output_tokens=sum(each.number * (each.usage.output_tokens or 0) for each in todo),
+        cost_usd=_rounded_sum(each.cost_usd for each in todo),
+        minutes=_minutes(options, sum(trials.values()), todo),
         free=all(entry.price == "free" for entry in plan.entries.values()),
         measured=tuple(
             driver_name(name, plan.endpoints[name]) for name in plan.entries if facts[name].measured
         ),
-        trials_within_cap=_within(options.max_cost_usd, spending, todo, calls),
-        batch=_in_batches(plan, calls) if options.batch else None,
+        trials_within_cap=_within(options.max_cost_usd, spending, trials, todo),
+        batch=batch,
     )
 
 
@@ -147,14 +143,6 @@ def price_factor(entry: ModelEntry) -> float:
     return 1.0 if terms is None else terms.price_factor
 
 
-def _in_batches(plan: Plan, calls: Sequence[_Calls]) -> BatchEstimate:
-    return BatchEstimate(
-        cost_usd=_rounded_sum(each.paid_usd for each in calls),
-        rounds=max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0),
-        most_rounds=max(map(most_prompts, plan.arms), default=0),
-    )
-
-
 def _rounded_sum(costs: Iterable[float | None]) -> float | None:
     """The sum to a cent; None where a price is unknown."""
     known = list(costs)
@@ -162,7 +150,7 @@ def _rounded_sum(costs: Iterable[float | None]) -> float | None:
 
 
 def _within(
-    cap_usd: float | None, spending: Spending, todo: Mapping[str, Todo], calls: Sequence[_Calls]
+    cap_usd: float | None, spending: Spending, trials: Mapping[str, int], calls: Sequence[_Calls]
 ) -> int | None:
     """How many trials the money left buys, spread evenly; None without a cap or a price."""
     if cap_usd is None or any(each.cost_usd is None for each in calls):
@@ -170,7 +158,7 @@ def _within(
     usd = sum(each.paid_usd or 0.0 for each in calls)
     paid = {each.arm for each in calls if each.paid_usd}
     share = max(0.0, min(1.0, (cap_usd - spending.committed_usd) / usd)) if usd else 1.0
-    return int(sum(t.trials * (share if label in paid else 1.0) for label, t in todo.items()))
+    return int(sum(n * (share if label in paid else 1.0) for label, n in trials.items()))
 
 
 def _minutes(options: Options, trials: int, calls: Sequence[_Calls]) -> float:

@@ -8,8 +8,8 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
@@ -82,28 +82,36 @@ class Progress:
 
     def fields(self) -> list[tuple[str, str]]:
         """Name and text of every figure that is shown."""
+        now = self.standing("")
         elapsed = time.monotonic() - self.started
         rates = [meter.last_minute() for meter in self.meters]
         requests, tokens = (sum(rate[i] for rate in rates) for i in (0, 1))
-        left_s = self._left_s()
-        left = "" if left_s is None else f", about {left_s:.0f} s left"
+        left = "" if now.left_s is None else f", about {now.left_s:.0f} s left"
         window = min(60.0, max(elapsed, 1.0)) / 60
         before = f" (+{self.stored} stored before)" if self.stored else ""
-        running = f"{self.runner.running} running{self._on()}"
+        workers = now.workers
+        on = "" if workers is None else f" on {workers or 'no'} worker{'s' * (workers != 1)}"
+        spent = (
+            f", {now.committed_usd:.2f} of {now.cap_usd:g} over all runs"
+            if now.cap_usd is not None
+            else ""
+        )
+        batches = _shortened(self.batches(), "others")
+        waiting = self._waiting()
         return [
-            *(("WARNING", text) for text in self._warnings()),
-            ("trials", f"{self.ended}/{self.total} ended{before}, {running}"),
-            ("failed", str(self.outcome_counts["failed"])),
-            ("calls", f"{self._calls_live} live, {self._calls_cached} from recordings"),
+            *(("WARNING", text) for text in now.warnings),
+            ("trials", f"{self.ended}/{self.total} ended{before}, {now.running} running{on}"),
+            ("failed", str(now.failed)),
+            ("calls", f"{now.calls_live} live, {now.calls_cached} from recordings"),
             ("rate", f"{requests / window:.0f} requests/min, {tokens / window:.0f} tokens/min"),
-            ("cost", f"{self._cost_usd:.2f} USD{self._in_the_end()}{self._spent()}"),
-            *(("batches", text) for text in self._batches()),
-            *(("calls waiting", "; ".join(texts)) for texts in [self._waiting()] if texts),
+            ("cost", f"{now.cost_usd:.2f} USD{self._in_the_end(now.cost_usd)}{spent}"),
+            *(("batches", text) for text in batches + [CLOSE_IT] * bool(batches)),
+            *([("calls waiting", "; ".join(waiting))] if waiting else []),
             ("time", f"{elapsed:.0f} s{left}"),
         ]
 
     def standing(self, sweep_id: str) -> Standing:
-        """Where the sweep stands, cell by cell, for other processes."""
+        """Where the sweep stands, for the display and for other processes."""
         return Standing(
             sweep_id=sweep_id,
             name=self.plan.name,
@@ -119,9 +127,9 @@ class Progress:
             workers=self.runner.workers,
             ended=self.stored + self.ended - self.outcome_counts["failed"],
             failed=self.outcome_counts["failed"],
-            calls_live=self._calls_live,
-            calls_cached=self._calls_cached,
-            cost_usd=self._cost_usd,
+            calls_live=sum(meter.calls_live for meter in self.meters),
+            calls_cached=sum(meter.calls_cached for meter in self.meters),
+            cost_usd=sum(meter.cost_usd for meter in self.meters),
             cap_usd=self.cap_usd,
             committed_usd=self.ledger.spending.committed_usd,
             left_s=self._left_s(),
@@ -135,41 +143,12 @@ class Progress:
         """One for each model."""
         return tuple(self.runner.meters.values())
 
-    @property
-    def _calls_live(self) -> int:
-        return sum(meter.calls_live for meter in self.meters)
-
-    @property
-    def _calls_cached(self) -> int:
-        return sum(meter.calls_cached for meter in self.meters)
-
-    @property
-    def _cost_usd(self) -> float:
-        return sum(meter.cost_usd for meter in self.meters)
-
-    def _on(self) -> str:
-        workers = self.runner.workers
-        return "" if workers is None else f" on {workers or 'no'} worker{'s' * (workers != 1)}"
-
-    def _in_the_end(self) -> str:
+    def _in_the_end(self, cost_usd: float) -> str:
         """What a run in batches will cost, by the calls that are answered."""
         part = self._part()
-        if not part or not self._cost_usd or not self.batches():
+        if not part or not cost_usd or not self.batches():
             return ""
-        return f", about {self._cost_usd / part:.2f} in the end"
-
-    def _spent(self) -> str:
-        """What counts against the cap: spending of all runs of the sweep, and money set aside."""
-        if self.cap_usd is None:
-            return ""
-        return f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
-
-    def _batches(self) -> list[str]:
-        """What is pending where, and what to do about it: nothing."""
-        texts = self.batches()
-        more = [f"{len(texts) - REASONS_SHOWN} others"] * (len(texts) > REASONS_SHOWN)
-        shown = texts[:REASONS_SHOWN] + more
-        return [*shown, CLOSE_IT] if shown else []
+        return f", about {cost_usd / part:.2f} in the end"
 
     def _warnings(self) -> list[str]:
         others = sum((meter.mismatches for meter in self.meters), Counter[str]())
@@ -197,7 +176,7 @@ class Progress:
         ended, total = self.ended, self.total
         if ended == total:
             return None
-        calls = self._calls_live + self._calls_cached
+        calls = sum(meter.calls_live + meter.calls_cached for meter in self.meters)
         expected_calls = total * self.plan.calls_of_a_trial
         by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
         return max(ended / total, by_calls) or None
@@ -212,15 +191,19 @@ class Progress:
             ends = [wait.until for wait in those if wait.until is not None]
             until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
             texts.append(f"{len(those)} {what}{until}")
-        more = [f"{len(texts) - REASONS_SHOWN} other reasons"] * (len(texts) > REASONS_SHOWN)
-        return texts[:REASONS_SHOWN] + more
+        return _shortened(texts, "other reasons")
+
+
+def _shortened(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[str]:
+    """The first texts, and how many ``others`` there are."""
+    more = [f"{len(texts) - shown} {others}"] * (len(texts) > shown)
+    return texts[:shown] + more
 
 
 @asynccontextmanager
 async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
     """Keep a sweep's progress file up to date while the body runs; remove the file at the end."""
     clear_dead(file.db)
-    file.write(progress.standing(file.sweep_id))
     publishing = asyncio.create_task(_publish(progress, file))
     try:
         yield
@@ -235,12 +218,9 @@ async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[
 
     ``quiet``: only the clients' messages.
     """
-    show = _show_live if sys.stderr.isatty() else _show_plain
-    if quiet:
-        show = _show_notes
     stop = asyncio.Event()
-    display = asyncio.create_task(show(progress, stop))
-    pulse = asyncio.create_task(_feel_pulse(progress))
+    display = asyncio.create_task(_show(progress, stop, quiet=quiet))
+    pulse = asyncio.create_task(_measure_stalls(progress))
     try:
         yield
     finally:
@@ -255,11 +235,11 @@ async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[
 
 async def _publish(progress: Progress, file: ProgressFile) -> None:
     while True:
+        file.write(progress.standing(file.sweep_id))
         await asyncio.sleep(EVERY_S)
-        await asyncio.to_thread(file.write, progress.standing(file.sweep_id))
 
 
-async def _feel_pulse(progress: Progress) -> None:
+async def _measure_stalls(progress: Progress) -> None:
     """Measure how late the event loop wakes a task that sleeps."""
     loop = asyncio.get_running_loop()
     while True:
@@ -268,37 +248,44 @@ async def _feel_pulse(progress: Progress) -> None:
         progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
 
 
-async def _show_live(progress: Progress, stop: asyncio.Event) -> None:
-    from rich.console import Console
-    from rich.live import Live
-    from rich.text import Text
-
-    console = Console(stderr=True)
-    with Live(_table(progress), console=console, auto_refresh=False) as live:
-        while not await _stopped(stop, LIVE_EVERY_S):
+async def _show(progress: Progress, stop: asyncio.Event, *, quiet: bool) -> None:
+    with _screen(progress, quiet=quiet) as (every_s, say, update):
+        stopped = False
+        while not stopped:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(every_s):
+                    await stop.wait()
+            stopped = stop.is_set()
             for note in _notes(progress):
-                console.print(Text(note))
-            live.update(_table(progress), refresh=True)
-        for note in _notes(progress):
-            console.print(Text(note))
-        live.update(_table(progress), refresh=True)
+                say(note)
+            update()
 
 
-async def _show_plain(progress: Progress, stop: asyncio.Event) -> None:
-    while not await _stopped(stop, PLAIN_EVERY_S):
-        for note in _notes(progress):
-            _say(note)
-        _say(_line(progress))
-    for line in (*_notes(progress), _line(progress)):
-        _say(line)
+@contextmanager
+def _screen(
+    progress: Progress, *, quiet: bool
+) -> Iterator[tuple[float, Callable[[str], None], Callable[[], None]]]:
+    """How often to show something in s, what shows a note, and what shows the figures."""
+    if quiet:
+        yield PLAIN_EVERY_S, _say, lambda: None
+    elif not sys.stderr.isatty():
+        yield (
+            PLAIN_EVERY_S,
+            _say,
+            lambda: _say("; ".join(f"{name}: {text}" for name, text in progress.fields())),
+        )
+    else:
+        from rich.console import Console
+        from rich.live import Live
+        from rich.text import Text
 
-
-async def _show_notes(progress: Progress, stop: asyncio.Event) -> None:
-    stopped = False
-    while not stopped:
-        stopped = await _stopped(stop, PLAIN_EVERY_S)
-        for note in _notes(progress):
-            _say(note)
+        console = Console(stderr=True)
+        with Live(_table(progress), console=console, auto_refresh=False) as live:
+            yield (
+                LIVE_EVERY_S,
+                lambda note: console.print(Text(note)),
+                lambda: live.update(_table(progress), refresh=True),
+            )
 
 
 def _table(progress: Progress) -> Table:
@@ -311,10 +298,6 @@ def _table(progress: Progress) -> Table:
     return table
 
 
-def _line(progress: Progress) -> str:
-    return "; ".join(f"{name}: {text}" for name, text in progress.fields())
-
-
 def _notes(progress: Progress) -> list[str]:
     """The clients' messages since the last call: each once, and the first NOTES_SHOWN."""
     notes: dict[str, None] = {}
@@ -322,17 +305,7 @@ def _notes(progress: Progress) -> list[str]:
         while meter.notes:
             notes[meter.notes.popleft()] = None
     lines = [printable(note) for note in notes]
-    more = [f"... and {len(lines) - NOTES_SHOWN} more like these"] * (len(lines) > NOTES_SHOWN)
-    return lines[:NOTES_SHOWN] + more
-
-
-async def _stopped(stop: asyncio.Event, seconds: float) -> bool:
-    try:
-        async with asyncio.timeout(seconds):
-            await stop.wait()
-    except TimeoutError:
-        return False
-    return True
+    return _shortened(lines, "more like these", NOTES_SHOWN)
 
 
 def _say(line: str) -> None:

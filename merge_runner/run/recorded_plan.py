@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,11 +46,8 @@ def _has_replies(folder: Path, plan: Plan) -> bool:
     ids = {entry.id for entry in plan.entries.values()}
     unreadable: list[str] = []
     try:
-        cache = ResponseCache(folder, read_only=True)
-        try:
+        with closing(ResponseCache(folder, read_only=True)) as cache:
             found = any(entry.request.model in ids for entry in cache.entries(unreadable))
-        finally:
-            cache.close()
     except MergeRunnerError:
         return True  # it says so when the replay opens it
     return found or bool(unreadable)

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import zip_longest
 
 from merge_runner.llm.cache import CachedCall
 from merge_runner.records import ChatRequest, Slot
@@ -40,35 +41,22 @@ def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
         same_place.setdefault(_place(request.slot), request)
     alike: dict[str, list[tuple[Miss, str]]] = {}
     for miss in misses:
-        text = _explained(miss, same_slot, same_place)
+        request, place = miss.request, _place(miss.request.slot)
+        others = same_slot.get(request.slot) or [
+            same_place.get(place) or next(iter(same_place.values()), request)
+        ]
+        nearest = min((list(_differences(other, request)) for other in others), key=len)
+        text = f"the nearest recorded request differs in {'; '.join(nearest)}"
+        text = text if nearest else "nothing is recorded at all"
         alike.setdefault(_NUMBER.sub("0", text), []).append((miss, text))
-    return [_as_line(group) for group in alike.values()]
-
-
-def _as_line(group: list[tuple[Miss, str]]) -> str:
-    """The first of the misses that differ in the same way, and their number, as a line of text."""
-    (first, text), *others = group
-    slot = first.request.slot
-    line = f"{first.trial_id}, {slot.side}, decision {slot.decision}: {text}"
-    if not others:
-        return line
-    trials = len({miss.trial_id for miss, _ in group})
-    return f"{line}; {len(group)} calls of {trials} trials differ like this"
-
-
-def _explained(
-    miss: Miss,
-    same_slot: dict[Slot, list[ChatRequest]],
-    same_place: dict[tuple[str, str, int], ChatRequest],
-) -> str:
-    request, slot = miss.request, miss.request.slot
-    others = same_slot.get(slot) or [
-        same_place.get(_place(slot)) or next(iter(same_place.values()), request)
-    ]
-    nearest = min((list(_differences(other, request)) for other in others), key=len)
-    if not nearest:
-        return "nothing is recorded at all"
-    return f"the nearest recorded request differs in {'; '.join(nearest)}"
+    lines = []
+    for group in alike.values():
+        first, text = group[0]
+        slot, trials = first.request.slot, {miss.trial_id for miss, _ in group}
+        line = f"{first.trial_id}, {slot.side}, decision {slot.decision}: {text}"
+        more = f"; {len(group)} calls of {len(trials)} trials differ like this"
+        lines.append(line + more * (len(group) > 1))
+    return lines
 
 
 def _place(slot: Slot) -> tuple[str, str, int]:
@@ -81,17 +69,21 @@ def _fields(request: ChatRequest) -> dict[str, object]:
         "path": request.path,
         "headers": request.headers,
         **request.slot.as_dict(),
+        **dict(_leaves("body", json.loads(request.body))),
     }
 
 
 def _differences(recorded: ChatRequest, wanted: ChatRequest) -> Iterator[str]:
-    old = {**_fields(recorded), **dict(_leaves("body", json.loads(recorded.body)))}
-    new = {**_fields(wanted), **dict(_leaves("body", json.loads(wanted.body)))}
+    """Yield the fields that differ, each with both values; of texts the first lines that differ."""
+    old, new = _fields(recorded), _fields(wanted)
     for name in sorted(old.keys() | new.keys()):
-        if old.get(name) == new.get(name):
+        before, after = old.get(name), new.get(name)
+        if before == after:
             continue
-        before, after = _first_difference(old.get(name), new.get(name))
-        yield f"{name} (recorded {before}, wanted {after})"
+        if isinstance(before, str) and isinstance(after, str):
+            lines = zip_longest(before.split("\n"), after.split("\n"))
+            before, after = next((a, b) for a, b in lines if a != b)
+        yield f"{name} (recorded {_short(before)}, wanted {_short(after)})"
 
 
 def _leaves(name: str, value: object) -> Iterator[tuple[str, object]]:
@@ -105,18 +97,6 @@ def _leaves(name: str, value: object) -> Iterator[tuple[str, object]]:
         yield name, value
 
 
-def _first_difference(old: object, new: object) -> tuple[str, str]:
-    """Both values; for two texts, the first line that differs."""
-    if isinstance(old, str) and isinstance(new, str):
-        before, after = old.split("\n"), new.split("\n")
-        for line, other in zip(before, after, strict=False):
-            if line != other:
-                return _short(line), _short(other)
-        if len(before) != len(after):
-            return f"{len(before)} lines", f"{len(after)} lines"
-    return ("nothing" if old is None else _short(old)), ("nothing" if new is None else _short(new))
-
-
 def _short(value: object) -> str:
-    text = repr(value)
+    text = "nothing" if value is None else repr(value)
     return text if len(text) <= SHOWN else text[:SHOWN] + "..."

@@ -10,7 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -26,7 +26,6 @@ from merge_runner.errors import (
     CallFailed,
     MergeRunnerError,
     RecordingError,
-    TrialSuspended,
     unknown_name,
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
@@ -73,9 +72,11 @@ NOT_REPLAYED = (
     "sweeps.git_dirty",
     "sweeps.versions",
 )
-# Members of a spec that change with the program, and not with the sweep's configuration.
-OF_THE_PROGRAM = frozenset({"spec_version", "prompt_blocks", "left.source", "right.source"})
-OF_THE_DATA = frozenset({"left.data", "right.data"})
+# Members of a spec that change with the program or its data, not with the sweep's configuration.
+OF_THE_PROGRAM = frozenset(
+    {"spec_version", "prompt_blocks"}
+    | {f"{side}.{name}" for side in SIDES for name in ("source", "data")}
+)
 HINT = "install the package that registers it, or name the study: --study FILE"
 SWEEPS = """
 SELECT sweep_id, config::VARCHAR, coalesce(exit_code = 0, false) FROM sweeps
@@ -100,13 +101,16 @@ def audit_database(
                     "sweep", sweep_id, [row[0] for row in reversed(rows)], f"in {path}"
                 )
             rows = known
-        if cache is not None:
-            ResponseCache(cache, read_only=True).close()  # raises where there is none
         kept = Audit(str(cache), {"trials": 0})
-        audits = [
-            _audit(connection, name, config, cache, kept, finished=finished)
-            for name, config, finished in rows
-        ]
+        with (
+            nullcontext()
+            if cache is None
+            else closing(ResponseCache(cache, read_only=True)) as replies
+        ):
+            audits = [
+                _audit(connection, name, config, replies, kept, finished=finished)
+                for name, config, finished in rows
+            ]
         audits.reverse()
         if sweep_id is None:
             audits.append(check_rest(connection, path))
@@ -117,7 +121,7 @@ def _audit(
     connection: duckdb.DuckDBPyConnection,
     sweep_id: str,
     config: str,
-    cache: Path | None,
+    cache: ResponseCache | None,
     kept: Audit,
     *,
     finished: bool,
@@ -129,26 +133,43 @@ def _audit(
     specs: list[TrialSpec] = []
     try:
         plan = Plan.model_validate_json(config)
-        _use_stored(plan)
-        problems += _disagreements(plan, json.loads(config), sweep_id)
-        plan, planned, specs = _part_that_is_here(connection, plan, notes)
+        # The stored plug-ins are somebody's code and never run.
+        if plan.study.is_own and not in_use().text:
+            use(declared_catalogue(plan.study.text))
+        stored, members = json.loads(config), plan.model_dump(mode="json").items()
+        if wrong := [name for name, value in members if stored.get(name, value) != value]:
+            text = f"it disagrees with itself in {', '.join(wrong)}"
+            problems.append(Finding("config", text, sweep_id))
+        plan, planned, specs = _installed_part(connection, plan, notes)
+    except ValidationError as exc:
+        error = exc.errors()[0]
+        problems.append(
+            _unreadable(f"{'.'.join(map(str, error['loc']))}: {error['msg']}", sweep_id)
+        )
     except (*DAMAGED, AttributeError, MergeRunnerError) as exc:
-        text = f"its configuration cannot be read, so that its trials are not known: {_first(exc)}"
-        problems.append(Finding("config", text, sweep_id))
+        problems.append(_unreadable(exc, sweep_id))
     audit = check_sweep(connection, sweep_id, list(planned.items()), finished=finished)
     audit.findings += problems
     if specs:
-        there = _replayable(connection, plan, specs, audit, notes)
-        audit.counts["replayed"] = len(there)
-        audit.findings += _replay(connection, plan, there, None, sweep_id)
+        specs = _replayable(connection, plan, specs, audit, notes)
+        audit.counts["replayed"] = len(specs)
+        stored_replies = StoredReplies(connection, plan)
+        audit.findings += _replay(connection, plan, specs, stored_replies, sweep_id)
         if cache is not None:
-            kept.counts["trials"] += len(there)
-            kept.findings += _replay(connection, plan, there, cache, sweep_id)
-    audit.notes += [f"not replayed: {count} trials, since {why}" for why, count in notes.items()]
+            kept.counts["trials"] += len(specs)
+            kept.findings += _replay(connection, plan, specs, cache, sweep_id)
+    audit.notes += [
+        f"not replayed: {count} trials, since {why}" for why, count in notes.items() if count
+    ]
     return audit
 
 
-def _part_that_is_here(
+def _unreadable(why: object, sweep_id: str) -> Finding:
+    text = f"its configuration cannot be read, so that its trials are not known: {why}"
+    return Finding("config", text, sweep_id)
+
+
+def _installed_part(
     connection: duckdb.DuckDBPyConnection, plan: Plan, notes: Counter[str]
 ) -> tuple[Plan, dict[str, str], list[TrialSpec]]:
     """Return the part of a plan whose drivers, prompts and conditions are installed.
@@ -158,19 +179,21 @@ def _part_that_is_here(
     """
     if plan.trials > MOST_TRIALS:
         raise ValueError(f"it has {plan.trials} trials")
-    planned = {}
     arms = []
     conditions = tuple(name for name in plan.conditions if name in CONDITIONS)
     for arm in plan.arms:
-        for condition in plan.conditions:
-            for repetition in range(1, arm.repetitions + 1):
-                planned[plan.trial_id_of(arm, condition, repetition)] = ""
-        trials = arm.repetitions * len(plan.conditions)
-        if not (why := _lacking(connection, arm)):
+        if why := _lacking(connection, arm):
+            notes[why] += arm.repetitions * len(plan.conditions)
+        else:
             arms.append(arm)
-            trials = arm.repetitions * (len(plan.conditions) - len(conditions))
-            why = "their condition is not installed"
-        notes += Counter({why: trials})
+            lacking = len(plan.conditions) - len(conditions)
+            notes["their condition is not installed"] += arm.repetitions * lacking
+    planned = {
+        plan.trial_id_of(arm, condition, repetition): ""
+        for arm in plan.arms
+        for condition in plan.conditions
+        for repetition in range(1, arm.repetitions + 1)
+    }
     part = plan.model_copy(update={"arms": tuple(arms), "conditions": conditions})
     specs = part.trial_specs() if part.trials else []
     return part, planned | {spec.trial_id: spec.spec_hash for spec in specs}, specs
@@ -194,29 +217,6 @@ def _lacking(connection: duckdb.DuckDBPyConnection, arm: Arm) -> str:
     return ""
 
 
-def _disagreements(plan: Plan, config: Mapping[str, object], sweep_id: str) -> Iterator[Finding]:
-    """Yield a finding where what a plan says twice, for other programs, is not the same."""
-    members = plan.model_dump(mode="json").items()
-    if wrong := [name for name, value in members if config.get(name, value) != value]:
-        yield Finding("config", f"it disagrees with itself in {', '.join(wrong)}", sweep_id)
-
-
-def _first(exc: Exception) -> str:
-    if not isinstance(exc, ValidationError):
-        return str(exc)
-    error = exc.errors()[0]
-    return f"{'.'.join(map(str, error['loc']))}: {error['msg']}"
-
-
-def _use_stored(plan: Plan) -> None:
-    """Use the prompts and conditions of a sweep's study, unless a user named a study.
-
-    The stored plug-ins are somebody's code and never run.
-    """
-    if plan.study.is_own and not in_use().text:
-        use(declared_catalogue(plan.study.text))
-
-
 def _replayable(
     connection: duckdb.DuckDBPyConnection,
     plan: Plan,
@@ -235,30 +235,27 @@ def _replayable(
     wanted = plan.specs()
     others: dict[tuple[str, str], list[str]] = {}
     for spec in specs:
-        there = hashes.get(spec.trial_id, spec.spec_hash)
-        if there != spec.spec_hash:
-            others.setdefault((there, spec.spec_hash), []).append(spec.trial_id)
-    for (there, mine), trials in others.items():
-        members = _differing(stored.get(there, "{}"), wanted[mine])
-        if members <= OF_THE_PROGRAM | OF_THE_DATA:
-            names = ", ".join(sorted(members))
-            notes[f"they were made by another version or other data: {names}"] += len(trials)
+        actual = hashes.get(spec.trial_id, spec.spec_hash)
+        if actual != spec.spec_hash:
+            others.setdefault((actual, spec.spec_hash), []).append(spec.trial_id)
+    for (actual, expected), trials in others.items():
+        try:
+            old, new = _members(stored.get(actual, "{}")), _members(wanted[expected])
+            names = {name for name in old.keys() | new.keys() if old.get(name) != new.get(name)}
+        except (ValueError, RecursionError, AttributeError):
+            names = {"everything"}
+        listed = ", ".join(sorted(names))
+        if names <= OF_THE_PROGRAM:
+            notes[f"they were made by another version or other data: {listed}"] += len(trials)
         else:
-            text = f"its spec is not what the sweep says in {', '.join(sorted(members))}"
+            text = f"its spec is not what the sweep says in {listed}"
             audit.findings.append(Finding("spec", text, audit.subject, trials[0]))
     return [spec for spec in specs if hashes.get(spec.trial_id) == spec.spec_hash]
 
 
-def _differing(stored: str, wanted: str) -> set[str]:
-    """Return the members in which two specs differ, those of drivers one by one."""
-    try:
-        old, new = _members(json.loads(stored)), _members(json.loads(wanted))
-    except (ValueError, RecursionError, AttributeError):
-        return {"everything"}
-    return {name for name in old.keys() | new.keys() if old.get(name) != new.get(name)}
-
-
-def _members(spec: Mapping[str, Any]) -> dict[str, object]:
+def _members(text: str) -> dict[str, object]:
+    """Return the members of a spec, those of drivers one by one."""
+    spec = json.loads(text)
     drivers = {
         f"{side}.{name}": value for side in SIDES for name, value in spec.get(side, {}).items()
     }
@@ -269,22 +266,14 @@ def _replay(
     connection: duckdb.DuckDBPyConnection,
     plan: Plan,
     specs: Sequence[TrialSpec],
-    cache: Path | None,
+    replies: StoredReplies | ResponseCache,
     sweep_id: str,
 ) -> list[Finding]:
-    """Play trials by the stored replies or by those of a cache, and compare their rows."""
-
-    async def compared() -> list[Finding]:
-        if cache is None:
-            return await _compared(
-                connection, plan, specs, StoredReplies(connection, plan), sweep_id
-            )
-        with closing(ResponseCache(cache, read_only=True)) as replies:
-            return await _compared(connection, plan, specs, replies, sweep_id)
-
+    """Play trials by stored replies or those of a cache, and compare their rows."""
     # An event loop may run in the caller's thread, where no other one can.
     with ThreadPoolExecutor(max_workers=1) as thread:
-        return thread.submit(asyncio.run, compared()).result()
+        played = _compared(connection, plan, specs, replies, sweep_id)
+        return thread.submit(asyncio.run, played).result()
 
 
 async def _compared(
@@ -297,20 +286,14 @@ async def _compared(
     clients = sealed_clients(plan, cast(ResponseCache, replies))  # of which they only ask ``get``
     runner = LocalRunner(plan, clients, in_flight=1)
     findings: list[Finding] = []
-    records: list[TrialRecord] = []
-
-    def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-        assert isinstance(record, TrialRecord)  # what asks nobody needs no money
-        records.append(record)
-
     by_key = {(spec.trial_id, spec.spec_hash): spec for spec in specs}
     for keys, spans in in_order(connection, by_key):
         tables = {name: stored_rows(connection, name, keys, spans[name]) for name in PLACES}
         for key in keys:
             if isinstance(replies, StoredReplies):
                 replies.load(by_key[key], spans["calls"])
-            await runner.play([by_key[key]], ended)
-            findings += _findings(records.pop(), tables, replies, sweep_id)
+            record = await runner.play_one(by_key[key])
+            findings += _findings(record, tables, replies, sweep_id)
     return findings
 
 

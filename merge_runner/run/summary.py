@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from itertools import groupby
 from operator import itemgetter
@@ -19,9 +19,7 @@ from merge_runner.run.plan import Options, Plan
 from merge_runner.run.sweep import Outcome
 from merge_runner.study.crossing import PROMPT
 
-# Places in a row of ``SweepFacts.outcomes``.
-VARIANT, CONDITION, STATUS, FELL_BACK = 0, 1, 2, 4
-Groups = defaultdict[tuple[object, ...], Counter[str]]
+Groups = defaultdict[Any, dict[str, int]]
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
 LEDGER = ("model", "variant", "fate", "outcome", "attempts")
 ASKED = ("side", "own dv", "asked", "invalid", "M", "action")
@@ -70,16 +68,16 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
         "failed": dict(facts.failed) if facts else {},
         "audit": None if outcome.audit is None else outcome.audit.as_dict(),
         "outcomes": [
-            {"variant": variant, "condition": condition, **_named(counts)}
+            {"variant": variant, "condition": condition, **counts}
             for (variant, condition), counts in (
-                _counts(facts, VARIANT, CONDITION) if facts else {}
+                _counts(facts, lambda variant, condition, _: (variant, condition)) if facts else {}
             ).items()
         ],
         "outcomes_by_level": [
-            {"factor": factor, "level": level, **_named(counts)}
+            {"factor": factor, "level": level, **counts}
             for (factor, level), counts in (_by_level(facts) if facts else {}).items()
         ],
-        "outcomes_without_fallbacks": (_named(_counts(facts, FELL_BACK)[False,]) if facts else {}),
+        "outcomes_without_fallbacks": _by_fallback(facts)[False] if facts else {},
         **({"first_looks": facts.first_looks if facts else []} if plan.seat else {}),
     }
 
@@ -121,11 +119,10 @@ def _failures(facts: SweepFacts) -> Iterator[str]:
         named = ", ".join(f"{count} {what}" for what, count in counts.most_common())
         yield f"attempts without a plan, {model}, {variant}: {named}"
     if facts.fallbacks:
-        for name, counts in (
-            ("all trials", _counts(facts)[()]),
-            ("trials without fallbacks", _counts(facts, FELL_BACK)[False,]),
-        ):
-            yield f"outcomes of {name}: " + ", ".join(f"{n} {w}" for w, n in _named(counts).items())
+        outcomes = _counts(facts, lambda *_: "all trials")
+        outcomes["trials without fallbacks"] = _by_fallback(facts)[False]
+        for name, tally in outcomes.items():
+            yield f"outcomes of {name}: " + ", ".join(f"{n} {what}" for what, n in tally.items())
 
 
 def _costs(outcome: Outcome, options: Options, expected: Estimate | None) -> Iterator[str]:
@@ -169,24 +166,28 @@ def _mismatches(facts: SweepFacts | None) -> dict[str, int]:
 
 def _table(plan: Plan, facts: SweepFacts) -> Iterator[str]:
     """Counts per condition, and per variant, model and level of a factor where these vary."""
-    by_condition = _counts(facts, CONDITION)
-    yield _row("condition", COLUMNS)
-    for condition in plan.conditions:
-        yield _row(condition, _named(by_condition[condition,]).values())
-    yield _row("all", _named(_counts(facts)[()]).values())
-    if len(plan.repetitions) > 1:
-        by_variant = _counts(facts, VARIANT)
-        yield ""
-        yield _row("variant", COLUMNS)
-        for variant in plan.repetitions:
-            yield _row(variant, _named(by_variant[variant,]).values())
+    conditions = _counts(facts, lambda _, condition, __: condition)
+    variants = _counts(facts, lambda variant, *_: variant)
     by_level = _by_level(facts)
-    for factor, levels in _varying(plan).items():
-        width = max(map(len, (factor, *levels))) + 1
+    yield from _section("condition", {name: conditions[name] for name in plan.conditions})
+    yield _row("all", _counts(facts, lambda *_: "all")["all"].values())
+    if len(plan.repetitions) > 1:
         yield ""
-        yield _row(factor, COLUMNS, width)
-        for level in levels:
-            yield _row(level, _named(by_level[factor, level]).values(), width)
+        yield from _section("variant", {name: variants[name] for name in plan.repetitions})
+    levels = {"model": [arm.model_level for arm in plan.arms]}
+    for factor, level in (item for arm in plan.arms for item in arm.factors.items()):
+        levels.setdefault(factor, []).append(level)
+    for factor, each in levels.items():
+        if factor != PROMPT and len({*each}) > 1:
+            yield ""
+            yield from _section(factor, {level: by_level[factor, level] for level in each})
+
+
+def _section(title: str, groups: dict[str, dict[str, int]]) -> Iterator[str]:
+    width = max(map(len, (title, *groups))) + 1
+    yield _row(title, COLUMNS, width)
+    for name, counts in groups.items():
+        yield _row(name, counts.values(), width)
 
 
 def _asked(facts: SweepFacts) -> Iterator[str]:
@@ -212,19 +213,14 @@ def _asked(facts: SweepFacts) -> Iterator[str]:
             yield _row(row["side"], cells)
 
 
-def _varying(plan: Plan) -> dict[str, list[str]]:
-    """The models, and the factors but the prompt, where there are several, with their levels."""
-    found = {"model": [arm.model_level for arm in plan.arms]}
-    for arm in plan.arms:
-        for factor, level in arm.factors.items():
-            found.setdefault(factor, []).append(level)
-    levels = {name: list(dict.fromkeys(each)) for name, each in found.items() if name != PROMPT}
-    return {name: each for name, each in levels.items() if len(each) > 1}
-
-
 def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
     """Stand-ins, and what the registry notes of models."""
-    yield from (_stand_in(*found) for found in facts.stand_ins)
+    for driver, model, provider, scripted, answers in facts.stand_ins:
+        if provider == EMULATOR:
+            yield f"The model `{model}` is a scripted stand-in, no language model."
+        else:
+            part = "" if scripted == answers else f" in {scripted} of {answers} answers"
+            yield f"{driver}: a scripted stand-in answered, not {model}{part}"
     if outcome.meter.cost_usd and facts.stand_ins:
         yield PRICED_ALIKE
     for name, entry in outcome.plan.entries.items():
@@ -264,43 +260,37 @@ def _failed(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
         yield "Run the same command again to play the failed trials anew."
 
 
-def _stand_in(driver: str, model: str, provider: str, scripted: int, answers: int) -> str:
-    """Says that a stand-in answered in a model's name, or that it was asked for by its own."""
-    if provider == "emulator":
-        return f"The model `{model}` is a scripted stand-in, no language model."
-    part = "" if scripted == answers else f" in {scripted} of {answers} answers"
-    return f"{driver}: a scripted stand-in answered, not {model}{part}"
-
-
-def _counts(facts: SweepFacts, *by: int) -> Groups:
-    """Counts of trials by COLUMNS, for each group of rows that are equal in these places."""
-    groups: Groups = defaultdict(Counter)
-    for row in facts.outcomes:
-        _, _, status, merged_first, _, trials = row
-        _count(groups[tuple(row[place] for place in by)], status, merged_first, trials)
+def _counts(facts: SweepFacts, group: Callable[[str, str, bool], object]) -> Groups:
+    """Counts of trials by COLUMNS, for each group by variant, condition, and had a fallback."""
+    groups: Groups = defaultdict(lambda: dict.fromkeys(COLUMNS, 0))
+    for variant, condition, status, merged_first, fell_back, trials in facts.outcomes:
+        _count(groups[group(variant, condition, fell_back)], status, merged_first, trials)
     return groups
 
 
 def _by_level(facts: SweepFacts) -> Groups:
     """The same for each level of each factor."""
-    groups: Groups = defaultdict(Counter)
+    groups: Groups = defaultdict(lambda: dict.fromkeys(COLUMNS, 0))
     for factor, level, status, merged_first, trials in facts.levels:
         _count(groups[factor, level], status, merged_first, trials)
     return groups
 
 
-def _count(counts: Counter[str], status: str, merged_first: str | None, trials: int) -> None:
+def _by_fallback(facts: SweepFacts) -> Groups:
+    return _counts(facts, lambda _, __, fell_back: fell_back)
+
+
+def _count(counts: dict[str, int], status: str, merged_first: str | None, trials: int) -> None:
     counts["trials"] += trials
-    counts[f"{merged_first} first" if status == "finished" else status] += trials
-
-
-def _named(counts: Counter[str]) -> dict[str, int]:
-    return {column: counts[column] for column in COLUMNS}
+    if (column := f"{merged_first} first" if status == "finished" else status) in COLUMNS:
+        counts[column] += trials
 
 
 def _statuses(facts: SweepFacts) -> dict[str, int]:
-    groups = _counts(facts, STATUS)
-    return {status: groups[status,]["trials"] for status in get_args(Status)}
+    counts: Counter[str] = Counter()
+    for _, _, status, _, _, trials in facts.outcomes:
+        counts[status] += trials
+    return {status: counts[status] for status in get_args(Status)}
 
 
 def _row(name: str, values: Iterable[object], width: int = 10) -> str:

@@ -11,7 +11,6 @@ from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
-from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +32,7 @@ from merge_runner.llm.content_hashes import canonical_json, manner
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger, Spending, scopes
 from merge_runner.llm.meter import Meter
-from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.records import DecisionRow, TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.progress_file import ProgressFile
 from merge_runner.results.provenance import git_state, versions
@@ -48,7 +47,7 @@ from merge_runner.run.clients import (
     open_rounds,
     sealed_clients,
 )
-from merge_runner.run.estimate import Estimate, Todo, estimate
+from merge_runner.run.estimate import Estimate, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, MOST_HELD, Flusher
 from merge_runner.run.local_runner import LocalRunner
@@ -102,38 +101,39 @@ class Outcome:
         self.exit_code = self.exit_code or exit_code
         self.messages.append(message)
 
+    def fail_by(self, error: BaseException | None) -> None:
+        """Note an error that a user can act on; raises any other one."""
+        if isinstance(error, MergeRunnerError):
+            self.fail(error.exit_code, str(error))
+        elif error is not None:
+            raise error
 
+
+@dataclass
 class Sweep:
     """One run of a plan (see ``open_sweep``), which plays the trials ``todo``."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        options: Options,
-        cache: ResponseCache,
-        stored: list[TrialSpec],
-        todo: list[TrialSpec],
-        *,
-        say: Callable[[str], None],
-    ) -> None:
-        self._plan = plan
-        self._options = options
-        self._cache = cache
-        self._stored = stored
-        self._todo = todo
-        self._say = say
-        self._arms = plan.by_label()
-        self._misses: list[Miss] = []
-        self._ledger = Ledger(cache, plan.ledger)
-        self._suspended: TrialSuspended | None = None
-        self._rounds: Rounds | None = None
+    _plan: Plan
+    _options: Options
+    _cache: ResponseCache
+    _stored: list[TrialSpec]
+    _todo: list[TrialSpec]
+    _say: Callable[[str], None]
+    _misses: list[Miss] = field(default_factory=list)
+    _suspended: TrialSuspended | None = None
+    _rounds: Rounds | None = None
+
+    def __post_init__(self) -> None:
+        """Nobody plays yet."""
+        self._arms = self._plan.by_label()
+        self._ledger = Ledger(self._cache, self._plan.ledger)
         self._progress = Progress(
-            plan=plan,
-            planned=len(stored) + len(todo),
-            stored=len(stored),
-            runner=LocalRunner(plan, {}, in_flight=0),  # nobody plays yet
+            plan=self._plan,
+            planned=len(self._stored) + len(self._todo),
+            stored=len(self._stored),
+            runner=LocalRunner(self._plan, {}, in_flight=0),
             ledger=self._ledger,
-            cap_usd=options.max_cost_usd,
+            cap_usd=self._options.max_cost_usd,
         )
 
     @property
@@ -167,16 +167,11 @@ class Sweep:
         """The first calls of all trials if none is recorded; else nothing."""
         runner = LocalRunner(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
         misses: list[Miss] = []
-
-        def none_found() -> bool:
-            return not any(meter.calls_cached for meter in runner.meters.values())
-
-        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            if isinstance(record, TrialRecord):
-                misses.extend(_misses(spec, record))
-
-        await runner.play(takewhile(lambda _: none_found(), self._todo), ended)
-        return misses if none_found() else []
+        for spec in self._todo:
+            misses += _misses(spec, await runner.play_one(spec))
+            if any(meter.calls_cached for meter in runner.meters.values()):
+                return []
+        return misses
 
     def _not_recorded(self, misses: list[Miss]) -> Outcome:
         """The outcome of a replay that stores nothing, since it has none of its calls."""
@@ -214,7 +209,7 @@ class Sweep:
                 if self._options.replay:  # which spends nothing
                     outcome.messages.append(str(exc))
                 else:
-                    outcome.fail(exc.exit_code, str(exc))
+                    outcome.fail_by(exc)
         for meter in runner.meters.values():
             outcome.meter.add(meter)
         counts = self._progress.outcome_counts
@@ -229,43 +224,38 @@ class Sweep:
             outcome.fail(1, f"{counts['failed']} trials failed")
         return outcome
 
-    async def estimate(self) -> Estimate:
-        """What a live run takes: plays from recorded replies alone, and counts what is missing."""
-        plan = self._plan
-        trials = Counter(spec.arm for spec in self._todo if not self._arms[spec.arm].entries)
+    async def estimate(self, *, whole: bool = False) -> Estimate:
+        """What a live run takes: plays from recorded replies alone, and counts what is missing.
+
+        ``whole``: what all trials take, as if none were stored or recorded yet.
+        """
+        trials: Counter[str] = Counter()
         calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in self._arms.items()}
 
-        def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            if isinstance(record, TrialSuspended) or record.status != "failed":
-                return
-            trials[spec.arm] += 1
+        def count(spec: TrialSpec, decisions: Sequence[DecisionRow] = ()) -> None:
             arm = self._arms[spec.arm]
+            trials[spec.arm] += 1
             for side, name in arm.asked.items():
-                if name in plan.entries:
-                    answered = sum(row.side == side for row in record.decisions)
+                if name in arm.entries:
+                    answered = sum(row.side == side for row in decisions)
                     calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
 
-        asking = [spec for spec in self._todo if self._arms[spec.arm].entries]
-        clients = sealed_clients(plan, self._cache)
-        await LocalRunner(plan, clients, in_flight=1).play(asking, ended)
-        return self._estimated({label: Todo(trials[label], calls[label]) for label in self._arms})
-
-    def estimate_of_all(self) -> Estimate:
-        """What all trials take, as if none were stored or recorded yet."""
-        conditions = len(self._plan.conditions)
-        todo = {}
-        for label, arm in self._arms.items():
-            trials = arm.repetitions * conditions
-            sides = Counter(name for name in arm.asked.values() if name in arm.entries)
-            calls = {name: trials * n * usual_prompts(arm) for name, n in sides.items()}
-            todo[label] = Todo(trials, calls)
-        return self._estimated(todo)
-
-    def _estimated(self, todo: Mapping[str, Todo]) -> Estimate:
+        if whole:
+            for spec in [*self._stored, *self._todo]:
+                count(spec)
+        else:
+            clients = sealed_clients(self._plan, self._cache)
+            runner = LocalRunner(self._plan, clients, in_flight=1)
+            for spec in self._todo:
+                if not self._arms[spec.arm].entries:
+                    count(spec)
+                elif (record := await runner.play_one(spec)).status == "failed":
+                    count(spec, record.decisions)
         return estimate(
             self._plan,
             self._options,
-            todo=todo,
+            trials=trials,
+            calls=calls,
             facts=self._measured(),
             spending=self._ledger.spending,
         )
@@ -388,16 +378,10 @@ class Sweep:
                 raise error
         if self._rounds is not None:
             outcome.batches = self._rounds.standing()
-        self._note_end(work, outcome)
-
-    def _note_end(self, work: asyncio.Task[None], outcome: Outcome) -> None:
-        """Note how the playing ended, if not with the last trial."""
         if work.cancelled():
             outcome.fail(INTERRUPTED, f"Interrupted. {GO_ON}")
-        elif isinstance(error := work.exception(), MergeRunnerError):
-            outcome.fail(error.exit_code, str(error))
-        elif error is not None:
-            raise error
+        else:
+            outcome.fail_by(work.exception())
 
     async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> None:
         """Store what has ended and is not stored yet; Ctrl-C ends the waiting for that."""
@@ -408,10 +392,8 @@ class Sweep:
             outcome.gave_up = True
             why = f": {flusher.problem}. {AGAIN}" if flusher.problem else ". " + GO_ON
             outcome.fail(INTERRUPTED, f"Interrupted{why}")
-        elif isinstance(error := closing.exception(), MergeRunnerError):
-            outcome.fail(error.exit_code, str(error))
-        elif error is not None:
-            raise error
+        elif error := closing.exception():
+            outcome.fail_by(error)
         elif flusher.differing:
             outcome.fail(
                 StoreError.exit_code,
@@ -422,11 +404,6 @@ class Sweep:
 
     async def _store_all(self, flusher: Flusher) -> None:
         """Store the trials in memory, and play those again that were dropped: without a call."""
-
-        def ended(_: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            assert isinstance(record, TrialRecord)  # what asks nobody needs no money
-            flusher.add(record)
-
         await flusher.close()
         if flusher.dropped:
             self._say(
@@ -436,7 +413,9 @@ class Sweep:
         while flusher.dropped:
             again, flusher.dropped = flusher.dropped[:MOST_HELD], flusher.dropped[MOST_HELD:]
             clients = sealed_clients(self._plan, self._cache)
-            await LocalRunner(self._plan, clients, in_flight=1).play(again, ended)
+            runner = LocalRunner(self._plan, clients, in_flight=1)
+            for spec in again:
+                flusher.add(await runner.play_one(spec))
             await flusher.close()
 
     def _end(self, outcome: Outcome) -> None:
@@ -462,7 +441,7 @@ class Sweep:
             ended_at = datetime.now(UTC).replace(tzinfo=None)
             self._store.end_sweep(outcome.sweep_id, ended_at, outcome.exit_code)
         except (StoreError, UsageError) as exc:
-            outcome.fail(exc.exit_code, str(exc))
+            outcome.fail_by(exc)
 
     def _first_decisions(self, *, one_by_one: bool = False) -> FirstDecisions:
         """The first decisions of the models, with those that are stored already."""
@@ -511,7 +490,7 @@ async def open_sweep(
             entries = plan.entries.items()
             cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in entries})
         stored = [spec for key, spec in specs.items() if key in ended]
-        yield Sweep(plan, options, cache, stored, todo, say=say)
+        yield Sweep(plan, options, cache, stored, todo, say)
 
 
 async def _named(
@@ -572,29 +551,20 @@ def _less_what_is_spent(
     return replace(options, max_cost_usd=max(0.0, options.max_cost_usd - spent_usd))
 
 
-async def unsent(plan: Plan, options: Options, *, say: Callable[[str], None]) -> Estimate:
-    """What is neither stored nor recorded yet; makes no database or cache that is not there."""
-    async with _open_unchanged(plan, options, say) as prepared:
-        return await prepared.estimate()
+async def unsent(
+    plan: Plan, options: Options, *, say: Callable[[str], None], whole: bool = False
+) -> Estimate:
+    """What is neither stored nor recorded yet; makes no database or cache that is not there.
 
-
-async def of_all(plan: Plan, options: Options, *, say: Callable[[str], None]) -> Estimate:
-    """What the whole plan takes, as if nothing were stored or recorded; makes nothing either."""
-    async with _open_unchanged(plan, options, say) as prepared:
-        return prepared.estimate_of_all()
-
-
-@asynccontextmanager
-async def _open_unchanged(
-    plan: Plan, options: Options, say: Callable[[str], None]
-) -> AsyncIterator[Sweep]:
+    ``whole``: as if nothing were stored or recorded.
+    """
     with tempfile.TemporaryDirectory() as folder:
         db = options.db if options.db.is_file() else Path(folder) / "none.duckdb"
         recorded = (options.cache / "cache.db").is_file()
         cache = options.cache if recorded else Path(folder) / "responses"
         options = replace(options, db=db, cache=cache, dry_run=True)
         async with open_sweep(plan, options, say=say) as sweep:
-            yield sweep
+            return await sweep.estimate(whole=whole)
 
 
 def _misses(spec: TrialSpec, record: TrialRecord) -> list[Miss]:

@@ -123,18 +123,6 @@ def test_the_name_of_a_sweep_leads_out_of_no_folder(tmp_path):
     assert (tmp_path / "outside.json").exists()
 
 
-def test_an_older_state_never_takes_the_place_of_a_newer_one_nor_comes_after_the_end(tmp_path):
-    db = tmp_path / "m.duckdb"
-    file, old = ProgressFile(db, "s"), standing()
-    new = replace(old, updated_at=old.updated_at + timedelta(seconds=1), doing="checking")
-    file.write(new)
-    file.write(old)
-    assert read_standing(db, "s") == new
-    file.remove()
-    file.write(replace(new, updated_at=new.updated_at + timedelta(seconds=1)))
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_disk_that_takes_no_file_fails_nothing_and_is_told_of_once(tmp_path, caplog):
     (tmp_path / "m.duckdb.progress").write_text("a file where the folder should be")
     file = ProgressFile(tmp_path / "m.duckdb", "s")

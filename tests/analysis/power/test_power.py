@@ -23,7 +23,7 @@ from merge_runner.planted_effect import PlantedEffect
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import SIDES, Slot
 from merge_runner.run.plan import Options, make_plan
-from merge_runner.run.sweep import of_all
+from merge_runner.run.sweep import unsent
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
@@ -149,7 +149,7 @@ def test_an_effect_that_four_times_the_trials_do_not_show_is_not_findable():
 def powered(tmp_path, study, model=(), simulations=60, seed=0):
     plan = make_plan(study, model)
     options = Options(db=tmp_path / "none.duckdb", cache=tmp_path / "none")
-    expected = asyncio.run(of_all(plan, options, say=print))
+    expected = asyncio.run(unsent(plan, options, say=print, whole=True))
     return chances(plan, expected, [], simulations=simulations, seed=seed)
 
 
