@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
+import signal
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +25,6 @@ from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.registry import Catalogue, in_use, use
 from merge_runner.run.dask_cluster import connected
 from merge_runner.run.dask_tasks import use_study
-from merge_runner.signals import FROM_TERMINAL
 from merge_runner.study.file import read_study
 from tests.gate import HANGS_S, Gate
 from tests.harness import FAST, PROJECT, environment, watched
@@ -353,7 +353,7 @@ async def test_a_coordinator_that_is_killed_takes_its_workers_along(merge_runner
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("number", FROM_TERMINAL)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, number):
     gate = Gate(40)
     async with watched(gate.middle) as server:
