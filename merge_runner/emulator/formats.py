@@ -127,7 +127,9 @@ class _Chat(_OpenAI):
                         "role": "assistant",
                         "content": None if refused else said.text,
                         "refusal": REFUSAL if refused else None,
+                        "annotations": [],
                     },
+                    "logprobs": None,
                     "finish_reason": "stop",
                 }
             ],
@@ -135,9 +137,14 @@ class _Chat(_OpenAI):
                 "prompt_tokens": said.tokens_in,
                 "completion_tokens": said.output,
                 "total_tokens": said.tokens_in + said.output,
-                "prompt_tokens_details": {"cached_tokens": 0},
-                "completion_tokens_details": {"reasoning_tokens": said.reasoning},
+                "prompt_tokens_details": {"cached_tokens": 0, "audio_tokens": 0},
+                "completion_tokens_details": {
+                    "reasoning_tokens": said.reasoning,
+                    "audio_tokens": 0,
+                },
             },
+            "service_tier": "default",
+            "system_fingerprint": None,
         }
 
 
@@ -162,6 +169,8 @@ class _Responses(_OpenAI):
             "model": said.model,
             "error": None,
             "incomplete_details": None,
+            "instructions": None,
+            "metadata": {},
             "parallel_tool_calls": True,
             "tool_choice": "auto",
             "tools": [],
@@ -182,6 +191,8 @@ class _Responses(_OpenAI):
                 "output_tokens_details": {"reasoning_tokens": said.reasoning},
                 "total_tokens": said.tokens_in + said.output,
             },
+            "temperature": 1.0,
+            "top_p": 1.0,
         }
 
 
@@ -271,6 +282,7 @@ class _Anthropic(ServedFormat):
                 "cache_read_input_tokens": 0,
                 "output_tokens": said.output,
                 "output_tokens_details": {"thinking_tokens": said.reasoning},
+                "service_tier": "standard",
             },
         }
 

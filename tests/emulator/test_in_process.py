@@ -14,6 +14,7 @@ from merge_runner.emulator.faults import FaultPlan
 from merge_runner.emulator.handler import Emulator, InProcess
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
+from tests.harness import RECORDING
 
 ENTRY = ModelEntry(provider="emulator", format="openai-chat", id="m", max_output_tokens=1)
 
@@ -79,3 +80,10 @@ async def test_a_connection_that_breaks_off_is_lost(carried, driving_prompt, fau
 
 async def test_what_is_not_there_is_not_found(carried):
     assert (await carried().ask("GET", "/nothing", {}, timeout_s=5)).status == 404
+
+
+async def test_its_replies_are_byte_for_byte_those_of_the_shipped_recording(merge_runner):
+    part = ("baseline", "--model", "emulator", "--reps", 1, "--conditions", "N_0_0")
+    assert (await merge_runner("sweep", *part)).code == 0
+    replay = await merge_runner("replay", *part, "--recording", RECORDING)
+    assert replay.code == 0, replay.err
