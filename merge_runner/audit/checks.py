@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
@@ -11,8 +13,9 @@ import duckdb
 
 from merge_runner.audit.findings import Audit, Finding, Sharing
 from merge_runner.errors import StoreError
+from merge_runner.records import ANSWERED_FIELD
 from merge_runner.results.comparison import TrialKey
-from merge_runner.results.database import append, by_name, read_database
+from merge_runner.results.database import append, by_name, fetched, read_database
 from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
@@ -22,6 +25,8 @@ CREATE OR REPLACE TEMP TABLE audited AS
 SELECT trial_id, spec_hash FROM linked SEMI JOIN trials USING (trial_id, spec_hash)
 ANTI JOIN done USING (trial_id, spec_hash)
 """
+# Where the formats have the answer.
+ANSWERS = ("choices", "output", "candidates", "content")
 # How many decisions of each driver, prompt and model that was asked are invalid.
 DECIDED = f"""
 SELECT driver || '/' || variant, model, sum(invalid)::BIGINT, sum(asked)::BIGINT
@@ -48,7 +53,29 @@ def prepare(connection: duckdb.DuckDBPyConnection) -> None:
     """Make the views of checks.sql, and read the ids of all replies."""
     make_views(connection)
     append(connection, "other_models", other_models(connection))
+    replies = fetched(connection.execute("SELECT rowid, reply::VARCHAR FROM calls"))
+    append(connection, "told", [row for place, reply in replies if (row := _told(place, reply))])
     connection.execute("INSERT INTO reply_ids FROM identified")
+
+
+def _told(place: int, reply: str | None) -> tuple[int, str | None, str, str] | None:
+    """Return what a reply tells: its id, a hash of its answer, and what it says that it answers.
+
+    What is beside the answer, such as a time, may differ in a copy. In an unknown format everything
+    counts: else any two of its answers would be equal.
+    """
+    try:
+        body = json.loads(reply or "")
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(body, dict):
+        return None
+    found = body.get("id") or body.get("responseId")
+    reply_id = found.encode(errors="replace").decode() if isinstance(found, str) else None
+    known = (body[name] for name in ANSWERS if body.get(name) is not None)
+    answer = json.dumps(next(known, body)).encode()
+    content = hashlib.blake2b(answer, digest_size=16).hexdigest()
+    return place, reply_id, content, json.dumps(body.get(ANSWERED_FIELD))
 
 
 def make_views(connection: duckdb.DuckDBPyConnection) -> None:

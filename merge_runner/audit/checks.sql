@@ -156,7 +156,9 @@ UNION ALL SELECT 'gap', trial_id, format('it is {} m in trial_metrics, and by it
 FROM judged WHERE gap_m IS DISTINCT FROM view_gap_m
     AND NOT coalesce(abs(view_gap_m - gap_m) <= 1e-6, false);
 
--- The calls and their answers.
+-- The calls and their answers. Replies are read one by one, since each may be many megabytes long:
+-- the id of each, a hash of its answer, and which request it answers, if it says so.
+CREATE OR REPLACE TEMP TABLE told (place BIGINT, reply_id VARCHAR, content VARCHAR, answered JSON);
 
 CREATE OR REPLACE TEMP VIEW call_findings AS
 -- One finding for each pair of models, at its first answer.
@@ -182,30 +184,22 @@ UNION ALL SELECT 'attempt', trial_id, side, decision, text FROM (
 UNION ALL SELECT 'exchanged', trial_id, side, decision,
     'its reply is, as the server says in it, the answer to another request'
 FROM (
-    SELECT trial_id, calls.side, calls.decision, condition, rep, sample_set, request,
-        if(json_valid(reply), reply->'$.merge_runner_request', NULL) AS answered
+    SELECT trial_id, calls.side, calls.decision, condition, rep, sample_set, request, answered
     FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
-    JOIN trials USING (trial_id, spec_hash)
+    JOIN trials USING (trial_id, spec_hash) JOIN told ON calls.rowid = place
 ) WHERE answered->>'$.body_sha256' <> sha256(request::VARCHAR)
     OR [answered->>'$.slot.condition', answered->>'$.slot.repetition', answered->>'$.slot.side',
         answered->>'$.slot.decision', answered->>'$.slot.sample_set']
         <> [condition, rep::VARCHAR, side, decision::VARCHAR, sample_set::VARCHAR]
     AND json_type(answered, '$.slot') = 'OBJECT';
 
--- A reply's id and a hash of its answer: what is beside it, such as a time, may differ in a copy. Ids
--- are compared within an endpoint: two emulators give equal questions equal ids.
+-- Ids are compared within an endpoint: two emulators give equal questions equal ids.
 CREATE OR REPLACE TEMP VIEW identified AS
 SELECT calls.trial_id, calls.spec_hash, calls.side, decision, call_key, provider, model_requested,
     coalesce(json_extract_string(spec, '$.' || side || '.endpoint'), '') AS endpoint, reply_id,
-    hash(coalesce(reply->'$.choices', reply->'$.output', reply->'$.candidates', reply->'$.content',
-        reply)::VARCHAR) AS content
-FROM (
-    SELECT *, nullif(coalesce(reply->>'$.id', reply->>'$.responseId'), '') AS reply_id
-    FROM (
-        SELECT * REPLACE (if(json_valid(reply), reply, NULL) AS reply)
-        FROM calls WHERE http_status = 200
-    )
-) AS calls LEFT JOIN specs USING (spec_hash) WHERE reply_id IS NOT NULL;
+    content
+FROM calls JOIN told ON calls.rowid = place LEFT JOIN specs USING (spec_hash)
+WHERE http_status = 200 AND reply_id IS NOT NULL;
 CREATE OR REPLACE TEMP TABLE reply_ids AS FROM identified LIMIT 0;
 
 -- Some servers draw ids out of a thousand, or have but one. An id that came with different answers
