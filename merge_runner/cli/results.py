@@ -81,7 +81,7 @@ def audit(
     as_json: JsonOption = False,
 ) -> None:
     """Check that each trial is there and follows from its replies."""
-    from merge_runner.audit.recordings import audit_recording
+    from merge_runner.audit.checks import audit_recording
     from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 
     use_study(study, trust=trust)
