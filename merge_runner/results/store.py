@@ -28,16 +28,17 @@ from merge_runner.results.database import (
     by_name,
     check_schema,
     fetched,
+    has_these_measures,
     merge_small_groups,
     names_of,
     read_database,
     schema_sql,
     unreadable_is_usage,
-    update_measures,
     write_database,
 )
 from merge_runner.results.rows import Row, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.measures import measures_sql
 from merge_runner.served_model import other_models
 
 # Columns that differ from run to run: whether the run made an attempt itself, and when.
@@ -88,7 +89,8 @@ class Store:
         with unreadable_is_usage(), write_database(self.path) as connection:
             if connection.execute("SHOW TABLES").fetchall():
                 check_schema(connection, path)
-                update_measures(connection)
+                if not has_these_measures(connection):
+                    connection.execute(measures_sql())
             else:
                 connection.execute(schema_sql())
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
@@ -308,11 +310,11 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
         connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
         connection.execute(FACTS.read_text(encoding="utf-8"))
         append(connection, "other_models", other_models(connection))
-        names = ("outcomes", "levels", "ledger", "failed", "others", "stand_ins")
+        facts = next(by_name(connection.execute("FROM decided")))
+        for name in ("outcomes", "levels", "ledger", "failed", "others", "stand_ins"):
+            facts[name] = connection.execute(f"FROM {name}").fetchall()
         return SweepFacts(
-            **{name: connection.execute(f"FROM {name}").fetchall() for name in names},
-            **next(by_name(connection.execute("FROM decided"))),
-            first_looks=list(by_name(connection.execute("FROM first_looks"))),
+            **facts, first_looks=list(by_name(connection.execute("FROM first_looks")))
         )
 
 
