@@ -45,10 +45,12 @@ from merge_runner.served_model import other_models
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
 FACTS = Path(__file__).with_name("facts.sql")
 SWEEPS = "FROM sweeps ORDER BY started_at"
+# By their slots.
 CALLS_OF = """
-SELECT DISTINCT call_key FROM decisions
+SELECT DISTINCT condition, rep, side, decision, sample_set, call_key
+FROM decisions JOIN trials USING (trial_id, spec_hash)
 SEMI JOIN (FROM sweep_trials WHERE list_contains(?, sweep_id)) USING (trial_id, spec_hash)
-WHERE call_key IS NOT NULL ORDER BY call_key
+WHERE call_key IS NOT NULL ORDER BY ALL
 """
 # The first and the third of these columns order the rows of a trial.
 OF_THE_DIGEST = {
@@ -285,7 +287,7 @@ def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str
         wanted = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
         rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in wanted]
         keys = connection.execute(CALLS_OF, [wanted]).fetchall()
-    return rows, [key for (key,) in keys]
+    return rows, [key for *_, key in keys]
 
 
 @dataclass(frozen=True, slots=True)
