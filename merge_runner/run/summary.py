@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, get_args
 
-from merge_runner.audit.findings import Audit, Sharing
+from merge_runner.audit.findings import Audit
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.records import Status
@@ -24,7 +24,6 @@ COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed
 LEDGER = ("model", "variant", "fate", "outcome", "attempts")
 ASKED = ("side", "own dv", "asked", "invalid", "M", "action")
 FAILURES_SHOWN = NOTES_SHOWN = 10
-SHARINGS_SHOWN = 3
 PRICED_ALIKE = "replies of stand-ins are priced as the model's; nobody charges for them"
 
 
@@ -231,24 +230,10 @@ def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
 def _audited(audit: Audit) -> Iterator[str]:
     checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
     yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
-    told = [*audit.notes, *_shared(audit.sharings)]
+    told = audit.notes
     yield from (f"note: {text}" for text in told[:NOTES_SHOWN])
     if len(told) > NOTES_SHOWN:
         yield f"... and {len(told) - NOTES_SHOWN} more notes: `merge-runner audit`"
-
-
-def _shared(sharings: Sequence[Sharing]) -> Iterator[str]:
-    """What is shared, in one line where many arms ask the same in the same slots."""
-    calls = [each for each in sharings if each.what == "calls"]
-    for each in sharings:
-        if each not in calls or len(calls) <= SHARINGS_SHOWN:
-            yield str(each)
-    if len(calls) > SHARINGS_SHOWN:
-        total = sum(each.count for each in calls)
-        yield (
-            f"{len(calls)} pairs of arms share {total} calls, where they asked the same in the "
-            "same slots: `merge-runner audit` names them"
-        )
 
 
 def _failed(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
