@@ -44,7 +44,7 @@ from merge_runner.run.clients import sealed_clients
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.study.crossing import MOST_TRIALS, Arm
+from merge_runner.study.crossing import Arm
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import one_line
 
@@ -121,7 +121,10 @@ def _audit(
     planned: dict[str, str] = {}
     specs: list[TrialSpec] = []
     try:
-        plan = _plan(config)
+        plan = Plan.model_validate_json(config)
+        # The stored plug-ins are somebody's code and never run.
+        if plan.study.is_own and not in_use().text:
+            use(declared_catalogue(plan.study.text))
         stored, members = json.loads(config), plan.model_dump(mode="json").items()
         if wrong := [name for name, value in members if stored.get(name, value) != value]:
             text = f"it disagrees with itself in {', '.join(wrong)}"
@@ -153,22 +156,6 @@ def _audit(
             kept.findings += _replay(connection, plan, specs, cache, sweep_id)
     audit.notes += [f"not replayed: {count} trials, since {why}" for why, count in notes.items()]
     return audit
-
-
-def _plan(config: str) -> Plan:
-    """Read a sweep's plan, and use the parts that its study declares; raises one of DAMAGED."""
-    plan = Plan.model_validate_json(config)
-    # The stored plug-ins are somebody's code and never run.
-    if plan.study.is_own and not in_use().text:
-        use(declared_catalogue(plan.study.text))
-    if plan.trials > MOST_TRIALS:
-        raise ValueError(f"it has {plan.trials} trials")
-    for name, entry in plan.entries.items():
-        if entry.format not in FORMATS:
-            raise ValueError(
-                f"its model {name} has the format {entry.format!r}, which there is not"
-            )
-    return plan
 
 
 def _installed_specs(connection: duckdb.DuckDBPyConnection, plan: Plan) -> list[TrialSpec]:
