@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -60,7 +59,6 @@ OF_THE_DIGEST = {
     "decisions": "decision, time_s, side, valid, failure, tactical, rationale, plan, applied, "
     "fallback, prompt",
 }
-AGAIN_S = 0.1  # after which a query that has not ended is told so again
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,11 +190,16 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
     """The result of a query, to be fetched; the database is locked until the block ends."""
     # The settings hold for a whole instance, and cannot be taken back.
-    with (
-        read_database(path, Instance()) as connection,
-        answering(connection, sql) as result,
-    ):
-        yield result
+    with read_database(path, Instance()) as connection:
+        # DuckDB looks at no signal while several of its threads work on a query.
+        connection.execute("SET threads = 1")
+        try:
+            with answering(connection, sql) as result:
+                yield result
+        except RuntimeError as exc:
+            if "interrupted" not in str(exc):
+                raise
+            raise KeyboardInterrupt from exc
 
 
 @contextmanager
@@ -219,7 +222,7 @@ def answering(
                 "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
                 "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
             )
-        _execute(connection, statements[0])
+        connection.execute(statements[0])
         yield connection
     except duckdb.IOException:
         raise  # a query reaches no file but the database, so it is the database that is damaged
@@ -231,22 +234,6 @@ def answering(
     except duckdb.Error as exc:
         hint = "; cast times with a zone, as in now()::TIMESTAMP" if "pytz" in str(exc) else ""
         raise UsageError(f"the query failed: {exc}{hint}") from exc
-
-
-def _execute(connection: duckdb.DuckDBPyConnection, statement: duckdb.Statement) -> None:
-    """Run a statement in a thread, so that Ctrl-C ends it.
-
-    DuckDB looks at no signal while several of its threads work on a query.
-    """
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(connection.execute, statement)
-        try:
-            running.result()
-        except KeyboardInterrupt:
-            while not running.done():  # a query that is about to begin forgets that it was to end
-                connection.interrupt()
-                wait([running], AGAIN_S)
-            raise
 
 
 def _reads(statement: duckdb.Statement) -> bool:
