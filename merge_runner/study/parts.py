@@ -17,7 +17,7 @@ from pathlib import Path
 from traceback import extract_tb
 from types import CodeType, ModuleType
 
-from merge_runner.config import validated
+from merge_runner.config import both_sides, validated
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import (
@@ -31,7 +31,7 @@ from merge_runner.prompts.blocks import (
 )
 from merge_runner.registry import FAULTS, Catalogue, collecting, use
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.study.crossing import chosen_models, driver_names
+from merge_runner.study.crossing import OPPONENT, chosen_models, level_text
 from merge_runner.study.file import (
     AddedText,
     StudyDriver,
@@ -57,7 +57,11 @@ def load_study(
     """
     study = read_study(name)
     file = study.file
-    asked = () if models is None else driver_names(file, chosen_models(file, models))
+    asked: set[str] = set()
+    if models is not None:
+        opponents = map(level_text, file.factors.get(OPPONENT, ()))
+        pairs = map(both_sides, [*chosen_models(file, models), *opponents])
+        asked = {name for pair in pairs for name in pair.values()}
     require_agreement(study, asked, trust=trust)
     use(catalogue_of(file, study.text, study.plugins))
     return study

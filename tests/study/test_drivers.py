@@ -133,7 +133,7 @@ async def test_a_clock_holds_each_action(plan_of):
         ),
         ('[drivers.mine]\nprogram = "brake"\n', "unknown driver 'brake'; valid: constant, "),
         ('[drivers.braking]\nprogram = "constant"\n', "there is a driver 'braking' already"),
-        ('[drivers.o3]\nprogram = "constant"\n', "needs another name: there is a model o3"),
+        ('[drivers.o3]\nprogram = "constant"\n', "needs another name: there is one"),
         (
             '[drivers.mine]\nprogram = "projected-order"\ntarget_gap_m = 5\n',
             "the parameters of projected-order stand in its source and cannot be set",
