@@ -42,7 +42,7 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
 ) -> None:
     """Write a folder with a study that runs, to change into your own."""
-    from merge_runner.study.folder import write_folder
+    from merge_runner.study.file import write_folder
 
     for path in write_folder(folder):
         say(f"wrote {path}")
