@@ -124,14 +124,8 @@ class Program:
         values, given = self.values, dict(self.parameters)
         # Which other parameters there are depends on the set, so that it comes first.
         for each in sorted(changes, key=lambda each: each != SET):
-            value = changes[each]
-            sets = [f'"{one}"' for one, numbers in self.sets.items() if each in numbers]
-            if each not in values and sets:
-                raise UsageError(
-                    f"{each} of {name} is a number of its sets: name one beside it, "
-                    f"{SET} = {' or '.join(sets)}"
-                )
-            default = require(values, f"parameter of {name}", each)
+            hint = f"each {SET} has parameters of its own" if self.sets else ""
+            value, default = changes[each], require(values, f"parameter of {name}", each, hint)
             if isinstance(default, str) and isinstance(value, str):
                 given[each] = value
             elif not isinstance(default, str) and _is_number(value):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import product
@@ -97,27 +97,11 @@ def cross(
     arm is played in so many ``conditions``.
     """
     _check_names(file, registry)
-    factors = {MODEL: models, **{n: each for n, each in file.factors.items() if n != PROMPT}}
-    if PROMPT in file.factors or len(repetitions) > 1:
-        factors[PROMPT] = tuple(repetitions)
-    axes = {name: _axis(file, name, levels) for name, levels in factors.items()}
+    axes = _axes(file, models, repetitions)
     varying = [name for name, levels in axes.items() if len(levels) > 1]
-    # What is left out may be a model or a prompt that is not asked for today.
-    known = {**axes, PROMPT: VARIANTS, MODEL: {*axes[MODEL], *file.models}}
-    skip = [
-        {n: {*map(level_text, w if isinstance(w, list) else [w])} for n, w in row.items()}
-        for row in file.skip
-    ]
-    reference = {name: {level_text(level)} for name, level in file.reference.items()}
-    for row in (*skip, reference):
-        _check_levels(known, row)
-    _check_levels(axes, only)
-    for name, texts in only.items():
-        axes[name] = {text: level for text, level in axes[name].items() if text in texts}
-    _check_size(axes, skip, repetitions, conditions)
     mirrored = mirror or file.mirror
     arms: dict[tuple[str, ...], Arm] = {}
-    for prompt, chosen in _crossings(axes, skip, repetitions):
+    for prompt, chosen in _crossings(file, axes, repetitions, only, conditions):
         try:
             arm = _arm(file, chosen, prompt, repetitions[prompt], registry, varying)
         except UsageError as exc:
@@ -181,16 +165,60 @@ def _reference_first(file: StudyFile, factor: str, texts: Iterable[str]) -> list
     return sorted(texts, key=lambda text: text != reference)
 
 
-def _axis(file: StudyFile, factor: str, levels: Iterable[JsonValue]) -> dict[str, JsonValue]:
-    """The levels of a factor by their texts; raises UsageError for none, or one twice."""
-    axis = {level_text(level): level for level in levels}
-    numbers = [
-        level_text(int(level) if isinstance(level, float) and level.is_integer() else level)
-        for level in levels
+def _axes(
+    file: StudyFile, models: Sequence[str], prompts: Iterable[str]
+) -> dict[str, dict[str, JsonValue]]:
+    """The levels of each factor by their texts; raises UsageError for none, or one twice."""
+    factors = {MODEL: models, **{n: each for n, each in file.factors.items() if n != PROMPT}}
+    if PROMPT in file.factors or len([*prompts]) > 1:
+        factors[PROMPT] = tuple(prompts)
+    axes = {}
+    for name, levels in factors.items():
+        whole = (int(x) if isinstance(x, float) and x.is_integer() else x for x in levels)
+        if not levels or len({*map(level_text, whole)}) < len(levels):
+            raise UsageError(f"the factor {name} needs levels, and each of them once")
+        axis = {level_text(level): level for level in levels}
+        axes[name] = {text: axis[text] for text in _reference_first(file, name, axis)}
+    return axes
+
+
+def _crossings(
+    file: StudyFile,
+    axes: Mapping[str, Levels],
+    repetitions: Mapping[str, int],
+    only: Mapping[str, Collection[str]],
+    conditions: int,
+) -> list[tuple[str, Levels]]:
+    """Each crossing that is to be played: its prompt and its levels; raises UsageError."""
+    # What is left out may be a model or a prompt that is not asked for today.
+    known = {**axes, PROMPT: VARIANTS, MODEL: {*axes[MODEL], *file.models}}
+    skip = [
+        {n: {*map(level_text, w if isinstance(w, list) else [w])} for n, w in row.items()}
+        for row in file.skip
     ]
-    if not numbers or len({*numbers}) < len(numbers):
-        raise UsageError(f"the factor {factor} needs levels, and each of them once")
-    return {text: axis[text] for text in _reference_first(file, factor, axis)}
+    reference = {name: {level_text(level)} for name, level in file.reference.items()}
+    _check_levels(axes, only)
+    for row in (*skip, reference):
+        _check_levels(known, row)
+    axes = {
+        name: {text: level for text, level in levels.items() if text in only.get(name, levels)}
+        for name, levels in axes.items()
+    }
+    crossings: list[tuple[str, Levels]] = []
+    trials = conditions * math.prod(map(len, axes.values()))
+    if trials <= MOST_TRIALS:  # few enough to go through
+        for chosen in product(*axes.values()):
+            texts = {PROMPT: next(iter(repetitions)), **dict(zip(axes, chosen, strict=True))}
+            if not any(all(texts[name] in wanted for name, wanted in row.items()) for row in skip):
+                crossings.append((texts[PROMPT], {name: axes[name][texts[name]] for name in axes}))
+        trials = conditions * sum(repetitions[prompt] for prompt, _ in crossings)
+    if trials > MOST_TRIALS:
+        raise UsageError(
+            f"these are {trials:,} trials or more, and at most {MOST_TRIALS:,} can be played: "
+            "leave out levels, conditions or repetitions, in the file or by --only, --conditions "
+            "or --reps"
+        )
+    return crossings
 
 
 def _check_levels(
@@ -201,37 +229,6 @@ def _check_levels(
         levels = dict.fromkeys(require(axes, "factor", name))
         for text in texts:
             require(levels, f"level of {name}", text)
-
-
-def _check_size(
-    axes: Mapping[str, Levels],
-    skip: Sequence[Mapping[str, Collection[str]]],
-    repetitions: Mapping[str, int],
-    conditions: int,
-) -> None:
-    """Raise UsageError where these are more trials than can be played."""
-    trials = conditions * math.prod(map(len, axes.values()))
-    if trials <= MOST_TRIALS:  # few enough to go through
-        played = (repetitions[prompt] for prompt, _ in _crossings(axes, skip, repetitions))
-        trials = conditions * sum(played)
-    if trials > MOST_TRIALS:
-        raise UsageError(
-            f"these are {trials:,} trials or more, and at most {MOST_TRIALS:,} can be played: "
-            "leave out levels, conditions or repetitions, in the file or by --only, --conditions "
-            "or --reps"
-        )
-
-
-def _crossings(
-    axes: Mapping[str, Levels],
-    skip: Sequence[Mapping[str, Collection[str]]],
-    repetitions: Iterable[str],
-) -> Iterator[tuple[str, Levels]]:
-    """Each crossing that is to be played: its prompt and its levels."""
-    for chosen in product(*axes.values()):
-        texts = {PROMPT: next(iter(repetitions)), **dict(zip(axes, chosen, strict=True))}
-        if not any(all(texts[name] in wanted for name, wanted in row.items()) for row in skip):
-            yield texts[PROMPT], {name: axes[name][texts[name]] for name in axes}
 
 
 def _arm(
@@ -299,14 +296,6 @@ def _scenario(file: StudyFile, levels: Levels, programs: Mapping[str, Program]) 
     scenario = validated(ScenarioConfig, given, "factors")
     for name, program in programs.items():
         pace_of(scenario, program.in_spec(name))
-        source, rate_hz = PROGRAMS.get(program.based_on), program.rate_hz or 0
-        # A program without a rate of its own has the prompt rate.
-        if source and not source.rate_hz and rate_hz > scenario.prompt_rate_hz * (1 + 1e-9):
-            raise UsageError(
-                f"{name}: clock = {1 / rate_hz:g} is too fast: {program.based_on} decides every "
-                f"{1 / scenario.prompt_rate_hz:g} s (1 / prompt_rate_hz), and a clock can only "
-                "slow it down"
-            )
     return scenario
 
 
