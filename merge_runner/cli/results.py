@@ -81,7 +81,7 @@ def audit(
     as_json: JsonOption = False,
 ) -> None:
     """Check that each trial is there and follows from its replies."""
-    from merge_runner.audit.recordings import audit_recording
+    from merge_runner.audit.checks import audit_recording
     from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 
     use_study(study, trust=trust)
@@ -123,15 +123,15 @@ def forget(
 
     if not sweeps:
         raise UsageError("name a sweep; `merge-runner sql 'from sweeps'` lists them")
-    going = forgetting.to_forget(db, sweeps)
+    ids, going = forgetting.to_forget(db, sweeps)
     agree(
         f"these go from {db}: {going}",
         "Remove them?",
         otherwise="nothing was removed",
         yes=yes,
     )
-    gone = forgetting.forget(db, sweeps, going)
+    forgetting.forget(db, ids)
     say(
-        f"removed: {gone}. Their replies stay in the cache: the same `merge-runner sweep` plays "
+        f"removed: {going}. Their replies stay in the cache: the same `merge-runner sweep` plays "
         "the trials again without a call"
     )

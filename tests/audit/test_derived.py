@@ -9,7 +9,7 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from merge_runner.audit.recordings import audit_recording
+from merge_runner.audit.checks import audit_recording
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.recording import export_recording

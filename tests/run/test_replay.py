@@ -403,7 +403,7 @@ async def test_a_recording_of_another_format_is_refused(merge_runner, told, tmp_
         run = await merge_runner("recording", command, "other.parquet")
         assert run.code == 1
         (line,) = run.err.splitlines()
-        assert f"has the format 'merge-runner recording {number}', this program reads" in line
+        assert f"has the format 'merge-runner recording {number}' with keys of" in line
 
 
 @pytest.mark.slow
