@@ -21,7 +21,7 @@ from __future__ import annotations
 import asyncio
 import bisect
 import contextlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -52,36 +52,35 @@ class TrialCalls:
 
 
 @dataclass(slots=True)
-class Answers:
-    """The number of measured answers, and what they cost together in USD."""
-
-    number: int = 0
-    usd: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
 class TrialCosts:
     """The expected costs of trials, which are named by their order in the sweep.
 
-    ``calls`` returns a trial's by model; ``answers`` are those of each model to similar requests,
-    of earlier runs, too. They decide which trials begin, never what may be spent.
+    ``calls`` returns a trial's by model. What answers cost decides which trials begin, never what
+    may be spent.
     """
 
     calls: Callable[[int], Mapping[str, TrialCalls]]
-    answers: defaultdict[str, Answers] = field(default_factory=lambda: defaultdict(Answers))
+    _answers: Counter[str] = field(default_factory=Counter)
+    _usd: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+    def count(self, model: str, usd: float, answers: int = 1) -> None:
+        """Count answers of a model to such requests, of earlier runs, too, and their cost."""
+        self._answers[model] += answers
+        self._usd[model] += usd
 
     def usd(self, trial: int) -> float:
         """Return the USD that a trial is expected to cost: all it can, before any answer."""
-        return sum(self._usd(self.answers[m], calls) for m, calls in self.calls(trial).items())
-
-    def _usd(self, answers: Answers, calls: TrialCalls) -> float:
-        most_usd = calls.most * calls.worst_usd
-        if not answers.number:
-            return most_usd
-        # The worst case counts as one more answer: a few cheap ones prove little.
-        mean_usd = (answers.usd + calls.worst_usd) / (answers.number + 1)
-        # Up to its last call a trial must be able to reserve that call's worst case.
-        return min(most_usd, MARGIN * calls.usual * mean_usd + calls.worst_usd)
+        sum_usd = 0.0
+        for model, calls in self.calls(trial).items():
+            expected_usd = calls.most * calls.worst_usd
+            if answers := self._answers[model]:
+                # The worst case counts as one more answer: a few cheap ones prove little.
+                mean_usd = (self._usd[model] + calls.worst_usd) / (answers + 1)
+                # Up to its last call a trial must be able to reserve that call's worst case.
+                usual_usd = MARGIN * calls.usual * mean_usd + calls.worst_usd
+                expected_usd = min(expected_usd, usual_usd)
+            sum_usd += expected_usd
+        return sum_usd
 
 
 @dataclass(slots=True)
@@ -135,8 +134,7 @@ class PaidAttempt:
         kept = await self.ledger.cache.put(entry)
         await self._pay(entry.attempts[-1])
         if self.cost_usd is not None:
-            answers = self.budget.costs.answers[self.asked.model]
-            answers.number, answers.usd = answers.number + 1, answers.usd + self.cost_usd
+            self.budget.costs.count(self.asked.model, self.cost_usd)
         return kept
 
     async def _pay(self, attempt: Attempt) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -44,11 +44,8 @@ COMMIT;
 PRAGMA journal_mode = wal;
 PRAGMA synchronous = full; -- it survives a power cut
 """
-_SPENDING = """
-SELECT (SELECT total(usd) FROM spent WHERE scope = ?1), total(usd), count(*),
-(SELECT total(overrun_usd) FROM spent WHERE scope = ?1) FROM open WHERE scope = ?1
-"""
-_OVERRUNS = "SELECT driver, most_overrun FROM spent WHERE scope = ? AND most_overrun > 0"
+_SPENT = "SELECT driver, usd, overrun_usd, most_overrun FROM spent WHERE scope = ?"
+_RESERVED = "SELECT total(usd), count(*) FROM open WHERE scope = ?"
 _OPEN = "INSERT INTO open VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _BEGUN = """
 SELECT since FROM open WHERE call = ? AND attempt > ? AND outcome = 'in flight' ORDER BY attempt
@@ -129,17 +126,17 @@ class LedgerFile:
                 return []
             return self._connection("ro").execute(sql, values).fetchall()
 
-    def spending(self, scope: str) -> Spending:
-        """Return the sums of a sweep; raises UsageError where they cannot be."""
+    def spending(self, scope: str, ask: Callable[..., Rows]) -> Spending:
+        """Return the sums of a sweep, by ``read`` or ``write``; raises UsageError for odd ones."""
         with self._told():
-            for row in self.read(_SPENDING, scope):
-                spent_usd, reserved_usd, attempts, overrun_usd = row
-                overruns = dict(self.read(_OVERRUNS, scope))
-                spending = Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
-                if not (spending.spent_usd >= 0 and spending.reserved_usd >= 0):
-                    raise sqlite3.IntegrityError("no sweep can have spent that")
-                return spending
-        return Spending()
+            # What is reserved first: what is settled meanwhile counts twice rather than never.
+            ((reserved_usd, attempts),) = ask(_RESERVED, scope) or [(0.0, 0)]
+            spent = ask(_SPENT, scope)
+            spent_usd, overrun_usd = (sum(row[column] for row in spent) for column in (1, 2))
+            if not (spent_usd >= 0 and reserved_usd >= 0):
+                raise sqlite3.IntegrityError("no sweep can have spent that")
+        overruns = {driver: most for driver, _, _, most in spent if most > 0}
+        return Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
 
     def write(self, sql: str, *values: object) -> Rows:
         """Execute a statement within a transaction, and return its rows."""
@@ -168,12 +165,8 @@ class LedgerFile:
         with contextlib.suppress(UsageError):  # which is told before anything is paid
             rows = self.read(_BEGUN, call, tried)
         for number, (since,) in enumerate(rows, tried + 1):
-            yield Attempt(
-                number=number,
-                outcome="unknown",
-                started_at=since,
-                error="the run ended before a reply was seen; it may have been charged",
-            )
+            why = "the run ended before a reply was seen; it may have been charged"
+            yield Attempt(number, "unknown", started_at=since, error=why)
 
     def close(self) -> None:
         """Close the file."""
@@ -225,7 +218,7 @@ class Ledger:
 
     def read(self) -> Spending:
         """Return the current state; raises UsageError where its record is damaged."""
-        self.spending = self.cache.money.spending(self.scope)
+        self.spending = self.cache.money.spending(self.scope, self.cache.money.read)
         return self.spending
 
     def reserve(
@@ -236,11 +229,11 @@ class Ledger:
             return True
         money = self.cache.money
         with money.transaction():
-            ((spent_usd, reserved_usd, *_),) = money.write(_SPENDING, self.scope)
-            if cap_usd is not None and spent_usd + reserved_usd + usd > cap_usd + TOLERANCE_USD:
+            committed_usd = money.spending(self.scope, money.write).committed_usd
+            if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
                 return False
             since = datetime.now(UTC).isoformat(timespec="milliseconds")
-            place = (asked.driver, asked.slot, asked.honest_usd or usd, since, "in flight")
+            place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
             money.write(_OPEN, self.scope, key, number, usd, *place)
         return True
 
@@ -274,9 +267,9 @@ class Ledger:
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""
-        queries = ("SELECT * FROM spent WHERE scope = ?", "SELECT * FROM open WHERE scope = ?")
-        spent, opened = (self.cache.money.read(sql, self.scope) for sql in queries)
-        return [row[1:] for row in spent], [row[1:] for row in opened]
+        read = self.cache.money.read
+        opened = read("SELECT * FROM open WHERE scope = ?", self.scope)
+        return read(_SPENT, self.scope), [row[1:] for row in opened]
 
     def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
         """Put what a task has spent, and has open, in the place of the share reserved for it."""

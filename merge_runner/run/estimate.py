@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
 from merge_runner.llm.batch.terms import batch_terms
-from merge_runner.llm.budget import Answers, TrialCalls, TrialCosts
+from merge_runner.llm.budget import TrialCalls, TrialCosts
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import without_prompt
 from merge_runner.llm.prices import cost_usd
@@ -39,12 +39,11 @@ class CallTotals:
     latency_s: float = 0.0
 
     @property
-    def mean(self) -> Usage:
-        """The tokens of an answer on average."""
-        return Usage(
-            input_tokens=round(self.input_tokens / self.measured),
-            output_tokens=round(self.output_tokens / self.measured),
-        )
+    def mean(self) -> Usage | None:
+        """The tokens of an answer on average; None before any is measured."""
+        sums = (self.input_tokens, self.output_tokens)
+        read, written = (round(tokens / max(1, self.measured)) for tokens in sums)
+        return Usage(input_tokens=read, output_tokens=written) if self.measured else None
 
 
 def call_totals(entries: Iterable[CachedCall]) -> dict[tuple[str, str, str, str], CallTotals]:
@@ -98,7 +97,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class _Calls:
-    """How many calls a model of the registry has yet to answer in one arm, and what one takes."""
+    """The calls of a model that one arm lacks, each with its tokens and its latency in s."""
 
     model: str
     entry: ModelEntry
@@ -106,10 +105,20 @@ class _Calls:
     usage: Usage
     latency_s: float
 
-    @property
-    def tokens(self) -> tuple[int, int]:
-        """Those that one reads and writes."""
-        return self.usage.input_tokens or 0, self.usage.output_tokens or 0
+    def limited_s(self, options: Options) -> float:
+        """Return how long the limits stretch the calls, in s.
+
+        Within a minute's window a call counts with its output cap until its reply is in, and with
+        its actual tokens from then on.
+        """
+        rpm, tpm = options.rates(self.entry)
+        waiting = min(self.latency_s / 60, 1.0)
+        written = waiting * self.entry.max_output_tokens
+        written += (1 - waiting) * (self.usage.output_tokens or 0)
+        tokens = (self.usage.input_tokens or 0) + written
+        return max(
+            60 * self.number / (rpm or math.inf), 60 * self.number * tokens / (tpm or math.inf)
+        )
 
 
 def estimate(
@@ -120,7 +129,7 @@ def estimate(
     calls: Mapping[str, Mapping[str, float]],
     facts: Mapping[str, CallTotals],
 ) -> Estimate:
-    """The estimate for the ``trials`` that a live run of a plan has yet to play.
+    """Return the estimate for the ``trials`` that a live run of a plan has yet to play.
 
     ``calls`` is roughly how many each model has yet to answer, by arm. ``facts`` is what the cache
     knows about each model's earlier answers to similar requests at its endpoint.
@@ -133,18 +142,24 @@ def estimate(
     batch = None
     if options.batch:
         batch = BatchEstimate(
-            cost_usd=_cost_usd(todo, batch=True),
+            _cost_usd(todo, batch=True),
             rounds=max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0),
             most_rounds=max(map(most_prompts, plan.arms), default=0),
         )
+    at_once, minutes = min(options.connections, 2 * max(trials, 1)), 0.0
+    for model in {each.model for each in todo}:
+        own = [each for each in todo if each.model == model]
+        in_turn_s = math.ceil(sum(each.number for each in own) / at_once) * own[0].latency_s
+        limited_s = sum(each.limited_s(options) for each in own)
+        minutes = max(minutes, round(max(in_turn_s, limited_s) / 60, 1))
     return Estimate(
         plan.driver,
         trials,
         calls=sum(each.number for each in todo),
-        input_tokens=sum(each.number * each.tokens[0] for each in todo),
-        output_tokens=sum(each.number * each.tokens[1] for each in todo),
+        input_tokens=sum(each.number * (each.usage.input_tokens or 0) for each in todo),
+        output_tokens=sum(each.number * (each.usage.output_tokens or 0) for each in todo),
         cost_usd=_cost_usd(todo),
-        minutes=_minutes(options, trials, todo),
+        minutes=minutes,
         free=all(entry.price == "free" for entry in plan.entries.values()),
         measured=tuple(
             driver_name(name, plan.endpoints[name]) for name in plan.entries if facts[name].measured
@@ -156,12 +171,11 @@ def estimate(
 def _calls(plan: Plan, arm: Arm, name: str, number: int, facts: CallTotals) -> _Calls:
     """Return the calls of a model in an arm, as measured or as listed in the registry."""
     entry = arm.entries[name]
-    if facts.measured:
-        usage = facts.mean
-    else:
+    usage = facts.mean or Usage(
         # English has about 4 bytes a token.
-        prompt_tokens = len(typical_prompt(plan, arm).encode()) // 4
-        usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
+        input_tokens=len(typical_prompt(plan, arm).encode()) // 4,
+        output_tokens=entry.typical_output_tokens,
+    )
     latency_s = facts.latency_s / facts.timed if facts.timed else entry.typical_latency_s
     return _Calls(plan.registered[name], entry, number, usage, latency_s)
 
@@ -173,38 +187,14 @@ def _cost_usd(calls: Iterable[_Calls], *, batch: bool = False) -> float | None:
         usd = cost_usd(each.entry, each.usage)
         if usd is None:
             return None
-        sum_usd += each.number * usd * (_price_factor(each.entry) if batch else 1.0)
+        sum_usd += each.number * usd * _part(each.entry, batch=batch)
     return round(sum_usd, 2)
 
 
-def _price_factor(entry: ModelEntry) -> float:
-    """Return the part of its price that a model costs in batches."""
-    terms = batch_terms(entry)
+def _part(entry: ModelEntry, *, batch: bool) -> float:
+    """Return the part of its price that a model costs, which is less than 1 in batches."""
+    terms = batch_terms(entry) if batch else None
     return 1.0 if terms is None else terms.price_factor
-
-
-def _minutes(options: Options, trials: int, calls: Sequence[_Calls]) -> float:
-    """Return how long the slowest model takes, by its latency or by its limits."""
-    at_once = min(options.connections, 2 * max(trials, 1))
-    slowest_s = 0.0
-    for model in {each.model for each in calls}:
-        own = [each for each in calls if each.model == model]
-        in_turn_s = math.ceil(sum(each.number for each in own) / at_once) * own[0].latency_s
-        slowest_s = max(slowest_s, in_turn_s, sum(_limited_s(options, each) for each in own))
-    return round(slowest_s / 60, 1)
-
-
-def _limited_s(options: Options, calls: _Calls) -> float:
-    """Return how long the limits stretch calls, in s.
-
-    Within a minute's window a call counts with its output cap until its reply is in, and with
-    its actual tokens from then on.
-    """
-    rpm, tpm = options.rates(calls.entry)
-    waiting, (read, written) = min(calls.latency_s / 60, 1.0), calls.tokens
-    tokens = read + waiting * calls.entry.max_output_tokens + (1 - waiting) * written
-    number = calls.number
-    return max(60 * number / rpm if rpm else 0.0, 60 * number * tokens / tpm if tpm else 0.0)
 
 
 def trial_costs(plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = False) -> TrialCosts:
@@ -213,40 +203,33 @@ def trial_costs(plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = Fa
     ``facts`` is as for ``estimate``.
     """
     labels = {spec.order: spec.arm for spec in plan.trial_specs()}
-    parts = {name: _price_factor(e) if batch else 1.0 for name, e in plan.entries.items()}
-    calls = {arm.label: _trial_calls(plan, arm, parts) for arm in plan.arms}
-    earlier: defaultdict[str, Answers] = defaultdict(Answers)
+    calls = {arm.label: _trial_calls(plan, arm, batch=batch) for arm in plan.arms}
+    costs = TrialCosts(lambda order: calls[labels[order]])
     for name, totals in facts.items():
-        if totals.measured:
-            answers, one_usd = (
-                earlier[plan.registered[name]],
-                cost_usd(plan.entries[name], totals.mean),
-            )
-            answers.number += totals.measured
-            answers.usd += totals.measured * (one_usd or 0.0) * parts[name]
-    return TrialCosts(lambda order: calls[labels[order]], earlier)
+        if totals.mean is not None:
+            entry, model = plan.entries[name], plan.registered[name]
+            usd = (cost_usd(entry, totals.mean) or 0.0) * _part(entry, batch=batch)
+            costs.count(model, totals.measured * usd, totals.measured)
+    return costs
 
 
-def _trial_calls(plan: Plan, arm: Arm, parts: Mapping[str, float]) -> dict[str, TrialCalls]:
+def _trial_calls(plan: Plan, arm: Arm, *, batch: bool) -> dict[str, TrialCalls]:
     """Return the calls of each model in a trial: at most up to the timeout, all at their caps.
 
-    A model that drives on both sides with different parameters counts with the dearer ones. Each
-    costs so many ``parts`` of its price.
+    A model that drives on both sides with different parameters counts with the dearer ones.
     """
     # No tokeniser makes more tokens than bytes.
     read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
-    calls: defaultdict[str, TrialCalls] = defaultdict(lambda: TrialCalls(0, 0, 0.0))
-    for name in arm.asked.values():
-        if (entry := arm.entries.get(name)) is not None:
-            worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
-            worst_usd = (cost_usd(entry, worst) or 0.0) * parts[name]
-            other = calls[plan.registered[name]]
-            calls[plan.registered[name]] = TrialCalls(
-                other.usual + usual_prompts(arm),
-                other.most + most_prompts(arm),
-                max(other.worst_usd, worst_usd),
-            )
-    return dict(calls)
+    usual, most = usual_prompts(arm), most_prompts(arm)
+    calls: dict[str, TrialCalls] = {}
+    for name in filter(arm.entries.get, arm.asked.values()):
+        entry, model = arm.entries[name], plan.registered[name]
+        worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
+        worst_usd = (cost_usd(entry, worst) or 0.0) * _part(entry, batch=batch)
+        other = calls.get(model, TrialCalls(0, 0, 0.0))
+        worst_usd = max(worst_usd, other.worst_usd)
+        calls[model] = TrialCalls(other.usual + usual, other.most + most, worst_usd)
+    return calls
 
 
 def typical_prompt(plan: Plan, arm: Arm) -> str:
