@@ -15,7 +15,7 @@ from pathlib import Path
 from aiohttp import web
 
 from merge_runner.emulator.server import HOST, application
-from merge_runner.llm.trial_costs import TrialCalls, TrialCosts
+from merge_runner.llm.budget import TrialCalls, TrialCosts
 from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 from merge_runner.registry import GROUP
 from merge_runner.run.plan import Options, Plan

@@ -193,7 +193,7 @@ async def test_a_mistyped_name_is_answered_with_the_nearest(merge_runner):
         (["digest", "--db", "no.duckdb"], "there is no database no.duckdb"),
         (["sql", "select 1", "--format", "xml"], "csv"),
         (["recording", "export", "x.parquet"], "there is no database"),
-        (["ledger", "--cache", "none"], "there is no cache in none, so nothing was spent"),
+        (["ledger", "--cache", "none"], "there is no cache in none"),
         (["tables"], "there is no database"),
         (["tables", "--format", "xml"], "latex"),
         (["report"], "there is no database"),

@@ -129,6 +129,4 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
             "round takes as long as its slowest batch: minutes, an hour; after two the "
             "rest is asked singly"
         )
-    if expected.trials_within_cap is not None:
-        print_out(f"cap     buys about {expected.trials_within_cap} trials")
     print_out("Nothing was sent.")

@@ -13,7 +13,6 @@ from merge_runner.config import (
     ModelEntry,
     base_urls,
     check_network,
-    driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
 )
@@ -26,15 +25,15 @@ from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Call
-from merge_runner.llm.call_totals import CallTotals
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
-from merge_runner.llm.prices import is_known
-from merge_runner.run.estimate import trial_costs
+from merge_runner.llm.prices import cost_usd
+from merge_runner.records import Usage
+from merge_runner.run.estimate import CallTotals, trial_costs
 from merge_runner.run.plan import Options, Plan, most_prompts
 from merge_runner.run.rehearsal import SPEED, behaviour
 
@@ -123,14 +122,14 @@ def live_clients(
     from merge_runner.llm.http import HttpTransport
 
     for name, entry in plan.entries.items():
-        if options.max_cost_usd is not None and not is_known(entry):
+        unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
+        if options.max_cost_usd is not None and unknown:
             raise UsageError(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
-        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
     costs = trial_costs(plan, endpoint_plan.measured, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
     limiters = _limiters(plan, options, share)

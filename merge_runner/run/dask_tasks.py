@@ -170,7 +170,7 @@ async def _play(task: Task, stopping: threading.Event) -> Played:
         cache = ResponseCache(folder)
         stack.callback(cache.close)
         ledger = Ledger(cache, task.plan.ledger)
-        cache.run_now([lambda: cache.keep_all(task.recorded, task.unanswered)])
+        cache.put_now(task.recorded, task.unanswered.items())
         ledger.settle_share(
             "", [(driver, 0, 0, ratio) for driver, ratio in task.overruns.items()], []
         )
@@ -431,7 +431,7 @@ class DaskTasks:
 
     def _keep(self, given: _Given, played: Played) -> None:
         """Keep what a task has brought: its replies first."""
-        self._cache.run_now([lambda: self._cache.keep_all(played.replies, played.unanswered)])
+        self._cache.put_now(played.replies, played.unanswered.items())
         self._ledger.settle_share(given.name, played.spent, played.opened)
         now = asyncio.get_running_loop().time()
         used: Counter[str] = Counter(played.tokens)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import tempfile
 import time
-from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
@@ -27,8 +26,7 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.call_totals import CallTotals, call_totals
-from merge_runner.llm.content_hashes import canonical_json, manner
+from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger, Spending, scopes
 from merge_runner.llm.meter import Meter
@@ -47,7 +45,7 @@ from merge_runner.run.clients import (
     open_rounds,
     sealed_clients,
 )
-from merge_runner.run.estimate import Estimate, estimate
+from merge_runner.run.estimate import CallTotals, Estimate, call_totals, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, MOST_HELD, Flusher
 from merge_runner.run.local_runner import LocalRunner
@@ -229,12 +227,13 @@ class Sweep:
 
         ``whole``: what all trials take, as if none were stored or recorded yet.
         """
-        trials: Counter[str] = Counter()
+        trials = 0
         calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in self._arms.items()}
 
         def count(spec: TrialSpec, decisions: Sequence[DecisionRow] = ()) -> None:
+            nonlocal trials
             arm = self._arms[spec.arm]
-            trials[spec.arm] += 1
+            trials += 1
             for side, name in arm.asked.items():
                 if name in arm.entries:
                     answered = sum(row.side == side for row in decisions)
@@ -257,7 +256,6 @@ class Sweep:
             trials=trials,
             calls=calls,
             facts=self._measured(),
-            spending=self._ledger.spending,
         )
 
     def _measured(self) -> dict[str, CallTotals]:
@@ -265,13 +263,13 @@ class Sweep:
         facts = {}
         for name, entry in self._plan.entries.items():
             sent = FORMATS[entry.format].request(entry, "")
-            asked = manner(sent.path, canonical_json(sent.body))
-            place = entry.id, self._plan.endpoints[name], asked
+            body = canonical_json(sent.body)
+            place = entry.id, self._plan.endpoints[name], sent.path, body
             facts[name] = self._totals.get(place, CallTotals())
         return facts
 
     @cached_property
-    def _totals(self) -> dict[tuple[str, str, str], CallTotals]:
+    def _totals(self) -> dict[tuple[str, str, str, str], CallTotals]:
         """What the recorded calls took, by model, endpoint and how it was asked."""
         return call_totals(self._cache.entries())
 
@@ -315,7 +313,7 @@ class Sweep:
             # Recorded replies come at once: more trials in flight would only wait for each other.
             in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
             return LocalRunner(plan, clients, in_flight)
-        answered = {(model, endpoint) for model, endpoint, _ in self._totals}
+        answered = {(model, endpoint) for model, endpoint, *_ in self._totals}
         known = frozenset(
             name
             for name, entry in plan.entries.items()
