@@ -1,17 +1,21 @@
-"""A call under way: what it has tried so far, and whether anything of it is in flight."""
+"""A call under way, with what it has tried and what it waits for, and the counts of all calls."""
 
 from __future__ import annotations
 
 import asyncio
+import time
+from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 
 from merge_runner.errors import CallFailed
 from merge_runner.llm.batch.journal import OpenLine
 from merge_runner.llm.ledger import Asked
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
+
+MINUTE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +89,50 @@ class Call:
         if self.wait is not None:
             self.task.cancel()
 
-    def failed(self, why: str) -> CallFailed:
-        """Return the error of a call that ends without an answer."""
-        return CallFailed(why, self.request, tuple(self.attempts), self.earlier)
-
 
 def slot_text(slot: Slot) -> str:
     """Format a slot for a reader."""
     return f"{slot.condition} rep {slot.repetition} {slot.side}, decision {slot.decision}"
+
+
+@dataclass(slots=True)
+class Meter:
+    """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts.
+
+    ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name; ``damaged``
+    are the keys of recorded replies that could not be read.
+    """
+
+    calls_live: int = 0
+    calls_cached: int = 0
+    cost_usd: float = 0.0
+    cost_unknown: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    mismatches: Counter[str] = field(default_factory=Counter)
+    stand_ins: int = 0
+    notes: deque[str] = field(default_factory=deque)
+    damaged: list[str] = field(default_factory=list)
+    events: deque[tuple[float, int]] = field(default_factory=deque)
+
+    def count_attempt(self, attempt: Attempt) -> None:
+        """Count one live attempt."""
+        self.outcomes[attempt.outcome] += 1
+        self.cost_usd += attempt.cost_usd or 0.0
+        self.cost_unknown += attempt.cost_usd is None
+        tokens = (attempt.usage.input_tokens or 0) + (attempt.usage.output_tokens or 0)
+        self.events.append((time.monotonic(), tokens))
+
+    def add(self, other: Meter) -> None:
+        """Add what another meter has counted."""
+        # The other's clock may be another machine's: what it has just counted counts as of now.
+        now = time.monotonic()
+        counted = replace(other, events=deque((now, tokens) for _, tokens in other.events))
+        for each in fields(self):
+            setattr(self, each.name, getattr(self, each.name) + getattr(counted, each.name))
+
+    def last_minute(self) -> tuple[int, int]:
+        """Return the requests and tokens of the last minute."""
+        now = time.monotonic()
+        while self.events and now - self.events[0][0] > MINUTE_S:
+            self.events.popleft()
+        return len(self.events), sum(tokens for _, tokens in self.events)

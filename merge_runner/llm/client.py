@@ -1,7 +1,4 @@
-"""The client of one model: what is known, what is sealed, and what is asked.
-
-What an attempt means for its call is decided in http_outcome.py.
-"""
+"""The client of one model: what is known, what is sealed, and what is asked."""
 
 from __future__ import annotations
 
@@ -16,9 +13,11 @@ from typing import TYPE_CHECKING
 from merge_runner.config import ModelEntry, driver_name, is_own_host
 from merge_runner.errors import (
     CallFailed,
+    EndpointRefused,
     MergeRunnerError,
     ModelSwapped,
     ProviderDown,
+    QuotaExhausted,
     RecordingError,
     ReplayMiss,
     SweepStopped,
@@ -26,13 +25,13 @@ from merge_runner.errors import (
 from merge_runner.llm.batch.lines import Batches
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Call, Wait, slot_text
+from merge_runner.llm.call import Call, Meter, Wait, slot_text
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import WireFormat
 from merge_runner.llm.http_outcome import (
+    NOBODY_S,
     AttemptOutcome,
-    Consequences,
     Deadline,
     FirstCall,
     OutOfTime,
@@ -40,13 +39,15 @@ from merge_runner.llm.http_outcome import (
     RequestFailed,
     TransportFailure,
     TryAgain,
-    is_web_page,
+    advice,
+    backoff_s,
+    if_nobody,
     judge,
     may_be_charged,
+    why_refused,
 )
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import cost_usd
 from merge_runner.llm.verify import reply_object
 from merge_runner.records import (
@@ -66,6 +67,10 @@ if TYPE_CHECKING:
 
 # A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
+# How often a format that knows empty answers as a fault is asked again after one; and how many
+# refusals by an endpoint that has answered before mean the configuration.
+EMPTY_RETRIES, SEVERAL = 2, 3
+SAVED = "Every reply so far is saved"
 
 
 @dataclass(slots=True)
@@ -94,7 +99,7 @@ class LlmClient:
     sealed: bool = False
     strict: bool = False
     model: str = ""
-    first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
+    first: FirstCall = field(default_factory=lambda: FirstCall(passed=True))
     batches: Batches | None = None
     under_way: dict[str, Call] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter)
@@ -102,24 +107,17 @@ class LlmClient:
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
     _money: Budget = field(init=False)
-    _consequences: Consequences = field(init=False)
+    _own_host: str | None = field(init=False)  # the provider whose own host is asked
     _stopping: bool = False
 
     def __post_init__(self) -> None:
         """Derive what every call needs."""
+        provider = self.entry.provider
         self.driver = driver_name(self.name, self.endpoint)
         self._wire = FORMATS[self.entry.format]
         self._own_names = own_names(self.entry.id, self.entry.aliases)
         self._money = self.budget or Budget(Ledger(self.cache, ""))  # a ledger that keeps nothing
-        provider = self.entry.provider
-        self._consequences = Consequences(
-            self.name,
-            self.entry,
-            self.driver,
-            # The provider whose own host is asked; None: another server in its format.
-            provider if is_own_host(provider, self.endpoint) else None,
-            self.first,
-        )
+        self._own_host = provider if is_own_host(provider, self.endpoint) else None
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """Return the model's reply for a slot; lower ``order`` is served first.
@@ -246,10 +244,14 @@ class LlmClient:
         opened = self.batches is not None and self.batches.takes_up(call)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
-        alone = False
-        if not self.first.passed and not opened:  # nobody waits for an answer that may take hours
+        first = self.first
+        alone = not first.passed and not opened  # nobody waits for an answer that may take hours
+        if alone:
             with call.waiting(f"for the first answer of {self.driver}"):
-                alone = await self.first.turn()
+                await first.alone.acquire()
+            if first.passed:  # answered meanwhile: nobody goes alone any more
+                first.alone.release()
+                alone = False
         try:
             self._resume(call)
             return await self._attempts(call)
@@ -258,7 +260,7 @@ class LlmClient:
             raise
         finally:
             if alone:
-                self.first.give_turn()
+                first.alone.release()
 
     def _resume(self, call: Call) -> None:
         """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
@@ -292,14 +294,14 @@ class LlmClient:
         try:
             return await deadline.keep(partial(self._attempt, call, deadline), sleep=sleep)
         except (OutOfTime, RequestFailed) as exc:
-            why, made = f"{exc} ({call.last_failure})", len(call.own_attempts)
+            why = f"{exc} ({call.last_failure}), {len(call.own_attempts)} attempts"
             if isinstance(exc, OutOfTime) and not self.first.passed:
                 raise ProviderDown(
-                    f"{self.driver}: {exc} to the first call of this run ({call.last_failure}), "
-                    f"{made} attempts: nothing else is asked. When the service answers again, run "
-                    "the same command"
+                    f"{self.driver}: the first call of this run: {why}: nothing else is asked. "
+                    "When the service answers again, run the same command"
                 ) from exc
-            raise call.failed(f"{self.name}: {why}, {made} attempts") from exc
+            attempts = tuple(call.attempts)
+            raise CallFailed(f"{self.name}: {why}", call.request, attempts, call.earlier) from exc
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; return its answer, which is kept, or raise what follows from it."""
@@ -350,22 +352,71 @@ class LlmClient:
         call.attempts.append(record)
         self.meter.count_attempt(record)
         self._tell_overrun(call, paid.aside_usd)
-        error = error or self._consequences.error(call, outcome)
+        error = error or self._error(call, outcome)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
             if kept.attempts[-1] != record:  # an import was first
                 return self._read(kept, call.earlier)
             text = outcome.reading.text
             return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
-        if isinstance(error, TryAgain) and error.pause_s is not None:
-            self.limiter.pause(error.pause_s)
-            until = datetime.now(UTC) + timedelta(seconds=error.pause_s)
+        if outcome.pause and isinstance(error, TryAgain):
+            pause_s = error.delay_s or backoff_s(len(call.own_attempts))
+            self.limiter.pause(pause_s)
+            until = datetime.now(UTC) + timedelta(seconds=pause_s)
             self.meter.notes.append(
-                f"{self.driver}: all its calls wait {error.pause_s:.1f} s, until "
-                f"{until:%H:%M:%S} UTC: {error}"
+                f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
+                f"{error}"
             )
         await paid.settle(call.attempts)  # before the error, which may end the whole run
         raise error
+
+    def _error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
+        """Return the error that follows from a call's last attempt, None if it is an answer."""
+        if not self.first.passed and (why := self._end_of_run(call, outcome)):
+            return why
+        message, delay_s = outcome.message or outcome.name, outcome.delay_s
+        if outcome.pause and (delay_s or 0) > self.entry.deadline_s:
+            return QuotaExhausted(
+                f"{self.driver}: the provider asks to wait {delay_s:.0f} s, longer than a call's "
+                f"deadline of {self.entry.deadline_s:.0f} s ({message}). {SAVED}; run the same "
+                "command again later to go on."
+            )
+        match outcome.action:
+            case "retry":
+                return TryAgain(message, delay_s)
+            case "fail":
+                which = "reply" if outcome.name == "reply_refused" else "request"
+                return RequestFailed(f"the {which} was rejected")
+            case "quota":
+                return QuotaExhausted(
+                    f"{self.driver}: the account's quota is exhausted ({message}). {SAVED}; when "
+                    "there is credit again, run the same command to go on."
+                )
+            case "refused":
+                what = advice(self.name, self.entry, outcome)
+                return EndpointRefused(f"{self.driver}: {what} ({message})")
+        self.first.passed = self.first.known = True
+        if outcome.name == "empty" and self._wire.retries_empty:
+            empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
+            return TryAgain("empty answer") if empty <= EMPTY_RETRIES else None
+        return None
+
+    def _end_of_run(self, call: Call, outcome: AttemptOutcome) -> SweepStopped | None:
+        """Return the error that ends a run whose other calls would fare no better."""
+        first = self.first
+        if outcome.raw is None:
+            # A server that is just starting is waited for, but only for seconds.
+            waited_s = asyncio.get_running_loop().time() - call.began_s
+            if outcome.name != "no_connection" or waited_s < NOBODY_S:
+                return None
+            what = if_nobody(self.name, self.entry)
+            return ProviderDown(f"{self.driver}: {call.last_failure}: {what}")
+        why = why_refused(self.name, self.entry, outcome)
+        first.refused += why is not None and outcome.action == "fail"
+        # An endpoint that has answered before may mean this prompt alone.
+        if why is None or (first.known and first.refused < SEVERAL):
+            return None
+        return EndpointRefused(f"{self.driver}: {why}")
 
     def _tell_overrun(self, call: Call, aside_usd: float) -> None:
         spent_usd = call.attempts[-1].cost_usd or 0.0
@@ -408,9 +459,8 @@ class LlmClient:
             return cost_usd(self.entry, usage)
         if (usage.output_tokens or 0) > self.entry.max_output_tokens:
             return cost_usd(self.entry, replace(worst, output_tokens=usage.output_tokens))
-        stray = raw.status == 200 and is_web_page(raw) and not self.first.known
-        charged = may_be_charged(raw, self._consequences.own_host) and not stray
-        return None if charged else 0.0
+        stray = raw.status == 200 and raw.is_web_page and not self.first.known
+        return None if may_be_charged(raw, self._own_host) and not stray else 0.0
 
     async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""

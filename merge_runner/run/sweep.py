@@ -27,11 +27,11 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call import Meter
 from merge_runner.llm.call_totals import CallTotals, call_totals
 from merge_runner.llm.content_hashes import canonical_json, manner
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger, Spending, scopes
-from merge_runner.llm.meter import Meter
 from merge_runner.records import DecisionRow, TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.progress_file import ProgressFile

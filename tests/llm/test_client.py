@@ -17,11 +17,11 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call import Meter
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http_outcome import FirstCall, RawReply, TransportFailure
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
-from merge_runner.llm.meter import Meter
 from merge_runner.records import Slot
 from tests.virtual_time import in_virtual_time, now_s
 
