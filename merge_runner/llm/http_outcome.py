@@ -346,7 +346,9 @@ def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | 
         return None
     if raw.status not in REQUEST_ITSELF:
         return f"no language model answers there: {base_url} ({outcome.message})"
-    return f"the request is refused: look at [{name}] in {REGISTRY} ({outcome.message})"
+    said = f"{as_dict(as_dict(raw.first).get('error')).get('param')} {outcome.message}"
+    named = next((f"`parameters.{each}` of " for each in entry.parameters if each in said), "")
+    return f"the request is refused: look at {named}[{name}] in {REGISTRY} ({outcome.message})"
 
 
 def advice(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:

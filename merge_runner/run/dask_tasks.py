@@ -36,7 +36,7 @@ from merge_runner.errors import (
     UsageError,
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Meter, Wait
+from merge_runner.llm.client import Meter, Wait
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import WINDOW_S
 from merge_runner.records import Attempt, TrialRecord, TrialSpec

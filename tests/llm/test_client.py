@@ -17,8 +17,7 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.call import Meter
-from merge_runner.llm.client import LlmClient
+from merge_runner.llm.client import LlmClient, Meter
 from merge_runner.llm.http_outcome import FirstCall, RawReply, TransportFailure
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
