@@ -56,6 +56,10 @@ class Slot:
     decision: int
     sample_set: int
 
+    def __str__(self) -> str:
+        """The slot for a reader."""
+        return f"{self.condition} rep {self.repetition} {self.side}, decision {self.decision}"
+
     def as_dict(self) -> dict[str, str | int]:
         """The slot as plain JSON values."""
         return {

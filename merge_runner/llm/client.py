@@ -76,7 +76,6 @@ LONG_WAIT_S = 5.0
 # refusals by an endpoint that has answered before mean the configuration.
 EMPTY_RETRIES, SEVERAL = 2, 3
 MINUTE_S = 60.0
-SAVED = "Every reply so far is saved"
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,11 +148,6 @@ class Call:
         # What is in flight may be charged whether or not anybody takes the answer: it goes on.
         if self.wait is not None:
             self.task.cancel()
-
-
-def slot_text(slot: Slot) -> str:
-    """Format a slot for a reader."""
-    return f"{slot.condition} rep {slot.repetition} {slot.side}, decision {slot.decision}"
 
 
 @dataclass(slots=True)
@@ -279,10 +273,9 @@ class LlmClient:
         served = reply.attempts[-1].model_served
         if self.strict and served not in self._own_names:
             raise ModelSwapped(
-                f"{self.driver}: {served} answered where {self.entry.id} was asked for, at "
-                f"{slot_text(slot)}; --strict-model stops the sweep. The reply is kept. To go on "
-                "with it, leave --strict-model out, or name it in `aliases` in "
-                "experiments/models.toml"
+                f"{self.driver}: {served} answered where {self.entry.id} was asked for, at {slot}; "
+                "the reply is kept. To go on with it, leave --strict-model out, or name it in "
+                "`aliases` in experiments/models.toml"
             )
         return reply
 
@@ -352,7 +345,7 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
         worst_usd = cost_usd(self.entry, worst) or 0.0
-        asked = Asked(self.driver, slot_text(request.slot), worst_usd, self.model or self.name)
+        asked = Asked(self.driver, str(request.slot), worst_usd, self.model or self.name)
         call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call
@@ -485,14 +478,8 @@ class LlmClient:
                 return self._read(kept, call.earlier)
             text = outcome.reading.text
             return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
-        if outcome.pause and isinstance(error, TryAgain):
-            pause_s = error.delay_s or backoff_s(len(call.own_attempts))
-            self.limiter.pause(pause_s)
-            until = datetime.now(UTC) + timedelta(seconds=pause_s)
-            self.meter.notes.append(
-                f"{self.driver}: all its calls wait {pause_s:.1f} s, until {until:%H:%M:%S} UTC: "
-                f"{error}"
-            )
+        if outcome.pause:
+            self.limiter.pause(outcome.delay_s or backoff_s(len(call.own_attempts)))
         await paid.settle(call.attempts)  # before the error, which may end the whole run
         raise error
 
@@ -500,31 +487,29 @@ class LlmClient:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
         if not self.first.passed and (why := self._end_of_run(call, outcome)):
             return why
-        message, delay_s = outcome.message or outcome.name, outcome.delay_s
-        if outcome.pause and (delay_s or 0) > self.entry.deadline_s:
+        message, delay_s = outcome.message or outcome.name, outcome.delay_s or 0.0
+        why = ""
+        if outcome.action == "quota":
+            why = "the account's quota is exhausted"
+        elif outcome.pause and delay_s > self.entry.deadline_s:
+            why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
+        if why:
             return QuotaExhausted(
-                f"{self.driver}: the provider asks to wait {delay_s:.0f} s, longer than a call's "
-                f"deadline of {self.entry.deadline_s:.0f} s ({message}). {SAVED}; run the same "
-                "command again later to go on."
+                f"{self.driver}: {why} ({message}). Every reply so far is saved; run the same "
+                "command later to go on."
             )
         match outcome.action:
             case "retry":
-                return TryAgain(message, delay_s)
+                return TryAgain(message, outcome.delay_s)
             case "fail":
-                which = "reply" if outcome.name == "reply_refused" else "request"
-                return RequestFailed(f"the {which} was rejected")
-            case "quota":
-                return QuotaExhausted(
-                    f"{self.driver}: the account's quota is exhausted ({message}). {SAVED}; when "
-                    "there is credit again, run the same command to go on."
-                )
+                return RequestFailed("nothing that is asked again would help")
             case "refused":
                 what = advice(self.name, self.entry, outcome)
                 return EndpointRefused(f"{self.driver}: {what} ({message})")
         self.first.passed = self.first.known = True
-        if outcome.name == "empty" and self._wire.retries_empty:
-            empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
-            return TryAgain("empty answer") if empty <= EMPTY_RETRIES else None
+        empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
+        if outcome.name == "empty" and self._wire.retries_empty and empty <= EMPTY_RETRIES:
+            return TryAgain("empty answer")
         return None
 
     def _end_of_run(self, call: Call, outcome: AttemptOutcome) -> SweepStopped | None:
