@@ -65,7 +65,6 @@ from merge_runner.records import (
     is_scripted,
     says_scripted,
 )
-from merge_runner.served_model import own_names
 
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
@@ -235,7 +234,7 @@ class LlmClient:
         provider = self.entry.provider
         self.driver = driver_name(self.name, self.endpoint)
         self._wire = FORMATS[self.entry.format]
-        self._own_names = own_names(self.entry.id, self.entry.aliases)
+        self._own_names = frozenset({None, self.entry.id, *self.entry.aliases})
         self._money = self.budget or Budget(Ledger(self.cache, ""))  # a ledger that keeps nothing
         self._own_host = provider if is_own_host(provider, self.endpoint) else None
 
@@ -485,8 +484,8 @@ class LlmClient:
 
     def _error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
-        if not self.first.passed and (why := self._end_of_run(call, outcome)):
-            return why
+        if not self.first.passed and (stop := self._end_of_run(call, outcome)):
+            return stop
         message, delay_s = outcome.message or outcome.name, outcome.delay_s or 0.0
         why = ""
         if outcome.action == "quota":
