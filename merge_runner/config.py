@@ -283,9 +283,9 @@ class Provider:
     ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are the members that
     every error of the provider has, by its documentation: one without them may be a gateway's.
     ``parameters`` are those that its servers take beside those of the wire format. ``batch`` are
-    the terms of its batch mode; None: it has none.
-    ``model_env`` is the variable that names the model of an entry without a name; a provider with
-    one also lists its models at ``/models``. ``if_nobody`` says what to do where nobody answers.
+    the terms of its batch mode. ``model_env`` is the variable that names the model of an entry
+    without a name; a provider with one also lists its models at ``/models``. ``if_nobody`` says
+    what to do where nobody answers.
     """
 
     base_url: str
@@ -301,6 +301,7 @@ class Provider:
 
 
 _half = partial(BatchTerms, price_factor=0.5)
+_ANTHROPIC_GUIDE = "platform.claude.com/docs/en/build-with-claude/batch-processing, 2026-11"
 PROVIDERS: Registry[Provider] = Registry("provider")
 for _name, _provider in {
     "openai": Provider(
@@ -325,9 +326,7 @@ for _name, _provider in {
         ("ANTHROPIC_API_KEY",),
         auth="x-api-key",
         error_members=frozenset({"message", "type"}),
-        batch=_half(
-            source="platform.claude.com/docs/en/build-with-claude/batch-processing, 2026-11"
-        ),
+        batch=_half(source=_ANTHROPIC_GUIDE),
     ),
     "openrouter": Provider(
         "https://openrouter.ai/api/v1",
@@ -571,17 +570,17 @@ def state_folder(env: Mapping[str, str] = os.environ) -> Path:
     It lies in XDG_STATE_HOME, or else in HOME, and is never relative, or else a working folder
     could bring its own. Raises UsageError.
     """
-    for named, below in (("XDG_STATE_HOME", ""), ("HOME", ".local/state")):
-        folder = Path(env.get(named, ""))
-        if folder.is_absolute():
-            return folder / below / "merge-runner"
-    raise UsageError("HOME names no folder: set it, or XDG_STATE_HOME")
+    home = Path(env.get("HOME", ""), ".local/state")
+    folder = next(filter(Path.is_absolute, (Path(env.get("XDG_STATE_HOME", "")), home)), None)
+    if folder is None:
+        raise UsageError("HOME names no folder: set it, or XDG_STATE_HOME")
+    return folder / "merge-runner"
 
 
 def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
     """The variables of this environment that say where the entries' providers are reached."""
     variables = {PROVIDERS.require(entry.provider).base_url_env for entry in entries.values()}
-    return {v: os.environ[v] for v in variables if v is not None and os.environ.get(v)}
+    return {v: os.environ[v] for v in variables if v and os.environ.get(v)}
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -606,10 +605,8 @@ def validated(model: type[ModelT], value: object, where: str) -> ModelT:
 
 def experiments() -> list[Path]:
     """The folders of studies: that of the working directory goes before what ships."""
-    here = Path("experiments")
-    if here.is_dir() and not (SHIPPED_EXPERIMENTS.is_dir() and here.samefile(SHIPPED_EXPERIMENTS)):
-        return [here, SHIPPED_EXPERIMENTS]
-    return [here if here.is_dir() else SHIPPED_EXPERIMENTS]
+    folders = {path.resolve(): path for path in (SHIPPED_EXPERIMENTS, Path("experiments"))}
+    return [path for path in reversed(folders.values()) if path.is_dir()]
 
 
 def url_origin(url: str) -> str:
@@ -620,19 +617,17 @@ def url_origin(url: str) -> str:
 
 def _explain(exc: ValidationError, model: type[BaseModel]) -> Iterator[str]:
     for error in exc.errors():
-        place = ".".join(str(part) for part in error["loc"])
-        if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-            owner: Any = model
-            for part in error["loc"][:-1]:
-                known = getattr(owner, "model_fields", {}).get(str(part))
-                owner = (known and model_in(known.annotation)) or owner
-            keys = (
-                [each.name for each in fields(owner)] if is_dataclass(owner) else owner.model_fields
-            )
-            yield str(unknown_name("key", place, keys))
-        else:
-            text = error["msg"].removeprefix("Value error, ")
+        place = ".".join(map(str, error["loc"]))
+        text = error["msg"].removeprefix("Value error, ")
+        if error["type"] not in ("extra_forbidden", "unexpected_keyword_argument"):
             yield f"{place}: {text}" if place else text
+            continue
+        owner: Any = model
+        for part in error["loc"][:-1]:
+            known = getattr(owner, "model_fields", {}).get(str(part))
+            owner = (known and model_in(known.annotation)) or owner
+        keys = [f.name for f in fields(owner)] if is_dataclass(owner) else owner.model_fields
+        yield str(unknown_name("key", place, keys))
 
 
 def model_in(annotation: object) -> type | None:

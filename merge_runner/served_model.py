@@ -27,7 +27,7 @@ FROM sweeps, json_each(config, '$.models') ORDER BY ALL
 def others_among(pairs: Iterable[Pair], aliases: Iterable[Pair]) -> list[Pair]:
     """Return the pairs in which another model answered; ``aliases`` pair ids with aliases."""
     declared = {*aliases}
-    return [pair for pair in pairs if pair[0] != pair[1] and pair not in declared]
+    return [pair for pair in pairs if pair[1] not in (None, pair[0]) and pair not in declared]
 
 
 def other_models(connection: duckdb.DuckDBPyConnection) -> list[Pair]:
