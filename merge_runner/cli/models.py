@@ -35,7 +35,7 @@ def models(as_json: JsonOption = False) -> None:
         usd = ["unknown" if cost is None else round(cost * 1000, 6) for cost in costs]
         closes = str(entry.shutdown or "")
         source = entry.price.source if isinstance(entry.price, Price) else entry.price
-        key = key_status(name, entry)
+        key = key_status(entry)
         rows.append((name, entry.provider, key, *usd, closes, entry.id, source, entry.note))
     for name, program in PROGRAMS.items():
         rows.append((name, "program", "not needed", 0, 0, "", "", "", program.described))

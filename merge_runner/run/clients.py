@@ -24,8 +24,7 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.call import Call
-from merge_runner.llm.client import LlmClient
+from merge_runner.llm.client import Call, LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Ledger

@@ -36,10 +36,9 @@ from merge_runner.errors import (
     UsageError,
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Wait
+from merge_runner.llm.client import Meter, Wait
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import WINDOW_S
-from merge_runner.llm.meter import Meter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec
 from merge_runner.registry import in_use, plugin_sources, use
 from merge_runner.run.clients import EndpointPlan, live_clients, sealed_clients

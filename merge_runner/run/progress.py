@@ -14,9 +14,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
 
-from merge_runner.llm.call import Wait
+from merge_runner.llm.client import Meter, Wait
 from merge_runner.llm.ledger import Ledger
-from merge_runner.llm.meter import Meter
 from merge_runner.results.progress_file import (
     EVERY_S,
     MACHINE,

@@ -26,10 +26,10 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.client import Meter
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Ledger, Spending, scopes
-from merge_runner.llm.meter import Meter
 from merge_runner.records import DecisionRow, TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.progress_file import ProgressFile

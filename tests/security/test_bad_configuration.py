@@ -107,7 +107,7 @@ def refused(program, *arguments):
         (model(shutdown='"soon"'), "shutdown: Input should be a valid date"),
         (model(aliases='"x"'), "aliases: Input should be a valid tuple"),
         (model(base_url='"nope"'), "must begin with http:// or https://"),
-        (model(base_url='"http://user:word@host/v1"'), "has a user name, a password"),
+        (model(base_url='"http://user:word@host/v1"'), "is no base URL"),
         (b"m = 1", "[m]: Input should be a valid dictionary"),
         (b'["a\\nb"]\nx = 1', "[a?b]: provider: Field required"),
         (b"[m", "is no TOML file: Expected ']'"),

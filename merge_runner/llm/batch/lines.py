@@ -17,7 +17,7 @@ from merge_runner.records import Attempt
 
 if TYPE_CHECKING:
     from merge_runner.llm.batch.rounds import Rounds
-    from merge_runner.llm.call import Call
+    from merge_runner.llm.client import Call
 
 
 @dataclass(frozen=True, slots=True)
