@@ -239,7 +239,6 @@ async def test_a_batch_of_o3_is_created_as_by_openais_library(driving_prompt):
                 endpoint="/v1/chat/completions",
                 completion_window="24h",
                 metadata={"merge_runner_mark": "a-mark"},
-                output_expires_after={"anchor": "created_at", "seconds": 2_592_000},
             )
     assert ours == requests
 

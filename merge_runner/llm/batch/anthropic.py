@@ -13,8 +13,6 @@ from merge_runner.llm.batch.service import (
     LineResult,
     as_reply,
     as_word,
-    id_of,
-    json_object,
 )
 from merge_runner.llm.formats.base import as_count, as_dict, as_text
 
@@ -37,8 +35,6 @@ STATUSES = {
 class AnthropicBatches(BatchService):
     """``/v1/messages/batches``, with all requests in the body; see BatchService."""
 
-    # Of 256 MB; the rest is for what stands around the lines.
-    most_bytes = 255_000_000
     takes_mark = False
     path = "/v1/messages/batches"
 
@@ -47,24 +43,16 @@ class AnthropicBatches(BatchService):
         slot = self.slot_members(line)
         return f'{{"custom_id":"{line.key}","params":{line.request.body}{slot}}}'.encode()
 
-    async def create(self, lines: Sequence[BatchLine], mark: str) -> str:
+    def creation(self, lines: Sequence[BatchLine], file: str, mark: str) -> tuple[str, bytes]:
         """See BatchService; a batch takes no name, so that the mark is not sent."""
-        body = b'{"requests":[' + b",".join(map(self.line, lines)) + b"]}"
-        return id_of(json_object(await self._post(self.path, body)))
+        return self.path, b'{"requests":[' + b",".join(map(self.line, lines)) + b"]}"
 
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        counts = as_dict(batch.get("request_counts"))
-        total = sum(as_count(count) or 0 for count in counts.values())
         ended = as_word(batch.get("processing_status")) == "ENDED"
-        return BatchStatus(
-            state="ended" if ended else "waiting",
-            # While a batch is in progress all its requests count as such.
-            done=total - (as_count(counts.get("processing")) or 0) if ended else None,
-            total=total or None,
-            results=total,
-            batch=batch,
-        )
+        counts = as_dict(batch.get("request_counts")).values()
+        total = sum(as_count(count) or 0 for count in counts)
+        return BatchStatus("ended" if ended else "waiting", total, batch=batch)
 
     def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
         """See BatchService."""
@@ -84,6 +72,5 @@ class AnthropicBatches(BatchService):
                 kind = as_text(as_dict(error.get("error")).get("type")) or ""
                 return LineResult(key, as_reply(STATUSES.get(kind, 500), error))
             case "expired" | "canceled" as why:
-                message = f"the batch {'has expired' if why == 'expired' else why}"
-                return LineResult(key, None, message)
+                return LineResult(key, None, f"its result is {why!r}")
         return None

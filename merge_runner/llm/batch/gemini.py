@@ -17,13 +17,12 @@ from merge_runner.llm.batch.service import (
     BatchService,
     BatchStatus,
     LineResult,
-    Listed,
+    Page,
     as_message,
     as_reply,
     as_word,
     id_of,
     json_object,
-    moment_of,
 )
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import as_count, as_dict, as_dicts, as_text, read_error
@@ -33,56 +32,39 @@ METHOD, BATCH_METHOD = ":generateContent", ":batchGenerateContent"
 # Of ASCII, as a URL is; it may carry a long token.
 UPLOAD_PATH = re.compile("/[!-~]{0,8000}")
 ENDED = frozenset({"SUCCEEDED", "PARTIALLY_SUCCEEDED", "CANCELLED", "EXPIRED"})
-# The HTTP status of an error by its code (google/rpc/code.proto), and its name.
-CODES = {
-    1: (499, "CANCELLED"),
-    2: (500, "UNKNOWN"),
-    3: (400, "INVALID_ARGUMENT"),
-    4: (504, "DEADLINE_EXCEEDED"),
-    5: (404, "NOT_FOUND"),
-    6: (409, "ALREADY_EXISTS"),
-    7: (403, "PERMISSION_DENIED"),
-    8: (429, "RESOURCE_EXHAUSTED"),
-    9: (400, "FAILED_PRECONDITION"),
-    10: (409, "ABORTED"),
-    11: (400, "OUT_OF_RANGE"),
-    12: (501, "UNIMPLEMENTED"),
-    13: (500, "INTERNAL"),
-    14: (503, "UNAVAILABLE"),
-    15: (500, "DATA_LOSS"),
-    16: (401, "UNAUTHENTICATED"),
+# The HTTP status of an error by its code (google/rpc/code.proto); of all others it is 500.
+STATUSES = {
+    1: 499,
+    3: 400,
+    4: 504,
+    5: 404,
+    6: 409,
+    7: 403,
+    8: 429,
+    9: 400,
+    10: 409,
+    11: 400,
+    12: 501,
+    14: 503,
+    16: 401,
 }
-NOT_ASKED = frozenset({"CANCELLED"})
+CANCELLED = 499
 
 
 class GeminiBatches(BatchService):
     """``models/MODEL:batchGenerateContent`` and ``batches``; see BatchService."""
 
-    # A file may have 2 GB, but this one is held in memory.
-    most_bytes = 200_000_000
     # A page has few batches, since one may come with all its results.
     path, pages, cursor = f"{API}/batches", "pageSize=10", "pageToken"
-    cancel_suffix, key_member = ":cancel", "key"
+    id_member, key_member = "name", "key"
 
     def line(self, line: BatchLine) -> bytes:
         """See BatchService."""
         slot = self.slot_members(line)
         return f'{{"key":"{line.key}","request":{line.request.body}{slot}}}\n'.encode()
 
-    async def create(self, lines: Sequence[BatchLine], mark: str) -> str:
+    async def upload(self, content: bytes, mark: str) -> str:
         """See BatchService."""
-        try:
-            name = await self._upload(b"".join(map(self.line, lines)), mark)
-        except BatchFailed as exc:
-            exc.sent = False  # a file is no batch yet
-            raise
-        batch = {"displayName": mark, "inputConfig": {"fileName": name}}
-        path = lines[0].request.path.replace(METHOD, BATCH_METHOD)
-        created = await self._post(path, canonical_json({"batch": batch}).encode())
-        return self.batch_id_of(json_object(created))
-
-    async def _upload(self, content: bytes, mark: str) -> str:
-        """Return the name of a file with these lines."""
         start = {
             "x-goog-upload-protocol": "resumable",
             "x-goog-upload-command": "start",
@@ -90,10 +72,10 @@ class GeminiBatches(BatchService):
             "x-goog-upload-header-content-type": "application/jsonl",
         }
         file = canonical_json({"file": {"displayName": mark, "mimeType": "application/jsonl"}})
-        begun = await self._post(f"/upload{API}/files", file.encode(), start)
+        begun = await self._ask("POST", f"/upload{API}/files", file.encode(), start)
         finish = {"x-goog-upload-command": "upload, finalize", "x-goog-upload-offset": "0"}
         path = self._own_path(begun.headers.get("x-goog-upload-url", ""))
-        uploaded = json_object(await self._post(path, content, finish))
+        uploaded = json_object(await self._ask("POST", path, content, finish))
         return id_of(as_dict(uploaded.get("file")), "name")
 
     def _own_path(self, url: str) -> str:
@@ -107,32 +89,28 @@ class GeminiBatches(BatchService):
             raise BatchFailed("again", "the reply names no URL for the upload")
         return f"{path}?{parts.query}"
 
-    def page_of(self, page: dict[str, Any]) -> tuple[list[Listed], str | None]:
-        """See BatchService; the mark is the display name."""
-        listed = []
-        for batch in as_dicts(page.get("operations")):
-            metadata = as_dict(batch.get("metadata"))
-            created = moment_of(metadata.get("createTime"))
-            listed.append(Listed(metadata.get("displayName"), created, batch))
-        return listed, as_text(page.get("nextPageToken")) or None
+    def creation(self, lines: Sequence[BatchLine], file: str, mark: str) -> tuple[str, bytes]:
+        """See BatchService."""
+        batch = {"displayName": mark, "inputConfig": {"fileName": file}}
+        path = lines[0].request.path.replace(METHOD, BATCH_METHOD)
+        return path, canonical_json({"batch": batch}).encode()
 
-    def batch_id_of(self, batch: dict[str, Any]) -> str:
-        """Return the id in the name ``batches/ID``."""
-        return id_of(batch, "name").rpartition("/")[2]
+    def page_of(self, page: dict[str, Any]) -> Page:
+        """See BatchService; the mark is the display name."""
+        batches = as_dicts(page.get("operations"))
+        listed = [(as_dict(batch.get("metadata")).get("displayName"), batch) for batch in batches]
+        return listed, as_text(page.get("nextPageToken")) or None
 
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        state, error = _state(batch), as_dict(batch.get("error"))
+        error = as_dict(batch.get("error"))
         stats = as_dict(as_dict(batch.get("metadata")).get("batchStats"))
-        total, pending = _count(stats, "requestCount"), _count(stats, "pendingRequestCount")
-        why = read_error(_status_of(error)[0] if error else 400, {}, "", batch)
+        answered = str(stats.get("successfulRequestCount"))  # 64-bit numbers are texts
         return BatchStatus(
-            state=state,
-            done=None if total is None else max(0, total - (pending or 0)),
-            total=total,
-            results=_count(stats, "successfulRequestCount") or 0,
+            state=_state(batch),
+            results=int(answered) if re.fullmatch("[0-9]{1,18}", answered) else 0,
             message=as_message(error.get("message")),
-            failure=self.failure_of(why) if state == "failed" else None,
+            failure=self.failure_of(read_error(_status_of(error) if error else 400, {}, "", batch)),
             batch=batch,
         )
 
@@ -153,12 +131,10 @@ class GeminiBatches(BatchService):
             return LineResult(key, as_reply(200, response))
         if not error:
             return None
-        status, name = _status_of(error)
-        if name in NOT_ASKED:
+        status = _status_of(error)
+        if status == CANCELLED:
             return LineResult(key, None, as_message(error.get("message")))
-        return LineResult(
-            key, as_reply(status, {"error": {**error, "code": status, "status": name}})
-        )
+        return LineResult(key, as_reply(status, {"error": {**error, "code": status}}))
 
 
 def _word(batch: Mapping[str, Any]) -> str:
@@ -176,15 +152,7 @@ def _state(batch: dict[str, Any]) -> Literal["waiting", "ended", "failed"]:
     return "ended" if done else "waiting"
 
 
-def _count(stats: dict[str, Any], name: str) -> int | None:
-    """A count, which is a text, as 64-bit numbers are in JSON of protobuf; 0 is left out."""
-    text = str(stats.get(name, "0"))
-    return as_count(int(text)) if stats and re.fullmatch("[0-9]{1,18}", text) else None
-
-
-def _status_of(error: dict[str, Any]) -> tuple[int, str | None]:
-    """The HTTP status of an error, whose code may be one already, and its name."""
+def _status_of(error: dict[str, Any]) -> int:
+    """The HTTP status of an error, whose code may be one already."""
     code = as_count(error.get("code")) or 2
-    if 400 <= code < 600:
-        return code, as_text(error.get("status"))
-    return CODES.get(code, CODES[2])
+    return code if 400 <= code < 600 else STATUSES.get(code, 500)

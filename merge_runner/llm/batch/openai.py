@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any
 from uuid import uuid4
 
-from merge_runner.config import is_own_host
 from merge_runner.llm.batch.service import (
-    BatchFailed,
     BatchLine,
     BatchService,
     BatchStatus,
     LineResult,
-    Listed,
+    Page,
     as_message,
     as_reply,
     as_word,
@@ -37,8 +34,6 @@ from merge_runner.llm.verify import LARGEST_STATUS
 # Where the files of a batch stand, whatever the base URL of the server is.
 API = "/v1"
 MARK = "merge_runner_mark"
-# What OpenAI itself does with input files.
-KEPT_S = 30 * 86400
 ENDED = frozenset({"COMPLETED", "EXPIRED", "CANCELLED"})
 NOT_ASKED = frozenset({"batch_expired", "batch_cancelled"})
 
@@ -46,7 +41,6 @@ NOT_ASKED = frozenset({"batch_expired", "batch_cancelled"})
 class OpenAIBatches(BatchService):
     """``/files`` and ``/batches``; see BatchService."""
 
-    most_bytes = 200_000_000
     path, pages, cursor = "/batches", "limit=100", "after"
 
     def line(self, line: BatchLine) -> bytes:
@@ -55,20 +49,8 @@ class OpenAIBatches(BatchService):
         members = f'"method":"POST","url":{url},"body":{line.request.body}{slot}'
         return f'{{"custom_id":"{line.key}",{members}}}\n'.encode()
 
-    async def create(self, lines: Sequence[BatchLine], mark: str) -> str:
+    async def upload(self, content: bytes, mark: str) -> str:
         """See BatchService."""
-        batch: dict[str, Any] = {
-            "input_file_id": await self._upload(b"".join(map(self.line, lines))),
-            "endpoint": API + lines[0].request.path,
-            "completion_window": "24h",
-            "metadata": {MARK: mark},
-        }
-        if is_own_host("openai", self._endpoint.identity):  # others may not know the member
-            batch["output_expires_after"] = {"anchor": "created_at", "seconds": KEPT_S}
-        return id_of(json_object(await self._post(self.path, canonical_json(batch).encode())))
-
-    async def _upload(self, content: bytes) -> str:
-        """Return the id of a file with these lines."""
         boundary = uuid4().hex
         purpose = 'content-disposition: form-data; name="purpose"\r\n\r\nbatch'
         file = 'content-disposition: form-data; name="file"; filename="batch.jsonl"'
@@ -76,40 +58,36 @@ class OpenAIBatches(BatchService):
         head += "content-type: application/jsonl\r\n\r\n"
         body = head.encode() + content + f"\r\n--{boundary}--\r\n".encode()
         form = {"content-type": f"multipart/form-data; boundary={boundary}"}
-        try:
-            return id_of(json_object(await self._post("/files", body, form)))
-        except BatchFailed as exc:
-            exc.sent = False  # a file is no batch yet
-            raise
+        return id_of(json_object(await self._ask("POST", "/files", body, form)))
 
-    def page_of(self, page: dict[str, Any]) -> tuple[list[Listed], str | None]:
+    def creation(self, lines: Sequence[BatchLine], file: str, mark: str) -> tuple[str, bytes]:
+        """See BatchService."""
+        batch = {
+            "input_file_id": file,
+            "endpoint": API + lines[0].request.path,
+            "completion_window": "24h",
+            "metadata": {MARK: mark},
+        }
+        return self.path, canonical_json(batch).encode()
+
+    def page_of(self, page: dict[str, Any]) -> Page:
         """See BatchService; the mark is among the metadata."""
         batches = as_dicts(page.get("data"))
-        last = as_text(page.get("last_id")) or next(
-            (as_text(batch.get("id")) for batch in reversed(batches)), None
-        )
-        listed = [
-            Listed(as_dict(batch.get("metadata")).get(MARK), _created(batch), batch)
-            for batch in batches
-        ]
-        return listed, last if page.get("has_more") else None
+        listed = [(as_dict(batch.get("metadata")).get(MARK), batch) for batch in batches]
+        return listed, as_text(page.get("last_id")) if page.get("has_more") else None
 
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
         word = as_word(batch.get("status"))
-        counts = as_dict(batch.get("request_counts"))
-        answered = as_count(counts.get("completed")) or 0
         error = first_of(as_dict(batch.get("errors")).get("data"))
         why = read_error(400, {}, "", {"error": error})
-        why = replace(why, status=status_within(why) if why.names else 400)
-        failed = word == "FAILED"
+        if why.names:
+            why = replace(why, status=status_within(why))
         return BatchStatus(
-            state="failed" if failed else "ended" if word in ENDED else "waiting",
-            done=answered + (as_count(counts.get("failed")) or 0) if counts else None,
-            total=as_count(counts.get("total")) or None,
-            results=answered,
+            state="failed" if word == "FAILED" else "ended" if word in ENDED else "waiting",
+            results=as_count(as_dict(batch.get("request_counts")).get("completed")) or 0,
             message=as_message(error.get("message")),
-            failure=self.failure_of(why) if failed else None,
+            failure=self.failure_of(why),
             batch=batch,
         )
 
@@ -127,11 +105,4 @@ class OpenAIBatches(BatchService):
         message = as_message(error.get("message"))
         if as_text(error.get("code")) in NOT_ASKED:
             return LineResult(key, None, message)
-        if error:
-            return LineResult(key, as_reply(500, {"error": error}), message)
-        return None
-
-
-def _created(batch: dict[str, Any]) -> datetime | None:
-    created_s = as_count(batch.get("created_at"))
-    return None if created_s is None else datetime.fromtimestamp(created_s, UTC)
+        return LineResult(key, as_reply(500, {"error": error}), message) if error else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import socket
 from datetime import UTC, datetime, timedelta
@@ -12,7 +11,7 @@ import pytest
 from aiohttp import web
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.service import BatchFailed, Unreadable
+from merge_runner.llm.batch.service import BatchFailed
 from tests.llm.batch.conftest import KEY, endpoint_at
 from tests.llm.batch.lines import lines
 
@@ -30,11 +29,6 @@ BATCH = {
 LISTS = {
     "openai-chat": "GET /v1/batches",
     "gemini": "GET /v1beta/batches",
-}
-CANCEL = {
-    "openai-chat": "POST /v1/batches/b1/cancel",
-    "anthropic": "POST /v1/messages/batches/b1/cancel",
-    "gemini": "POST /v1beta/batches/b1:cancel",
 }
 RESULTS = "GET /v1/messages/batches/b1/results"
 OUTPUT, ERRORS = "GET /v1/files/f1/content", "GET /v1/files/f2/content"
@@ -151,7 +145,7 @@ def jsonl(*parts):
 
 async def results_of(service):
     status = await service.status("b1")
-    return [each async for each in service.results("b1", status, 10)]
+    return [each async for each in service.results("b1", status)]
 
 
 async def read(service):
@@ -159,11 +153,11 @@ async def read(service):
     status = await service.status("b1")
     keys, broken = [], []
     try:
-        async for result in service.results("b1", status, 10):
-            if isinstance(result, Unreadable):
-                broken.append(result.why)
-            else:
+        async for result in service.results("b1", status):
+            if result.key:
                 keys.append(result.key)
+            else:
+                broken.append(result.message)
     except BatchFailed as exc:
         return keys, broken, exc
     return keys, broken, None
@@ -172,15 +166,15 @@ async def read(service):
 @pytest.mark.parametrize(
     ("broken", "said"),
     [
-        (b'{"custom_id": "b", "res', "line 2 is no JSON"),
-        (b"[1, 2]", "line 2 is no JSON object"),
-        (b'"text"', "line 2 is no JSON object"),
-        (b'{"result": {"type": "succeeded"}}', "line 2 has no custom_id"),
-        (b'{"custom_id": 7, "result": {}}', "line 2 has no custom_id"),
-        (b'{"custom_id": "b", "result": {"type": "strange"}}', "of b is of no known form"),
+        (b'{"custom_id": "b", "res', "it is no JSON object"),
+        (b"[1, 2]", "it is no JSON object"),
+        (b'"text"', "it is no JSON object"),
+        (b'{"result": {"type": "succeeded"}}', "it has no custom_id"),
+        (b'{"custom_id": 7, "result": {}}', "it has no custom_id"),
+        (b'{"custom_id": "b", "result": {"type": "strange"}}', "of no known form"),
         (
             jsonl(succeeded("b", "x" * 5000)),
-            "line 2: the reply is refused: it is longer than 0.004",
+            "the reply is refused: it is longer than 0.004",
         ),
     ],
 )
@@ -215,24 +209,6 @@ async def test_results_that_break_off_can_be_read_again(server, service_at):
     assert (keys, failed.kind) == (["a"], "again")
     results_at(server, (200, jsonl(succeeded("a"), succeeded("b"))))
     assert await read(service) == (["a", "b"], [], None)
-
-
-async def test_results_without_an_end_are_not_read_for_ever(server, service_at):
-    """Blank lines are lines too: whatever comes in place of results, the reading ends."""
-
-    async def endless(request):
-        response = web.StreamResponse()
-        await response.prepare(request)
-        await response.write(json.dumps(succeeded("a")).encode())
-        with contextlib.suppress(ConnectionError):
-            while True:
-                await response.write(b"\n" * 5)
-        return response
-
-    results_at(server, endless)
-    keys, broken, failed = await asyncio.wait_for(read(service_at(server.url, "anthropic")), 10)
-    assert (keys, broken, failed.kind) == (["a"], [], "single")
-    assert str(failed) == "there are more than 30 lines of results"
 
 
 async def test_a_key_goes_to_no_other_host_than_the_configured_one(server, service_at):
@@ -337,10 +313,10 @@ async def test_results_that_a_provider_has_and_does_not_show_yet_are_waited_for(
 
 
 async def test_a_list_that_turns_in_a_circle_ends(server, service_at):
-    page = {"data": [{"id": "b1"}], "has_more": True}
+    page = {"data": [{"id": "b1"}], "has_more": True, "last_id": "b1"}
     server.replies[LISTS["openai-chat"]] = (200, page)
     service = service_at(server.url, "openai-chat")
-    assert await service.find("mark", datetime.now(UTC)) is None
+    assert await service.find("mark") is None
     assert len(server.asked) == 2
 
 
@@ -348,8 +324,7 @@ async def used(service, what):
     """What an operation on a batch that exists raises."""
     asked = {
         "status": lambda: service.status("b1"),
-        "find": lambda: service.find("mark", datetime.now(UTC)),
-        "cancel": lambda: service.cancel("b1"),
+        "find": lambda: service.find("mark"),
     }
     with pytest.raises(BatchFailed) as failed:
         await asked[what]()
@@ -361,7 +336,7 @@ async def used(service, what):
     [
         (form, what)
         for form in BATCH
-        for what in ("status", "find", "cancel")
+        for what in ("status", "find")
         if form in LISTS or what != "find"
     ],
 )
@@ -381,16 +356,9 @@ async def used(service, what):
 async def test_a_batch_that_may_exist_is_never_asked_singly(
     server, service_at, form, what, status, kind
 ):
-    where = {"status": BATCH, "find": LISTS, "cancel": CANCEL}[what][form]
+    where = {"status": BATCH, "find": LISTS}[what][form]
     server.replies[where] = (status, error())
     assert (await used(service_at(server.url, form), what)).kind == kind
-
-
-@pytest.mark.parametrize("form", BATCH)
-@pytest.mark.parametrize("status", [400, 409])
-async def test_to_cancel_a_batch_that_has_ended_is_no_error(server, service_at, form, status):
-    server.replies[CANCEL[form]] = (status, error())
-    await service_at(server.url, form).cancel("b1")
 
 
 @pytest.mark.parametrize(("status", "kind"), [(404, "again"), (410, "lost"), (500, "again")])
@@ -460,17 +428,7 @@ async def test_a_batch_is_found_in_a_list_that_begins_with_the_oldest(server, se
     old = [listed(form, "old", NOW - timedelta(days=n), f"old{n}") for n in (9, 8, 7)]
     new = [listed(form, mark, NOW, mark * 240) for mark in ("other", "mark")]
     server.replies[LISTS[form]] = paged(form, old[:2], [], [old[2]], new)
-    assert await service_at(server.url, form).find("mark", NOW) == "mark" * 240
-
-
-@pytest.mark.parametrize("form", LISTS)
-async def test_nobody_looks_behind_a_page_from_which_a_list_goes_back_in_time(
-    server, service_at, form
-):
-    old = [listed(form, "old", NOW - timedelta(days=n), f"old{n}") for n in (7, 8, 9)]
-    server.replies[LISTS[form]] = paged(form, old[:2], [old[2]])
-    assert await service_at(server.url, form).find("mark", NOW) is None
-    assert len(server.asked) == 1
+    assert await service_at(server.url, form).find("mark") == "mark" * 240
 
 
 @pytest.mark.parametrize("form", LISTS)
@@ -484,7 +442,7 @@ async def test_a_list_without_end_leaves_open_whether_there_is_a_batch(server, s
 async def test_every_request_has_the_headers_of_its_format(server, service_at, form):
     service = service_at(server.url, form)
     await failure(service, form)
-    for what in ("status", "cancel", *(["find"] if form in LISTS else [])):
+    for what in ("status", *(["find"] if form in LISTS else [])):
         await used(service, what)
     server.replies[BATCH[form]] = (200, {"output_file_id": "f1", "done": True})
     await read(service)
