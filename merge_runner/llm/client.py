@@ -416,9 +416,9 @@ class LlmClient:
         """Make one attempt as a line of a batch; see ``_attempt``."""
         line = await batches.line(call)
         with closing(line.paid):
-            call.open, call.singly = None, True
             with call.waiting(f"for batches of {batches.model}", idle=True):
                 end, batch = await batches.rounds.ask(line)
+            call.open, call.singly = None, True
             outcome = AttemptOutcome("retry", end.outcome, end.message, charged=end.unclear)
             if end.raw is not None:  # no limit of single calls is meant, and no call waits for one
                 outcome = replace(judge(end.raw, self._wire), pause=False, delay_s=None)

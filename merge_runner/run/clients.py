@@ -20,8 +20,8 @@ from merge_runner.config import (
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.journal import Journal
+from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
 from merge_runner.llm.batch.rounds import Batches, Rounds
-from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Call

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
-from merge_runner.llm.batch.terms import batch_terms
+from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.call_totals import CallTotals
 from merge_runner.llm.ledger import Spending
 from merge_runner.llm.prices import cost_usd

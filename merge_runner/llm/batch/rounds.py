@@ -27,7 +27,7 @@ from merge_runner.errors import (
     TrialSuspended,
 )
 from merge_runner.llm.batch.journal import Journal, OpenBatch
-from merge_runner.llm.batch.service import BatchFailed, BatchLine, BatchService
+from merge_runner.llm.batch.service import BatchFailed, BatchService
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.http_outcome import RawReply, backoff_s
 from merge_runner.records import Attempt
@@ -45,8 +45,8 @@ SHORTEST_POLL_S, LONGEST_POLL_S, POLL_SHARE = 0.25, 60.0, 0.1
 # A creation whose answer was lost may be in effect only after 30 s, since gateways keep requests:
 # the pauses between looks.
 ARRIVAL_S = (1.0, 1.0, 2.0, 4.0, 8.0, 14.0)
-# How long the first creation of a run is tried again, and all others: the provider is there.
-FIRST_S, OUTAGE_S = 60.0, 600.0
+# How long a creation is tried again.
+OUTAGE_S = 600.0
 # How long a batch that has ended may take to show its results.
 ENDING_S = 3600.0
 T = TypeVar("T")
@@ -67,23 +67,26 @@ class LineEnd:
     error: MergeRunnerError | None = None
 
 
-@dataclass(slots=True, eq=False, kw_only=True)
-class Line(BatchLine):
-    """An attempt that waits for a batch to be created, or to end.
+@dataclass(slots=True, eq=False)
+class Line:
+    """A call whose next attempt waits for a batch to be created, or to end.
 
-    ``model`` is its name in the registry, ``attempts`` are those before it. ``note`` is the
-    batch in which an earlier run has put it, ``batch`` will be the one that it goes to.
+    ``model`` is its name in the registry, ``batch`` will be the one that it goes to.
     """
 
+    call: Call
     model: str
     paid: PaidAttempt
-    attempts: Sequence[Attempt]
-    note: OpenBatch | None = None
     batch: asyncio.Future[Batch] = field(init=False)
+
+    @property
+    def key(self) -> str:
+        """That of its request, which is its id at the provider."""
+        return self.call.request.key
 
     def begins(self) -> bool:
         """Set its money aside durably, unless that is done; False if the cap is used up."""
-        return not self.paid.queued or self.paid.set_aside(self.attempts)
+        return not self.paid.queued or self.paid.set_aside(self.call.attempts)
 
 
 @dataclass(slots=True, eq=False)
@@ -138,14 +141,7 @@ class Batches:
                 paid = await self.money.set_aside(*who)
         else:
             paid = self.money.going_on(*who, call.open.ledger)
-        return Line(
-            call.request,
-            len(call.attempts) + 1,
-            model=self.model,
-            paid=paid,
-            attempts=call.attempts,
-            note=call.open,
-        )
+        return Line(call, self.model, paid)
 
 
 class Rounds:
@@ -169,7 +165,6 @@ class Rounds:
         self._forming: list[Line] = []
         self._batches: dict[str, Batch] = {}
         self._creations: set[asyncio.Task[None]] = set()
-        self._reached: set[str] = set()  # models of which a batch was created
         # Models of which a batch was refused: the most calls of the next. They go one by one.
         self._most: dict[str, int] = {}
 
@@ -182,7 +177,8 @@ class Rounds:
 
     async def ask(self, line: Line) -> tuple[LineEnd, OpenBatch]:
         """Wait for the end of a line, in the next round or in the batch where it waits already."""
-        batch = await self._next_round(line) if line.note is None else self._taken_up(line.note)
+        note = line.call.open
+        batch = await self._next_round(line) if note is None else self._taken_up(note)
         while True:
             await asyncio.shield(batch.work)
             if line.key not in batch.note.lines:
@@ -252,7 +248,7 @@ class Rounds:
                     model=model,
                     ledger=ledger,
                     submitted_at=datetime.now(UTC),
-                    lines={line.key: line.attempt for line in part},
+                    lines={line.key: len(line.call.attempts) + 1 for line in part},
                 )
                 batch = Batch(note)
                 self._start(batch, self._submit(batch, part))
@@ -296,34 +292,30 @@ class Rounds:
                 line.paid.begun()
         if not begun:
             return
-        model, takes_mark = batch.note.model, self.services[batch.note.model].takes_mark
-        patience_s = OUTAGE_S if model in self._reached else FIRST_S
         try:
-            await self._patiently(batch, partial(self._create, batch, begun), patience_s)
+            await self._patiently(batch, partial(self._create, batch, begun), OUTAGE_S)
         except BatchFailed as exc:
-            if exc.kind == "lost" and not takes_mark:
-                batch.rest = LineEnd(outcome="batch_lost", message=str(exc), unclear=True)
+            model = batch.note.model
+            if exc.kind == "lost" and not self.services[model].takes_mark:
+                batch.rest = LineEnd(None, "batch_lost", str(exc), unclear=True)
             elif exc.kind in ("again", "lost"):
                 # It may be there all the same: the next run looks for it, and nothing is settled.
                 raise ProviderDown(
                     f"{model}: no batch can be submitted ({exc}): nothing else is asked. "
                     "When the service answers again, run the same command"
                 ) from exc
-            elif exc.kind == "single" and model not in self._reached:
-                why = f"{model}: there is no batch mode there ({exc}): leave --batch out"
-                batch.rest = LineEnd(None, "not_created", why, error=EndpointRefused(why))
             else:
                 await self._not_asked(batch, exc, "not_created")
-            return
-        self._reached.add(model)
-        await self._follow(batch)
+        else:
+            await self._follow(batch)
 
     async def _create(self, batch: Batch, lines: Sequence[Line]) -> None:
         """Create a batch; where its answer is lost, look for it."""
         service = self.services[batch.note.model]
 
         async def create() -> None:
-            await self._note(batch, await service.create(lines, batch.note.mark))
+            requests = [line.call.request for line in lines]
+            await self._note(batch, await service.create(requests, batch.note.mark))
 
         creation = asyncio.create_task(create())
         self._creations.add(creation)
@@ -354,12 +346,11 @@ class Rounds:
         """Wait for the end of a batch, and read its results until no more can be had."""
         note, message = batch.note, "the batch has ended without a result for it"
         ask = partial(self.services[note.model].status, note.batch_id)
-        while (status := await self._patiently(batch, ask)).state == "waiting":
+        while not (status := await self._patiently(batch, ask)).ended and not status.failure:
             pause_s = min(LONGEST_POLL_S, POLL_SHARE * batch.age_s)
             await batch.sleep(max(SHORTEST_POLL_S, pause_s))
-        if status.state == "failed":
-            failure = BatchFailed(status.failure, status.message)
-            await self._not_asked(batch, failure, "batch_failed")
+        if status.failure:
+            await self._not_asked(batch, status.failure, "batch_failed")
             return
         try:
             await self._patiently(batch, partial(self._read, batch), ENDING_S)
@@ -375,48 +366,45 @@ class Rounds:
         """Take the results of a batch; raises BatchFailed where there should be others."""
         note, service = batch.note, self.services[batch.note.model]
         status = await service.status(note.batch_id)
-        if status.state != "ended":
+        if not status.ended:
             raise BatchFailed("again", "a batch that has ended is said to go on")
-        foreign, broken = 0, []
-        async for result in service.results(note.batch_id, status):
-            end = LineEnd(result.raw, "" if result.raw else "expired", result.message)
-            if not result.key:
-                broken.append(result.message)
-            elif result.key not in note.lines or batch.ends.setdefault(result.key, end) != end:
-                foreign += 1
-        which = f"{note.model}: {{}} results of batch {note.batch_id}"
-        if broken:
-            self._say(f"{which.format(len(broken))} cannot be used: {broken[0]}")
-        if foreign:
-            self._say(
-                f"{which.format(foreign)} are ignored: they are of none of its calls, or differ "
-                "from an earlier one"
+        foreign = broken = 0
+        async for key, raw in service.results(note.batch_id, status):
+            end = LineEnd(raw) if raw else LineEnd(None, "expired", "it was not asked in time")
+            broken += not key
+            foreign += bool(key) and (
+                key not in note.lines or batch.ends.setdefault(key, end) != end
             )
-        there = len(batch.ends) + len(broken)
-        if there < min(status.results, len(note.lines)):
-            raise BatchFailed("again", f"{there} of the {status.results} results are there")
+        if broken or foreign:
+            self._say(
+                f"{note.model}: {broken + foreign} results of batch {note.batch_id} are ignored: "
+                "they are broken, of none of its calls, or differ from an earlier one"
+            )
+        if len(batch.ends) + broken < min(status.results, len(note.lines)):
+            raise BatchFailed(
+                "again", f"{len(batch.ends)} of the {status.results} results are there"
+            )
 
     async def _not_asked(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
         """End a batch of which the provider asks no line, or let its lines go in smaller ones."""
         model, calls = batch.note.model, len(batch.note.lines)
         is_alone = self._open(model) == [batch]
         error: MergeRunnerError | None = None
-        if exc.kind == "quota":
-            error = QuotaExhausted(
-                f"{model}: the account's quota is exhausted ({exc}). Every reply so far is saved; "
-                "when there is credit again, run the same command to go on."
+        if exc.kind in ("quota", "refused"):
+            kind = QuotaExhausted if exc.kind == "quota" else EndpointRefused
+            error = kind(
+                f"{model}: its batch mode refuses: {exc}. Every reply so far is saved: correct "
+                "that, or leave --batch out, and run the same command to go on"
             )
-        elif exc.kind == "refused":
-            error = EndpointRefused(f"{model}: its batch mode refuses: {exc}")
-        elif exc.kind in ("smaller", "again") and not (is_alone and calls == 1):
+        elif is_alone and calls == 1:
+            self._say(f"{model}: a call is asked singly, at the full price ({exc})")
+        else:
             if model not in self._most:
                 self._say(f"{model}: {calls} calls go in smaller batches: {exc}")
             self._most[model] = max(1, calls // 2) if is_alone else calls
             # It counts as open, so that no other one is submitted meanwhile.
             await batch.sleep(exc.delay_s or 1.0)
             return
-        else:
-            self._say(f"{model}: {calls} calls are asked singly, at the full price ({exc})")
         batch.rest = LineEnd(None, outcome, str(exc), error=error)
 
     def _lost(self, batch: Batch, exc: BatchFailed) -> None:

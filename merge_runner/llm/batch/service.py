@@ -14,7 +14,7 @@ from urllib.parse import quote
 from merge_runner.config import Endpoint, is_own_host
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.llm.formats.base import ServerError, WireFormat, as_text
+from merge_runner.llm.formats.base import ServerError, WireFormat, as_dict, as_text
 from merge_runner.llm.http_outcome import (
     ErrorReply,
     RawReply,
@@ -22,7 +22,7 @@ from merge_runner.llm.http_outcome import (
     judge_error,
     may_be_charged,
 )
-from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
+from merge_runner.records import SLOT_HEADER, ChatRequest
 
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
@@ -30,36 +30,22 @@ if TYPE_CHECKING:
 # A batch, or a page of a list, may have many megabytes.
 TIMEOUT_S = 300.0
 MOST_BYTES = 256_000_000
-# What a server answers that has no batch mode, or none for the model.
-NO_BATCH_MODE = frozenset({404, 405, 501})
-# What it answers of a batch that it does not have, or no longer.
+LONGEST_MESSAGE = 500
+# What a server answers of a batch that it does not have, or no longer.
 GONE = frozenset({301, 302, 303, 307, 308, 404, 410})
 ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
-MOST_PAGES = 100
-LONGEST_MESSAGE = 500
-
 # Batches of a list, each with its mark, and the cursor of the next page, if any.
 Page = tuple[list[tuple[object, dict[str, Any]]], str | None]
-FailureKind = Literal["again", "smaller", "single", "quota", "refused", "lost"]
-"""What to do after a failure.
-
-``again``: the same once more, after a while. ``smaller``: submit fewer lines, since too many tokens
-are enqueued. ``single``: ask the lines singly, since there is no batch mode for them. ``quota`` and
-``refused``: nothing at this endpoint will be answered, as the same actions of an AttemptOutcome
-say. ``lost``: what became of the batch cannot be known, since its server no longer has it, or
-answers with what cannot be read; its lines may have been charged.
-"""
-
-# What the judgement of a single call means here.
-JUDGED: dict[str, FailureKind] = {"quota": "quota", "refused": "refused", "retry": "again"}
+FailureKind = Literal["again", "smaller", "quota", "refused", "lost"]
 
 
 class BatchFailed(MergeRunnerError):
-    """A batch mode did not do what it was asked.
+    """A batch mode did not do what it was asked; ``kind`` says what to do.
 
-    ``smaller`` and ``single`` come from ``create`` and as the ``failure`` of a status, ``lost``
-    from all other methods alone. ``delay_s`` is how long the server asks to wait. ``sent`` is False
-    where certainly no batch was created.
+    ``again``: the same once more, after a while, ``delay_s`` where the server asks for that.
+    ``smaller``: submit fewer lines, since too many tokens are enqueued. ``quota`` and ``refused``:
+    nothing at this endpoint will be answered. ``lost``: what became of the batch cannot be known;
+    its lines may have been charged. ``sent`` is False where certainly no batch was created.
     """
 
     def __init__(
@@ -71,48 +57,18 @@ class BatchFailed(MergeRunnerError):
         self.sent = sent
 
 
-@dataclass(slots=True, eq=False)
-class BatchLine:
-    """One request of a batch, known there by its key; ``attempt`` counts from 1, as for a call."""
-
-    request: ChatRequest
-    attempt: int = 1
-
-    @property
-    def key(self) -> str:
-        """Its id there: 64 hexadecimal digits, as many characters as Anthropic takes."""
-        return self.request.key
-
-
 @dataclass(frozen=True, slots=True)
 class BatchStatus:
-    """The state of a batch.
+    """The state of a batch, and in ``batch`` all that its server says of it.
 
-    ``ended``: there are results to fetch, at least ``results``, perhaps not of all lines; also of
-    one that expired or was cancelled. ``failed``: no line was asked and nothing is charged;
-    ``failure`` says what to do, ``message`` what the provider says. ``batch`` is all that it says.
+    One that ``ended``, or expired or was cancelled, has results to fetch, at least ``results``,
+    perhaps not of all lines. Where there is a ``failure`` no line was asked or charged.
     """
 
-    state: Literal["waiting", "ended", "failed"]
+    ended: bool
     results: int = 0
-    message: str = ""
-    failure: FailureKind = "again"
+    failure: BatchFailed | None = None
     batch: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class LineResult:
-    """The result of one line.
-
-    ``raw`` is what the plain endpoint would have replied, an answer (status 200) or an error, to be
-    judged in the same way; None where the line was never asked and is not charged, since the batch
-    expired or was cancelled before, as ``message`` says. A line that cannot be used has no ``key``,
-    and ``message`` says why.
-    """
-
-    key: str
-    raw: RawReply | None = None
-    message: str = ""
 
 
 class BatchService(ABC):
@@ -120,7 +76,8 @@ class BatchService(ABC):
 
     Where a batch takes no mark, one whose id was lost cannot be found. Batches are at ``path``,
     where ``pages`` is the query for a page of their list, and ``cursor`` that for the one after it.
-    A batch has its id as ``id_member``, a result the key of its request as ``key_member``.
+    A batch has its id as ``id_member``, a result the key of its request as ``key_member``: 64
+    hexadecimal digits, as many characters as Anthropic takes.
     """
 
     takes_mark: ClassVar[bool] = True
@@ -131,13 +88,13 @@ class BatchService(ABC):
     key_member: ClassVar[str] = "custom_id"
 
     def __init__(self, transport: HttpTransport, endpoint: Endpoint, wire: WireFormat) -> None:
-        self._transport = transport
-        self._endpoint = endpoint
-        self._wire = wire
+        self.transport = transport
+        self.endpoint = endpoint
+        self.wire = wire
         self.forgets = endpoint.is_emulator  # what waits there ends with the emulator
 
     @abstractmethod
-    def line(self, line: BatchLine) -> bytes:
+    def line(self, request: ChatRequest) -> bytes:
         """Return a line as it is sent, with the body as it is hashed."""
 
     async def upload(self, content: bytes, mark: str) -> str:
@@ -145,36 +102,31 @@ class BatchService(ABC):
         return ""
 
     @abstractmethod
-    def creation(self, lines: Sequence[BatchLine], file: str, mark: str) -> tuple[str, bytes]:
-        """Return the path and the body that create a batch of lines, which are in the file."""
+    def creation(self, requests: Sequence[ChatRequest], file: str, mark: str) -> tuple[str, bytes]:
+        """Return the path and the body that create a batch of requests, which are in the file."""
 
-    async def create(self, lines: Sequence[BatchLine], mark: str) -> str:
-        """Create a batch of lines with different keys; returns its id.
+    async def create(self, requests: Sequence[ChatRequest], mark: str) -> str:
+        """Create a batch of requests with different keys; returns its id.
 
         ``mark``, up to 64 letters, digits, _ and -, is attached where the provider takes a name.
         """
         try:
-            file = await self.upload(b"".join(map(self.line, lines)), mark)
+            file = await self.upload(b"".join(map(self.line, requests)), mark)
         except BatchFailed as exc:
             exc.sent = False  # a file is no batch yet
             raise
-        created = await self._ask("POST", *self.creation(lines, file, mark))
+        created = await self.ask("POST", *self.creation(requests, file, mark))
         return self._batch_id(json_object(created))
 
     async def find(self, mark: str) -> str | None:
-        """Return the id of the batch with this mark.
-
-        Raises BatchFailed with the kind ``lost`` where there are too many to look through.
-        """
+        """Return the id of the batch with this mark."""
         cursor: str | None = ""
         seen: set[str] = set()
         while cursor is not None and cursor not in seen:  # ends where a server knows no pages
-            if len(seen) == MOST_PAGES:
-                raise BatchFailed("lost", "the list of batches cannot be read to its end")
             seen.add(cursor)
             after = f"&{self.cursor}={quote(cursor, safe='')}" if cursor else ""
-            page = json_object(await self._ask("GET", f"{self.path}?{self.pages}{after}"))
-            listed, cursor = self.page_of(page)
+            page = await self.ask("GET", f"{self.path}?{self.pages}{after}")
+            listed, cursor = self.page_of(json_object(page))
             for its, batch in listed:
                 if its == mark:
                     return self._batch_id(batch)
@@ -186,7 +138,7 @@ class BatchService(ABC):
 
     async def status(self, batch_id: str) -> BatchStatus:
         """Return the state of a batch."""
-        return self.status_of(json_object(await self._ask("GET", f"{self.path}/{batch_id}")))
+        return self.status_of(json_object(await self.ask("GET", f"{self.path}/{batch_id}")))
 
     @abstractmethod
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
@@ -197,11 +149,17 @@ class BatchService(ABC):
         """Return where the results of a batch that has ended are: JSONL, in any order."""
 
     @abstractmethod
-    def read(self, key: str, line: dict[str, Any]) -> LineResult | None:
-        """Return the result in a line, None where it has no known form."""
+    def read(self, line: dict[str, Any]) -> RawReply | None:
+        """Return what the plain endpoint would have replied: an answer (status 200) or an error.
 
-    async def results(self, batch_id: str, status: BatchStatus) -> AsyncIterator[LineResult]:
-        """Yield the results of a batch that has ended.
+        None where the line was never asked, since the batch expired or was cancelled before. Raises
+        ValueError where the line has no known form.
+        """
+
+    async def results(
+        self, batch_id: str, status: BatchStatus
+    ) -> AsyncIterator[tuple[str, RawReply | None]]:
+        """Yield the results of a batch that has ended, by key; it is empty where one is broken.
 
         Where one file cannot be read, those of the other come all the same. Raises BatchFailed with
         the kind ``again`` where they can be read from the beginning.
@@ -209,7 +167,7 @@ class BatchService(ABC):
         failure: BatchFailed | None = None
         for path in self.result_paths(batch_id, status.batch):
             try:
-                body = self._transport.lines(path, self._wire.headers, timeout_s=TIMEOUT_S)
+                body = self.transport.lines(path, self.wire.headers, timeout_s=TIMEOUT_S)
                 async with aclosing(body) as lines:
                     async for line in lines:
                         if line:
@@ -223,29 +181,30 @@ class BatchService(ABC):
         if failure is not None:
             raise failure
 
-    def failure_of(self, error: ServerError) -> FailureKind:
-        """Return what to do with lines whose batch is not created, or fails as a whole."""
+    def failure_of(self, error: ServerError) -> BatchFailed:
+        """Return the failure of a batch that is not created, or fails as a whole."""
+        action = judge_error(error, self.wire).action
         enqueued = "token_limit_exceeded" in error.names or "enqueued" in error.message.lower()
+        kind: FailureKind = "refused"
         if enqueued or error.status == 413:
-            return "smaller"
-        if error.status in NO_BATCH_MODE:
-            return "single"
-        return JUDGED.get(judge_error(error, self._wire).action, "single")
+            kind = "smaller"
+        elif action in ("retry", "quota"):
+            kind = "again" if action == "retry" else "quota"
+        return BatchFailed(kind, error.message[:LONGEST_MESSAGE])
 
-    def slot_members(self, line: BatchLine) -> str:
-        """Return what our own emulator alone is told of a line, as members of its JSON object."""
-        if not self._endpoint.is_emulator:
+    def slot_members(self, request: ChatRequest) -> str:
+        """Return what our own emulator alone is told of a line, as a member of its JSON object."""
+        if not self.endpoint.is_emulator:
             return ""
-        slot = canonical_json(line.request.slot.as_dict())
-        return f',"{SLOT_HEADER}":{slot},"{ATTEMPT_HEADER}":{line.attempt}'
+        return f',"{SLOT_HEADER}":{canonical_json(request.slot.as_dict())}'
 
-    async def _ask(
+    async def ask(
         self, method: str, path: str, body: bytes = b"", headers: Mapping[str, str] | None = None
     ) -> RawReply:
         """Return the reply to a step of a creation (POST), or to a look at what exists (GET)."""
-        sent = {**self._wire.headers, **(headers or {})}
+        sent = {**self.wire.headers, **(headers or {})}
         try:
-            raw = await self._transport.ask(
+            raw = await self.transport.ask(
                 method, path, sent, body, timeout_s=TIMEOUT_S, most_bytes=MOST_BYTES
             )
         except TransportFailure as exc:
@@ -255,32 +214,28 @@ class BatchService(ABC):
         return raw
 
     def _refused(self, raw: RawReply, *, exists: bool) -> BatchFailed:
-        """Return the failure in a reply; a batch that may exist is never asked singly."""
-        outcome = judge_error(raw.error, self._wire)
-        kind = JUDGED.get(outcome.action, "again") if exists else self.failure_of(raw.error)
+        outcome = judge_error(raw.error, self.wire)
+        kind = self.failure_of(raw.error).kind
         if exists and raw.status in GONE:
             kind = "lost"
+        elif exists and outcome.action not in ("quota", "refused"):
+            kind = "again"
         # Without a mark it cannot be looked for: what the provider says of itself decides.
-        own = is_own_host(self._endpoint.provider, self._endpoint.identity)
-        sent = may_be_charged(raw, self._endpoint.provider if own else None)
+        own = is_own_host(self.endpoint.provider, self.endpoint.identity)
+        sent = may_be_charged(raw, self.endpoint.provider if own else None)
         sent = sent or (self.takes_mark and raw.status >= 500)
-        message = f"HTTP {raw.status}: {as_message(raw.error.message)}"
+        message = f"HTTP {raw.status}: {raw.error.message[:LONGEST_MESSAGE]}"
         return BatchFailed(kind, message, delay_s=outcome.delay_s, sent=sent)
 
     def _batch_id(self, batch: dict[str, Any]) -> str:
         return id_of(batch, self.id_member).rpartition("/")[2]
 
-    def _result(self, line: str | TransportFailure) -> LineResult:
-        if isinstance(line, TransportFailure):
-            return LineResult("", message=str(line))
+    def _result(self, line: str | TransportFailure) -> tuple[str, RawReply | None]:
         try:
-            value = json.loads(line)
-            key = as_text(value.get(self.key_member))
-        except (ValueError, AttributeError):
-            return LineResult("", message="it is no JSON object")
-        if not key:
-            return LineResult("", message=f"it has no {self.key_member}")
-        return self.read(key, value) or LineResult("", message="it is of no known form")
+            value = as_dict(json.loads(line) if isinstance(line, str) else None)
+            return as_text(value.get(self.key_member)) or "", self.read(value)
+        except ValueError:
+            return "", None
 
 
 def json_object(raw: RawReply) -> dict[str, Any]:
@@ -288,22 +243,6 @@ def json_object(raw: RawReply) -> dict[str, Any]:
     if not isinstance(raw.payload, dict):
         raise BatchFailed("again", f"HTTP {raw.status}: the body is not a JSON object")
     return raw.payload
-
-
-def as_reply(status: int, body: dict[str, Any]) -> RawReply:
-    """Return the reply of the plain endpoint that a result stands for."""
-    # In ASCII, since JSON can spell half of a surrogate pair, which no file can hold.
-    return RawReply(status, {}, json.dumps(body))
-
-
-def as_message(value: object) -> str:
-    """Return a text for a reader in one line, empty where there is none."""
-    return " ".join((as_text(value) or "").split())[:LONGEST_MESSAGE]
-
-
-def as_word(value: object) -> str:
-    """Return a provider's word for a state, in capitals."""
-    return (as_text(value) or "").upper()
 
 
 def id_of(reply: Mapping[str, Any], member: str = "id") -> str:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from merge_runner.config import PROVIDERS, BatchTerms
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import split_lines
 from merge_runner.llm.models import load_models

@@ -26,7 +26,7 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.rounds import Batches, Rounds
-from merge_runner.llm.batch.service import BatchFailed, BatchStatus, LineResult
+from merge_runner.llm.batch.service import BatchFailed, BatchStatus
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
@@ -88,21 +88,21 @@ class Memory:
     async def status(self, batch_id):
         if batch_id not in self.batches:
             raise BatchFailed("lost", "HTTP 404: no such batch", sent=False)
-        step = self.states.pop(0) if self.states else BatchStatus("ended")
+        step = self.states.pop(0) if self.states else BatchStatus(ended=True)
         if isinstance(step, BatchFailed):
             raise step
         return step
 
     async def results(self, batch_id, status):
         for line in reversed(self.batches[batch_id]):
-            repetition = line.request.slot.repetition
+            repetition = line.slot.repetition
             fates = self.fates.get(repetition, [])
             fate = fates.pop(0) if fates else answer(f"batched {repetition}")
             if fate == "missing":
                 continue
             if fate is not None and fate.status == 200:
                 self.answered[line.key] += 1
-            yield LineResult(line.key, fate, "" if fate else "it has expired")
+            yield line.key, fate
 
     @property
     def sizes(self):
@@ -209,14 +209,14 @@ async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
     class Watching(Memory):
         async def create(self, lines, mark):
             aside.append(run.ledger.read().reserved_usd)
-            self.size = len(lines[0].request.body.encode())
+            self.size = len(lines[0].body.encode())
             return await super().create(lines, mark)
 
     aside = []
     service = Watching()
     run = Run(cache, service)
     await run.ask(3)
-    bytes_of_one = len(service.batches["batch-0"][0].request.body.encode())
+    bytes_of_one = len(service.batches["batch-0"][0].body.encode())
     assert aside == [pytest.approx(3 * (bytes_of_one + 100 * 100.0) / 1e6 / 2)]
 
 
@@ -283,7 +283,7 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cac
 @in_virtual_time
 async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
     service = Memory()
-    service.states = [BatchStatus("failed", message="enqueued", failure="smaller")]
+    service.states = [BatchStatus(ended=False, failure=BatchFailed("smaller", "enqueued"))]
     run = Run(cache, service)
     replies = await run.ask(4)
     assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
@@ -294,23 +294,12 @@ async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves
 @in_virtual_time
 async def test_where_no_batch_mode_is_at_the_first_creation_the_run_ends(cache):
     service = Memory()
-    service.creations = [BatchFailed("single", "HTTP 404", sent=False)]
+    service.creations = [BatchFailed("refused", "HTTP 404", sent=False)]
     run = Run(cache, service)
     (first, *_) = await run.ask(3)
     assert (type(first), first.exit_code) == (EndpointRefused, 2)
     assert "leave --batch out" in str(first)
     assert (run.alone.asked, run.ledger.read().committed_usd) == ([], 0.0)
-
-
-@in_virtual_time
-async def test_where_the_batch_mode_is_gone_later_everything_is_asked_alone(cache):
-    service = Memory()
-    service.creations = [None, BatchFailed("single", "HTTP 404", sent=False)]
-    run = Run(cache, service)
-    await run.ask(3)
-    replies = await run.ask(3, decision=1)
-    assert texts(replies) == ["alone 1", "alone 2", "alone 3"]
-    assert replies[0].attempts[0].cost_usd == 0.0
 
 
 @in_virtual_time
@@ -333,7 +322,7 @@ async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache,
 
 async def left_behind(cache, service, repetitions=1, **options):
     """A run that is interrupted while a batch waits."""
-    service.states = [BatchStatus("waiting")] * 1000
+    service.states = [BatchStatus(ended=False)] * 1000
     run = Run(cache, service, **options)
     asking = asyncio.create_task(run.ask(repetitions))
     await asyncio.sleep(5)
@@ -348,7 +337,7 @@ async def left_behind(cache, service, repetitions=1, **options):
 async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
     class Slow(Memory):
         async def status(self, batch_id):
-            return BatchStatus("waiting" if batch_id == "batch-0" else "ended")
+            return BatchStatus(ended=batch_id != "batch-0")
 
     service = Slow()
     service.creations = [None, BatchFailed("again", "HTTP 504")]
@@ -416,7 +405,7 @@ async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(ca
         looks = 0
 
         async def status(self, batch_id):
-            return BatchStatus("ended", results=3)
+            return BatchStatus(ended=True, results=3)
 
         async def results(self, batch_id, status):
             self.looks += 1
@@ -463,12 +452,15 @@ async def test_results_that_never_come_are_waited_for_an_hour(cache):
 async def test_what_a_batch_answered_unreadably_stays_set_aside(cache):
     class Broken(Memory):
         async def results(self, batch_id, status):
-            yield LineResult("", message="it is no JSON object")
-            yield LineResult("", message="it is of no known form")
+            yield "", None
+            yield "", None
 
     run = Run(cache, Broken())
     (reply,) = await run.ask()
-    assert run.said == ["m: 2 results of batch batch-0 cannot be used: it is no JSON object"]
+    assert run.said == [
+        "m: 2 results of batch batch-0 are ignored: they are broken, of none of its calls, or "
+        "differ from an earlier one"
+    ]
     assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
     assert run.ledger.read().open_attempts == 1
 
@@ -552,7 +544,7 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
         async def status(self, batch_id):
             if not died.is_set():
                 died.set()
-                return BatchStatus("waiting")
+                return BatchStatus(ended=False)
             return await super().status(batch_id)
 
     died = asyncio.Event()
@@ -679,17 +671,17 @@ class Dear(Memory):
         self.bill_usd = 0.0
 
     async def results(self, batch_id, status):
-        async for result in super().results(batch_id, status):
+        async for key, raw in super().results(batch_id, status):
             read = 10
             written = self.chance.randint(0, 100)
             kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])
             if kind != "ok":
-                yield LineResult(result.key, error(500) if kind == "failed" else None)
+                yield key, error(500) if kind == "failed" else None
                 continue
-            body = json.loads(result.raw.body)
+            body = json.loads(raw.body)
             body["usage"] = {"prompt_tokens": read, "completion_tokens": written}
             self.bill_usd += (read + 100 * written) / 1e6 / 2
-            yield LineResult(result.key, RawReply(200, {}, json.dumps(body)))
+            yield key, RawReply(200, {}, json.dumps(body))
 
 
 @given(seed=st.integers(0, 1000), cents=st.integers(1, 12), runs=st.integers(1, 3))
@@ -715,7 +707,7 @@ def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
 @in_virtual_time
 async def test_what_is_pending_is_told_by_model_and_batch(cache):
     service = Memory()
-    service.states = [BatchStatus("waiting")] * 10**4
+    service.states = [BatchStatus(ended=False)] * 10**4
     run = Run(cache, service)
     asking = asyncio.create_task(run.ask(3))
     await asyncio.sleep(5)

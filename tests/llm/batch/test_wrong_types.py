@@ -108,9 +108,9 @@ async def uses(service):
 
     async def results():
         return [
-            judge(each.raw, FORMATS["gemini"])
-            async for each in service.results("b1", await service.status("b1"))
-            if each.raw
+            judge(raw, FORMATS["gemini"])
+            async for _, raw in service.results("b1", await service.status("b1"))
+            if raw
         ]
 
     finds = [lambda: service.find(MARK)] if service.takes_mark else []
