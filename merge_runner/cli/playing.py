@@ -126,7 +126,6 @@ def _print_estimate(expected: Estimate, *, as_json: bool) -> None:
         usd = "unknown" if batch.cost_usd is None else f"{batch.cost_usd:.2f} USD"
         print_out(
             f"batch   about {usd} in about {batch.rounds} rounds, at most {batch.most_rounds}; a "
-            "round takes as long as its slowest batch: minutes, an hour; after two the "
-            "rest is asked singly"
+            "round takes as long as its slowest batch: minutes, an hour, a day at most"
         )
     print_out("Nothing was sent.")

@@ -19,9 +19,8 @@ from merge_runner.config import (
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.journal import Journal
-from merge_runner.llm.batch.lines import Batches
-from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.rounds import Batches, Rounds
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
@@ -33,7 +32,7 @@ from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Usage
 from merge_runner.run.estimate import CallTotals, trial_costs
-from merge_runner.run.plan import Options, Plan, most_prompts
+from merge_runner.run.plan import Options, Plan
 from merge_runner.run.rehearsal import SPEED, behaviour
 
 # For the database, the cache, the log and what libraries open for themselves.
@@ -191,7 +190,7 @@ def _batches(
     if rounds is None or terms is None:
         return None
     money = Budget(Ledger(cache, "")) if entry.price == "free" else budget
-    return Batches(rounds, model, budget.ledger.scope, money, terms.price_factor)
+    return Batches(rounds, model, money, terms.price_factor)
 
 
 def open_rounds(
@@ -201,27 +200,18 @@ def open_rounds(
     journal = Journal(cache)
     models = set(plan.registered.values())
     left = [each for each in journal.batches() if each.model in models and journal.waits(each)]
-    own = [each for each in left if each.ledger == plan.ledger]
     if options.dask is not None:
-        if own:
+        if left:
             raise UsageError(
                 "calls wait in batches of an earlier run: run the same command without --dask "
                 "until they have ended"
             )
         return None
-    if own and not options.batch:
+    if left and not options.batch:
         say("calls that wait in batches of an earlier run are not asked again")
-    if others := sorted({each.ledger for each in left} - {plan.ledger}):
-        say(f"calls that wait in batches of {', '.join(others)} are not asked again")
     if not options.batch and not left:
         return None
-    most = max((most_prompts(arm) for arm in plan.arms), default=1)
-    free = {
-        plan.registered[name]
-        for name, entry in plan.entries.items()
-        if plan.is_rehearsal or entry.price == "free"
-    }
-    return Rounds(journal, {}, submits=options.batch, most_rounds=most, free=free, say=say)
+    return Rounds(journal, {}, submits=options.batch, say=say)
 
 
 def check_batches(plan: Plan, options: Options) -> None:

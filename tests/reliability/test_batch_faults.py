@@ -211,7 +211,7 @@ PLAIN = {}
 def play(tmp_path, monkeypatch):
     """Plays a sweep of a provider; returns its digest, what was said, and the server's counts."""
     monkeypatch.setattr("merge_runner.llm.batch.rounds.ENDING_S", 2.0)
-    monkeypatch.setattr("merge_runner.llm.batch.rounds.ARRIVAL_S", 2.0)
+    monkeypatch.setattr("merge_runner.llm.batch.rounds.ARRIVAL_S", (1.0, 1.0))
 
     async def run(provider, middle=None, plan=None, **options):
         registry = REGISTRY.format(provider=provider, format=FORMATS[provider])

@@ -7,7 +7,7 @@ from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry
 from merge_runner.emulator.server import serve
-from merge_runner.llm.batch.terms import SERVICES
+from merge_runner.llm.batch.providers import SERVICES
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 
