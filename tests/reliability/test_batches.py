@@ -14,11 +14,11 @@ from collections import Counter
 import httpx
 import pytest
 
-from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.seat import first_situations
 from tests.harness import FAST, PROJECT, run_sweep, watched
+from tests.mock_server import BatchPlan, FaultPlan
 
 KILLS = 20
 TWO = ("--conditions", "L_4_0,N_0_0", "--reps", 1)
