@@ -187,7 +187,6 @@ async def test_a_mistyped_name_is_answered_with_the_nearest(merge_runner):
         (["sweep", "baseline", "--rpm", "0"], "--rpm"),
         (["sweep", "baseline", "--sample-set", "-1"], "--sample-set"),
         (["sweep", "baseline", "--recording", "x.parquet"], "recording import"),
-        (["sweep", "baseline", "--fault-rate", "2"], "no probability"),
         (["replay", "baseline", "--recording", "x.parquet"], "there is no recording x.parquet"),
         (["sql", "select 1"], "there is no database results/merge.duckdb"),
         (["digest", "--db", "no.duckdb"], "there is no database no.duckdb"),

@@ -27,7 +27,6 @@ from merge_runner.cli.options import (
 )
 from merge_runner.cli.output import print_out, say
 from merge_runner.cli.playing import play
-from merge_runner.cli.stand_in import FaultRateOption, FaultsOption, SeedOption, faults_of
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 
@@ -145,9 +144,6 @@ def sweep(
             help="Also replay from this file, without importing it; may be repeated.",
         ),
     ] = None,
-    fault_rate: FaultRateOption = 0.0,
-    faults: FaultsOption = None,
-    seed: SeedOption = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -179,7 +175,6 @@ def sweep(
         max_cost_usd=max_cost,
         replay=replay,
         recordings=recording or (),
-        faults=faults_of(fault_rate, faults, seed),
         strict_model=strict_model,
         keep_going=keep_going,
         quiet=quiet,

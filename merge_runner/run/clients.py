@@ -16,7 +16,7 @@ from merge_runner.config import (
     rehearsal_endpoint,
     resolve_endpoint,
 )
-from merge_runner.emulator.faults import FaultPlan
+from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
@@ -49,7 +49,7 @@ class EndpointPlan:
     """
 
     urls: Mapping[str, str]
-    emulator: FaultPlan | None
+    emulator: Behaviour | None
     known: frozenset[str]
     measured: Mapping[str, CallTotals]
 
@@ -93,11 +93,10 @@ def endpoint_plan(
 ) -> EndpointPlan:
     """Return how the endpoints of a plan's models are asked; see EndpointPlan for the last two."""
     emulated = any(entry.provider == "emulator" for entry in plan.entries.values())
+    runs = bool(os.environ.get("EMULATOR_BASE_URL"))  # and is the one to ask
+    emulator = Behaviour() if emulated and not runs else None
     if plan.is_rehearsal:
-        emulator: FaultPlan | None = behaviour(plan)
-    else:
-        runs = bool(os.environ.get("EMULATOR_BASE_URL"))  # and is the one to ask
-        emulator = options.faults if emulated and not runs else None
+        emulator = behaviour(plan)
     return EndpointPlan(base_urls(plan.entries), emulator, known, measured)
 
 
@@ -134,9 +133,9 @@ def live_clients(
     _allow_open_files(options.connections + SPARE_FILES)
     in_process = None
     if endpoint_plan.emulator is not None:
-        from merge_runner.emulator.handler import Emulator, InProcess
+        from merge_runner.emulator.handler import Emulator
 
-        in_process = InProcess(Emulator(endpoint_plan.emulator))
+        in_process = Emulator(endpoint_plan.emulator).transport()
     transports: dict[str, HttpTransport] = {}
     clients: dict[str, LlmClient] = {}
     under_way: dict[str, Call] = {}  # two names of one model may ask the same
@@ -224,6 +223,9 @@ def check_batches(plan: Plan, options: Options) -> None:
         raise UsageError("--batch plays in this process: leave --dask out")
     if not plan.entries:
         raise UsageError("no language model is asked: leave --batch out")
+    runs = os.environ.get("EMULATOR_BASE_URL")
+    if not runs and any(entry.provider == "emulator" for entry in plan.entries.values()):
+        raise UsageError("the emulator has no batch mode: leave --batch out")
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         require_batch(plan.registered[name], entry, registry)

@@ -7,7 +7,7 @@ import math
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,7 +33,6 @@ from merge_runner.config import (
 )
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, HumanTrials, Program
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
@@ -81,9 +80,9 @@ class Options:
     ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
     those of other sweeps.
     ``dask`` names the cluster that plays the trials; if None, this process plays them.
-    ``faults`` are those of the emulator. A ``dry_run`` sends nothing, a ``quiet`` run shows no
-    progress, and one that is to ``keep_going`` asks a model on that gives no valid decision. In a
-    ``batch`` run all trials ask together, at a lower price.
+    A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to
+    ``keep_going`` asks a model on that gives no valid decision. In a ``batch`` run all trials ask
+    together, at a lower price.
     """
 
     db: Path
@@ -95,7 +94,6 @@ class Options:
     ledgers: Sequence[str] = ()
     replay: bool = False
     recordings: Sequence[Path] = ()
-    faults: FaultPlan = field(default_factory=FaultPlan)
     strict_model: bool = False
     keep_going: bool = False
     quiet: bool = False

@@ -512,8 +512,6 @@ async def _named(
 def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
     """The endpoint's identity: in a replay, the one under which the model is recorded."""
     entry, configured = plan.entries[name], plan.endpoints[name]
-    if entry.provider == "emulator":
-        configured += options.faults.identity
     if not options.replay:
         return configured
     recorded = sorted({r.endpoint for r in cache.recorded(lambda r: r.model == entry.id)})

@@ -14,9 +14,9 @@ from collections import Counter
 import httpx
 import pytest
 
-from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
 from tests.harness import FAST, PROJECT, watched
+from tests.mock_server import BatchPlan, FaultPlan
 
 KILLS = 20
 TWO = ("--conditions", "L_4_0,N_0_0", "--reps", 1)
