@@ -73,22 +73,20 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     }
 
 
-def _limiters(plan: Plan, options: Options, share: float) -> dict[str, Limiter]:
-    """The rate limiter of each entry, with a share of its model's limits."""
+def _add_limiters(plan: Plan, options: Options, share: float, made: dict[str, Limiter]) -> None:
+    """Make the limiters that are missing, with a share of each model's limits."""
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
-    # An account's limits are those of a model, with whatever parameters it is asked.
-    by_model: dict[str, Limiter] = {}
     for name, entry in plan.entries.items():
-        if plan.registered[name] not in by_model:
+        # An account's limits are those of a model, with whatever parameters it is asked.
+        if plan.registered[name] not in made:
             rpm, tpm = (limit and max(1, int(limit * share)) for limit in options.rates(entry))
-            by_model[plan.registered[name]] = Limiter(
+            made[plan.registered[name]] = Limiter(
                 rpm=rpm,
                 tpm=tpm,
                 pause=pauses[plan.endpoints[name]],
                 window_s=WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S,
             )
-    return {name: by_model[plan.registered[name]] for name in plan.entries}
 
 
 def endpoint_plan(
@@ -114,10 +112,12 @@ def live_clients(
     stack: AsyncExitStack,
     rounds: Rounds | None = None,
     share: float = 1.0,
+    limiters: dict[str, Limiter] | None = None,
 ) -> dict[str, LlmClient]:
     """Clients with connections, closed with ``stack``, and a share of the rate limits.
 
-    ``rounds`` are those of this run, which get the batch modes of its models. Raises UsageError
+    ``rounds`` are those of this run, which get the batch modes of its models. ``limiters`` by
+    registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
     """
     from merge_runner.llm.http import HttpTransport
@@ -133,7 +133,8 @@ def live_clients(
         ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
     costs = trial_costs(plan, endpoint_plan.measured, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
-    limiters = _limiters(plan, options, share)
+    limiters = {} if limiters is None else limiters
+    _add_limiters(plan, options, share, limiters)
     _allow_open_files(options.connections + SPARE_FILES)
     in_process = None
     if endpoint_plan.emulator is not None:
@@ -164,7 +165,7 @@ def live_clients(
             endpoint=plan.endpoints[name],
             cache=cache,
             transport=transports[model],
-            limiter=limiters[name],
+            limiter=limiters[model],
             budget=None if entry.price == "free" else budget,
             strict=options.strict_model,
             model=model,

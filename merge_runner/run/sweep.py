@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.audit.findings import Audit
@@ -47,6 +46,7 @@ from merge_runner.run.clients import (
     open_rounds,
     sealed_clients,
 )
+from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, MOST_HELD, Flusher
@@ -56,9 +56,6 @@ from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
 from merge_runner.signals import on_interrupt
-
-if TYPE_CHECKING:
-    from merge_runner.run.dask_tasks import DaskTasks
 
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
@@ -325,11 +322,7 @@ class Sweep:
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
         first = self._first_decisions(one_by_one=rounds is None)
         if options.dask is not None:
-            from merge_runner.run.dask_cluster import connected
-
             client = await stack.enter_async_context(connected(options.dask))
-            from merge_runner.run.dask_tasks import DaskTasks  # imports Dask
-
             return DaskTasks(client, plan, options, endpoints, self._cache, self._ledger, first)
         clients = live_clients(
             plan, options, endpoints, self._cache, self._ledger, stack=stack, rounds=rounds
