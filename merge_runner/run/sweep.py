@@ -450,7 +450,7 @@ class Sweep:
         for spec, side, valid, invalid, failure, rationale in stored:
             model = arms[spec].asked[side]
             if model in self._plan.entries:
-                first.add_stored(model, valid, invalid, failure, rationale)
+                first.add(model, valid, invalid, failure, rationale)
 
 
 @asynccontextmanager

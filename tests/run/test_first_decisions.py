@@ -25,7 +25,7 @@ async def test_a_live_run_stops_after_20_invalid_decisions_and_keeps_what_was_an
         (message,) = stopped.summary["messages"]
         assert message.startswith("none of the first 20 decisions of emulator is valid")
         assert 'The first reply is "M I would rather describe my plan in words than' in message
-        assert "no_array, it has no list of numbers. To mend that look at the output" in message
+        assert "no_array, it has no list of numbers. To mend that look at what" in message
         again = await merge_runner(*SWEEP, **env)
         assert (again.code, server.requests) == (1, MOST_INVALID), "it asked on"
         whole = await merge_runner(*SWEEP, "--reps", 1, "--keep-going", **env)

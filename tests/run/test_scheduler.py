@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from merge_runner.run.scheduler import run_bounded
+from merge_runner.run.local_runner import run_bounded
 
 
 @pytest.mark.parametrize(("jobs", "in_flight"), [(50, 7), (3, 10), (20, 1), (0, 5)])
