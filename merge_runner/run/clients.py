@@ -9,7 +9,6 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass
 
 from merge_runner.config import (
-    Endpoint,
     ModelEntry,
     base_urls,
     check_network,
@@ -26,8 +25,9 @@ from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Call
-from merge_runner.llm.call_totals import CallTotals
+from merge_runner.llm.call_totals import CallTotals, call_totals
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.content_hashes import canonical_json, manner
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Ledger
@@ -73,33 +73,25 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     }
 
 
-def _add_limiters(plan: Plan, options: Options, share: float, made: dict[str, Limiter]) -> None:
-    """Make the limiters that are missing, with a share of each model's limits."""
-    # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
-    pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
+def endpoint_plan(plan: Plan, options: Options, cache: ResponseCache) -> EndpointPlan:
+    """Return how the endpoints of a plan's models are asked, by what the cache holds of them."""
+    totals = call_totals(cache.entries())
+    answered = {(model, endpoint) for model, endpoint, _ in totals}
+    known, measured = set(), {}
     for name, entry in plan.entries.items():
-        # An account's limits are those of a model, with whatever parameters it is asked.
-        if plan.registered[name] not in made:
-            rpm, tpm = (limit and max(1, int(limit * share)) for limit in options.rates(entry))
-            made[plan.registered[name]] = Limiter(
-                rpm=rpm,
-                tpm=tpm,
-                pause=pauses[plan.endpoints[name]],
-                window_s=WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S,
-            )
-
-
-def endpoint_plan(
-    plan: Plan, options: Options, known: frozenset[str], measured: Mapping[str, CallTotals]
-) -> EndpointPlan:
-    """Return how the endpoints of a plan's models are asked; see EndpointPlan for the last two."""
+        endpoint = plan.endpoints[name]
+        sent = FORMATS[entry.format].request(entry, "")
+        asked = manner(sent.path, canonical_json(sent.body))
+        measured[name] = totals.get((entry.id, endpoint, asked), CallTotals())
+        if (entry.id, endpoint) in answered:
+            known.add(name)
     emulated = any(entry.provider == "emulator" for entry in plan.entries.values())
     if plan.is_rehearsal:
         emulator: FaultPlan | None = behaviour(plan)
     else:
         runs = bool(os.environ.get("EMULATOR_BASE_URL"))  # and is the one to ask
         emulator = options.faults if emulated and not runs else None
-    return EndpointPlan(base_urls(plan.entries), emulator, known, measured)
+    return EndpointPlan(base_urls(plan.entries), emulator, frozenset(known), measured)
 
 
 def live_clients(
@@ -134,7 +126,8 @@ def live_clients(
     costs = trial_costs(plan, endpoint_plan.measured, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
     limiters = {} if limiters is None else limiters
-    _add_limiters(plan, options, share, limiters)
+    # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
+    pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
     _allow_open_files(options.connections + SPARE_FILES)
     in_process = None
     if endpoint_plan.emulator is not None:
@@ -147,7 +140,11 @@ def live_clients(
     for name, entry in plan.entries.items():
         model = plan.registered[name]
         if model not in transports:
-            endpoint = _endpoint(plan, name, endpoint_plan.urls)
+            endpoint = (
+                rehearsal_endpoint(entry)
+                if plan.is_rehearsal
+                else resolve_endpoint(name, entry, {**os.environ, **endpoint_plan.urls})
+            )
             check_network(endpoint.base_url)
             transports[model] = HttpTransport(
                 endpoint,
@@ -156,6 +153,15 @@ def live_clients(
                 carrier=in_process if endpoint.is_emulator else None,
             )
             stack.push_async_callback(transports[model].close)
+            # An account's limits are those of a model, with whatever parameters it is asked.
+            rpm, tpm = (limit and max(1, int(limit * share)) for limit in options.rates(entry))
+            limiter = Limiter(
+                rpm=rpm,
+                tpm=tpm,
+                pause=pauses[plan.endpoints[name]],
+                window_s=WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S,
+            )
+            limiters.setdefault(model, limiter)
             if rounds is not None and batch_terms(entry) is not None:
                 service = SERVICES[entry.format]
                 rounds.services[model] = service(transports[model], endpoint, FORMATS[entry.format])
@@ -178,12 +184,6 @@ def live_clients(
             under_way=under_way,
         )
     return clients
-
-
-def _endpoint(plan: Plan, name: str, urls: Mapping[str, str]) -> Endpoint:
-    if plan.is_rehearsal:
-        return rehearsal_endpoint(plan.entries[name])
-    return resolve_endpoint(name, plan.entries[name], {**os.environ, **urls})
 
 
 def _batches(
@@ -246,11 +246,11 @@ def _allow_open_files(wanted: int) -> None:
     """Raise this process's limit on open files to what the connections need."""
     # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft >= wanted or soft == resource.RLIM_INFINITY:
-        return
-    if hard != resource.RLIM_INFINITY and hard < wanted:
+    try:
+        if wanted > soft != resource.RLIM_INFINITY:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    except ValueError as exc:
         raise UsageError(
             f"{wanted} connections exceed this system's limit of {hard} open files: choose a lower "
             "--in-flight or raise `ulimit -n`"
-        )
-    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        ) from exc

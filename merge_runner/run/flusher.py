@@ -12,16 +12,12 @@ from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.store import Store
 
-EVERY_S = 1.0
-POLL_S = 0.05
-BATCH = 64
-"""Trials in one transaction: few enough that a reader gets its turn soon."""
-BATCH_OF_REPLAY = 4 * BATCH
-"""Of trials that take no time: a transaction costs as much as storing dozens of them."""
-MOST_PENDING = 8 * BATCH
+EVERY_S, POLL_S = 1.0, 0.05
+# Trials in one transaction, which costs as much as storing dozens of them; and in memory while
+# storing fails, as when another program holds the file.
+BATCH = 256
+MOST_PENDING = 2 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
-MOST_HELD = 4 * BATCH
-"""Trials in memory while storing fails, as when another program holds the file."""
 LOCK_PATIENCE_S = 2.0
 # How long the end of a sweep retries what is no lock, such as a full disk. A lock is waited for.
 LAST_PATIENCE_S = 3.0
@@ -41,21 +37,18 @@ def size_of(record: TrialRecord) -> int:
 class Flusher:
     """Collects ended trials and stores them about once a second.
 
-    While storing fails, trials beyond MOST_HELD are dropped and others are played; where storing is
+    While storing fails, trials beyond a batch are dropped and others are played; where storing is
     merely slow, new trials wait for it. ``dropped`` trials can be played again from the recorded
     replies; failed ones cannot, and stay in memory. ``differing`` maps trials that were already
     stored with other values to the columns that differ.
     """
 
-    def __init__(
-        self, store: Store, sweep_id: str, say: Callable[[str], None], batch: int = BATCH
-    ) -> None:
+    def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
         self.differing: dict[str, list[str]] = {}
         self.dropped: list[TrialSpec] = []
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
-        self._batch = batch
         self._pending: list[tuple[TrialRecord, int]] = []  # with their sizes
         self._problem: StoreError | None = None
         self._closing = False
@@ -67,7 +60,7 @@ class Flusher:
         self._pending.append((record, size_of(record)))
         if self._problem is not None:
             self._drop_excess()
-        if len(self._pending) >= self._batch or self._bytes >= BATCH_BYTES:
+        if len(self._pending) >= BATCH or self._bytes >= BATCH_BYTES:
             self._awake.set()
 
     async def room(self) -> None:
@@ -132,7 +125,7 @@ class Flusher:
 
     async def _flush(self) -> bool:
         """Write one batch, which may be empty; False if that did not work."""
-        sizes = accumulate(size for _, size in self._pending[: self._batch])
+        sizes = accumulate(size for _, size in self._pending[:BATCH])
         # At least one: a single trial may be larger than a batch should be.
         number = max(1, sum(size <= BATCH_BYTES for size in sizes))
         # It stays in front until it is stored: others are added behind it meanwhile.
@@ -155,7 +148,7 @@ class Flusher:
         pending, self._pending = self._pending, []
         held_bytes = 0
         for record, size in pending:
-            is_much = len(self._pending) >= MOST_HELD or held_bytes + size > MOST_PENDING_BYTES
+            is_much = len(self._pending) >= BATCH or held_bytes + size > MOST_PENDING_BYTES
             if is_much and self._pending and record.status != "failed":
                 self.dropped.append(record.spec)
             else:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TypeVar
 
 from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
@@ -22,7 +21,6 @@ from merge_runner.run.plan import Plan
 from merge_runner.study.crossing import Arm
 from merge_runner.trial import play_trial
 
-ResultT = TypeVar("ResultT")
 # Called with each trial that ends, or is suspended for lack of money.
 Ended = Callable[[TrialSpec, TrialRecord | TrialSuspended], None]
 # Awaited before a trial begins: returns once there is memory to hold the trial until it is stored.
@@ -31,30 +29,6 @@ Room = Callable[[], Awaitable[None]]
 FAILURES_IN_A_ROW = 10
 # Calls that begin in one round of the event loop, so that each round stays short.
 A_FEW = 16
-
-
-async def run_bounded(
-    jobs: Iterable[Callable[[], Awaitable[ResultT]]],
-    *,
-    in_flight: int,
-    on_done: Callable[[ResultT], None],
-) -> None:
-    """Run jobs in order, at most ``in_flight`` at once; each result goes to ``on_done``.
-
-    The first exception of a job cancels all others and is raised.
-    """
-    waiting = iter(jobs)
-
-    async def work() -> None:
-        for job in waiting:
-            on_done(await job())
-
-    try:
-        async with asyncio.TaskGroup() as group:
-            for _ in range(in_flight):
-                group.create_task(work())
-    except BaseExceptionGroup as errors:
-        raise errors.exceptions[0] from None
 
 
 @dataclass
@@ -114,22 +88,26 @@ class LocalRunner:
         self, specs: Iterable[TrialSpec], ended: Ended, room: Room | None = None
     ) -> None:
         """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
+        waiting = iter(specs)
 
-        async def play(spec: TrialSpec) -> tuple[TrialSpec, TrialRecord | TrialSuspended]:
-            if room is not None:  # before any call: what is answered must also be stored
-                await room()
-            try:
-                return spec, await self.play_one(spec)
-            except TrialSuspended as exc:
-                return spec, exc
+        async def work() -> None:
+            for spec in waiting:
+                if room is not None:  # before any call: what is answered must also be stored
+                    await room()
+                try:
+                    record = await self.play_one(spec)
+                except TrialSuspended as exc:
+                    ended(spec, exc)
+                else:
+                    ended(spec, record)
+                    self._watch_for_outage(record)
 
-        def done(result: tuple[TrialSpec, TrialRecord | TrialSuspended]) -> None:
-            ended(*result)
-            if isinstance(result[1], TrialRecord):
-                self._watch_for_outage(result[1])
-
-        jobs = (partial(play, spec) for spec in specs)
-        await run_bounded(jobs, in_flight=self.in_flight, on_done=done)
+        try:
+            async with asyncio.TaskGroup() as group:
+                for _ in range(self.in_flight):
+                    group.create_task(work())
+        except BaseExceptionGroup as errors:  # the first one has cancelled the others
+            raise errors.exceptions[0] from None
 
     async def play_one(self, spec: TrialSpec) -> TrialRecord:
         """Play a trial; raises TrialSuspended where there is no money for it."""
