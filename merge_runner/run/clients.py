@@ -6,17 +6,15 @@ import os
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from types import MappingProxyType
 
 from merge_runner.config import (
     ModelEntry,
-    base_urls,
     check_network,
     driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
 )
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.lines import Batches
@@ -42,21 +40,6 @@ from merge_runner.run.rehearsal import SPEED, behaviour
 SPARE_FILES = 64
 
 
-@dataclass(frozen=True, slots=True)
-class EndpointPlan:
-    """How the endpoints of a sweep are asked; ``urls`` maps variables to base URLs.
-
-    ``emulator`` says how the emulator of this process behaves, None where none is needed. ``known``
-    names the models whose endpoint has ever given an answer in its format, and ``measured`` is what
-    the cache knows about each model's answers to similar requests.
-    """
-
-    urls: Mapping[str, str]
-    emulator: FaultPlan | None
-    known: frozenset[str]
-    measured: Mapping[str, CallTotals]
-
-
 def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     """Clients that answer from recordings alone: no key, no connection."""
     return {
@@ -73,42 +56,40 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     }
 
 
-def endpoint_plan(plan: Plan, options: Options, cache: ResponseCache) -> EndpointPlan:
-    """Return how the endpoints of a plan's models are asked, by what the cache holds of them."""
+def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, CallTotals]:
+    """Return what the cache knows of each model's answers to requests like those of a plan.
+
+    A model whose endpoint has never given an answer is not among them.
+    """
     totals = call_totals(cache.entries())
     answered = {(model, endpoint) for model, endpoint, _ in totals}
-    known, measured = set(), {}
+    earlier = {}
     for name, entry in plan.entries.items():
-        endpoint = plan.endpoints[name]
-        sent = FORMATS[entry.format].request(entry, "")
-        asked = manner(sent.path, canonical_json(sent.body))
-        measured[name] = totals.get((entry.id, endpoint, asked), CallTotals())
-        if (entry.id, endpoint) in answered:
-            known.add(name)
-    emulated = any(entry.provider == "emulator" for entry in plan.entries.values())
-    if plan.is_rehearsal:
-        emulator: FaultPlan | None = behaviour(plan)
-    else:
-        runs = bool(os.environ.get("EMULATOR_BASE_URL"))  # and is the one to ask
-        emulator = options.faults if emulated and not runs else None
-    return EndpointPlan(base_urls(plan.entries), emulator, frozenset(known), measured)
+        place = entry.id, plan.endpoints[name]
+        if place in answered:
+            sent = FORMATS[entry.format].request(entry, "")
+            asked = manner(sent.path, canonical_json(sent.body))
+            earlier[name] = totals.get((*place, asked), CallTotals())
+    return earlier
 
 
 def live_clients(
     plan: Plan,
     options: Options,
-    endpoint_plan: EndpointPlan,
+    earlier: Mapping[str, CallTotals],
     cache: ResponseCache,
     ledger: Ledger,
     *,
     stack: AsyncExitStack,
     rounds: Rounds | None = None,
+    urls: Mapping[str, str] = MappingProxyType({}),
     share: float = 1.0,
     limiters: dict[str, Limiter] | None = None,
 ) -> dict[str, LlmClient]:
     """Clients with connections, closed with ``stack``, and a share of the rate limits.
 
-    ``rounds`` are those of this run, which get the batch modes of its models. ``limiters`` by
+    ``earlier`` is as ``earlier_answers`` says. ``rounds`` are those of this run, which get the
+    batch modes of its models. Variables in ``urls`` go before the environment. ``limiters`` by
     registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
     """
@@ -123,28 +104,29 @@ def live_clients(
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
         ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
-    costs = trial_costs(plan, endpoint_plan.measured, batch=options.batch)
+    costs = trial_costs(plan, earlier, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
+    _allow_open_files(options.connections + SPARE_FILES)
+    env = {**os.environ, **urls}
+    in_process = None
+    if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
+        from merge_runner.emulator.handler import Emulator, InProcess
+
+        faults = behaviour(plan) if plan.is_rehearsal else options.faults
+        in_process = InProcess(Emulator(faults))
     limiters = {} if limiters is None else limiters
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
-    _allow_open_files(options.connections + SPARE_FILES)
-    in_process = None
-    if endpoint_plan.emulator is not None:
-        from merge_runner.emulator.handler import Emulator, InProcess
-
-        in_process = InProcess(Emulator(endpoint_plan.emulator))
     transports: dict[str, HttpTransport] = {}
     clients: dict[str, LlmClient] = {}
     under_way: dict[str, Call] = {}  # two names of one model may ask the same
     for name, entry in plan.entries.items():
         model = plan.registered[name]
         if model not in transports:
-            endpoint = (
-                rehearsal_endpoint(entry)
-                if plan.is_rehearsal
-                else resolve_endpoint(name, entry, {**os.environ, **endpoint_plan.urls})
-            )
+            if plan.is_rehearsal:
+                endpoint = rehearsal_endpoint(entry)
+            else:
+                endpoint = resolve_endpoint(name, entry, env)
             check_network(endpoint.base_url)
             transports[model] = HttpTransport(
                 endpoint,
@@ -178,7 +160,7 @@ def live_clients(
             first=FirstCall(
                 # A round is asked at once: no call of it waits for another one's answer.
                 passed=rounds is not None and rounds.submits,
-                known=name in endpoint_plan.known,
+                known=name in earlier,
             ),
             batches=_batches(model, entry, budget, cache, rounds),
             under_way=under_way,

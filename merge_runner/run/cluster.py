@@ -29,6 +29,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import merge_runner
+from merge_runner.config import base_urls
 from merge_runner.errors import (
     ClusterFailed,
     MergeRunnerError,
@@ -38,12 +39,13 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.call import Wait
+from merge_runner.llm.call_totals import CallTotals
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.meter import Meter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec
 from merge_runner.registry import in_use, plugin_sources, use
-from merge_runner.run.clients import EndpointPlan, live_clients, sealed_clients
+from merge_runner.run.clients import live_clients, sealed_clients
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.local_runner import Ended, LocalRunner, Room
@@ -69,10 +71,6 @@ _WHERE = re.compile(
 VALID = (
     "valid: local:N (N workers on this machine), the address of a scheduler "
     "(tcp://HOST:PORT, tls://HOST:PORT), or its scheduler file (PATH.json)"
-)
-SCHEDULER_GONE = (
-    "the Dask scheduler is gone, and with it the tasks that were under way; run the same command "
-    "again to go on"
 )
 
 
@@ -143,7 +141,7 @@ async def _local_cluster(workers: int) -> AsyncIterator[str]:
 class Task:
     """Trials for one worker, what is recorded of their calls, and its ``share`` of the limits.
 
-    Its share of the cap is reserved under its ``name``.
+    Its share of the cap is reserved under its ``name``. ``urls`` are the coordinator's base URLs.
     """
 
     run: str
@@ -151,7 +149,8 @@ class Task:
     specs: Sequence[TrialSpec]
     plan: Plan
     options: Options
-    endpoints: EndpointPlan
+    urls: Mapping[str, str]
+    earlier: Mapping[str, CallTotals]
     share: float
     first: FirstDecisions
     recorded: Sequence[CachedCall]
@@ -225,8 +224,8 @@ async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Pla
         ledger.settle_share("", [(driver, 0, 0, ratio) for driver, ratio in task.overruns], [])
         try:
             clients = live_clients(
-                task.plan, task.options, task.endpoints, replies, ledger,
-                stack=stack, share=task.share, limiters=limiters,
+                task.plan, task.options, task.earlier, replies, ledger,
+                stack=stack, urls=task.urls, share=task.share, limiters=limiters,
             )  # fmt: skip
             runner = LocalRunner(task.plan, clients, task.options.in_flight, task.first)
             played.meters = runner.meters
@@ -240,7 +239,7 @@ async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Pla
             if not work.cancelled():
                 work.result()
         except MergeRunnerError as exc:
-            played.error = exc
+            played.error = type(exc)(str(exc))  # without its frames, which no pickle can hold
         known = {call.request.key for call in task.recorded}
         played.replies = [call for call in replies.entries() if call.request.key not in known]
         played.unanswered = replies.all_unanswered()
@@ -258,14 +257,14 @@ class DaskTasks:
     _client: Client
     _plan: Plan
     _options: Options
-    _endpoints: EndpointPlan
+    _earlier: Mapping[str, CallTotals]
     _cache: ResponseCache
     _ledger: Ledger
     first: FirstDecisions
     waits: Sequence[Wait] = ()
+    workers: int = 0
     _run: str = field(default_factory=lambda: secrets.token_hex(8))
     _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(1))
-    _addresses: list[str] = field(default_factory=list)
     _groups: deque[list[TrialSpec]] = field(default_factory=deque)
     _given: dict[str, tuple[Task, asyncio.Task[Played | Exception]]] = field(default_factory=dict)
     _losses: Counter[int] = field(default_factory=Counter)
@@ -273,12 +272,7 @@ class DaskTasks:
 
     def __post_init__(self) -> None:
         self.meters = {name: Meter() for name in self._plan.entries}
-        self._costs = trial_costs(self._plan, self._endpoints.measured)
-
-    @property
-    def workers(self) -> int:
-        """How many workers there are."""
-        return len(self._addresses)
+        self._costs = trial_costs(self._plan, self._earlier)
 
     @property
     def running(self) -> int:
@@ -297,16 +291,20 @@ class DaskTasks:
         for spec in specs:  # trials that may ask the same go together, so that one worker asks
             groups.setdefault((spec.condition, spec.repetition, spec.sample_set), []).append(spec)
         self._groups.extend(groups.values())
-        while self._groups or self._given:
-            try:
-                self._addresses = list(await self._client.nthreads())
-            except OSError as exc:
-                raise ClusterFailed(SCHEDULER_GONE) from exc
-            for address in self._addresses:
-                if self._groups and address not in self._given:
-                    await room()
-                    await self._give(address)
-            await self._collect()
+        try:
+            while self._groups or self._given:
+                addresses = list(await self._client.nthreads())
+                self.workers = len(addresses)
+                for address in addresses:
+                    if self._groups and address not in self._given:
+                        await room()
+                        await self._give(address)
+                await self._collect()
+        except OSError as exc:
+            raise ClusterFailed(
+                "the Dask scheduler is gone, and with it the tasks that were under way; run the "
+                "same command again to go on"
+            ) from exc
 
     async def drain(self) -> None:
         """Stop the workers, and keep what their tasks have brought."""
@@ -314,7 +312,7 @@ class DaskTasks:
             async with asyncio.timeout(GOODBYE_S):
                 await self._client.run(stop, self._run, on_error="ignore")
         while self._given:
-            with contextlib.suppress(MergeRunnerError):  # the first error is told already
+            with contextlib.suppress(MergeRunnerError, OSError):  # the first one is told already
                 await self._collect()
 
     async def _give(self, address: str) -> None:
@@ -329,6 +327,7 @@ class DaskTasks:
         specs = self._groups.popleft()
         while self._groups and len(specs) + len(self._groups[0]) <= size:
             specs = specs + self._groups.popleft()
+        recorded, unanswered = await self._recorded(specs)
         name = f"task {self._run} {next(self._numbers)}"
         cap_usd = self._options.max_cost_usd
         if any(entry.price != "free" for entry in self._plan.entries.values()):
@@ -337,14 +336,14 @@ class DaskTasks:
                 usd = cap_usd = max(0.0, cap_usd - self._ledger.read().committed_usd) / idle
             asked = Asked(f"Dask worker {address}", specs[0].trial_id, usd)
             self._ledger.reserve(name, 1, usd, None, asked)
-        recorded, unanswered = await self._recorded(specs)
         task = Task(
             run=self._run,
             name=name,
             specs=specs,
             plan=self._plan,
             options=replace(self._options, in_flight=in_flight, max_cost_usd=cap_usd),
-            endpoints=self._endpoints,
+            urls=base_urls(self._plan.entries),
+            earlier=self._earlier,
             share=1 / slots,
             first=self.first,
             recorded=recorded,
@@ -394,10 +393,7 @@ class DaskTasks:
             if not work.done():
                 continue
             del self._given[address]
-            try:
-                played = work.result()
-            except OSError as exc:
-                raise ClusterFailed(SCHEDULER_GONE) from exc
+            played = work.result()
             if not isinstance(played, Played):
                 self._lose(task, address, played)
                 continue

@@ -26,6 +26,7 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.call_totals import CallTotals
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.ledger import Ledger, Spending, scopes
 from merge_runner.llm.meter import Meter
@@ -39,7 +40,7 @@ from merge_runner.results.rows import factor_rows
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     check_batches,
-    endpoint_plan,
+    earlier_answers,
     live_clients,
     open_rounds,
     sealed_clients,
@@ -189,12 +190,13 @@ class Sweep:
                 if name in arm.entries:
                     answered = sum(row.side == side for row in record.decisions) if record else 0
                     calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
+        nothing = {name: CallTotals() for name in self._plan.entries}
         return estimate(
             self._plan,
             self._options,
             trials=trials,
             calls=calls,
-            facts=endpoint_plan(self._plan, self._options, self._cache).measured,
+            facts={**nothing, **earlier_answers(self._plan, self._cache)},
             spending=self._ledger.spending,
         )
 
@@ -270,7 +272,7 @@ class Sweep:
         plan, options = self._plan, self._options
         if options.sends_nothing or not plan.entries:
             return self._sealed_runner(1 if plan.entries else min(options.in_flight, FROM_PROGRAMS))
-        endpoints = endpoint_plan(plan, options, self._cache)
+        earlier = earlier_answers(plan, self._cache)
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
         first = FirstDecisions()
         if not options.keep_going:
@@ -278,9 +280,9 @@ class Sweep:
             self._add_stored(first, self._stored)
         if options.dask is not None:
             client = await stack.enter_async_context(connected(options.dask))
-            return DaskTasks(client, plan, options, endpoints, self._cache, self._ledger, first)
+            return DaskTasks(client, plan, options, earlier, self._cache, self._ledger, first)
         clients = live_clients(
-            plan, options, endpoints, self._cache, self._ledger, stack=stack, rounds=rounds
+            plan, options, earlier, self._cache, self._ledger, stack=stack, rounds=rounds
         )
         if rounds is not None:
             stack.push_async_callback(rounds.close)
