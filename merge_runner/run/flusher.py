@@ -19,8 +19,6 @@ BATCH = 256
 MOST_PENDING = 2 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
 LOCK_PATIENCE_S = 2.0
-# How long the end of a sweep retries what is no lock, such as a full disk. A lock is waited for.
-LAST_PATIENCE_S = 3.0
 AGAIN = (
     "When that is fixed, run the same command again: it writes them from the recorded replies "
     "without a call."
@@ -86,17 +84,14 @@ class Flusher:
     async def close(self) -> None:
         """Store the trials in memory, and leave the database reachable.
 
-        Waits for a program that holds it as long as that does; raises StoreError for anything else
-        that lasts. More trials may be added later, and stored by the next call.
+        Waits for a program that holds it as long as that does; raises StoreError for anything else.
+        More trials may be added later, and stored by the next call.
         """
         self._closing = True
         self._awake.set()
         await self._task
-        loop = asyncio.get_running_loop()
-        began, said = loop.time(), False
+        said = False
         while not await self._flush() or self._pending:
-            if self._problem is None:
-                continue
             if isinstance(self._problem, StoreLocked):
                 if not said:
                     self._say(
@@ -104,11 +99,11 @@ class Flusher:
                         "replies are in the cache"
                     )
                 said = True
-            elif not self.left:
-                return  # whoever opens the database next will say what is wrong with it
-            elif loop.time() - began >= LAST_PATIENCE_S:
+                await asyncio.sleep(EVERY_S)
+            elif self._problem and self.left:
                 raise StoreError(f"{self.left} trials are not stored: {self._problem}. {AGAIN}")
-            await asyncio.sleep(EVERY_S)
+            elif self._problem:
+                return  # whoever opens the database next will say what is wrong with it
 
     @property
     def _bytes(self) -> int:

@@ -6,7 +6,7 @@ import asyncio
 import tempfile
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -164,12 +164,12 @@ class Sweep:
                 outcome.fail(1, f"{failed} trials failed")
             for meter in runner.meters.values():
                 outcome.meter.add(meter)
-            outcome.worst_stall_s = progress.worst_stall_s
+            outcome.batches, outcome.worst_stall_s = progress.batches(), progress.worst_stall_s
             self._add_costs(outcome)
             progress.doing = "checking"
             file.write(progress.standing(outcome.sweep_id))
             if is_stored:
-                self._check(outcome)
+                self._check(runner.first, outcome)
         return outcome
 
     async def estimate(self, *, whole: bool = False) -> Estimate:
@@ -236,13 +236,8 @@ class Sweep:
 
     def _explain(self, outcome: Outcome) -> None:
         """Say why calls of a replay are not recorded."""
-        left_out: list[str] = []
-        for line in explain(self._misses, self._cache.entries(left_out)) if self._misses else ():
+        for line in explain(self._misses, self._cache.entries()) if self._misses else ():
             outcome.fail(ReplayMiss.exit_code, line)
-        if left_out:
-            outcome.messages.append(
-                f"{len(left_out)} rows of the cache are left out of this, the first: {left_out[0]}"
-            )
 
     async def _begin(self) -> str:
         """Add the sweep to the database, with the trials that are stored already."""
@@ -277,7 +272,11 @@ class Sweep:
         first = FirstDecisions()
         if not options.keep_going:
             first = FirstDecisions(MOST_INVALID, one_by_one=rounds is None)
-            self._add_stored(first, self._stored)
+            arms = {spec.spec_hash: self._arms[spec.arm] for spec in self._stored}
+            stored = self._store.decisions_by_spec(arms) if arms else []
+            for spec_hash, side, *decisions in stored:
+                if (model := arms[spec_hash].asked[side]) in plan.entries:
+                    first.add(model, *decisions)
         if options.dask is not None:
             client = await stack.enter_async_context(connected(options.dask))
             return DaskTasks(client, plan, options, earlier, self._cache, self._ledger, first)
@@ -310,9 +309,13 @@ class Sweep:
             self._note_misses(record)
             flusher.add(record)
 
+        async def drained() -> None:
+            await asyncio.wait([work])
+            await runner.drain()
+
         # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
         work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
-        drain = asyncio.create_task(_drained(runner, work))
+        drain = asyncio.create_task(drained())
         watching = asyncio.create_task(_watched(runner, self._rounds))
         watching.add_done_callback(lambda _: work.cancel())  # nobody would close a round
 
@@ -387,7 +390,7 @@ class Sweep:
             else:
                 outcome.fail_by(exc)
 
-    def _check(self, outcome: Outcome) -> None:
+    def _check(self, first: FirstDecisions, outcome: Outcome) -> None:
         """Read back what the database holds of the sweep, audit it, and note how it ended."""
         db, sweep_id = self._options.db, outcome.sweep_id
         keys = [(spec.trial_id, spec.spec_hash) for spec in self._plan.trial_specs()]
@@ -395,9 +398,7 @@ class Sweep:
             outcome.facts = sweep_facts(db, sweep_id)
             outcome.audit = audit_sweep(db, sweep_id, keys, finished=outcome.exit_code == 0)
             if not (outcome.exit_code or self._options.sends_nothing or self._options.keep_going):
-                stored = FirstDecisions()
-                self._add_stored(stored, [*self._stored, *self._todo])
-                for line in stored.without_a_valid_one():
+                for line in first.without_a_valid_one():
                     outcome.fail(NoValidDecision.exit_code, line)
             # Answers from another model are reported elsewhere; only --strict-model stops for them.
             findings = [f for f in outcome.audit.findings if f.kind != "served"]
@@ -408,15 +409,6 @@ class Sweep:
             self._store.end_sweep(sweep_id, ended_at, outcome.exit_code)
         except (StoreError, UsageError) as exc:
             outcome.fail_by(exc)
-
-    def _add_stored(self, first: FirstDecisions, specs: Iterable[TrialSpec]) -> None:
-        """Add the decisions of these trials that are stored."""
-        arms = {spec.spec_hash: self._arms[spec.arm] for spec in specs}
-        stored = self._store.decisions_by_spec(arms) if arms else []
-        for spec_hash, side, *decisions in stored:
-            model = arms[spec_hash].asked[side]
-            if model in self._plan.entries:
-                first.add(model, *decisions)
 
 
 @asynccontextmanager
@@ -521,12 +513,6 @@ async def unsent(
         options = replace(options, db=db, cache=cache, dry_run=True)
         async with open_sweep(plan, options, say=say) as sweep:
             return await sweep.estimate(whole=whole)
-
-
-async def _drained(runner: LocalRunner | DaskTasks, work: asyncio.Task[None]) -> None:
-    """Once the work has ended, however it did, save the calls that are in flight."""
-    await asyncio.wait([work])
-    await runner.drain()
 
 
 async def _watched(runner: LocalRunner | DaskTasks, rounds: Rounds | None) -> None:

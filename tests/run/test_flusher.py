@@ -164,8 +164,7 @@ async def test_while_the_database_is_held_long_replies_stay_up_to_a_bound_and_a_
     assert [spec.order for spec in flusher.dropped] == [1, 5, 6, 7]
 
 
-async def test_what_is_dropped_counts_as_not_stored_where_the_disk_is_full(monkeypatch):
-    monkeypatch.setattr("merge_runner.run.flusher.LAST_PATIENCE_S", 0.0)
+async def test_what_is_dropped_counts_as_not_stored_where_the_disk_is_full():
     flusher = Flusher(Refusing(StoreError("the disk is full")), "sweep", lambda line: None)
     for order in range(300):
         flusher.add(ended(order))
