@@ -58,8 +58,6 @@ if TYPE_CHECKING:
 CONNECT_TIMEOUT_S = 10
 # Workers may come and go: how often they are counted.
 LOOK_EVERY_S = 1.0
-# A scheduler that hangs must not keep Ctrl-C from ending the run.
-GOODBYE_S = 5.0
 # A worker that dies loses so many times its trials in flight, and the longest trial of a task
 # holds the others up.
 TRIALS_PER_SEAT = 4
@@ -308,9 +306,8 @@ class DaskTasks:
 
     async def drain(self) -> None:
         """Stop the workers, and keep what their tasks have brought."""
-        with contextlib.suppress(OSError):  # a timeout among them
-            async with asyncio.timeout(GOODBYE_S):
-                await self._client.run(stop, self._run, on_error="ignore")
+        with contextlib.suppress(OSError):
+            await self._client.run(stop, self._run, workers=[*self._given], on_error="ignore")
         while self._given:
             with contextlib.suppress(MergeRunnerError, OSError):  # the first one is told already
                 await self._collect()
@@ -376,11 +373,10 @@ class DaskTasks:
         answers = await self._client.run(
             play_task, fingerprint(), pickle.dumps(task), workers=[address], on_error="return"
         )
-        played: Played | Exception = answers[address]
-        if isinstance(played, ImportError):
-            why = f"it cannot load merge-runner ({played}): install the same one for all"
+        if isinstance(error := answers[address], ImportError):
+            why = f"it cannot load merge-runner ({error}): install the same one for all"
             return Played(error=UsageError(why))
-        return played
+        return answers[address]  # type: ignore[no-any-return] # Dask has no types
 
     async def _collect(self) -> None:
         """Wait a while for tasks, and keep what those that have ended return."""
@@ -389,10 +385,8 @@ class DaskTasks:
             return
         works = [work for _, work in self._given.values()]
         await asyncio.wait(works, timeout=LOOK_EVERY_S, return_when=asyncio.FIRST_COMPLETED)
-        for address, (task, work) in [*self._given.items()]:
-            if not work.done():
-                continue
-            del self._given[address]
+        for address in [address for address, (_, work) in self._given.items() if work.done()]:
+            task, work = self._given.pop(address)
             played = work.result()
             if not isinstance(played, Played):
                 self._lose(task, address, played)
@@ -422,13 +416,13 @@ class DaskTasks:
 
     def _lose(self, task: Task, address: str, error: Exception) -> None:
         """Give the trials of a lost task out again; its share of the cap stays reserved."""
-        self._losses.update(spec.order for spec in task.specs)
-        if max(self._losses[spec.order] for spec in task.specs) >= MOST_LOSSES:
+        number, order = len(task.specs), task.specs[0].order
+        self._losses[order] += 1
+        if self._losses[order] == MOST_LOSSES:
             raise ClusterFailed(
                 f"a task was begun on {MOST_LOSSES} Dask workers, and all died ({error!r}). Look "
                 "at their memory and their logs; run the same command again to go on"
             )
         self._groups.appendleft([*task.specs])
-        next(iter(self.meters.values())).notes.append(
-            f"the worker {address} is lost: its {len(task.specs)} trials go to others"
-        )
+        lost = f"the worker {address} is lost: its {number} trials go to others"
+        next(iter(self.meters.values())).notes.append(lost)

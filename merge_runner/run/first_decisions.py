@@ -16,20 +16,7 @@ from merge_runner.text_safety import one_line
 MOST_INVALID = 20
 """After so many a live run stops."""
 SHOWN = 300
-WHY = {
-    "no_array": "it has no list of numbers",
-    "several_arrays": "it has several different lists that could be the plan",
-    "out_of_range": "its list has a number that is not between -1 and 1",
-    "wrong_length": "its list has another length than the prompt asks for",
-    "not_finite": "its list has a number that is not finite",
-    "not_a_number": "its list has an entry that is no number",
-    "refusal": "the model refuses to answer",
-    "truncated": "it is cut off at the most tokens that the model may write",
-    "empty": "it is empty",
-}
-TOO_SHORT = f"set a higher `max_output_tokens` in {REGISTRY}"
-ADVICE = {"truncated": TOO_SHORT, "empty": TOO_SHORT}
-OF_THE_FORM = (
+ADVICE = (
     "look at what the prompt asks for, and in which output format; some servers hold a small "
     "model to it by a grammar"
 )
@@ -105,8 +92,7 @@ class FirstDecisions:
 
 def _described(failure: str, text: str) -> str:
     """The reply, why it is invalid, and what to look at."""
-    text = one_line(" ".join(text.split()))
-    cut = f"{text[:SHOWN]}..." if len(text) > SHOWN else text
-    shown = f'The first reply is "{cut}"' if text else "The first reply has no text"
-    why = WHY.get(failure, failure)
-    return f"{shown}: {failure}, {why}. To mend that {ADVICE.get(failure, OF_THE_FORM)}"
+    shown = one_line(" ".join(text.split()))[:SHOWN]
+    is_short = failure in ("truncated", "empty")
+    advice = f"set a higher `max_output_tokens` in {REGISTRY}" if is_short else ADVICE
+    return f'The first reply is "{shown}" ({failure.replace("_", " ")}). To mend that {advice}'
