@@ -15,7 +15,7 @@ from pathlib import Path
 
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.audit.findings import Audit
-from merge_runner.config import ModelEntry, model_id, resolve_endpoint
+from merge_runner.config import ModelEntry, model_id
 from merge_runner.errors import (
     MergeRunnerError,
     NoValidDecision,
@@ -134,10 +134,10 @@ class Sweep:
             )
             return outcome
         self._misses.clear()
-        with unreadable_is_usage():
-            outcome.sweep_id = await self._begin()
         async with AsyncExitStack() as stack:
             runner = await self._runner(stack)
+            with unreadable_is_usage():
+                outcome.sweep_id = await self._begin()
             flusher = Flusher(self._store, outcome.sweep_id, self._say)
             progress = Progress(
                 plan=self._plan,
@@ -213,10 +213,7 @@ class Sweep:
         return Store(self._options.db)
 
     def _sealed_runner(self, in_flight: int = 1) -> LocalRunner:
-        """What plays from recorded replies alone.
-
-        They come at once: more trials in flight would only wait for each other.
-        """
+        # Recorded replies come at once: more trials in flight would only wait for each other.
         return LocalRunner(self._plan, sealed_clients(self._plan, self._cache), in_flight)
 
     async def _nothing_is_recorded(self) -> bool:
@@ -235,12 +232,10 @@ class Sweep:
         ]
 
     def _explain(self, outcome: Outcome) -> None:
-        """Say why calls of a replay are not recorded."""
         for line in explain(self._misses, self._cache.entries()) if self._misses else ():
             outcome.fail(ReplayMiss.exit_code, line)
 
     async def _begin(self) -> str:
-        """Add the sweep to the database, with the trials that are stored already."""
         started_at = datetime.now(UTC).replace(tzinfo=None)
         commit, dirty = await asyncio.to_thread(git_state)
         row = SweepRow(
@@ -313,10 +308,16 @@ class Sweep:
             await asyncio.wait([work])
             await runner.drain()
 
+        async def watched() -> None:
+            if self._rounds is None or not isinstance(runner, LocalRunner):
+                await asyncio.Event().wait()
+            else:
+                await self._rounds.watch(lambda: runner.is_idle)
+
         # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
         work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
         drain = asyncio.create_task(drained())
-        watching = asyncio.create_task(_watched(runner, self._rounds))
+        watching = asyncio.create_task(watched())
         watching.add_done_callback(lambda _: work.cancel())  # nobody would close a round
 
         def interrupted() -> None:
@@ -353,10 +354,8 @@ class Sweep:
             return False
         outcome.fail_by(closing.exception())
         if flusher.differing:
-            shown = [
-                f"{trial_id} ({', '.join(columns)})"
-                for trial_id, columns in [*flusher.differing.items()][:SHOWN]
-            ]
+            differing = [*flusher.differing.items()][:SHOWN]
+            shown = [f"{trial_id} ({', '.join(columns)})" for trial_id, columns in differing]
             outcome.fail(
                 StoreError.exit_code,
                 f"{len(flusher.differing)} trials are stored otherwise in {self._options.db}, "
@@ -437,9 +436,6 @@ async def open_sweep(
         stored = [spec for key, spec in specs.items() if key in ended]
         todo = [spec for key, spec in specs.items() if key not in ended]
         if todo and not options.sends_nothing:
-            if not plan.is_rehearsal:
-                for name, entry in entries.items():
-                    resolve_endpoint(name, entry)  # raises where its key is missing
             if options.dask is None:  # workers may see other servers
                 await check_served(entries)
             options = _less_what_is_spent(plan, options, cache, say)
@@ -489,9 +485,9 @@ def _less_what_is_spent(
     others = [
         scope
         for scope in scopes(cache)
-        if scope in options.ledgers or (study in (own, scope) and scope.split("/")[0] == study)
+        if scope != own
+        and (scope in options.ledgers or (study in (own, scope) and scope.split("/")[0] == study))
     ]
-    others = [scope for scope in others if scope != own]
     spent_usd = sum(Ledger(cache, scope).read().committed_usd for scope in others)
     if options.max_cost_usd is None or not spent_usd:
         return options
@@ -513,11 +509,3 @@ async def unsent(
         options = replace(options, db=db, cache=cache, dry_run=True)
         async with open_sweep(plan, options, say=say) as sweep:
             return await sweep.estimate(whole=whole)
-
-
-async def _watched(runner: LocalRunner | DaskTasks, rounds: Rounds | None) -> None:
-    """Close the rounds of a run in batches, as long as it goes on."""
-    if rounds is None or not isinstance(runner, LocalRunner):
-        await asyncio.Event().wait()
-    else:
-        await rounds.watch(lambda: runner.is_idle)
