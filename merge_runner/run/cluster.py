@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
-import itertools
 import logging
 import math
 import os
@@ -20,7 +19,7 @@ import re
 import secrets
 import signal
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -45,7 +44,7 @@ from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.meter import Meter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec
 from merge_runner.registry import in_use, plugin_sources, use
-from merge_runner.run.clients import live_clients, sealed_clients
+from merge_runner.run.clients import live_clients
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.local_runner import Ended, LocalRunner, Room
@@ -85,10 +84,7 @@ async def connected(where: str) -> AsyncIterator[Client]:
     except ModuleNotFoundError as exc:
         raise UsageError("--dask needs the package distributed: pip install distributed") from exc
 
-    # Dask logs tracebacks for what we report in a line, such as lost workers.
-    for name in logging.root.manager.loggerDict:
-        if name.partition(".")[0] == "distributed":
-            logging.getLogger(name).setLevel(logging.CRITICAL)
+    logging.disable()  # Dask logs tracebacks for what we report in a line, such as lost workers
     async with AsyncExitStack() as stack:
         scheduler = {"scheduler_file" if named["file"] else "address": where}
         if named["workers"]:
@@ -261,8 +257,7 @@ class DaskTasks:
     first: FirstDecisions
     waits: Sequence[Wait] = ()
     workers: int = 0
-    _run: str = field(default_factory=lambda: secrets.token_hex(8))
-    _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(1))
+    _run: str = field(default_factory=secrets.token_hex)
     _groups: deque[list[TrialSpec]] = field(default_factory=deque)
     _given: dict[str, tuple[Task, asyncio.Task[Played | Exception]]] = field(default_factory=dict)
     _losses: Counter[int] = field(default_factory=Counter)
@@ -325,7 +320,7 @@ class DaskTasks:
         while self._groups and len(specs) + len(self._groups[0]) <= size:
             specs = specs + self._groups.popleft()
         recorded, unanswered = await self._recorded(specs)
-        name = f"task {self._run} {next(self._numbers)}"
+        name = f"task {secrets.token_hex(8)}"
         cap_usd = self._options.max_cost_usd
         if any(entry.price != "free" for entry in self._plan.entries.values()):
             usd = sum(self._costs.usd(spec.order) for spec in specs)
@@ -353,7 +348,7 @@ class DaskTasks:
         self, specs: Sequence[TrialSpec]
     ) -> tuple[list[CachedCall], dict[str, tuple[Attempt, ...]]]:
         """What the cache holds of the calls of these trials, up to the first that is missing."""
-        player = LocalRunner(self._plan, sealed_clients(self._plan, self._cache), in_flight=1)
+        player = LocalRunner.sealed(self._plan, self._cache)
         recorded: dict[str, CachedCall] = {}
         unanswered: dict[str, tuple[Attempt, ...]] = {}
         for spec in specs:
@@ -416,13 +411,12 @@ class DaskTasks:
 
     def _lose(self, task: Task, address: str, error: Exception) -> None:
         """Give the trials of a lost task out again; its share of the cap stays reserved."""
-        number, order = len(task.specs), task.specs[0].order
-        self._losses[order] += 1
-        if self._losses[order] == MOST_LOSSES:
+        self._losses[task.specs[0].order] += 1
+        if self._losses[task.specs[0].order] == MOST_LOSSES:
             raise ClusterFailed(
                 f"a task was begun on {MOST_LOSSES} Dask workers, and all died ({error!r}). Look "
                 "at their memory and their logs; run the same command again to go on"
             )
         self._groups.appendleft([*task.specs])
-        lost = f"the worker {address} is lost: its {number} trials go to others"
+        lost = f"the worker {address} is lost: its {len(task.specs)} trials go to others"
         next(iter(self.meters.values())).notes.append(lost)

@@ -12,10 +12,12 @@ from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import ProviderDown, TrialSuspended
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Wait
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.meter import Meter
 from merge_runner.records import SIDES, ChatReply, Slot, TrialRecord, TrialSpec
+from merge_runner.run.clients import sealed_clients
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.plan import Plan
 from merge_runner.study.crossing import Arm
@@ -46,6 +48,14 @@ class LocalRunner:
     _gate: asyncio.Semaphore = field(default_factory=partial(asyncio.Semaphore, A_FEW))
     # Keyed by model and its number of answered calls, so that an answer starts a new count.
     _failures_in_a_row: Counter[tuple[str, int]] = field(default_factory=Counter)
+
+    @classmethod
+    def sealed(cls, plan: Plan, cache: ResponseCache, in_flight: int = 1) -> LocalRunner:
+        """Return one that plays from recorded replies alone.
+
+        They come at once: more trials in flight would only wait for each other.
+        """
+        return cls(plan, sealed_clients(plan, cache), in_flight)
 
     @cached_property
     def arms(self) -> Mapping[str, Arm]:

@@ -43,7 +43,6 @@ from merge_runner.run.clients import (
     earlier_answers,
     live_clients,
     open_rounds,
-    sealed_clients,
 )
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, estimate
@@ -67,14 +66,12 @@ FROM_PROGRAMS = 16
 class Outcome:
     """What a run of a plan did.
 
-    ``stored_before`` trials were not played because they were stored already; ``suspended`` ones
-    wait for money, and their replies are in the cache. ``meter`` counts the calls of this run,
-    ``spending`` is that of the sweep over all its runs, and ``cache_cost_usd`` that of
-    all sweeps on the cache. ``facts`` summarises what the database holds of the sweep,
-    and ``audit`` the checks made there; both are None where nothing is stored, or its user
-    gave up waiting for the database. ``batches`` are those that go on without this run.
-    ``playing_s`` is how long the trials took, ``worst_stall_s`` the longest delay of the event
-    loop.
+    ``stored_before`` trials were stored already; ``suspended`` ones wait for money. ``meter``
+    counts the calls of this run, ``spending`` is that of the sweep over all its runs, and
+    ``cache_cost_usd`` that of all sweeps on the cache. ``facts`` and ``audit`` are of what the
+    database holds of the sweep; None where nothing is stored, or its user gave up waiting for it.
+    ``batches`` go on without this run. ``playing_s`` is how long the trials took,
+    ``worst_stall_s`` the longest delay of the event loop.
     """
 
     plan: Plan
@@ -179,7 +176,7 @@ class Sweep:
         """
         trials: Counter[str] = Counter()
         calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in self._arms.items()}
-        runner = self._sealed_runner()
+        runner = LocalRunner.sealed(self._plan, self._cache)
         for spec in [*self._stored, *self._todo] if whole else self._todo:
             arm = self._arms[spec.arm]
             record = await runner.play_one(spec) if arm.entries and not whole else None
@@ -212,13 +209,9 @@ class Sweep:
     def _store(self) -> Store:
         return Store(self._options.db)
 
-    def _sealed_runner(self, in_flight: int = 1) -> LocalRunner:
-        # Recorded replies come at once: more trials in flight would only wait for each other.
-        return LocalRunner(self._plan, sealed_clients(self._plan, self._cache), in_flight)
-
     async def _nothing_is_recorded(self) -> bool:
         """Whether all calls are missing, of which the first of each trial are noted."""
-        runner = self._sealed_runner()
+        runner = LocalRunner.sealed(self._plan, self._cache)
         for spec in self._todo:
             self._note_misses(await runner.play_one(spec))
             if any(meter.calls_cached for meter in runner.meters.values()):
@@ -261,7 +254,8 @@ class Sweep:
         """What plays the trials: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if options.sends_nothing or not plan.entries:
-            return self._sealed_runner(1 if plan.entries else min(options.in_flight, FROM_PROGRAMS))
+            in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
+            return LocalRunner.sealed(plan, self._cache, in_flight)
         earlier = earlier_answers(plan, self._cache)
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
         first = FirstDecisions()
@@ -373,7 +367,7 @@ class Sweep:
             )
         while flusher.dropped:
             again, flusher.dropped = flusher.dropped[:BATCH], flusher.dropped[BATCH:]
-            runner = self._sealed_runner()
+            runner = LocalRunner.sealed(self._plan, self._cache)
             for spec in again:
                 flusher.add(await runner.play_one(spec))
             await flusher.close()
