@@ -29,7 +29,7 @@ from merge_runner.text_safety import printable
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from merge_runner.run.dask_tasks import DaskTasks
+    from merge_runner.run.cluster import DaskTasks
     from merge_runner.run.local_runner import LocalRunner
 
 LIVE_EVERY_S = 0.25
