@@ -278,13 +278,14 @@ async def _check(plan: Plan, prepared: Sweep, *, may_spend: bool) -> None:
 
 async def _played(prepared: Sweep, options: Options) -> StudyOutcome:
     outcome = await prepared.run()
+    facts = summary.as_dict(outcome, options, None)
     return StudyOutcome(
         exit_code=outcome.exit_code,
         messages=outcome.messages,
-        facts=summary.as_dict(outcome, options, None),
+        facts=facts,
         db=options.db,
         sweep_id=outcome.sweep_id,
-        text="\n".join(summary.as_lines(outcome, options, None)),
+        text="\n".join(summary.as_lines(outcome, facts)),
     )
 
 

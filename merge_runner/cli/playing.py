@@ -60,12 +60,11 @@ def _run(plan: Plan, options: Options, *, yes: bool, as_json: bool) -> int:
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
         return INTERRUPTED
+    facts = summary.as_dict(outcome, options, expected)
     if as_json:
-        whole = summary.as_dict(outcome, options, expected)
-        print_out(json.dumps(whole, ensure_ascii=False))
+        print_out(json.dumps(facts, ensure_ascii=False))
     else:
-        for line in summary.as_lines(outcome, options, expected):
-            print_out(line)
+        print_out("\n".join(summary.as_lines(outcome, facts)))
     for message in outcome.messages:
         say(f"error: {message}")
     return outcome.exit_code
