@@ -8,11 +8,12 @@ from typing import Annotated
 
 import typer
 
-from merge_runner.cli.options import CacheOption, DbOption
+from merge_runner.cli.options import CacheOption, DbOption, JsonOption, option
 from merge_runner.cli.output import print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 
+SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
 
 recording_app = typer.Typer(
@@ -25,14 +26,7 @@ def recording_export(
     file: RecordingFile,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
-    sweeps: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--sweep",
-            metavar="ID",
-            help="A sweep_id, which may be repeated; the newest sweep if none is given.",
-        ),
-    ] = None,
+    sweeps: Annotated[list[str] | None, option("ID", SWEEP, "--sweep")] = None,
 ) -> None:
     """Write what sweeps asked and were answered into one file."""
     from merge_runner.llm.cache import ResponseCache
@@ -75,7 +69,7 @@ def recording_verify(file: RecordingFile) -> None:
 @recording_app.command("info")
 def recording_info(
     file: RecordingFile,
-    as_json: Annotated[bool, typer.Option("--json", help="The same.", show_default=False)] = True,
+    as_json: JsonOption = True,
 ) -> None:
     """Verify a recording and print what it holds, as JSON."""
     from dataclasses import asdict

@@ -1,10 +1,12 @@
-"""The commands that play a study."""
+"""The commands that play a study, or say what that would take."""
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
+from datetime import UTC, datetime
 from functools import wraps
 from math import isfinite
 from pathlib import Path
@@ -22,20 +24,31 @@ from merge_runner.cli.options import (
     RepsOption,
     TrustOption,
     VariantsOption,
+    YesOption,
+    flag,
     levels,
     listed,
+    option,
 )
-from merge_runner.cli.output import print_out, say
-from merge_runner.cli.playing import play
+from merge_runner.cli.output import agree, print_out, say
 from merge_runner.cli.stand_in import FaultRateOption, FaultsOption, SeedOption, faults_of
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 
 if TYPE_CHECKING:
-    from merge_runner.run.plan import Plan
+    from merge_runner.run.plan import Options, Plan
+    from merge_runner.run.sweep import Outcome
 
 # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
 GOES_ON = (0, 1, 4)
+GRID = (
+    "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
+    "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
+)
+DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
+BATCH = "Ask in the provider's batches, a decision of all trials a round, at a lower price."
+REHEARSE = "The emulator answers in the model's place, ten times as fast: no key, no cost."
+RECORDING = "Also replay from this file, without importing it; may be repeated."
 
 
 def init(
@@ -64,127 +77,59 @@ def sweep(
             help="experiments/NAME.toml, or a path. Several are played one after the other.",
         ),
     ],
-    first: Annotated[
-        bool,
-        typer.Option("--first", help="Only the first decision of both sides, without the trial."),
-    ] = False,
-    grid: Annotated[
-        str | None,
-        typer.Option(
-            metavar="GRID",
-            help="With --first, in the place of the study's conditions: "
-            "h=FROM:TO:STEP,dv=FROM:TO:STEP, projected headways in m and relative velocities in "
-            "m/s; usual: -6:6:2 and -1.6:1.6:0.4.",
-        ),
-    ] = None,
+    first: Annotated[bool, flag("--first", "Only the first decision of both sides.")] = False,
+    grid: Annotated[str | None, option("GRID", GRID)] = None,
     model: ModelOption = None,
     only: OnlyOption = None,
-    mirror: Annotated[
-        bool,
-        typer.Option(
-            "--mirror",
-            help="Also play two different drivers with their sides changed, as LEFT+RIGHT.",
-        ),
-    ] = False,
+    mirror: Annotated[bool, flag("--mirror", "Also play two drivers with sides changed.")] = False,
     reps: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
-    sample_set: Annotated[
-        int, typer.Option(metavar="N", help="Another number draws a fresh set of samples.")
-    ] = 0,
-    order_seed: Annotated[
-        int, typer.Option(metavar="N", help="Another number draws another order.")
-    ] = 0,
+    sample_set: Annotated[int, option("N", "Another number draws a fresh set of samples.")] = 0,
+    order_seed: Annotated[int, option("N", "Another number draws another order.")] = 0,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
-    in_flight: Annotated[
-        int, typer.Option(metavar="N", help="Trials at once, over all workers.", min=1)
-    ] = 200,
-    rpm: Annotated[int | None, typer.Option(metavar="N", help="Requests a minute.", min=1)] = None,
-    tpm: Annotated[int | None, typer.Option(metavar="N", help="Tokens a minute.", min=1)] = None,
-    max_cost: Annotated[
+    in_flight: Annotated[int, option("N", "Trials at once, over all workers.", min=1)] = 200,
+    rpm: Annotated[int | None, option("N", "Requests a minute.", min=1)] = None,
+    tpm: Annotated[int | None, option("N", "Tokens a minute.", min=1)] = None,
+    max_cost_usd: Annotated[
         float | None,
-        typer.Option(metavar="USD", help="Never spend more on this, over all its runs.", min=0),
+        option("USD", "Never spend more on this, over all its runs.", "--max-cost", min=0),
     ] = None,
-    dask: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CLUSTER",
-            help="Play on a Dask cluster: local:N, a scheduler's address, or its file.",
-        ),
-    ] = None,
-    batch: Annotated[
-        bool,
-        typer.Option(
-            "--batch",
-            help="Ask in the provider's batches, one decision of all trials a round, at a lower "
-            "price.",
-        ),
-    ] = False,
+    dask: Annotated[str | None, option("CLUSTER", DASK)] = None,
+    batch: Annotated[bool, flag("--batch", BATCH)] = False,
     strict_model: Annotated[
-        bool, typer.Option("--strict-model", help="Stop when another model answers.")
+        bool, flag("--strict-model", "Stop when another model answers.")
     ] = False,
     keep_going: Annotated[
-        bool, typer.Option("--keep-going", help="Go on with a model that gives no valid decision.")
+        bool, flag("--keep-going", "Go on with a model that gives no valid decision.")
     ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only estimate.")] = False,
-    rehearse: Annotated[
-        bool,
-        typer.Option(
-            "--rehearse",
-            help="The emulator answers in the model's place, ten times as fast: no key, no cost.",
-        ),
-    ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before spending.")] = False,
+    dry_run: Annotated[bool, flag("--dry-run", "Only estimate.")] = False,
+    rehearse: Annotated[bool, flag("--rehearse", REHEARSE)] = False,
+    yes: YesOption = False,
     trust: TrustOption = False,
-    replay: Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")] = False,
-    recording: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also replay from this file, without importing it; may be repeated.",
-        ),
-    ] = None,
+    replay: Annotated[bool, flag("--replay", "From recorded replies alone.")] = False,
+    recordings: Annotated[list[Path] | None, option("FILE", RECORDING, "--recording")] = None,
     fault_rate: FaultRateOption = 0.0,
     faults: FaultsOption = None,
     seed: SeedOption = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
+    quiet: Annotated[bool, flag("--quiet", "Show no progress.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of one or more sweeps that are not stored yet."""
+    given = {name: value for name, value in locals().items() if value is not None}
     from merge_runner.run.plan import Options, make_plan
-    from merge_runner.run.seat import first_situations, grid_conditions
 
-    for refused, advice in (
-        (not isfinite(max_cost or 0), "--max-cost is a number of USD"),
-        (
-            recording and not replay,
-            "--recording goes with a replay; to keep its replies: recording import",
-        ),
-        (dask is not None and replay, "a replay needs no cluster: leave --dask out"),
-        (grid is not None and not first, "--grid goes with --first"),
-        (
-            None not in (grid, conditions),
-            "--grid takes the place of --conditions: give one of them",
-        ),
-    ):
-        if refused:
-            raise UsageError(advice)
+    if not isfinite(max_cost_usd or 0):
+        raise UsageError("--max-cost is a number of USD")
+    if recordings and not replay:
+        raise UsageError("--recording goes with a replay; to keep its replies: recording import")
+    if replay and dask:
+        raise UsageError("a replay needs no cluster: leave --dask out")
+    named = {each.name for each in fields(Options)} & given.keys() - {"faults", "dry_run"}
     options = Options(
-        db=db,
-        cache=cache,
-        in_flight=in_flight,
-        rpm=rpm,
-        tpm=tpm,
-        max_cost_usd=max_cost,
-        replay=replay,
-        recordings=recording or (),
+        **{name: given[name] for name in named},
         faults=faults_of(fault_rate, faults, seed),
-        strict_model=strict_model,
-        keep_going=keep_going,
-        quiet=quiet,
-        dask=dask,
-        batch=batch,
     )
 
     def planned(name: str) -> Plan:
@@ -192,22 +137,24 @@ def sweep(
             name,
             model or (),
             reps,
-            listed(conditions) if grid is None else grid_conditions(grid),
+            listed(conditions),
             listed(variants),
             sample_set=sample_set,
             order_seed=order_seed,
             only=levels(only or (), "--only"),
             mirror=mirror,
+            first=first,
+            grid=grid,
             db=db,
             trust=trust,
         )
         if dask is not None and plan.replays_humans:
             raise UsageError("human trials are replayed in this process: leave --dask out")
-        return first_situations(plan) if first else plan
+        return plan
 
     if len(studies) > 1:  # all are looked at before the first one is played
         ledgers = [planned(name).ledger for name in studies]
-        options = replace(options, ledgers=() if max_cost is None else ledgers)
+        options = replace(options, ledgers=() if max_cost_usd is None else ledgers)
     whole = any(part is not None for part in (reps, grid, conditions, variants))
     codes = []
     for name in studies:
@@ -218,7 +165,7 @@ def sweep(
             from merge_runner.run.rehearsal import rehearsed
 
             plan, own = rehearsed(plan, options, home_of(name))
-        codes.append(play(plan, own, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
+        codes.append(_play(plan, own, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
         if codes[-1] not in GOES_ON:
             break
     sys.exit(next(filter(None, codes), 0))
@@ -228,3 +175,57 @@ def sweep(
 def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
     """Play a sweep from recorded replies alone: no key, no network."""
     sweep(**{**options, "replay": True})
+
+
+def _play(
+    plan: Plan, options: Options, *, whole: bool, dry_run: bool, yes: bool, as_json: bool
+) -> int:
+    """Play a plan, or print what that would take; return the exit code.
+
+    A replay that is not ``whole`` plays what it can.
+    """
+    import asyncio
+
+    from merge_runner.llm.models import shutdown_notes
+    from merge_runner.run import summary
+    from merge_runner.run.sweep import INTERRUPTED, open_sweep, unsent
+
+    if plan.is_rehearsal:
+        say(f"REHEARSAL: the emulator answers as {plan.driver}; nobody else is asked, or charges")
+    if options.replay:
+        from merge_runner.run.recorded_plan import replayed
+
+        plan, options, notes = replayed(plan, options, whole=whole)
+    else:
+        asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
+        notes = [*shutdown_notes(asked, datetime.now(UTC).date())]
+        options = plan.within_budget(options)
+    for note in notes:
+        say(note)
+    expected = None
+    if dry_run or not (options.replay or plan.is_free):
+        expected = asyncio.run(unsent(plan, options, say=say))
+        lines = "\n".join(summary.estimate_lines(expected))
+        if dry_run:
+            print_out(json.dumps(asdict(expected)) if as_json else f"{lines}\nNothing was sent.")
+            return 0
+        if expected.trials:
+            agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
+
+    async def run() -> Outcome:
+        async with open_sweep(plan, options, say=say) as sweep:
+            return await sweep.run()
+
+    try:
+        outcome = asyncio.run(run())
+    except KeyboardInterrupt:  # before the trials began or after they ended
+        say("interrupted: run the same command again to go on")
+        return INTERRUPTED
+    facts = summary.as_dict(outcome, options, expected)
+    if as_json:
+        print_out(json.dumps(facts, ensure_ascii=False))
+    else:
+        print_out("\n".join(summary.as_lines(outcome, facts)))
+    for message in outcome.messages:
+        say(f"error: {message}")
+    return outcome.exit_code

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
+from decimal import Decimal
+from itertools import chain, product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import (
     BaseModel,
@@ -18,8 +21,6 @@ from pydantic import (
     Field,
     PlainSerializer,
     computed_field,
-    field_serializer,
-    model_validator,
 )
 
 from merge_runner.config import (
@@ -30,6 +31,7 @@ from merge_runner.config import (
     both_sides,
     endpoint_identity,
     pair_name,
+    validated,
 )
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, HumanTrials, Program
@@ -45,14 +47,15 @@ from merge_runner.scenarios.merge.conditions import (
     CONDITIONS,
     HUMAN_CONDITIONS,
     MEAN_SPEED_MPS,
+    NUMBER,
+    Condition,
+    condition_name,
 )
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.crossing import (
     OPPONENT,
-    PERCEPTION,
     PROMPT,
-    SET_BY,
     Arm,
     chosen_models,
     cross,
@@ -69,6 +72,12 @@ from merge_runner.study.file import (
 from merge_runner.study.parts import load_study
 from merge_runner.text_safety import in_a_name
 
+USUAL_GRID = "h=-6:6:2,dv=-1.6:1.6:0.4"
+"""Projected headways in m and relative velocities in m/s, left minus right: FROM:TO:STEP."""
+MOST_VALUES = 100  # of an axis
+_AXIS = re.compile(
+    f"(?P<name>h|dv)=(?P<first>{NUMBER})(:(?P<last>{NUMBER}):(?P<step>{NUMBER}))?", re.ASCII
+)
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 _PROMPTS_PER_DRIVER = 10.5
 DRIVERS_SHOWN = 3
@@ -137,39 +146,22 @@ class Plan(BaseModel):
     language models of all arms by what an arm's ``asked`` calls them, and ``endpoints`` the
     identities of their endpoints (see ``config.Endpoint``). ``mirror``: its pairs are played both
     ways round whatever its file says. ``seat`` is ``first`` where only the first situations are
-    asked (see ``run.seat``), and empty in a sweep.
+    asked (see ``first_situations``), and empty in a sweep.
     """
 
-    model_config = ConfigDict(frozen=True, serialize_by_alias=True)
+    model_config = ConfigDict(frozen=True, serialize_by_alias=True, validate_by_name=True)
 
     name: str
     study: Annotated[StudySource, BeforeValidator(_study_of), PlainSerializer(_stored_study)]
     drivers: tuple[str, ...]
     arms: tuple[Arm, ...]
-    entries: dict[str, ModelEntry] = Field(serialization_alias="models")
+    entries: dict[str, ModelEntry] = Field(validation_alias="models", serialization_alias="models")
     endpoints: dict[str, str]
     conditions: tuple[str, ...]
     sample_set: int
     order_seed: int
     seat: Literal["", "first"] = ""
     mirror: bool = False
-
-    @model_validator(mode="before")
-    @classmethod
-    def _give_arms_their_entries(cls, stored: Any) -> Any:  # noqa: ANN401 # anything that is stored
-        """Read a stored plan, where an arm names its models and holds none."""
-        if not isinstance(stored, dict) or "models" not in stored:
-            return stored
-        entries = stored["models"]
-        arms = [
-            {**arm, "entries": {n: entries[n] for n in arm["asked"].values() if n in entries}}
-            for arm in stored["arms"]
-        ]
-        return {**stored, "entries": entries, "arms": arms}
-
-    @field_serializer("arms")
-    def _arms_without_entries(self, arms: tuple[Arm, ...]) -> list[dict[str, object]]:
-        return [asdict(replace(arm, entries={})) for arm in arms]
 
     @computed_field  # type: ignore[prop-decorator] # https://github.com/python/mypy/issues/14461
     @property
@@ -194,11 +186,6 @@ class Plan(BaseModel):
     def registered(self) -> dict[str, str]:
         """The names in the registry of the models of ``entries``, whatever their parameters."""
         return {arm.asked[side]: arm.sides[side] for arm in self.arms for side in SIDES}
-
-    @property
-    def scenario(self) -> ScenarioConfig:
-        """The first arm's."""
-        return self.arms[0].scenario
 
     @computed_field  # type: ignore[prop-decorator] # as above
     @property
@@ -241,6 +228,11 @@ class Plan(BaseModel):
         return any(map(_is_scripted, self.arms))
 
     @property
+    def is_free(self) -> bool:
+        """Whether nobody charges for its calls."""
+        return all(entry.price == "free" for entry in self.entries.values())
+
+    @property
     def is_rehearsal(self) -> bool:
         """Whether the emulator takes the place of the providers."""
         return REHEARSAL in self.endpoints.values()
@@ -263,32 +255,6 @@ class Plan(BaseModel):
         if options.max_cost_usd is not None:
             return options
         return replace(options, max_cost_usd=self.study.file.budget.total_usd)
-
-    def notes(self) -> Iterator[str]:
-        """What a user may have meant otherwise."""
-        if self.is_rehearsal:
-            yield (
-                f"REHEARSAL: the emulator answers as {self.driver}, ten times as fast as the "
-                "model; nothing is sent to the provider, and nobody charges"
-            )
-        prompts = self.study.file.prompts
-        used = {*self.repetitions, *(prompt.based_on for prompt in prompts.values())}
-        if unused := [name for name in prompts if name not in used]:
-            yield f"note: not played, though {self.study.path} has them: {', '.join(unused)}"
-        yield from dict.fromkeys(filter(None, map(self._finer_world, self.arms)))
-        levels = {str(each) for name in SET_BY for each in self.study.file.factors.get(name, ())}
-        if unused := [name for name in self.study.file.perception if name not in levels]:
-            yield (
-                f"note: no level of the factor {PERCEPTION}, though {self.study.path} has them: "
-                + ", ".join(unused)
-            )
-
-    def _finer_world(self, arm: Arm) -> str:
-        """A note where the drivers of an arm need a finer world than the study's own."""
-        step_s = arm.scenario.step_s
-        if step_s == self.study.file.scenario.step_s or "step_s" in arm.factors:
-            return ""
-        return f"note: {arm.model} is driven in steps of {step_s:g} s, as its drivers need"
 
     @property
     def capped_by(self) -> str:
@@ -341,15 +307,17 @@ class Plan(BaseModel):
             for arm in self.arms
             for name in self.conditions
         }
-        cells = [
-            (repetition, arm, condition)
-            for repetition in range(1, max(arm.repetitions for arm in self.arms) + 1)
-            for arm in self.arms
-            if repetition <= arm.repetitions
-            for condition in self.conditions
-        ]
-        cells.sort(
-            key=lambda cell: (cell[0], _lot(self.order_seed, cell[0], cell[1].label, cell[2]))
+        cells = sorted(
+            (
+                (repetition, arm, condition)
+                for arm in self.arms
+                for repetition in range(1, arm.repetitions + 1)
+                for condition in self.conditions
+            ),
+            key=lambda cell: (
+                cell[0],
+                _shuffle_key(self.order_seed, cell[0], cell[1].label, cell[2]),
+            ),
         )
         return [
             TrialSpec(
@@ -410,8 +378,8 @@ def _is_scripted(arm: Arm) -> bool:
     return any(entry.provider == "emulator" for entry in arm.entries.values())
 
 
-def _lot(*what: object) -> str:
-    """A sort key that orders trials randomly, but the same way on every machine."""
+def _shuffle_key(*what: object) -> str:
+    """A key that orders trials randomly, but the same way on every machine."""
     return hashlib.sha256("/".join(map(str, what)).encode()).hexdigest()
 
 
@@ -427,13 +395,22 @@ def make_plan(
     only: Mapping[str, Sequence[str]] | None = None,
     db: Path | None = None,
     mirror: bool = False,
+    first: bool = False,
+    grid: str | None = None,
     trust: bool = False,
 ) -> Plan:
     """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
+    ``first``: only the first situations, in the conditions or on a ``grid`` (``grid_conditions``).
     Uses the study's catalogue (``study.parts.load_study``, which ``trust`` is for), and the human
     trials of ``db`` where they are to be replayed. Raises UsageError.
     """
+    if grid is not None:
+        if conditions is not None or not first:
+            raise UsageError(
+                "a grid takes the place of the conditions, and goes with --first alone"
+            )
+        conditions = grid_conditions(grid)
     asked = (models,) if isinstance(models, str) else tuple(models)
     study = load_study(sweep, asked, trust=trust)
     registry = load_models(study.path.parent)
@@ -445,11 +422,9 @@ def make_plan(
     arms = cross(
         study.file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
     )
-    if db is not None:
-        _read_humans(arms, db)
-    _check_conditions(names, arms)
+    _check_arms(arms, names, db)
     entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
-    return Plan(
+    plan = Plan(
         name=study.name,
         study=study,
         drivers=drivers,
@@ -461,6 +436,63 @@ def make_plan(
         order_seed=order_seed,
         mirror=mirror,
     )
+    return first_situations(plan) if first else plan
+
+
+def first_situations(plan: Plan) -> Plan:
+    """The plan that asks what a sweep by the other plan asks first, and nothing more.
+
+    To ask is to play a trial whose time is up before its drivers would decide again. It is planned,
+    played, kept and checked as any other trial; its calls have the texts and the slots, and so the
+    keys, of the first decisions of the study's sweep. Its source is ``seat``, which tables of
+    trials that were driven to their end leave out (``analysis.data.load.TRIALS``).
+
+    Raises UsageError where both drivers cannot be asked at once.
+    """
+    arms = []
+    for arm in plan.arms:
+        given = arm.scenario.model_dump(exclude_unset=True)
+        given["timeout_s"] = 1 / arm.scenario.prompt_rate_hz
+        arms.append(replace(arm, scenario=validated(ScenarioConfig, given, "scenario")))
+        for condition in plan.conditions:
+            world = World(arm.scenario, CONDITIONS[condition], TRACK)
+            if not all(map(world.in_control, SIDES)):
+                raise UsageError(
+                    f"{condition}: a vehicle is in its tunnel yet when the first driver decides. "
+                    'First situations need control_start = "both_exits"'
+                )
+    changes = {"name": f"{plan.study.name}-first", "arms": tuple(arms), "seat": "first"}
+    return plan.model_copy(update=changes)
+
+
+def grid_conditions(text: str) -> list[str]:
+    """The names of the conditions of a grid such as USUAL_GRID, or ``usual``.
+
+    ``h`` or ``dv`` may be one number, or be left out for that of the usual grid. Raises UsageError.
+    """
+    axes = dict(map(_axis, USUAL_GRID.split(",")))
+    given = list(map(_axis, [] if text == "usual" else text.split(",")))
+    if len({name for name, _ in given}) < len(given):
+        raise UsageError(f"--grid: {text!r} has an axis twice; write it once, as FROM:TO:STEP")
+    names = []
+    for headway_m, velocity_mps in product(*(axes | dict(given)).values()):
+        Condition(headway_m, velocity_mps)  # raises where a vehicle would not drive forwards
+        names.append(condition_name(headway_m, velocity_mps))
+    return names
+
+
+def _axis(text: str) -> tuple[str, list[float]]:
+    """Name and values of a part of a grid, computed in decimals: 3 * 0.4 is 1.2."""
+    if axis := _AXIS.fullmatch(text.strip()):
+        first = Decimal(axis["first"])
+        last, step = Decimal(axis["last"] or first), Decimal(axis["step"] or 1)
+        if step > 0 and 0 <= (last - first) / step < MOST_VALUES:
+            count = int((last - first) / step) + 1
+            return axis["name"], [float(first + i * step) for i in range(count)]
+    raise UsageError(
+        f"--grid: {text!r} is no axis of 1 to {MOST_VALUES} values; write --grid usual, or --grid "
+        f"{USUAL_GRID}: FROM:TO:STEP or one number for each, with at most four decimals"
+    )
 
 
 def _replayed(arm: Arm) -> list[tuple[Program, HumanTrials]]:
@@ -469,35 +501,29 @@ def _replayed(arm: Arm) -> list[tuple[Program, HumanTrials]]:
     return [(program, program.data) for program in programs if program.data is not None]
 
 
-def _read_humans(arms: Iterable[Arm], db: Path) -> None:
-    """Read the human trials of a database where a program replays them."""
-    if replayed := {humans for arm in arms for _, humans in _replayed(arm)}:
+def _check_arms(arms: Sequence[Arm], conditions: Sequence[str], db: Path | None) -> None:
+    """Read the human trials of a database where programs replay them, and check all crossings.
+
+    Raises UsageError for a condition that an arm cannot be played in.
+    """
+    replayed = {humans for arm in arms for _, humans in _replayed(arm)}
+    if replayed and db is not None:
         with read_database(db) if db.is_file() else nullcontext() as connection:
             for humans in replayed:
                 humans.read(connection)
+    for arm, name in product(arms, conditions):
+        World(arm.scenario, CONDITIONS.require(name), TRACK)
+        for program, humans in _replayed(arm):
+            humans.check(program, arm.scenario, name, arm.repetitions)
 
 
 def _conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
     wanted = next(c for c in (chosen, file.conditions, HUMAN_CONDITIONS) if c is not None)
-    conditions = tuple(
-        dict.fromkeys(
-            name
-            for each in wanted
-            for name in (HUMAN_CONDITIONS if each == EVERY_CONDITION else (each,))
-        )
-    )
+    names = (HUMAN_CONDITIONS if each == EVERY_CONDITION else (each,) for each in wanted)
+    conditions = tuple(dict.fromkeys(chain.from_iterable(names)))
     if not conditions:
         raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
     return conditions
-
-
-def _check_conditions(conditions: Sequence[str], arms: Sequence[Arm]) -> None:
-    """Raise UsageError for a condition that an arm cannot be played in."""
-    for name in conditions:
-        for arm in arms:
-            World(arm.scenario, CONDITIONS.require(name), TRACK)
-            for program, humans in _replayed(arm):
-                humans.check(program, arm.scenario, name, arm.repetitions)
 
 
 def _repetitions(
@@ -506,20 +532,11 @@ def _repetitions(
     """The wanted prompts with their repetitions per condition; raises UsageError."""
     if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
-    given = dict(study.file.repetitions)
-    for_all = given.pop(EVERY_PROMPT, None)
-    listed = file_prompts(study.file)
-    for variant in (*given, *listed, *(variants or ())):
-        blocks_of(variant)
-    for name in given:
-        if name not in {*listed, *(variants or ())}:
-            raise UsageError(
-                f"{study.path} has repetitions for {name}, which is never played: name it in the "
-                f"factor {PROMPT}, which has {', '.join(listed)}"
-            )
+    given = study.file.repetitions
     wanted: dict[str, int] = {}
-    for variant in listed if variants is None else variants:
-        repetitions = chosen or given.get(variant, for_all)
+    for variant in file_prompts(study.file) if variants is None else variants:
+        blocks_of(variant)  # raises where there is none
+        repetitions = chosen or given.get(variant, given.get(EVERY_PROMPT))
         if repetitions is None:
             raise UsageError(
                 f"the sweep {study.name} has no variant {variant}; it has {', '.join(given)}. "

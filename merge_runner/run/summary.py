@@ -234,3 +234,28 @@ def _first(lines: Sequence[str], others: str) -> Iterator[str]:
     yield from lines[:SHOWN]
     if len(lines) > SHOWN:
         yield f"... and {len(lines) - SHOWN} {others}"
+
+
+def estimate_lines(expected: Estimate) -> Iterator[str]:
+    """What a run will take, for a reader."""
+
+    def about(cost_usd: float | None) -> str:
+        return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
+
+    measured = ", as measured before" if expected.measured else ""
+    singly = ", asked singly" if expected.batch is not None else ""
+    tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
+    yield f"driver  {expected.driver}"
+    yield f"trials  {expected.trials} that have not ended yet"
+    yield f"calls   about {expected.calls} that are not recorded yet"
+    yield f"tokens  {tokens}"
+    yield f"cost    {about(expected.cost_usd)}{singly}"
+    yield f"time    about {expected.minutes} minutes{singly}"
+    if (batch := expected.batch) is not None:
+        yield (
+            f"batch   {about(batch.cost_usd)} in about {batch.rounds} rounds, at most "
+            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour; "
+            "after two the rest is asked singly"
+        )
+    if expected.trials_within_cap is not None:
+        yield f"cap     buys about {expected.trials_within_cap} trials"

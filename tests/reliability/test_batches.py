@@ -16,8 +16,7 @@ import pytest
 
 from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
-from merge_runner.run.plan import Options, make_plan
-from merge_runner.run.seat import first_situations
+from merge_runner.run.plan import Options, first_situations, make_plan
 from tests.harness import FAST, PROJECT, run_sweep, watched
 
 KILLS = 20
