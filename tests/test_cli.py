@@ -127,8 +127,6 @@ async def test_a_quiet_sweep_shows_no_progress(merge_runner):
     ("typed", "completed"),
     [
         ("sw", "sweep"),
-        ("sweep base", "baseline"),
-        ("sweep baseline --model human-o", "human-odds"),
         ("sweep baseline --ord", "--order-seed"),
         ("tables indi", "indicators"),
     ],

@@ -37,13 +37,6 @@ def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> 
     return homes.pop() / path
 
 
-def _drivers() -> list[str]:
-    from merge_runner.drivers.registry import PROGRAMS
-    from merge_runner.llm.models import load_models
-
-    return [*load_models(), *PROGRAMS]
-
-
 DB = "The results database; that of a study's file lies beside it."
 CACHE = "The folder of recorded replies; that of a study's file lies beside it."
 DbOption = Annotated[Path, option("FILE", DB, "--db", callback=beside_study)]
@@ -55,7 +48,6 @@ ModelOption = Annotated[
         "A model of the registry, a program, or LEFT+RIGHT; may be repeated. Else those of the "
         "study's file, or the emulator.",
         "--model",
-        autocompletion=_drivers,
     ),
 ]
 OnlyOption = Annotated[

@@ -62,18 +62,11 @@ def init(
     print_out(f"go on: cd {shlex.quote(str(folder))} && merge-runner sweep study.toml")
 
 
-def _studies() -> list[str]:
-    from merge_runner.study.file import study_files
-
-    return sorted(study_files())
-
-
 def sweep(
     studies: Annotated[
         list[str],
         typer.Argument(
             metavar="NAME...",
-            autocompletion=_studies,
             help="experiments/NAME.toml, or a path. Several are played one after the other.",
         ),
     ],

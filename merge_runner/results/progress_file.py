@@ -15,7 +15,6 @@ from urllib.parse import quote
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
-EVERY_S = 1.0
 # While a sweep checks what it stored, the file is silent: only its process shows that it lives.
 STALE_S = {"playing": 10.0, "checking": 600.0}
 MOST_BYTES = 1_000_000
@@ -26,8 +25,8 @@ MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 class Standing(BaseModel):
     """Snapshot of a sweep, for its display and for other processes.
 
-    ``ended`` trials have an outcome, those that were ``stored_before`` this run among them. The
-    rates are those of the last minute. ``committed_usd`` counts against ``cap_usd``, over all runs.
+    ``ended`` trials have an outcome, those that were ``stored_before`` this run among them.
+    ``committed_usd`` counts against ``cap_usd``, over all runs.
     ``left_s`` is the estimated time left, None while there is no estimate. ``waiting`` says what
     its calls wait for, ``warnings`` what its user should know.
     """
@@ -50,8 +49,6 @@ class Standing(BaseModel):
     failed: NonNegativeInt
     calls_live: NonNegativeInt
     calls_cached: NonNegativeInt
-    requests_per_min: float
-    tokens_per_min: float
     cost_usd: float
     cap_usd: float | None
     committed_usd: float

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Literal
 from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Ledger
 from merge_runner.results.progress_file import (
-    EVERY_S,
     MACHINE,
     ProgressFile,
     Standing,
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
-PULSE_S = 0.05
+PULSE_S, PULSES = 0.05, 20  # between two writings of the file
 NOTES_SHOWN = 10
 REASONS_SHOWN = 3
 CLOSE_IT = "you may close this: the same command goes on"
@@ -66,8 +65,6 @@ class Progress:
         meters = self.runner.meters.values()
         now = datetime.now(UTC)
         elapsed_s = (now - self.began_at).total_seconds()
-        per_min = 60 / min(60.0, max(elapsed_s, 1.0))
-        rates = [meter.last_minute() for meter in meters]
         failed = self.outcome_counts["failed"]
         ended = self.outcome_counts.total() - self.outcome_counts["suspended"] - failed
         batches = _first(self.batches(), "others")
@@ -88,8 +85,6 @@ class Progress:
             failed=failed,
             calls_live=sum(meter.calls_live for meter in meters),
             calls_cached=sum(meter.calls_cached for meter in meters),
-            requests_per_min=per_min * sum(requests for requests, _ in rates),
-            tokens_per_min=per_min * sum(tokens for _, tokens in rates),
             cost_usd=sum(meter.cost_usd for meter in meters),
             cap_usd=self.cap_usd,
             committed_usd=self.ledger.spending.committed_usd,
@@ -142,12 +137,19 @@ def _first(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[st
 
 @asynccontextmanager
 async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
-    """Keep a sweep's progress file up to date while the body runs; remove the file at the end."""
+    """Keep a sweep's progress file up to date while the body runs; remove the file at the end.
+
+    Also measures how late the event loop wakes a task that sleeps.
+    """
 
     async def publish() -> None:
+        loop = asyncio.get_running_loop()
         while True:
             file.write(progress.standing(file.sweep_id))
-            await asyncio.sleep(EVERY_S)
+            for _ in range(PULSES):
+                due = loop.time() + PULSE_S
+                await asyncio.sleep(PULSE_S)
+                progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
 
     clear_dead(file.db)
     publishing = asyncio.create_task(publish())
@@ -166,26 +168,15 @@ async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[
     """
     stop = asyncio.Event()
     display = asyncio.create_task(_show(progress, stop, quiet=quiet))
-    pulse = asyncio.create_task(_measure_stalls(progress))
     try:
         yield
     finally:
-        pulse.cancel()
         stop.set()
         try:
             await display
         except OSError as exc:
             if exc.errno != errno.EIO:  # that of a terminal that is closed
                 raise
-
-
-async def _measure_stalls(progress: Progress) -> None:
-    """Measure how late the event loop wakes a task that sleeps."""
-    loop = asyncio.get_running_loop()
-    while True:
-        due = loop.time() + PULSE_S
-        await asyncio.sleep(PULSE_S)
-        progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
 
 
 async def _show(progress: Progress, stop: asyncio.Event, *, quiet: bool) -> None:
@@ -230,7 +221,6 @@ def rows_of(now: Standing) -> list[tuple[str, str]]:
         ),
         ("failed", str(now.failed)),
         ("calls", f"{now.calls_live} live, {now.calls_cached} from recordings"),
-        ("rate", f"{now.requests_per_min:.0f} requests/min, {now.tokens_per_min:.0f} tokens/min"),
         ("cost", f"{now.cost_usd:.2f} USD{cap}"),
         *(("waiting", text) for text in now.waiting),
         ("time", f"{elapsed_s:.0f} s{left}"),

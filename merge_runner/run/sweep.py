@@ -51,7 +51,7 @@ from merge_runner.run.estimate import Estimate, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, BATCH_OF_REPLAY, MOST_HELD, Flusher
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.model_names import check_served, recorded_name, served_name
+from merge_runner.run.model_names import recorded_name, served_name
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
@@ -484,8 +484,6 @@ async def open_sweep(
             if not plan.is_rehearsal:
                 for name, entry in plan.entries.items():
                     resolve_endpoint(name, entry)  # raises where its key is missing
-            if options.dask is None:  # workers may see other servers
-                await check_served(plan.entries)
             options = _less_what_is_spent(plan, options, cache, say)
             entries = plan.entries.items()
             cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in entries})
@@ -504,7 +502,7 @@ async def _named(
     for name, entry in entries.items():
         found = model_id(entry)
         if not found and options.sends_nothing:
-            found = recorded_name(name, entry, cache=cache, strict=options.replay)
+            found = recorded_name(entry, cache)
         elif not found:
             found = await served_name(name, entry, say=say)
         named[name] = entry.model_copy(update={"id": found})

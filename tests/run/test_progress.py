@@ -32,7 +32,6 @@ def test_every_figure_is_that_of_the_meters():
     assert fields["failed"] == "1"
     assert fields["WARNING"] == "another model answers: o3 -> gpt-4o"
     assert fields["calls"] == "34 live, 12 from recordings"
-    assert fields["rate"] == "2 requests/min, 150 tokens/min"
     assert fields["cost"] == "1.50 USD, 4.25 of 20 over all runs"
     # 3 of 10 trials have ended but only 46 of 210 calls are made: the larger share tells.
     assert fields["time"] == "60 s, about 140 s left"
