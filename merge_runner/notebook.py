@@ -25,8 +25,7 @@ from merge_runner.run import summary
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
 from merge_runner.run.progress import say
-from merge_runner.run.recorded_plan import replayed
-from merge_runner.run.sweep import open_sweep, unsent
+from merge_runner.run.sweep import unsent
 from merge_runner.study.crossing import level_text
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ def sync(method: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
     return blocking
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class StudyOutcome:
     """What a run did, and its trials as data frames, those that were stored before among them.
 
@@ -63,12 +62,14 @@ class StudyOutcome:
     wrong. ``facts`` is the summary that ``merge-runner sweep --json`` prints.
     """
 
-    exit_code: int
-    messages: list[str]
     facts: dict[str, Any]
-    db: Path
-    sweep_id: str
     text: str
+
+    def __post_init__(self) -> None:
+        self.exit_code: int = self.facts["exit_code"]
+        self.messages: list[str] = self.facts["messages"]
+        self.db = Path(self.facts["db"])
+        self.sweep_id: str = self.facts["sweep_id"]
 
     @property
     def ok(self) -> bool:
@@ -210,25 +211,18 @@ class Study:
         grid: str | None = None,
         **how: Any,  # noqa: ANN401 # Options
     ) -> StudyOutcome:
+        def agree(expected: Estimate) -> None:
+            if not yes:
+                lines = "; ".join(summary.estimate_lines(expected))
+                raise UsageError(f"this run spends money; yes=True goes ahead: {lines}")
+
         if not _playing.acquire(blocking=False):
             raise UsageError("another study is running in this process: wait for its end")
         try:
             plan = self.plan(first=first, grid=grid)
-            options = plan.within_budget(Options(self.db, self.cache, **how))
-            if options.replay:
-                whole = any(self._wanted.get(each) is not None for each in PARTS)
-                plan, options, notes = replayed(plan, options, whole=whole)
-                for note in notes:
-                    say(note)
-            async with open_sweep(plan, options, say=say) as sweep:
-                paid = not (yes or options.replay or plan.is_free)
-                if paid and (expected := await sweep.estimate()).trials:
-                    lines = "; ".join(summary.estimate_lines(expected))
-                    raise UsageError(f"this run spends money; yes=True goes ahead: {lines}")
-                outcome = await sweep.run()
+            options = Options(self.db, self.cache, **how)
+            whole = any(self._wanted.get(each) is not None for each in PARTS)
+            facts, text = await summary.play(plan, options, whole=whole, say=say, agree=agree)
         finally:
             _playing.release()
-        facts = summary.as_dict(outcome, options, None)
-        text = "\n".join(summary.as_lines(outcome, facts))
-        code, messages = outcome.exit_code, outcome.messages
-        return StudyOutcome(code, messages, facts, options.db, outcome.sweep_id, text)
+        return StudyOutcome(facts, text)

@@ -16,8 +16,7 @@ from merge_runner import __version__
 from merge_runner.cli.ledger import ledger
 from merge_runner.cli.options import flag
 from merge_runner.cli.output import print_out, say
-from merge_runner.cli.recording import recording_app
-from merge_runner.cli.results import audit, digest, forget, models, sql
+from merge_runner.cli.results import audit, digest, forget, models, recording_app, sql
 from merge_runner.cli.stand_in import emulate
 from merge_runner.cli.sweep import init, replay, sweep
 from merge_runner.errors import MergeRunnerError, UsageError

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import signal
 import sys
 from dataclasses import asdict, fields, replace
 from datetime import UTC, datetime
@@ -36,8 +37,8 @@ from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 
 if TYPE_CHECKING:
+    from merge_runner.run.estimate import Estimate
     from merge_runner.run.plan import Options, Plan
-    from merge_runner.run.sweep import Outcome
 
 # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
 GOES_ON = (0, 1, 4)
@@ -173,52 +174,39 @@ def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
 def _play(
     plan: Plan, options: Options, *, whole: bool, dry_run: bool, yes: bool, as_json: bool
 ) -> int:
-    """Play a plan, or print what that would take; return the exit code.
-
-    A replay that is not ``whole`` plays what it can.
-    """
+    """Play a plan, or print what that would take; return the exit code."""
     import asyncio
 
     from merge_runner.llm.models import shutdown_notes
     from merge_runner.run import summary
-    from merge_runner.run.sweep import INTERRUPTED, open_sweep, unsent
+    from merge_runner.run.sweep import INTERRUPTED, unsent
 
     if plan.is_rehearsal:
         say(f"REHEARSAL: the emulator answers as {plan.driver}; nobody else is asked, or charges")
-    if options.replay:
-        from merge_runner.run.recorded_plan import replayed
-
-        plan, options, notes = replayed(plan, options, whole=whole)
-    else:
+    if not options.replay:
         asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
-        notes = [*shutdown_notes(asked, datetime.now(UTC).date())]
-        options = plan.within_budget(options)
-    for note in notes:
-        say(note)
-    expected = None
-    if dry_run or not (options.replay or plan.is_free):
-        expected = asyncio.run(unsent(plan, options, say=say))
+        for note in shutdown_notes(asked, datetime.now(UTC).date()):
+            say(note)
+    if dry_run:
+        expected = asyncio.run(unsent(plan, plan.within_budget(options), say=say))
         lines = "\n".join(summary.estimate_lines(expected))
-        if dry_run:
-            print_out(json.dumps(asdict(expected)) if as_json else f"{lines}\nNothing was sent.")
-            return 0
-        if expected.trials:
-            agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
+        print_out(json.dumps(asdict(expected)) if as_json else f"{lines}\nNothing was sent.")
+        return 0
 
-    async def run() -> Outcome:
-        async with open_sweep(plan, options, say=say) as sweep:
-            return await sweep.run()
+    def leave(expected: Estimate) -> None:
+        lines = "\n".join(summary.estimate_lines(expected))
+        by_asyncio = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:  # Ctrl-C is an answer, too
+            agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
+        finally:
+            signal.signal(signal.SIGINT, by_asyncio)
 
     try:
-        outcome = asyncio.run(run())
+        facts, text = asyncio.run(summary.play(plan, options, whole=whole, say=say, agree=leave))
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
         return INTERRUPTED
-    facts = summary.as_dict(outcome, options, expected)
-    if as_json:
-        print_out(json.dumps(facts, ensure_ascii=False))
-    else:
-        print_out("\n".join(summary.as_lines(outcome, facts)))
-    for message in outcome.messages:
+    print_out(json.dumps(facts, ensure_ascii=False) if as_json else text)
+    for message in facts["messages"]:
         say(f"error: {message}")
-    return outcome.exit_code
+    return int(facts["exit_code"])

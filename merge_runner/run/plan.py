@@ -14,14 +14,7 @@ from itertools import chain, product
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PlainSerializer,
-    computed_field,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, computed_field
 
 from merge_runner.config import (
     MOST_REPETITIONS,
@@ -80,7 +73,6 @@ _AXIS = re.compile(
 )
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 _PROMPTS_PER_DRIVER = 10.5
-DRIVERS_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,21 +238,16 @@ class Plan(BaseModel):
     def driver(self) -> str:
         """The drivers with their endpoints; see ``pair_name``."""
         pairs = (pair_name(arm.names, self.endpoints) for arm in self.arms)
-        names = list(dict.fromkeys(pairs))
-        more = f" and {len(names) - DRIVERS_SHOWN} more" if len(names) > DRIVERS_SHOWN else ""
-        return ", ".join(names[:DRIVERS_SHOWN]) + more
+        return ", ".join(dict.fromkeys(pairs))
 
     def within_budget(self, options: Options) -> Options:
         """Return the options with the cap of the study's budget; ``--max-cost`` goes before it."""
-        if options.max_cost_usd is not None:
-            return options
-        return replace(options, max_cost_usd=self.study.file.budget.total_usd)
-
-    @property
-    def capped_by(self) -> str:
-        """Where a user raises what may be spent."""
-        own = self.study.file.budget != BudgetTerms()
-        return f"[budget] of {self.study.path}, or --max-cost," if own else "--max-cost"
+        budget_usd = self.study.file.budget.total_usd
+        return (
+            options
+            if options.max_cost_usd is not None
+            else replace(options, max_cost_usd=budget_usd)
+        )
 
     def by_label(self) -> dict[str, Arm]:
         """The arms by the labels that their trials carry."""
@@ -268,10 +255,8 @@ class Plan(BaseModel):
 
     def with_entries(self, entries: dict[str, ModelEntry]) -> Plan:
         """The same with other entries for the same names, in its arms too."""
-        arms = (
-            replace(arm, entries={name: entries[name] for name in arm.entries}) for arm in self.arms
-        )
-        return self.model_copy(update={"arms": tuple(arms), "entries": entries})
+        arms = tuple(replace(a, entries={n: entries[n] for n in a.entries}) for a in self.arms)
+        return self.model_copy(update={"arms": arms, "entries": entries})
 
     def specs(self) -> dict[str, str]:
         """Spec hash to the canonical JSON that it covers."""
@@ -302,27 +287,10 @@ class Plan(BaseModel):
         Within a repetition the order is random, by the order seed, so that no condition or arm
         always comes first: a service that drifts over hours affects all of them alike.
         """
-        hashes = {
-            (arm.label, name): spec_hash(self.spec(arm, name))
-            for arm in self.arms
-            for name in self.conditions
-        }
-        cells = sorted(
-            (
-                (repetition, arm, condition)
-                for arm in self.arms
-                for repetition in range(1, arm.repetitions + 1)
-                for condition in self.conditions
-            ),
-            key=lambda cell: (
-                cell[0],
-                _shuffle_key(self.order_seed, cell[0], cell[1].label, cell[2]),
-            ),
-        )
-        return [
+        specs = [
             TrialSpec(
                 trial_id=self.trial_id_of(arm, condition, repetition),
-                spec_hash=hashes[arm.label, condition],
+                spec_hash=hashed,
                 source="seat" if self.seat else "llm" if arm.entries else "driver",
                 model_left=arm.sides["left"],
                 model_right=arm.sides["right"],
@@ -330,13 +298,22 @@ class Plan(BaseModel):
                 condition=condition,
                 repetition=repetition,
                 sample_set=self.sample_set,
-                order=order,
+                order=0,
                 scripted=_is_scripted(arm),
                 factors=tuple(arm.factors.items()),
                 arm=arm.label,
             )
-            for order, (repetition, arm, condition) in enumerate(cells)
+            for arm, condition in product(self.arms, self.conditions)
+            for hashed in (spec_hash(self.spec(arm, condition)),)
+            for repetition in range(1, arm.repetitions + 1)
         ]
+        specs.sort(key=self._place)
+        return [replace(spec, order=order) for order, spec in enumerate(specs)]
+
+    def _place(self, spec: TrialSpec) -> tuple[int, str]:
+        """What orders trials randomly within a repetition, the same way on every machine."""
+        drawn_for = f"{self.order_seed}/{spec.repetition}/{spec.arm}/{spec.condition}"
+        return spec.repetition, hashlib.sha256(drawn_for.encode()).hexdigest()
 
     def trial_id_of(self, arm: Arm, condition: str, repetition: int) -> str:
         """The id of a trial of an arm."""
@@ -376,11 +353,6 @@ def usual_prompts(arm: Arm) -> float:
 
 def _is_scripted(arm: Arm) -> bool:
     return any(entry.provider == "emulator" for entry in arm.entries.values())
-
-
-def _shuffle_key(*what: object) -> str:
-    """A key that orders trials randomly, but the same way on every machine."""
-    return hashlib.sha256("/".join(map(str, what)).encode()).hexdigest()
 
 
 def make_plan(

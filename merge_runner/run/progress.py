@@ -15,12 +15,7 @@ from typing import TYPE_CHECKING, Literal
 
 from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Ledger
-from merge_runner.results.progress_file import (
-    MACHINE,
-    ProgressFile,
-    Standing,
-    clear_dead,
-)
+from merge_runner.results.progress_file import MACHINE, ProgressFile, Standing, clear_dead
 from merge_runner.run.plan import Plan
 from merge_runner.text_safety import printable
 

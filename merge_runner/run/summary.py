@@ -1,10 +1,12 @@
-"""A sweep's outcome as one JSON object for a program, and as text for a reader."""
+"""Plays a plan, and sums up what came of it: as one JSON object, and as text for a reader."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
+from itertools import groupby
+from operator import itemgetter
 from typing import Any, get_args
 
 from merge_runner.audit.findings import Audit
@@ -14,12 +16,40 @@ from merge_runner.records import Status
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
-from merge_runner.run.sweep import Outcome
-from merge_runner.study.crossing import PROMPT
+from merge_runner.run.recorded_plan import replayed
+from merge_runner.run.sweep import Outcome, open_sweep
 
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
 ASKED = ("first decision", "side", "own dv m/s", "asked", "invalid", "M", "action m/s2")
 SHOWN = 10
+
+
+async def play(
+    plan: Plan,
+    options: Options,
+    *,
+    whole: bool,
+    say: Callable[[str], None],
+    agree: Callable[[Estimate], None],
+) -> tuple[dict[str, Any], str]:
+    """Play what is not stored yet of a plan; return the summary as JSON values and as text.
+
+    A replay that is not ``whole`` plays what its recordings hold. ``agree`` gets an estimate before
+    money is spent, and raises where it is not to be. Raises UsageError.
+    """
+    if options.replay:
+        plan, options, notes = replayed(plan, options, whole=whole)
+        for note in notes:
+            say(note)
+    expected = None
+    options = plan.within_budget(options)
+    async with open_sweep(plan, options, say=say) as sweep:
+        if sweep.trials_to_play and not (options.replay or plan.is_free):
+            expected = await sweep.estimate()
+            agree(expected)
+        outcome = await sweep.run()
+    summary = as_dict(outcome, options, expected)
+    return summary, "\n".join(as_lines(outcome, summary))
 
 
 def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> dict[str, Any]:
@@ -72,34 +102,39 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
         "fallbacks": facts.fallbacks,
         "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts.others},
         "failed": dict(facts.failed),
-        "outcomes_by_level": [
-            {"factor": factor, "level": level, **{name: counts[name] for name in COLUMNS}}
-            for (factor, level), counts in _tallies(facts).items()
-        ],
+        "outcomes_by_level": [*_tallies(plan, facts)],
         "first_looks": facts.first_looks,
     }
 
 
-def _tallies(facts: SweepFacts) -> dict[tuple[str, str], Counter[str]]:
-    """Counts of trials by COLUMNS for each level of each factor, and by condition and variant."""
-    tallies: defaultdict[tuple[str, str], Counter[str]] = defaultdict(Counter)
-    rows: list[tuple[str, str, str, str | None, int]] = [
-        (factor, level, status, merged_first, trials)
-        for variant, condition, status, merged_first, _, trials in facts.outcomes
-        for factor, level in (("all", "all"), ("condition", condition), ("variant", variant))
+def _tallies(plan: Plan, facts: SweepFacts) -> Iterator[dict[str, Any]]:
+    """Counts of trials by COLUMNS, for each condition, all, and each level of each factor."""
+    shown = {"condition": [*plan.conditions, "all"], **plan.levels}
+    tallies = {(name, level): Counter[str]() for name in shown for level in shown[name]}
+    rows = [
+        ("condition", level, status, merged_first, trials)
+        for _, condition, status, merged_first, _, trials in facts.outcomes
+        for level in (condition, "all")
     ]
     for factor, level, status, merged_first, trials in [*rows, *facts.levels]:
         outcome = f"{merged_first} first" if status == "finished" else status
-        tallies[factor, level].update({"trials": trials, outcome: trials})
-    return tallies
+        tally = tallies.setdefault((factor, level), Counter())
+        tally.update({"trials": trials, outcome: trials})
+    for (factor, level), tally in tallies.items():
+        if tally["trials"]:
+            yield {"factor": factor, "level": level, **{name: tally[name] for name in COLUMNS}}
 
 
 def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
     """The summary for a reader; ``summary`` is the same by ``as_dict``."""
     facts = outcome.facts
     if facts is not None:
-        yield from _asked(facts) if outcome.plan.seat else _tables(outcome.plan, facts)
-        yield ""
+        if outcome.plan.seat:
+            yield from _asked(facts)
+        for factor, group in groupby(summary["outcomes_by_level"], key=itemgetter("factor")):
+            rows = [list(row.values())[1:] for row in group]
+            if len(rows) > 1 and not outcome.plan.seat:
+                yield from _grid([factor, *COLUMNS], rows)
         share = f" ({facts.invalid / facts.decisions:.1%})" if facts.invalid else ""
         yield (
             f"decisions: {facts.decisions}, {facts.invalid} invalid{share}, "
@@ -122,24 +157,6 @@ def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
             yield "Run the same command again to play the failed trials anew."
     if outcome.sweep_id:
         yield f"database: {summary['db']}"
-
-
-def _tables(plan: Plan, facts: SweepFacts) -> Iterator[str]:
-    """Counts per condition, and per variant, model and level of a factor where these vary."""
-    tallies = _tallies(facts)
-    shown = {"condition": [*plan.conditions, "all"]}
-    if len(plan.repetitions) > 1:
-        shown["variant"] = [*plan.repetitions]
-    levels = {"model": dict.fromkeys(arm.model_level for arm in plan.arms)}
-    for factor, level in (item for arm in plan.arms for item in arm.factors.items()):
-        levels.setdefault(factor, {})[level] = None
-    shown |= {name: [*each] for name, each in levels.items() if name != PROMPT and len(each) > 1}
-    for factor, names in shown.items():
-        if factor != "condition":
-            yield ""
-        keys = [(name if name == "all" else factor, name) for name in names]
-        rows = ([key[1], *(tallies[key][column] for column in COLUMNS)] for key in keys)
-        yield from _grid([factor, *COLUMNS], rows)
 
 
 def _asked(facts: SweepFacts) -> Iterator[str]:
@@ -168,6 +185,7 @@ def _grid(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator
     width = max(10, *(len(row[0]) + 1 for row in texts))
     for first, second, *others in texts:
         yield f"{first:<{width}}{second:>9}" + "".join(f"{text:>12}" for text in others)
+    yield ""
 
 
 def _without_a_plan(facts: SweepFacts) -> Iterator[str]:

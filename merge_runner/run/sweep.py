@@ -218,7 +218,7 @@ class Sweep:
             outcome.fail(
                 TrialSuspended.exit_code,
                 f"{outcome.suspended} trials wait for money: {self._suspended}. Their "
-                f"replies are kept: raise {self._plan.capped_by} and run the same command again",
+                "replies are kept: raise --max-cost, or the study's budget, and run it again",
             )
         if counts["failed"] and not self._misses:
             outcome.fail(1, f"{counts['failed']} trials failed")

@@ -229,8 +229,8 @@ def test_a_perception_is_a_factor_of_both_sides_or_of_one(plan_of):
         "perception=foggy",
     }
     one = plan_of(f'[factors]\nperception_right = ["foggy"]\n{FOGGY}')
-    assert one.scenario.perception_left.is_perfect
-    assert one.scenario.perception_right.speed_sd_mps == 0.3
+    assert one.arms[0].scenario.perception_left.is_perfect
+    assert one.arms[0].scenario.perception_right.speed_sd_mps == 0.3
 
 
 def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
