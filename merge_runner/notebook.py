@@ -179,38 +179,19 @@ class Study:
         options = Options(self.db, self.cache, max_cost_usd=max_cost_usd)
         return await unsent(plan, plan.within_budget(options), say=say)
 
-    async def arun(self, *, yes: bool = False, **how: Any) -> StudyOutcome:  # noqa: ANN401 # Options
-        """Play all trials that are not stored yet; ``yes`` lets it spend money."""
-        return await self._run(yes=yes, **how)
-
-    async def aseat_first(
-        self,
-        grid: str | None = None,
-        *,
-        yes: bool = False,
-        **how: Any,  # noqa: ANN401 # Options
-    ) -> StudyOutcome:
-        """Ask only what drivers do first, as ``sweep --first``; ``grid`` is its --grid.
-
-        Each situation is asked as often as the study has repetitions.
-        """
-        return await self._run(yes=yes, first=True, grid=grid, **how)
-
-    async def areplay(self, *recordings: Path | str) -> StudyOutcome:
-        """Play all trials from recorded replies alone, those of the files first; sends nothing."""
-        return await self._run(replay=True, recordings=tuple(map(Path, recordings)))
-
-    dry_run, run = sync(adry_run), sync(arun)
-    seat_first, replay = sync(aseat_first), sync(areplay)
-
-    async def _run(
+    async def arun(
         self,
         *,
         yes: bool = False,
         first: bool = False,
         grid: str | None = None,
-        **how: Any,  # noqa: ANN401 # Options
+        **how: Any,  # noqa: ANN401 # fields of Options
     ) -> StudyOutcome:
+        """Play all trials that are not stored yet; ``yes`` lets it spend money.
+
+        ``first`` and ``grid`` are as for ``plan``.
+        """
+
         def agree(expected: Estimate) -> None:
             if not yes:
                 lines = "; ".join(summary.estimate_lines(expected))
@@ -222,7 +203,22 @@ class Study:
             plan = self.plan(first=first, grid=grid)
             options = Options(self.db, self.cache, **how)
             whole = any(self._wanted.get(each) is not None for each in PARTS)
-            facts, text = await summary.play(plan, options, whole=whole, say=say, agree=agree)
+            return StudyOutcome(
+                *await summary.play(plan, options, whole=whole, say=say, agree=agree)
+            )
         finally:
             _playing.release()
-        return StudyOutcome(facts, text)
+
+    async def aseat_first(self, grid: str | None = None, **how: Any) -> StudyOutcome:  # noqa: ANN401 # as arun
+        """Ask only what drivers do first, as ``sweep --first``; ``grid`` is its --grid.
+
+        Each situation is asked as often as the study has repetitions.
+        """
+        return await self.arun(first=True, grid=grid, **how)
+
+    async def areplay(self, *recordings: Path | str) -> StudyOutcome:
+        """Play all trials from recorded replies alone, those of the files first; sends nothing."""
+        return await self.arun(replay=True, recordings=tuple(map(Path, recordings)))
+
+    dry_run, run = sync(adry_run), sync(arun)
+    seat_first, replay = sync(aseat_first), sync(areplay)

@@ -9,6 +9,7 @@ import sys
 from dataclasses import asdict, fields, replace
 from datetime import UTC, datetime
 from functools import wraps
+from inspect import signature
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -46,6 +47,9 @@ GRID = (
     "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
     "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
 )
+MAX_COST = "Never spend more on this, over all its runs."
+STRICT = "Stop when another model answers."
+KEEP_GOING = "Go on with a model that gives no valid decision."
 DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
 BATCH = "Ask in the provider's batches, a decision of all trials a round, at a lower price."
 REHEARSE = "The emulator answers in the model's place, ten times as fast: no key, no cost."
@@ -73,10 +77,10 @@ def sweep(
     ],
     first: Annotated[bool, flag("--first", "Only the first decision of both sides.")] = False,
     grid: Annotated[str | None, option("GRID", GRID)] = None,
-    model: ModelOption = None,
+    models: ModelOption = None,
     only: OnlyOption = None,
     mirror: Annotated[bool, flag("--mirror", "Also play two drivers with sides changed.")] = False,
-    reps: RepsOption = None,
+    repetitions: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
     sample_set: Annotated[int, option("N", "Another number draws a fresh set of samples.")] = 0,
@@ -86,18 +90,11 @@ def sweep(
     in_flight: Annotated[int, option("N", "Trials at once, over all workers.", min=1)] = 200,
     rpm: Annotated[int | None, option("N", "Requests a minute.", min=1)] = None,
     tpm: Annotated[int | None, option("N", "Tokens a minute.", min=1)] = None,
-    max_cost_usd: Annotated[
-        float | None,
-        option("USD", "Never spend more on this, over all its runs.", "--max-cost", min=0),
-    ] = None,
+    max_cost_usd: Annotated[float | None, option("USD", MAX_COST, "--max-cost", min=0)] = None,
     dask: Annotated[str | None, option("CLUSTER", DASK)] = None,
     batch: Annotated[bool, flag("--batch", BATCH)] = False,
-    strict_model: Annotated[
-        bool, flag("--strict-model", "Stop when another model answers.")
-    ] = False,
-    keep_going: Annotated[
-        bool, flag("--keep-going", "Go on with a model that gives no valid decision.")
-    ] = False,
+    strict_model: Annotated[bool, flag("--strict-model", STRICT)] = False,
+    keep_going: Annotated[bool, flag("--keep-going", KEEP_GOING)] = False,
     dry_run: Annotated[bool, flag("--dry-run", "Only estimate.")] = False,
     rehearse: Annotated[bool, flag("--rehearse", REHEARSE)] = False,
     yes: YesOption = False,
@@ -120,28 +117,17 @@ def sweep(
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
     if replay and dask:
         raise UsageError("a replay needs no cluster: leave --dask out")
-    named = {each.name for each in fields(Options)} & given.keys() - {"faults", "dry_run"}
+    known = {each.name for each in fields(Options)} & given.keys() - {"faults", "dry_run"}
     options = Options(
-        **{name: given[name] for name in named},
+        **{name: given[name] for name in known},
         faults=faults_of(fault_rate, faults, seed),
     )
+    wanted = {name: given[name] for name in signature(make_plan).parameters if name in given}
+    wanted |= {"conditions": listed(conditions), "variants": listed(variants)}
+    wanted["only"] = levels(only or (), "--only")
 
     def planned(name: str) -> Plan:
-        plan = make_plan(
-            name,
-            model or (),
-            reps,
-            listed(conditions),
-            listed(variants),
-            sample_set=sample_set,
-            order_seed=order_seed,
-            only=levels(only or (), "--only"),
-            mirror=mirror,
-            first=first,
-            grid=grid,
-            db=db,
-            trust=trust,
-        )
+        plan = make_plan(name, **wanted)
         if dask is not None and plan.replays_humans:
             raise UsageError("human trials are replayed in this process: leave --dask out")
         return plan
@@ -149,7 +135,7 @@ def sweep(
     if len(studies) > 1:  # all are looked at before the first one is played
         ledgers = [planned(name).ledger for name in studies]
         options = replace(options, ledgers=() if max_cost_usd is None else ledgers)
-    whole = any(part is not None for part in (reps, grid, conditions, variants))
+    whole = any(part is not None for part in (repetitions, grid, conditions, variants))
     codes = []
     for name in studies:
         if len(studies) > 1:

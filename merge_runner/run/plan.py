@@ -134,18 +134,22 @@ def _study_of(stored: object) -> object:
 class Plan(BaseModel):
     """A sweep before it runs: the arms of its study, each played in all conditions.
 
-    The column ``sweeps.config`` holds it as JSON, from which it is read again. ``entries`` are the
+    The column ``sweeps.config`` holds it as JSON, from which it is read again. ``model`` says who
+    drives but for opponents, as ids of sweeps do, with a comma between models. ``levels`` are those
+    of each factor of its file, a factor's reference first. ``entries`` are the
     language models of all arms by what an arm's ``asked`` calls them, and ``endpoints`` the
     identities of their endpoints (see ``config.Endpoint``). ``mirror``: its pairs are played both
     ways round whatever its file says. ``seat`` is ``first`` where only the first situations are
-    asked (see ``first_situations``), and empty in a sweep.
+    asked (see ``_first_decision``), and empty in a sweep.
     """
 
     model_config = ConfigDict(frozen=True, serialize_by_alias=True, validate_by_name=True)
 
     name: str
     study: Annotated[StudySource, BeforeValidator(_study_of), PlainSerializer(_stored_study)]
-    drivers: tuple[str, ...]
+    model: str
+    levels: dict[str, list[str]]
+    description: str
     arms: tuple[Arm, ...]
     entries: dict[str, ModelEntry] = Field(validation_alias="models", serialization_alias="models")
     endpoints: dict[str, str]
@@ -154,13 +158,6 @@ class Plan(BaseModel):
     order_seed: int
     seat: Literal["", "first"] = ""
     mirror: bool = False
-
-    @computed_field  # type: ignore[prop-decorator] # https://github.com/python/mypy/issues/14461
-    @property
-    def model(self) -> str:
-        """Who drives but for opponents, as ids of sweeps say, with a comma between models."""
-        pairs = (both_sides(name).values() for name in self.drivers)
-        return ",".join("+".join(dict.fromkeys(pair)) for pair in pairs)
 
     @property
     def ledger(self) -> str:
@@ -179,24 +176,11 @@ class Plan(BaseModel):
         """The names in the registry of the models of ``entries``, whatever their parameters."""
         return {arm.asked[side]: arm.sides[side] for arm in self.arms for side in SIDES}
 
-    @computed_field  # type: ignore[prop-decorator] # as above
+    @computed_field  # type: ignore[prop-decorator] # https://github.com/python/mypy/issues/14461
     @property
     def repetitions(self) -> dict[str, int]:
         """Prompt variant to repetitions."""
         return {arm.variant: arm.repetitions for arm in self.arms}
-
-    @computed_field  # type: ignore[prop-decorator] # as above
-    @property
-    def levels(self) -> dict[str, list[str]]:
-        """The levels of each factor of its file, a factor's reference first."""
-        models = (arm.model_level for arm in self.arms)
-        return listed_levels(self.study.file, models, self.repetitions)
-
-    @computed_field  # type: ignore[prop-decorator] # as above
-    @property
-    def description(self) -> str:
-        """What the study's file says of it."""
-        return self.study.file.description
 
     @property
     def trials(self) -> int:
@@ -389,52 +373,43 @@ def make_plan(
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
     drivers = chosen_models(study.file, asked)
+    pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
     wanted = _repetitions(study, variants, repetitions)
     names = _conditions(study.file, conditions)
     arms = cross(
         study.file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
     )
-    _check_arms(arms, names, db)
+    _check_arms(arms, names, db, first=first)
+    if first:
+        arms = list(map(_first_decision, arms))
     entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
-    plan = Plan(
-        name=study.name,
+    return Plan(
+        name=f"{study.name}-first" if first else study.name,
         study=study,
-        drivers=drivers,
+        model=",".join(map("+".join, pairs)),
+        levels=listed_levels(study.file, (arm.model_level for arm in arms), wanted),
+        description=study.file.description,
         arms=tuple(arms),
         entries=entries,
         endpoints={name: endpoint_identity(entry) for name, entry in entries.items()},
         conditions=names,
         sample_set=sample_set,
         order_seed=order_seed,
+        seat="first" if first else "",
         mirror=mirror,
     )
-    return first_situations(plan) if first else plan
 
 
-def first_situations(plan: Plan) -> Plan:
-    """The plan that asks what a sweep by the other plan asks first, and nothing more.
+def _first_decision(arm: Arm) -> Arm:
+    """The arm in trials whose time is up before their drivers would decide again.
 
-    To ask is to play a trial whose time is up before its drivers would decide again. It is planned,
-    played, kept and checked as any other trial; its calls have the texts and the slots, and so the
-    keys, of the first decisions of the study's sweep. Its source is ``seat``, which tables of
-    trials that were driven to their end leave out (``analysis.data.load.TRIALS``).
-
-    Raises UsageError where both drivers cannot be asked at once.
+    Such a trial is planned, played, kept and checked as any other; its calls have the texts and the
+    slots, and so the keys, of the first decisions of the study's sweep. Its source is ``seat``,
+    which tables of trials that were driven to their end leave out (``analysis.data.load.TRIALS``).
     """
-    arms = []
-    for arm in plan.arms:
-        given = arm.scenario.model_dump(exclude_unset=True)
-        given["timeout_s"] = 1 / arm.scenario.prompt_rate_hz
-        arms.append(replace(arm, scenario=validated(ScenarioConfig, given, "scenario")))
-        for condition in plan.conditions:
-            world = World(arm.scenario, CONDITIONS[condition], TRACK)
-            if not all(map(world.in_control, SIDES)):
-                raise UsageError(
-                    f"{condition}: a vehicle is in its tunnel yet when the first driver decides. "
-                    'First situations need control_start = "both_exits"'
-                )
-    changes = {"name": f"{plan.study.name}-first", "arms": tuple(arms), "seat": "first"}
-    return plan.model_copy(update=changes)
+    given = arm.scenario.model_dump(exclude_unset=True)
+    given["timeout_s"] = 1 / arm.scenario.prompt_rate_hz
+    return replace(arm, scenario=validated(ScenarioConfig, given, "scenario"))
 
 
 def grid_conditions(text: str) -> list[str]:
@@ -473,10 +448,13 @@ def _replayed(arm: Arm) -> list[tuple[Program, HumanTrials]]:
     return [(program, program.data) for program in programs if program.data is not None]
 
 
-def _check_arms(arms: Sequence[Arm], conditions: Sequence[str], db: Path | None) -> None:
+def _check_arms(
+    arms: Sequence[Arm], conditions: Sequence[str], db: Path | None, *, first: bool
+) -> None:
     """Read the human trials of a database where programs replay them, and check all crossings.
 
-    Raises UsageError for a condition that an arm cannot be played in.
+    Raises UsageError for a condition that an arm cannot be played in, or both drivers of which
+    cannot be asked ``first``.
     """
     replayed = {humans for arm in arms for _, humans in _replayed(arm)}
     if replayed and db is not None:
@@ -484,7 +462,12 @@ def _check_arms(arms: Sequence[Arm], conditions: Sequence[str], db: Path | None)
             for humans in replayed:
                 humans.read(connection)
     for arm, name in product(arms, conditions):
-        World(arm.scenario, CONDITIONS.require(name), TRACK)
+        world = World(arm.scenario, CONDITIONS.require(name), TRACK)
+        if first and not all(map(world.in_control, SIDES)):
+            raise UsageError(
+                f"{name}: a vehicle is in its tunnel yet when the first driver decides. First "
+                'situations need control_start = "both_exits"'
+            )
         for program, humans in _replayed(arm):
             humans.check(program, arm.scenario, name, arm.repetitions)
 

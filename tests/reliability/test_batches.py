@@ -16,7 +16,7 @@ import pytest
 
 from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
-from merge_runner.run.plan import Options, first_situations, make_plan
+from merge_runner.run.plan import Options, make_plan
 from tests.harness import FAST, PROJECT, run_sweep, watched
 
 KILLS = 20
@@ -218,7 +218,7 @@ async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly
     plan = BatchPlan(delay_s=1.0, slow=0.5, slow_factor=1000)
     async with watched(faults=FaultPlan(batch=plan)) as server:
         monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
-        first = first_situations(make_plan("baseline", "emulator", repetitions=1))
+        first = make_plan("baseline", "emulator", repetitions=1, first=True)
         options = Options(tmp_path / "m.duckdb", tmp_path / "c", batch=True)
         outcome = await run_sweep(first, options, say=said.append)
         batched, alone = await answered(server)

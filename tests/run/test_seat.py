@@ -13,7 +13,7 @@ from aiohttp import web
 from merge_runner.errors import UsageError
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.store import results_digest
-from merge_runner.run.plan import USUAL_GRID, first_situations, grid_conditions, make_plan
+from merge_runner.run.plan import USUAL_GRID, grid_conditions, make_plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.harness import FAST, RECORDING, watched
 
@@ -197,8 +197,9 @@ async def test_no_more_is_spent_than_the_cap_and_more_money_goes_on(merge_runner
 
 async def test_a_study_with_a_budget_pays_for_its_situations_from_it(merge_runner, tmp_path):
     (tmp_path / "mine.toml").write_text("repetitions = 1\n[budget]\ntotal_usd = 5\n")
-    plan = make_plan(str(tmp_path / "mine.toml"), "emulator")
-    assert first_situations(plan).ledger == plan.ledger == "mine"
+    for first in (True, False):
+        plan = make_plan(str(tmp_path / "mine.toml"), "emulator", first=first)
+        assert plan.ledger == "mine"
 
 
 async def test_an_estimate_counts_one_call_a_situation(merge_runner):
