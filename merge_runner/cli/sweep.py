@@ -79,7 +79,7 @@ def sweep(
     grid: Annotated[str | None, option("GRID", GRID)] = None,
     models: ModelOption = None,
     only: OnlyOption = None,
-    mirror: Annotated[bool, flag("--mirror", "Also play two drivers with sides changed.")] = False,
+    mirror: Annotated[bool, flag("--mirror", "Also play two drivers both ways.")] = False,
     repetitions: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
+from io import StringIO
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, get_args
@@ -13,6 +14,7 @@ from merge_runner.audit.findings import Audit
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.records import Status
+from merge_runner.results.query_output import write_table
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
@@ -20,7 +22,6 @@ from merge_runner.run.recorded_plan import replayed
 from merge_runner.run.sweep import Outcome, open_sweep
 
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
-ASKED = ("first decision", "side", "own dv m/s", "asked", "invalid", "M", "action m/s2")
 SHOWN = 10
 
 
@@ -129,8 +130,10 @@ def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
     """The summary for a reader; ``summary`` is the same by ``as_dict``."""
     facts = outcome.facts
     if facts is not None:
-        if outcome.plan.seat:
-            yield from _asked(facts)
+        if looks := facts.first_looks:
+            as_text = StringIO()
+            write_table([*looks[0]], (tuple(map(_short, look.values())) for look in looks), as_text)
+            yield as_text.getvalue()
         for factor, group in groupby(summary["outcomes_by_level"], key=itemgetter("factor")):
             rows = [list(row.values())[1:] for row in group]
             if len(rows) > 1 and not outcome.plan.seat:
@@ -159,25 +162,6 @@ def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
         yield f"database: {summary['db']}"
 
 
-def _asked(facts: SweepFacts) -> Iterator[str]:
-    """The share of M and the mean first action, for each driver, prompt, side and velocity."""
-    rows = []
-    for look in facts.first_looks:
-        driver, model = look["driver"], look["model"]
-        who = model if driver == model else f"{model} of {driver}"
-        merging, action_mps2 = look["share_m"], look["first_action_mps2"]
-        rows.append([
-            f"{who}/{look['variant']}",
-            look["side"],
-            f"{look['relative_velocity_mps']:+g}",
-            look["asked"],
-            look["invalid"],
-            "-" if merging is None else f"{merging:.0%}",
-            "-" if action_mps2 is None else f"{action_mps2:+.3f}",
-        ])  # fmt: skip
-    yield from _grid(ASKED, rows)
-
-
 def _grid(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
     # The widths do not depend on the counts, so that two runs can be compared side by side; rich
     # would fit them to the content.
@@ -186,6 +170,10 @@ def _grid(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator
     for first, second, *others in texts:
         yield f"{first:<{width}}{second:>9}" + "".join(f"{text:>12}" for text in others)
     yield ""
+
+
+def _short(value: object) -> object:
+    return f"{value:.3g}" if isinstance(value, float) else value
 
 
 def _without_a_plan(facts: SweepFacts) -> Iterator[str]:
@@ -212,13 +200,13 @@ def _costs(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
         yield f"estimated before: {expected['calls']} calls, {usd}"
     if spending.committed_usd:
         reserved = (
-            f", and {spending.reserved_usd:.4f} set aside for {spending.open_attempts} attempts of "
-            "unknown cost (`merge-runner ledger` says why)"
+            f", and {spending.reserved_usd:.4f} set aside (`merge-runner ledger` says why)"
+            if spending.open_attempts
+            else ""
         )
         yield (
-            f"this sweep over all its runs: {spending.spent_usd:.4f} USD"
-            + (reserved if spending.open_attempts else "")
-            + f"; all sweeps on this cache: {outcome.cache_cost_usd:.4f} USD"
+            f"this sweep over all its runs: {spending.spent_usd:.4f} USD{reserved}; "
+            f"all sweeps on this cache: {outcome.cache_cost_usd:.4f} USD"
         )
     if spending.overrun_usd:
         yield (

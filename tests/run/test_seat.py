@@ -231,7 +231,7 @@ async def test_the_two_drivers_of_a_pair_are_summed_up_apart(merge_runner):
     assert [look["with_a_word"] for look in looks] == [0, 0, 1, 1]
     again = await merge_runner(*FIRST, *pair)
     for model in ("constant", "emulator"):
-        assert f"\n{model} of emulator+constant/baseline " in again.out
+        assert f"\nemulator+constant  baseline  {model} " in again.out
 
 
 @pytest.mark.slow
