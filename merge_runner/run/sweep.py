@@ -47,7 +47,7 @@ from merge_runner.run.estimate import CallTotals, Estimate, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, Flusher
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.model_names import check_served, recorded_name, served_name
+from merge_runner.run.model_names import recorded_name, served_name
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
@@ -331,7 +331,7 @@ class Sweep:
             outcome.fail(
                 TrialSuspended.exit_code,
                 f"{outcome.suspended} trials wait for money: {suspended}. Their replies are kept: "
-                f"raise {self._plan.capped_by} and run the same command again",
+                "raise --max-cost, or the study's budget, and run the same command again",
             )
 
     async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> bool:
@@ -427,8 +427,6 @@ async def open_sweep(
         stored = [spec for key, spec in specs.items() if key in ended]
         todo = [spec for key, spec in specs.items() if key not in ended]
         if todo and not options.sends_nothing:
-            if options.dask is None:  # workers may see other servers
-                await check_served(entries)
             options = _less_what_is_spent(plan, options, cache, say)
             cache.locks.take({f"{e.id} at {endpoints[name]}" for name, e in entries.items()})
         yield Sweep(plan, options, cache, stored, todo, say)
@@ -440,7 +438,7 @@ async def _named(
     """The entry with its model's name: as told, as recorded, or as its server says."""
     found = model_id(entry)
     if not found and options.sends_nothing:
-        found = recorded_name(name, entry, cache=cache, strict=options.replay)
+        found = recorded_name(entry, cache)
     elif not found:
         found = await served_name(name, entry, say=say)
     return entry.model_copy(update={"id": found})

@@ -161,13 +161,6 @@ def test_effort_is_translated_for_a_model_that_has_no_parameter_of_this_name(pla
     }
 
 
-def test_a_prompt_that_is_not_played_is_noted(plan_of):
-    text = '[prompts.x]\nremove = ["C2"]\n[prompts.y]\nbased_on = "x"\n'
-    (note,) = plan_of(text).notes()
-    assert note.endswith("has them: y")
-    assert not list(plan_of(text, variants=["y"], repetitions=1).notes())
-
-
 def test_plain_sweeps_have_one_arm_for_each_prompt():
     plan = make_plan("ablations", "emulator")
     assert [arm.label for arm in plan.arms] == ["baseline", *(f"A{i}" for i in range(1, 8))]
@@ -235,8 +228,8 @@ def test_a_perception_is_a_factor_of_both_sides_or_of_one(plan_of):
         "perception=foggy",
     }
     one = plan_of(f'[factors]\nperception_right = ["foggy"]\n{FOGGY}')
-    assert one.scenario.perception_left.is_perfect
-    assert one.scenario.perception_right.speed_sd_mps == 0.3
+    assert one.arms[0].scenario.perception_left.is_perfect
+    assert one.arms[0].scenario.perception_right.speed_sd_mps == 0.3
 
 
 def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
@@ -274,11 +267,6 @@ def test_a_delay_has_to_fit_the_step_of_the_world_that_is_played(plan_of, scenar
     late = '[factors]\nperception = ["late"]\n[perception.late]\ndelay_s = 0.3\n'
     arm = plan_of(scenario + late, "idm").arms[0]
     assert (arm.scenario.step_s, arm.scenario.perception_left.delay_s) == (0.05, 0.3)
-
-
-def test_a_perception_that_no_factor_names_is_noted(plan_of):
-    (note,) = plan_of(FOGGY).notes()
-    assert note.endswith("foggy")
 
 
 def test_the_reference_of_a_factor_is_its_first_level_or_the_one_that_is_named(plan_of):

@@ -167,8 +167,6 @@ def test_a_world_is_as_fine_as_its_drivers_need_and_otherwise_as_it_was(plan_of)
         "slow": (0.2, None),
         "odd": (0.1, 0.2),
     }
-    note = "note: braking is driven in steps of 0.05 s, as its drivers need"
-    assert next(plan.notes()) == note
 
 
 def test_what_a_sweep_stores_of_its_world_is_what_its_trials_are_played_in(plan_of):
