@@ -5,7 +5,6 @@ pandas and the fits hold a Python process for seconds, and no page may wait for 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
-from analysis.explorer.child import serve, use_given
 from analysis.metrics import GAP, LEFT_FIRST, Metric
 from analysis.names import HUMAN
 from analysis.tables import make_tables
@@ -259,9 +257,3 @@ def _published_gaps() -> dict[str, float]:
     velocity = np.array([one.relative_velocity_mps for one in HUMAN_CONDITIONS.values()])
     gaps = gap_design(headway, velocity) @ terms
     return dict(zip(HUMAN_CONDITIONS, map(float, gaps), strict=True))
-
-
-if __name__ == "__main__":
-    use_given()
-    numbers = Numbers(Path(sys.argv[1]))
-    serve(lambda request: (numbers.answer(request), b""))

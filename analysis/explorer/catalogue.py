@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
 from analysis.accounts.course import Course
 from analysis.explorer.details import scenario_of
-from analysis.explorer.query_worker import csv_cell
+from analysis.explorer.display_text import csv_cell
 from analysis.explorer.reading import PATIENCE_S, Row, reading, records
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import language_models, stand_in, unresponsive

@@ -18,7 +18,7 @@ from analysis.explorer.conditions import condition_texts
 from analysis.explorer.display_text import visible
 from analysis.explorer.glossary import sections
 from analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
-from analysis.explorer.query_process import Sandbox
+from analysis.explorer.queries import Queries
 from analysis.explorer.search import Words
 from analysis.explorer.urls import HOME, Links
 from analysis.explorer.views import clock, condition_text
@@ -70,7 +70,7 @@ class Site:
         self._first_reading: threading.Thread | None = None
         self._conditions: dict[str, str] = {}
         self.catalogue = Catalogue(self.db)
-        self.sandbox = Sandbox(self.db)
+        self.queries = Queries(self.db)
         self.computing = Computing(self.db)
         self.words = Words(self.catalogue)
         self.notes = Notes(self.db, self.reader)
@@ -142,5 +142,4 @@ class Site:
     def close(self) -> None:
         """Leave nothing behind."""
         self.words.close()
-        self.sandbox.close()
         self.computing.close()
