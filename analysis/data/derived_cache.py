@@ -109,26 +109,27 @@ def finished(db: Path, made_of: str, options: str, names: Sequence[str]) -> dict
     """The tables or figures that are kept of this state, by name."""
     if not _beside(db).exists():
         return {}
-    found: dict[str, str] = {}
-    with _opened(db) as kept:
-        for name, content in kept.execute(
-            "SELECT name, content FROM finished WHERE state = ? AND options = ?", [made_of, options]
-        ):
-            if name in names:
-                found[name] = content
-    return found
+    query = "SELECT name, content FROM finished WHERE state = ? AND options = ?"
+    try:
+        with _opened(db) as kept:
+            rows = kept.execute(query, [made_of, options])
+            return {name: content for name, content in rows if name in names}
+    except sqlite3.Error as exc:
+        _say_once(str(exc))
+        return {}
 
 
 def keep_finished(db: Path, made_of: str, options: str, contents: Mapping[str, str]) -> None:
     """Keep tables or figures, unless the results have left the state that these are ``made_of``."""
     if present_state(db) != made_of:
         return
-    with _opened(db) as kept:
-        kept.execute("DELETE FROM finished WHERE state <> ?", [made_of])
-        kept.executemany(
-            "INSERT INTO finished VALUES (?, ?, ?, ?)",
-            [[made_of, options, name, content] for name, content in contents.items()],
-        )
+    rows = [(made_of, options, name, content) for name, content in contents.items()]
+    try:
+        with _opened(db) as kept:
+            kept.execute("DELETE FROM finished WHERE state <> ?", [made_of])
+            kept.executemany("INSERT INTO finished VALUES (?, ?, ?, ?)", rows)
+    except sqlite3.Error as exc:
+        _say_once(str(exc))
 
 
 def _beside(db: Path) -> Path:
@@ -137,13 +138,10 @@ def _beside(db: Path) -> Path:
 
 @contextmanager
 def _opened(db: Path) -> Iterator[sqlite3.Connection]:
-    """Open the file for one transaction; a warning says once why that is not possible."""
-    try:
-        with closing(sqlite3.connect(_beside(db), timeout=PATIENCE_S)) as kept, kept:
-            kept.execute(KEPT)
-            yield kept
-    except sqlite3.Error as exc:
-        _say_once(str(exc))
+    """Open the file for one transaction; raises sqlite3.Error."""
+    with closing(sqlite3.connect(_beside(db), timeout=PATIENCE_S)) as kept, kept:
+        kept.execute(KEPT)
+        yield kept
 
 
 @cache

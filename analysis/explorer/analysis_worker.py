@@ -91,8 +91,7 @@ class Numbers:
         if missing := [name for name in wanted if name not in kept]:
             study = self.study
             made = dict(zip(missing, make_tables(study, missing), strict=True))
-            # If the state in which the study was read is past, or another program holds the
-            # database, they are not kept there.
+            # If the state in which the study was read is past, they are not kept.
             texts = {name: to_text(made[name]) for name in missing}
             keep_finished(self.db, study.state, options, texts)
             self._made |= made
