@@ -472,17 +472,6 @@ class Catalogue:
         with self._lock:
             return self._memory.cursor()
 
-    def copy(self, sql: str) -> None:
-        """Run statements of ours that copy texts of the database; raises UsageError, StoreError."""
-        try:
-            with reading(self.db, self._instance) as connection:
-                connection.execute(sql)
-        except StoreLocked:
-            raise
-        except MergeRunnerError:
-            self._file = self._stamp = None  # as in refresh
-            raise
-
     def tag(self, tags: tuple[tuple[str, str, str], ...]) -> None:
         """Know the tags that readers gave: (trial, spec, tag), each once."""
         with self._lock:

@@ -1,33 +1,23 @@
-"""Runs a reader's query on a copy of the database: one that only reads, within limits, few at once.
-
-The database is open only while it is copied, so that a sweep can write while a query takes long.
-A copy lasts as long as the file stays as it is.
-"""
+"""Runs a reader's query on a copy of the database: one that only reads, within limits."""
 
 from __future__ import annotations
 
 import io
-import os
-import shutil
-import tempfile
 import threading
 import time
-import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import duckdb
 
-from analysis.explorer.catalogue import stamp_of
+from analysis.explorer.database_copy import Copies
 from analysis.explorer.display_text import csv_cell, text_of
-from analysis.explorer.reading import reading
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.results.database import SETTINGS, fetched, in_memory
 from merge_runner.results.store import answering
-from merge_runner.text_safety import csv_writer, first_line, in_spreadsheet, quoted
+from merge_runner.text_safety import csv_writer, first_line, in_spreadsheet
 
 AT_ONCE = 2
 WAITING = 8  # beside those that run: each keeps a thread of the server
@@ -38,7 +28,6 @@ DOWNLOADED_BYTES = 50_000_000
 COLUMNS = 1000
 NAME = 200  # characters of the name or type of a column
 PLAN_TEXT = 400_000
-LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
 CELL_COSTS = 30  # bytes of a cell of the page, beside its text
 AGAIN_S = 0.1  # a query that is about to begin forgets that it was to end
 
@@ -70,42 +59,15 @@ class QueryResult:
     seconds: float
 
 
-class Copy:
-    """A copy of a database as an open file without a name: it is gone when nobody holds it.
-
-    So nothing is left of it when the program is killed, and no query can say where it lies.
-    """
-
-    def __init__(self, db: Path, stamp: tuple[int, ...]) -> None:
-        """Make it; raises UsageError."""
-        self.stamp = stamp
-        try:
-            with tempfile.TemporaryDirectory(prefix="merge-runner-view-") as folder:
-                copy = f"{folder}/results.duckdb"
-                with reading(db):  # so that nobody writes
-                    # The database last: a process that closes a file loses all its locks on it.
-                    for end in (*LOGS, ""):
-                        with suppress(FileNotFoundError):
-                            shutil.copyfile(f"{db}{end}", f"{copy}{end}")
-                with duckdb.connect(copy) as whole:  # it loses its name, and its log with it
-                    whole.execute("CHECKPOINT")
-                self.fd = os.open(copy, os.O_RDONLY)
-        except OSError as exc:
-            raise UsageError(f"the database cannot be copied: {exc.strerror}") from exc
-        weakref.finalize(self, os.close, self.fd)
-
-
 class Queries:
     """Runs queries on one database."""
 
     def __init__(
-        self, db: Path, limits: Limits | None = None, patience_s: float = PATIENCE_S
+        self, copies: Copies, limits: Limits | None = None, patience_s: float = PATIENCE_S
     ) -> None:
-        self.db = db
+        self._copies = copies
         self.limits = limits or Limits()
         self._patience_s = patience_s
-        self._copy: Copy | None = None
-        self._copying = threading.Lock()
         self._turns = threading.Semaphore(AT_ONCE)
         self._places = threading.Semaphore(AT_ONCE + WAITING)
 
@@ -154,9 +116,8 @@ class Queries:
         settings = {**SETTINGS, "memory_limit": f"{self.limits.memory_mb}MB"}
         # An instance of its own, which stays restricted.
         with self._turn(), in_memory(settings) as connection:
-            copy = self._current()
-            file = quoted(f"/dev/fd/{copy.fd}")
-            connection.execute(f"ATTACH {file} AS results (READ_ONLY); USE results")
+            copy = self._copies.current()
+            connection.execute(f"ATTACH {copy.file} AS results (READ_ONLY); USE results")
             ended, late = threading.Event(), threading.Event()
 
             def stop() -> None:
@@ -180,15 +141,6 @@ class Queries:
                 raise UsageError(first_line(exc)) from exc
             finally:
                 ended.set()
-
-    def _current(self) -> Copy:
-        """A copy of the database as it is."""
-        with self._copying:
-            stamp = stamp_of(self.db)
-            if self._copy is None or self._copy.stamp != stamp:
-                self._copy = None  # the old one makes room first
-                self._copy = Copy(self.db, stamp)
-            return self._copy
 
     @contextmanager
     def _turn(self) -> Iterator[None]:

@@ -13,6 +13,7 @@ import duckdb
 import pytest
 
 from analysis.explorer import queries as module
+from analysis.explorer.database_copy import Copies
 from analysis.explorer.queries import Limits, Queries
 from merge_runner.errors import UsageError
 from merge_runner.results.database import open_database
@@ -44,7 +45,7 @@ def study(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def queries(study):
-    return Queries(study, Limits(seconds=60))
+    return Queries(Copies(study), Limits(seconds=60))
 
 
 @pytest.fixture
@@ -69,10 +70,10 @@ def texts(rows):
 
 
 def test_what_is_more_than_a_query_of_the_database_is_refused_and_changes_nothing(queries):
-    before = contents(queries.db.parent)
+    before = contents(queries._copies.db.parent)
     for sql, words in REFUSED.items():
         assert words in refusal(queries, sql), sql
-    assert contents(queries.db.parent) == before
+    assert contents(queries._copies.db.parent) == before
 
 
 def test_values_of_all_kinds_become_texts(queries):
@@ -100,7 +101,7 @@ def test_a_large_result_is_cut_and_says_so(study, queries):
     found = queries.result("SELECT range, repeat('x', 2100) AS x FROM range(1000000)")
     assert (len(found.rows), found.more) == (1000, True)
     assert found.rows[999] == [("999", 0), ("x" * 2000, 100)]
-    found = Queries(study, Limits(60, size=100_000)).result(
+    found = Queries(Copies(study), Limits(60, size=100_000)).result(
         "SELECT repeat('x', 900) FROM range(999)"
     )
     assert (50 < len(found.rows) < 120, found.more) == (True, True)
@@ -128,8 +129,8 @@ def test_a_download_is_whole_or_refused(queries, monkeypatch):
 
 def test_a_copy_that_cannot_be_made_is_said_in_a_line(study, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
-    assert "cannot be copied" in refusal(Queries(study), "SELECT 1")
-    assert str(tmp_path) not in refusal(Queries(study), "SELECT 1")
+    assert "cannot be copied" in refusal(Queries(Copies(study)), "SELECT 1")
+    assert str(tmp_path) not in refusal(Queries(Copies(study)), "SELECT 1")
 
 
 def test_what_needs_too_much_memory_is_stopped(queries):
@@ -138,12 +139,12 @@ def test_what_needs_too_much_memory_is_stopped(queries):
 
 
 def test_an_endless_query_is_stopped_in_time(study):
-    assert refusal(Queries(study, Limits(seconds=0.3)), ENDLESS) == "stopped after 0.3 s"
+    assert refusal(Queries(Copies(study), Limits(seconds=0.3)), ENDLESS) == "stopped after 0.3 s"
 
 
 def test_a_sweep_writes_while_a_query_runs(own):
-    queries = Queries(own, Limits(seconds=1))
-    copy = queries._current()
+    queries = Queries(Copies(own), Limits(seconds=1))
+    copy = queries._copies.current()
     said = []
     asking = threading.Thread(target=lambda: said.append(refusal(queries, ENDLESS)))
     asking.start()
@@ -151,7 +152,7 @@ def test_a_sweep_writes_while_a_query_runs(own):
         connection.execute("DELETE FROM sweeps")
     asking.join(60)
     assert said == ["stopped after 1 s"]
-    assert queries._current() is not copy
+    assert queries._copies.current() is not copy
 
 
 def test_a_value_that_python_has_not_is_told(queries):
@@ -166,23 +167,25 @@ def test_what_lies_in_the_log_beside_the_database_is_read(own, tmp_path):
             shutil.copy(f"{own}{end}", f"{crashed}{end}")
     assert Path(f"{crashed}.wal").stat().st_size > 0
     # Read by a copy of its own: the database is not read first, for what lies there is damaged.
-    result = Queries(crashed, Limits(seconds=60)).result("SELECT min(schema_version) FROM meta")
+    result = Queries(Copies(crashed), Limits(seconds=60)).result(
+        "SELECT min(schema_version) FROM meta"
+    )
     assert texts(result.rows) == [["-1"]]
 
 
 def test_a_copy_lasts_while_the_file_stays_and_leaves_nothing(own, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     before = contents(tmp_path)
-    queries = Queries(own)
-    first = queries._current()
-    assert queries._current() is first
+    copies = Copies(own)
+    first = copies.current()
+    assert copies.current() is first
     assert os.fstat(first.fd).st_size > 0
     assert contents(tmp_path) == before
     os.utime(own, ns=(0, 0))
-    second = queries._current()
+    second = copies.current()
     kept = [first.fd, second.fd]
     assert len({os.fstat(fd).st_ino for fd in kept}) == 2
-    del first, second, queries
+    del first, second, copies
     gc.collect()
     for fd in kept:
         with pytest.raises(OSError, match="Bad file descriptor"):
@@ -190,7 +193,7 @@ def test_a_copy_lasts_while_the_file_stays_and_leaves_nothing(own, tmp_path, mon
 
 
 def test_who_finds_others_running_is_told_after_a_while(study):
-    queries = Queries(study, patience_s=0.1)
+    queries = Queries(Copies(study), patience_s=0.1)
     with queries._turn(), queries._turn():
         assert "2 other queries are running" in refusal(queries, "SELECT 1")
     for _ in range(module.AT_ONCE + module.WAITING):
@@ -201,6 +204,6 @@ def test_who_finds_others_running_is_told_after_a_while(study):
 def test_what_is_no_database_is_said(tmp_path):
     (tmp_path / "text.duckdb").write_text("no database")
     assert "cannot be opened as a database" in refusal(
-        Queries(tmp_path / "text.duckdb"), "SELECT 1"
+        Queries(Copies(tmp_path / "text.duckdb")), "SELECT 1"
     )
-    assert "up to 10,000 characters" in refusal(Queries(tmp_path), "x" * 10_001)
+    assert "up to 10,000 characters" in refusal(Queries(Copies(tmp_path)), "x" * 10_001)
