@@ -26,12 +26,11 @@ from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.recordings import drive, write_folder
 from tests.harness import FAST, PROJECT, RECORDING, watched
+from tests.mock_server import FaultPlan, served
 
-FAULTS = """
-seed = 4
-delay_s = 0.01
-rates = { malformed = 0.15, refused = 0.1, rate_limit = 0.1 }
-"""
+FAULTS = FaultPlan(
+    seed=4, delay_s=0.01, rates={"rate_limit": 0.1, "refused": 0.1, "malformed": 0.15}
+)
 TWO = ("--conditions", "N_0_0,L_4_8")
 RESTARTS = """
 [repetitions]
@@ -43,12 +42,13 @@ control_start = "own_exit"
 # Two prompt variants with bad answers and retries; a third without; a mixed pair; programs alone;
 # and the other rules of when control starts and what is driven after a bad answer.
 SWEEPS = (
-    ("baseline", "--variants", "baseline,A7", "--reps", "2", *TWO, "--faults", "faults.toml"),
+    ("baseline", "--variants", "baseline,A7", "--reps", "2", *TWO),
     ("baseline", "--variants", "A1", "--reps", "3", *TWO),
     ("baseline", "--model", "emulator+constant", "--reps", "1", "--conditions", "N_0_0"),
     ("baseline", "--model", "projected-order", "--reps", "1", *TWO),
-    ("restarts.toml", "--conditions", "R_-4_8", "--faults", "faults.toml"),
+    ("restarts.toml", "--conditions", "R_-4_8"),
 )
+FAULTY = (SWEEPS[0], SWEEPS[-1])
 PAIR = "emulator/baseline/N_0_0/rep01"
 MIXED = "emulator+constant/baseline/N_0_0/rep01"
 OF_PAIR = f"trial_id = '{PAIR}'"
@@ -88,10 +88,11 @@ def audit(*arguments: object) -> Audited:
 def made(tmp_path_factory, prepare):
     """A folder in which the program ran these sweeps."""
     folder = tmp_path_factory.mktemp("made")
-    (folder / "faults.toml").write_text(FAULTS)
     (folder / "restarts.toml").write_text(RESTARTS)
-    for sweep in SWEEPS:
-        assert prepare(folder, "sweep", *sweep).code == 0
+    with served(FAULTS) as url:
+        for sweep in SWEEPS:
+            faulty = {"EMULATOR_BASE_URL": f"{url}/v1"} if sweep in FAULTY else {}
+            assert prepare(folder, "sweep", *sweep, **faulty).code == 0
     return folder
 
 
