@@ -16,7 +16,7 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import UsageError
-from merge_runner.records import TrialRecord
+from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.registry import require
 from merge_runner.results.comparison import FACTORS, PLACES, TrialKey, rows_of_trials, stored_rows
 from merge_runner.results.database import (
@@ -35,7 +35,7 @@ from merge_runner.results.database import (
     unreadable_is_usage,
     write_database,
 )
-from merge_runner.results.rows import Row, rows_of
+from merge_runner.results.rows import Row, factor_rows, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.measures import measures_sql
 from merge_runner.served_model import other_models
@@ -96,21 +96,18 @@ class Store:
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
 
     def begin_sweep(
-        self,
-        sweep: SweepRow,
-        specs: dict[str, str],
-        stored: Sequence[TrialKey],
-        factors: Sequence[Row] = (),
+        self, sweep: SweepRow, specs: dict[str, str], stored: Sequence[TrialSpec]
     ) -> None:
         """Add a sweep, what its spec hashes stand for, and those of its trials already stored.
 
-        ``factors`` are the levels of these trials, which another study may have stored without.
+        Their levels are added, too, which another study may have stored without.
         """
         with write_database(self.path) as connection:
             connection.execute("INSERT INTO sweeps BY NAME SELECT unnest(?)", [asdict(sweep)])
             _add_specs(connection, specs)
-            append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
-            _add_factors(connection, factors)
+            links = ((sweep.sweep_id, spec.trial_id, spec.spec_hash) for spec in stored)
+            append(connection, "sweep_trials", links)
+            _add_factors(connection, [*chain.from_iterable(map(factor_rows, stored))])
 
     def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
         """Note when and how a sweep ended."""
