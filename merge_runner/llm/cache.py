@@ -15,6 +15,7 @@ import os
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import islice
@@ -31,9 +32,9 @@ from merge_runner.llm.text_disk import (
     FILE,
     FORMAT,
     FORMAT_KEY,
+    NEW_CACHE,
     TextDisk,
     connect,
-    damage_told,
     making,
     open_texts,
     refuse_others,
@@ -78,9 +79,8 @@ class CachedCall:
         try:
             return _STORED.validate_json(text, strict=True).entry
         except ValidationError as exc:
-            raise RecordingError(
-                f"the recorded reply is damaged: {exc.errors()[0]['msg']}"
-            ) from exc
+            why = exc.errors()[0]["msg"]
+            raise RecordingError(f"the recorded reply is damaged: {why}") from exc
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,21 +123,12 @@ class ResponseCache:
         try:
             if not read_only:
                 _make(folder)
+            refuse_others(folder)
+            self._opened = self._file
             self._reading = connect(folder / FILE)
-            with contextlib.ExitStack() as stack:
-                stack.callback(self._reading.close)
-                refuse_others(folder, self._reading)
-                self._opened = self._file
-                if not read_only:
-                    self._texts = stack.enter_context(contextlib.closing(open_texts(folder)))
-                    with self._texts.transact():  # raises where nothing can be written
-                        self._texts.set("opened", "")
-                self._closing = stack.pop_all()
+            self._texts: Any = None if read_only else open_texts(folder)
         except FAILURES as exc:
-            raise UsageError(
-                f"the cache {folder} cannot be used: {exc}. Put a copy of it back, or fill another "
-                "one: `merge-runner recording import FILE --cache NEW`"
-            ) from exc
+            raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
 
     @cached_property
     def _overlay(self) -> Mapping[str, CachedCall]:
@@ -191,12 +182,9 @@ class ResponseCache:
             except RecordingError:
                 damaged.append(name)
         for name in damaged:
-            before = len(self.names(_DAMAGED + name))
-            aside = f"{_DAMAGED}{name} {before + 1}" if before else _DAMAGED + name
-            with (
-                self._told("written"),
-                contextlib.closing(connect(self.folder / FILE, "rw")) as own,
-            ):
+            aside = _DAMAGED + name
+            aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
+            with self._told("written"), closing(connect(self.folder / FILE, "rw")) as own:
                 own.execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
         return damaged
 
@@ -234,7 +222,7 @@ class ResponseCache:
 
         Raises RecordingError where it is damaged, CacheFailed where the folder cannot be read.
         """
-        with self._told("read"), damage_told():
+        with self._told("read"):
             row = self._reading.execute(_GET, [name]).fetchone()
         return None if row is None else _checked(self._disk.fetch(*row))
 
@@ -260,7 +248,7 @@ class ResponseCache:
         with self._told("read"):
             for row in self._reading.execute(_CALLS):
                 try:
-                    with damage_told():
+                    with self._told("read"):
                         key, raw, *value = self._reading.execute(_CALL, row).fetchone()
                     key, text = self._disk.get(key, raw), self._disk.fetch(*value)
                     entry = _verified(key, _checked(text))
@@ -286,7 +274,8 @@ class ResponseCache:
         self.locks.close()
         self.money.close()
         self._reading.close()  # first, since the last one to write ends the journal
-        self._closing.close()
+        if self._texts is not None:
+            self._texts.close()
 
     def _keep(self, entry: CachedCall) -> CachedCall | None:
         """Keep an entry unless there is one; None where that is damaged; an operation."""
@@ -313,17 +302,18 @@ class ResponseCache:
 
     @contextlib.contextmanager
     def _told(self, done: str) -> Iterator[None]:
-        """Raise CacheFailed where the folder cannot be read or written."""
+        """Raise CacheFailed where the folder cannot be used, RecordingError for what is no text."""
         try:
             yield
         except (diskcache.Timeout, *FAILURES) as exc:
+            if "utf-8" in str(exc).lower():  # SQLite says no more of it
+                raise RecordingError("the recorded reply is damaged: it is no text") from exc
             why = f"cannot be {done}: {str(exc) or 'another program writes'}"
             if self._file != self._opened:
-                why = "was removed, moved or replaced while it was in use, with what it kept"
+                why = "was removed, moved or replaced while it was in use"
             raise CacheFailed(
                 f"the cache {self.folder} {why}. When that is mended, or a copy of it put back, "
-                "run the same command again: what is in no cache is asked again. The database is "
-                "not affected"
+                "run the same command again: what is in no cache is asked again"
             ) from exc
 
     @property
@@ -338,11 +328,10 @@ class ResponseCache:
 def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
     """Add what the cache lacks of another folder's replies; returns (added, already there).
 
-    Each is verified, and the folder is only read. Raises RecordingError, when all others are added,
-    if any was damaged or none of ours.
+    The folder is only read. Raises RecordingError, when all others are added, if any was damaged.
     """
     left_out: list[str] = []
-    with contextlib.closing(ResponseCache(folder, read_only=True)) as source:
+    with closing(ResponseCache(folder, read_only=True)) as source:
         added, there = cache.add_missing(source.entries(left_out))
     if left_out:
         raise RecordingError(
@@ -360,7 +349,7 @@ def _make(folder: Path) -> None:
         return
     with making(folder), tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:
         if not (folder / FILE).exists():
-            with contextlib.closing(open_texts(Path(new))) as made:
+            with closing(open_texts(Path(new))) as made:
                 made.set(FORMAT_KEY, FORMAT)
             os.replace(Path(new) / FILE, folder / FILE)
 

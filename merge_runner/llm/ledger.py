@@ -55,14 +55,10 @@ INSERT INTO spent VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET usd = usd + e
 overrun_usd = overrun_usd + excluded.overrun_usd,
 most_overrun = max(most_overrun, excluded.most_overrun)
 """
-_NOTE = """
-UPDATE open SET outcome = ? WHERE rowid =
-(SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
-"""
 _CLOSE = """
 DELETE FROM open WHERE rowid =
 (SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
-RETURNING usd, worst_usd
+RETURNING usd, driver, slot, worst_usd, since
 """
 _REASONS = """
 SELECT driver, outcome, count(*), sum(usd), min(since), max(since), min(slot) FROM open
@@ -255,15 +251,15 @@ class Ledger:
             (self.scope, key, attempt.number),
             attempt.cost_usd,
         )
-        if cost_usd is None:  # it may have been charged
-            money.write(_NOTE, attempt.outcome, *place)
-            return
-        rows = money.write(_CLOSE, *place)
-        # A batch may end after its money was released: then nothing is known to compare with.
-        usd, worst_usd = rows[0] if rows else (cost_usd, cost_usd)
-        overran = cost_usd > usd + TOLERANCE_USD
-        over = (cost_usd - usd, cost_usd / max(worst_usd, TOLERANCE_USD)) if overran else (0.0, 0.0)
-        money.write(_PAY, self.scope, driver, cost_usd, *over)
+        over = 0.0, 0.0
+        # It may be gone: a batch may end after its money was released.
+        for row in money.write(_CLOSE, *place):
+            if cost_usd is None:  # it may have been charged
+                money.write(_OPEN, *place, *row, attempt.outcome)
+            elif cost_usd > row[0] + TOLERANCE_USD:
+                over = cost_usd - row[0], cost_usd / max(row[3], TOLERANCE_USD)
+        if cost_usd is not None:
+            money.write(_PAY, self.scope, driver, cost_usd, *over)
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""
