@@ -202,6 +202,8 @@ class CacheMachine(RuleBasedStateMachine):
             rows = database.execute("SELECT rowid, key FROM Cache ORDER BY rowid").fetchall()
             calls = [row for row in rows if len(row[1]) == 64 or row[1].startswith("attempts ")]
             others = [row for row in rows if row[1] != "format"]
+            if not others:
+                return
             rowid, name = data.draw(st.sampled_from(calls or others) | st.sampled_from(others))
             ((content,),) = database.execute(
                 "SELECT CAST(value AS BLOB) FROM Cache WHERE rowid = ?", [rowid]
