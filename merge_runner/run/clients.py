@@ -33,7 +33,7 @@ from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Usage
-from merge_runner.run.estimate import CallTotals, expected_costs
+from merge_runner.run.estimate import CallTotals, trial_costs
 from merge_runner.run.plan import Options, Plan, most_prompts
 from merge_runner.run.rehearsal import SPEED, behaviour
 
@@ -130,8 +130,8 @@ def live_clients(
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
-    costs_usd = expected_costs(plan, endpoint_plan.measured, batch=options.batch)
-    budget = Budget(ledger, options.max_cost_usd, costs_usd.__getitem__)
+    costs = trial_costs(plan, endpoint_plan.measured, batch=options.batch)
+    budget = Budget(ledger, options.max_cost_usd, costs)
     limiters = _limiters(plan, options, share)
     _allow_open_files(options.connections + SPARE_FILES)
     in_process = None

@@ -43,7 +43,7 @@ from merge_runner.llm.meter import Meter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec
 from merge_runner.registry import in_use, plugin_sources, use
 from merge_runner.run.clients import EndpointPlan, live_clients, sealed_clients
-from merge_runner.run.estimate import expected_costs
+from merge_runner.run.estimate import trial_costs
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.local_runner import Ended, LocalRunner, Room, no_wait
 from merge_runner.run.plan import Options, Plan
@@ -246,7 +246,7 @@ class DaskTasks:
 
     def __post_init__(self) -> None:
         self.meters = {name: Meter() for name in self._plan.entries}
-        self._costs_usd = expected_costs(self._plan, self._endpoints.measured)
+        self._costs = trial_costs(self._plan, self._endpoints.measured)
 
     @property
     def workers(self) -> int:
@@ -380,7 +380,7 @@ class DaskTasks:
             return None
         spending, cap_usd = self._ledger.read(), self._options.max_cost_usd
         if cap_usd is None:
-            return sum(self._costs_usd[spec.order] for spec in specs)
+            return sum(self._costs(spec.order) for spec in specs)
         return max(0.0, cap_usd - spending.committed_usd) / idle
 
     def _tokens(self, part: float) -> dict[str, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
@@ -198,10 +198,10 @@ def _part(entry: ModelEntry, *, batch: bool) -> float:
     return 1.0 if terms is None else terms.price_factor
 
 
-def expected_costs(
+def trial_costs(
     plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = False
-) -> dict[int, float]:
-    """Return the USD that each trial is expected to cost, by its order, in a ``batch`` run or not.
+) -> Callable[[int], float]:
+    """Return what tells by a trial's order the USD that it is expected to cost, perhaps in batches.
 
     They are its usual calls, with a margin, and one worst case, which the last call must be able to
     reserve. ``facts`` is as for ``estimate``.
@@ -216,7 +216,7 @@ def expected_costs(
             usual_usd, worst_usd = (cost_usd(entry, each) or 0.0 for each in (calls.usage, worst))
             usd = TRIAL_MARGIN * usual_prompts(arm) * usual_usd + worst_usd
             by_arm[arm.label] += usd * _part(entry, batch=batch)
-    return {spec.order: by_arm[spec.arm] for spec in plan.trial_specs()}
+    return {spec.order: by_arm[spec.arm] for spec in plan.trial_specs()}.__getitem__
 
 
 def typical_prompt(plan: Plan, arm: Arm) -> str:
