@@ -158,10 +158,7 @@ class Budget:
         return PaidAttempt(self, self.ledger, trial, key, asked, usd)
 
     def going_on(self, trial: int, key: str, asked: Asked, scope: str) -> PaidAttempt:
-        """Return the money of an attempt that an earlier run has begun under a ledger's name.
-
-        The caller closes it.
-        """
+        """Return the money of an attempt that an earlier run has begun under a ledger's name."""
         ledger = Ledger(self.ledger.cache, scope) if self.ledger.scope else self.ledger
         usd = ledger.aside_usd(key)
         return PaidAttempt(self, ledger, trial, key, asked, usd, queued=False)

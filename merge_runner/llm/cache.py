@@ -1,9 +1,9 @@
 """Recorded replies on disk: one text entry per call key, never evicted, never pickled.
 
-An entry is the JSON of a request, its slot and every attempt, the answering one last, behind a
-checksum. It is durable before anyone sees it: each batch of writes is one synchronous SQLite
-transaction. Beside the entries lie the attempts of calls that have no answer yet, the notes of
-batches, and damaged entries in quarantine. What was spent lies in the ledger's file (ledger.py).
+An entry is the JSON of a request and every attempt, the answering one last, behind a checksum.
+It is durable before anyone sees it: each batch of writes is one synchronous SQLite transaction.
+Beside the entries lie the attempts of calls that have no answer yet, the notes of batches, and
+damaged entries in quarantine.
 """
 
 from __future__ import annotations
@@ -139,10 +139,7 @@ class ResponseCache:
         return self._overlay.get(key) or self._kept(key)
 
     async def put(self, entry: CachedCall) -> CachedCall:
-        """Keep an entry; returns the one that is kept when it is durable.
-
-        That is another one where an import was first: a kept reply is never replaced.
-        """
+        """Keep an entry durably; returns what is kept, another one where an import was first."""
         while (kept := await self.write(partial(self._keep, entry))) is None:
             self.set_damage_aside(entry.request.key)
         return kept
@@ -171,10 +168,7 @@ class ResponseCache:
         return added, seen - added
 
     def set_damage_aside(self, key: str) -> list[str]:
-        """Move a damaged entry, or list of attempts, to quarantine, byte for byte.
-
-        Returns the names of what was moved.
-        """
+        """Move a damaged entry or list of attempts to quarantine as it is; returns their names."""
         damaged = []
         for name, check in ((key, self._kept), (_UNANSWERED + key, self._tried)):
             try:
@@ -189,10 +183,7 @@ class ResponseCache:
         return damaged
 
     def unanswered(self, key: str) -> Attempts:
-        """Return the attempts at a call that earlier runs made without an answer.
-
-        Those that a run began before it died are among them, with an unknown outcome.
-        """
+        """Return the attempts of earlier runs at a call without an answer, also unknown ones."""
         tried = self._tried(key)
         return (*tried, *self.money.begun(key, len(tried)))
 
@@ -218,13 +209,10 @@ class ResponseCache:
         return results
 
     def read(self, name: str) -> str | None:
-        """Return the text that was kept under a name, behind its checksum, or None.
-
-        Raises RecordingError where it is damaged, CacheFailed where the folder cannot be read.
-        """
+        """Return the text under a name, or None; raises RecordingError where it is damaged."""
         with self._told("read"):
-            row = self._reading.execute(_GET, [name]).fetchone()
-        return None if row is None else _checked(self._disk.fetch(*row))
+            rows = self._reading.rows(_GET, name)
+        return _checked(self._disk.fetch(*rows[0])) if rows else None
 
     def replace(self, name: str, text: str) -> None:
         """Keep a text under a name that is no call key, behind a checksum; an operation."""
@@ -237,7 +225,7 @@ class ResponseCache:
     def names(self, prefix: str) -> list[str]:
         """Return the names, none of a call, that begin with a prefix."""
         with self._told("read"):
-            rows = self._reading.execute(_KEYS, [prefix, prefix + chr(0x10FFFF)]).fetchall()
+            rows = self._reading.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
         return [name.decode(errors="replace") for (name,) in rows]
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
@@ -249,7 +237,7 @@ class ResponseCache:
             for row in self._reading.execute(_CALLS):
                 try:
                     with self._told("read"):
-                        key, raw, *value = self._reading.execute(_CALL, row).fetchone()
+                        ((key, raw, *value),) = self._reading.rows(_CALL, *row)
                     key, text = self._disk.get(key, raw), self._disk.fetch(*value)
                     entry = _verified(key, _checked(text))
                     check_body(entry.request.body)
@@ -355,11 +343,7 @@ def _make(folder: Path) -> None:
 
 
 def _verified(key: str, text: str) -> CachedCall:
-    """Return the entry that a row holds.
-
-    Raises RecordingError unless it is whole and belongs to its key: a reply to one request must
-    never answer another.
-    """
+    """Return the entry that a row holds; raises RecordingError unless it belongs to its key."""
     entry = CachedCall.from_json(text)
     try:
         check_call(key, entry.request, entry.attempts)

@@ -18,7 +18,7 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.text_disk import connect, making
+from merge_runner.llm.text_disk import Connection, connect, making
 from merge_runner.llm.write_batcher import BatchWriter, Operation
 from merge_runner.records import Attempt
 
@@ -110,7 +110,7 @@ class LedgerFile:
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / FILE
-        self._connections: dict[str, sqlite3.Connection] = {}
+        self._connections: dict[str, Connection] = {}
         self._one_at_a_time = RLock()
         self.writer = BatchWriter(self.run_now)
 
@@ -120,7 +120,7 @@ class LedgerFile:
             # Its first transaction makes all tables: until then it is empty.
             if not self._connections and not (self._file.exists() and self._file.stat().st_size):
                 return []
-            return self._connection("ro").execute(sql, values).fetchall()
+            return self._connection("ro").rows(sql, *values)
 
     def spending(self, scope: str, ask: Callable[..., Rows]) -> Spending:
         """Return the sums of a sweep, by ``read`` or ``write``; raises UsageError for odd ones."""
@@ -136,7 +136,7 @@ class LedgerFile:
 
     def write(self, sql: str, *values: object) -> Rows:
         """Execute a statement within a transaction, and return its rows."""
-        return self._connection("rwc").execute(sql, values).fetchall()
+        return self._connection("rwc").rows(sql, *values)
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -169,7 +169,7 @@ class LedgerFile:
         while self._connections:
             self._connections.popitem()[1].close()
 
-    def _connection(self, mode: str) -> sqlite3.Connection:
+    def _connection(self, mode: str) -> Connection:
         """Return a connection of its own to read or write: the event loop reads while one syncs."""
         if mode not in self._connections:
             self._connections[mode] = connection = connect(self._file, mode)
@@ -270,10 +270,7 @@ class Ledger:
                     self._money.write(sql, self.scope, *row)
 
     def reasons(self) -> list[dict[str, Any]]:
-        """Return the reservations by driver and outcome, the largest sum in USD first.
-
-        ``first`` and ``last`` are UTC in ISO 8601; ``slot`` is one of those that they are for.
-        """
+        """Return the reservations by driver and outcome, with times in UTC and one of the slots."""
         names = ("driver", "outcome", "attempts", "usd", "first", "last", "slot")
         return [dict(zip(names, r, strict=True)) for r in self._money.read(_REASONS, self.scope)]
 

@@ -13,6 +13,8 @@ import os
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Lock
+from typing import Any
 
 import diskcache
 from diskcache.core import METADATA, MODE_RAW, UNKNOWN
@@ -84,12 +86,27 @@ def making(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
-    """Return a connection of our own to an SQLite file, for any thread; ``mode`` is SQLite's."""
-    uri = f"{file.absolute().as_uri()}?mode={mode}"
-    return sqlite3.connect(
-        uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
-    )
+class Connection(sqlite3.Connection):
+    """A connection for all threads; ``rows`` runs one query at a time.
+
+    Threads share prepared statements, and one could read the row that another has asked for.
+    """
+
+    def __init__(self, uri: str) -> None:
+        super().__init__(
+            uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
+        )
+        self._one_at_a_time = Lock()
+
+    def rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
+        """Return the rows of a query."""
+        with self._one_at_a_time:
+            return self.execute(sql, values).fetchall()
+
+
+def connect(file: Path, mode: str = "ro") -> Connection:
+    """Return a connection of our own to an SQLite file; ``mode`` is SQLite's."""
+    return Connection(f"{file.absolute().as_uri()}?mode={mode}")
 
 
 def refuse_others(folder: Path) -> None:
@@ -99,8 +116,8 @@ def refuse_others(folder: Path) -> None:
     """
     sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
     with contextlib.closing(connect(folder / FILE)) as connection:
-        settings = connection.execute("SELECT key, value FROM Settings").fetchall()
-        (mark,) = connection.execute(sql, [FORMAT_KEY]).fetchone() or (b"1",)
+        settings = connection.rows("SELECT key, value FROM Settings")
+        ((mark,),) = connection.rows(sql, FORMAT_KEY) or [(b"1",)]
     for key, value in settings:
         if key not in METADATA and (key not in SETTINGS or value != SETTINGS[key]):
             name = one_line(repr(key))[:40]
