@@ -28,14 +28,13 @@ from pydantic import Field, TypeAdapter, ValidationError
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.ledger import LedgerFile
 from merge_runner.llm.model_lock import ModelLocks
+from merge_runner.llm.sqlite_files import connect, making
 from merge_runner.llm.text_disk import (
     FILE,
     FORMAT,
     FORMAT_KEY,
     NEW_CACHE,
     TextDisk,
-    connect,
-    making,
     open_texts,
     refuse_others,
 )

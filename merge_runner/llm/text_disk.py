@@ -8,24 +8,18 @@ other settings than ours is refused before diskcache opens it.
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import os
-import sqlite3
-from collections.abc import Iterator
 from pathlib import Path
-from threading import Lock
-from typing import Any
 
 import diskcache
 from diskcache.core import METADATA, MODE_RAW, UNKNOWN
 
 from merge_runner.errors import RecordingError, UsageError
+from merge_runner.llm.sqlite_files import BUSY_S, connect
 from merge_runner.text_safety import one_line
 
 FILE = "cache.db"
 FORMAT_KEY, FORMAT = "format", "5"
 NEW_CACHE = "`merge-runner recording import FILE --cache NEW` makes one from a recording"
-BUSY_S = 600.0  # another process may be writing long replies to a slow disk
 SETTINGS = diskcache.DEFAULT_SETTINGS | {
     "eviction_policy": "none",
     "cull_limit": 0,
@@ -72,41 +66,6 @@ class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
 def open_texts(folder: Path) -> diskcache.Cache:
     """Return the diskcache of a folder, whose file is made if there is none."""
     return diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
-
-
-@contextlib.contextmanager
-def making(folder: Path) -> Iterator[None]:
-    """Keep other processes from making a file in a folder; its name is durable afterwards."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-class Connection(sqlite3.Connection):
-    """A connection for all threads; ``rows`` runs one query at a time.
-
-    Threads share prepared statements, and one could read the row that another has asked for.
-    """
-
-    def __init__(self, uri: str) -> None:
-        super().__init__(
-            uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
-        )
-        self._one_at_a_time = Lock()
-
-    def rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
-        """Return the rows of a query."""
-        with self._one_at_a_time:
-            return self.execute(sql, values).fetchall()
-
-
-def connect(file: Path, mode: str = "ro") -> Connection:
-    """Return a connection of our own to an SQLite file; ``mode`` is SQLite's."""
-    return Connection(f"{file.absolute().as_uri()}?mode={mode}")
 
 
 def refuse_others(folder: Path) -> None:
