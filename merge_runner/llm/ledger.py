@@ -68,15 +68,11 @@ WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Who is asked, for which slot, and the most that costs if the output cap is respected.
-
-    ``model`` is its name in the registry; ``driver`` names its endpoint, too.
-    """
+    """Which driver at which endpoint is asked, for which slot, and the most that honestly costs."""
 
     driver: str = ""
     slot: str = ""
     honest_usd: float = 0.0
-    model: str = ""
 
 
 @dataclass(frozen=True, slots=True)

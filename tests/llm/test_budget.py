@@ -44,8 +44,8 @@ def ledger(cache, request):
     return Ledger(cache, request.node.name)
 
 
-def asked(worst, driver="", model="m"):
-    return Asked(driver, "", worst, model)
+def asked(worst, driver=""):
+    return Asked(driver, "", worst)
 
 
 def tried(actual, outcome="server_error"):
@@ -55,7 +55,7 @@ def tried(actual, outcome="server_error"):
 async def attempt(budget, trial, worst, actual, turns=0, model="m"):
     """Spend on one attempt as a client does."""
     await budget.admit(trial)
-    paid = await budget.set_aside(trial, f"key {model}", asked(worst, model=model))
+    paid = await budget.set_aside(trial, f"key {model}", asked(worst))
     with contextlib.closing(paid):
         await paid.begin([])
         for _ in range(turns):
