@@ -44,7 +44,6 @@ from merge_runner.llm.http_outcome import (
     RequestFailed,
     TransportFailure,
     TryAgain,
-    advice,
     backoff_s,
     if_nobody,
     judge,
@@ -484,27 +483,14 @@ class LlmClient:
 
     def _error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
-        if not self.first.passed and (stop := self._end_of_run(call, outcome)):
+        if stop := self._end_of_run(call, outcome):
             return stop
-        message, delay_s = outcome.message or outcome.name, outcome.delay_s or 0.0
-        why = ""
-        if outcome.action == "quota":
-            why = "the account's quota is exhausted"
-        elif outcome.pause and delay_s > self.entry.deadline_s:
-            why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
-        if why:
-            return QuotaExhausted(
-                f"{self.driver}: {why} ({message}). Every reply so far is saved; run the same "
-                "command later to go on."
-            )
+        message = outcome.message or outcome.name
         match outcome.action:
             case "retry":
                 return TryAgain(message, outcome.delay_s)
             case "fail":
                 return RequestFailed("nothing that is asked again would help")
-            case "refused":
-                what = advice(self.name, self.entry, outcome)
-                return EndpointRefused(f"{self.driver}: {what} ({message})")
         self.first.passed = self.first.known = True
         empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
         if outcome.name == "empty" and self._wire.retries_empty and empty <= EMPTY_RETRIES:
@@ -513,20 +499,34 @@ class LlmClient:
 
     def _end_of_run(self, call: Call, outcome: AttemptOutcome) -> SweepStopped | None:
         """Return the error that ends a run whose other calls would fare no better."""
-        first = self.first
-        if outcome.raw is None:
+        first, delay_s, why = self.first, outcome.delay_s or 0.0, None
+        if outcome.action == "refused" or not first.passed:
+            why = why_refused(self.name, self.entry, outcome)
+        if why is not None:
+            first.refused += outcome.action == "fail"
+            # An endpoint that has answered before may mean this prompt alone.
+            known = first.known and outcome.action != "refused"
+            return (
+                None
+                if known and first.refused < SEVERAL
+                else EndpointRefused(f"{self.driver}: {why}")
+            )
+        if outcome.name == "no_connection" and not first.passed:
             # A server that is just starting is waited for, but only for seconds.
-            waited_s = asyncio.get_running_loop().time() - call.began_s
-            if outcome.name != "no_connection" or waited_s < NOBODY_S:
+            if asyncio.get_running_loop().time() - call.began_s < NOBODY_S:
                 return None
             what = if_nobody(self.name, self.entry)
-            return ProviderDown(f"{self.driver}: {call.last_failure}: {what}")
-        why = why_refused(self.name, self.entry, outcome)
-        first.refused += why is not None and outcome.action == "fail"
-        # An endpoint that has answered before may mean this prompt alone.
-        if why is None or (first.known and first.refused < SEVERAL):
+            return ProviderDown(f"{self.driver}: {outcome.message}: {what}")
+        if outcome.action == "quota":
+            why = "the account's quota is exhausted"
+        elif outcome.pause and delay_s > self.entry.deadline_s:
+            why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
+        if why is None:
             return None
-        return EndpointRefused(f"{self.driver}: {why}")
+        return QuotaExhausted(
+            f"{self.driver}: {why} ({outcome.message}). Every reply so far is saved; run the same "
+            "command later to go on."
+        )
 
     def _tell_overrun(self, call: Call, aside_usd: float) -> None:
         spent_usd = call.attempts[-1].cost_usd or 0.0
