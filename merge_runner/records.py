@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -61,14 +61,8 @@ class Slot:
         return f"{self.condition} rep {self.repetition} {self.side}, decision {self.decision}"
 
     def as_dict(self) -> dict[str, str | int]:
-        """The slot as plain JSON values."""
-        return {
-            "condition": self.condition,
-            "decision": self.decision,
-            "repetition": self.repetition,
-            "sample_set": self.sample_set,
-            "side": self.side,
-        }
+        """The slot as plain JSON values, by their names' order."""
+        return dict(sorted(asdict(self).items()))
 
 
 @dataclass(frozen=True, slots=True)

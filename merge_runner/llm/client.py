@@ -27,8 +27,8 @@ from merge_runner.errors import (
     ReplayMiss,
     SweepStopped,
 )
-from merge_runner.llm.batch.journal import OpenLine
-from merge_runner.llm.batch.lines import Batches
+from merge_runner.llm.batch.journal import OpenBatch
+from merge_runner.llm.batch.rounds import Batches
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request
@@ -113,7 +113,7 @@ class Call:
     wait: Wait | None = None
     asking: int = 0
     singly: bool = False
-    open: OpenLine | None = None
+    open: OpenBatch | None = None
     task: asyncio.Task[ChatReply] = field(init=False)
 
     @property
@@ -390,9 +390,9 @@ class LlmClient:
             )
         earlier = self.cache.unanswered(key)
         if self.batches is not None:
-            call.open = self.batches.rounds.open_line(key, earlier)
+            call.open = self.batches.rounds.open_batch(key, earlier)
         opened = call.open  # the attempt that has begun there is the one that goes on
-        call.attempts = [each for each in earlier if not opened or each.number < opened.attempt]
+        call.attempts = [each for each in earlier if not opened or each.number < opened.lines[key]]
         call.earlier = len(call.attempts)
 
     async def _attempts(self, call: Call) -> ChatReply:
@@ -574,10 +574,11 @@ class LlmClient:
 
     async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""
-        opened, call.open = call.open, None
-        async with batches.attempt(call, opened) as (paid, line):
+        line = await batches.line(call)
+        with closing(line.paid):
             with call.waiting(f"for batches of {batches.model}", idle=True):
-                end = await batches.rounds.ask(line)
+                end, batch = await batches.rounds.ask(line)
+            call.open, call.singly = None, True
             outcome = AttemptOutcome("retry", end.outcome, end.message, charged=end.unclear)
             if end.raw is not None:  # no limit of single calls is meant, and no call waits for one
                 outcome = replace(judge(end.raw, self._wire), pause=False, delay_s=None)
@@ -587,9 +588,8 @@ class LlmClient:
                 usd = 0.0  # no line that failed is charged
             record = replace(
                 record,
-                started_at=line.submitted_at,
+                started_at=batch.submitted_at.isoformat(timespec="milliseconds"),
                 cost_usd=None if usd is None else usd * batches.price_factor,
-                batch_id=end.batch_id,
+                batch_id=batch.batch_id or None,
             )
-            call.singly = True
-            return await self._concluded(call, paid, outcome, record, end.error)
+            return await self._concluded(call, line.paid, outcome, record, end.error)

@@ -134,7 +134,7 @@ async def test_waits_are_told(merge_runner, tmp_path):
         "L_4_8 rep 1" in text and "decision 0 waits until" in text and "HTTP 429" in text
         for text in told
     )
-    assert any("calls waiting: " in text for text in run.err.splitlines())
+    assert any("waiting: " in text for text in run.err.splitlines())
 
 
 async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
