@@ -31,7 +31,7 @@ from merge_runner.llm.batch.journal import OpenBatch
 from merge_runner.llm.batch.rounds import Batches
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
+from merge_runner.llm.content_hashes import make_request, reply_object
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import WireFormat
 from merge_runner.llm.http_outcome import (
@@ -53,7 +53,6 @@ from merge_runner.llm.http_outcome import (
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd
-from merge_runner.llm.verify import reply_object
 from merge_runner.records import (
     SCRIPTED_HEADER,
     Attempt,
@@ -73,7 +72,6 @@ LONG_WAIT_S = 5.0
 # How often a format that knows empty answers as a fault is asked again after one; and how many
 # refusals by an endpoint that has answered before mean the configuration.
 EMPTY_RETRIES, SEVERAL = 2, 3
-MINUTE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +148,7 @@ class Call:
 
 @dataclass(slots=True)
 class Meter:
-    """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts.
+    """Counts of calls, attempts, tokens and cost.
 
     ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name; ``damaged``
     are the keys of recorded replies that could not be read.
@@ -158,6 +156,7 @@ class Meter:
 
     calls_live: int = 0
     calls_cached: int = 0
+    tokens: int = 0
     cost_usd: float = 0.0
     cost_unknown: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
@@ -165,30 +164,18 @@ class Meter:
     stand_ins: int = 0
     notes: deque[str] = field(default_factory=deque)
     damaged: list[str] = field(default_factory=list)
-    events: deque[tuple[float, int]] = field(default_factory=deque)
 
     def count_attempt(self, attempt: Attempt) -> None:
         """Count one live attempt."""
         self.outcomes[attempt.outcome] += 1
         self.cost_usd += attempt.cost_usd or 0.0
         self.cost_unknown += attempt.cost_usd is None
-        tokens = (attempt.usage.input_tokens or 0) + (attempt.usage.output_tokens or 0)
-        self.events.append((time.monotonic(), tokens))
+        self.tokens += (attempt.usage.input_tokens or 0) + (attempt.usage.output_tokens or 0)
 
     def add(self, other: Meter) -> None:
         """Add what another meter has counted."""
-        # The other's clock may be another machine's: what it has just counted counts as of now.
-        now = time.monotonic()
-        counted = replace(other, events=deque((now, tokens) for _, tokens in other.events))
         for each in fields(self):
-            setattr(self, each.name, getattr(self, each.name) + getattr(counted, each.name))
-
-    def last_minute(self) -> tuple[int, int]:
-        """Return the requests and tokens of the last minute."""
-        now = time.monotonic()
-        while self.events and now - self.events[0][0] > MINUTE_S:
-            self.events.popleft()
-        return len(self.events), sum(tokens for _, tokens in self.events)
+            setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
 
 
 @dataclass(slots=True)
