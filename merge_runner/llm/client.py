@@ -41,7 +41,6 @@ from merge_runner.llm.http_outcome import (
     FirstCall,
     OutOfTime,
     RawReply,
-    RequestFailed,
     TransportFailure,
     TryAgain,
     backoff_s,
@@ -397,15 +396,17 @@ class LlmClient:
 
         try:
             return await deadline.keep(partial(self._attempt, call, deadline), sleep=sleep)
-        except (OutOfTime, RequestFailed) as exc:
-            why = f"{exc} ({call.last_failure}), {len(call.own_attempts)} attempts"
-            if isinstance(exc, OutOfTime) and not self.first.passed:
-                raise ProviderDown(
-                    f"{self.driver}: the first call of this run: {why}: nothing else is asked. "
-                    "When the service answers again, run the same command"
-                ) from exc
-            attempts = tuple(call.attempts)
-            raise CallFailed(f"{self.name}: {why}", call.request, attempts, call.earlier) from exc
+        except OutOfTime as exc:
+            if self.first.passed:
+                raise self._failed(call, str(exc)) from exc
+            raise ProviderDown(
+                f"{self.driver}: the first call of this run: {exc} ({call.last_failure}): nothing "
+                "else is asked. When the service answers again, run the same command"
+            ) from exc
+
+    def _failed(self, call: Call, why: str) -> CallFailed:
+        why = f"{self.name}: {why} ({call.last_failure}), {len(call.own_attempts)} attempts"
+        return CallFailed(why, call.request, tuple(call.attempts), call.earlier)
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; return its answer, which is kept, or raise what follows from it."""
@@ -477,7 +478,7 @@ class LlmClient:
             case "retry":
                 return TryAgain(message, outcome.delay_s)
             case "fail":
-                return RequestFailed("nothing that is asked again would help")
+                return self._failed(call, "nothing that is asked again would help")
         self.first.passed = self.first.known = True
         empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
         if outcome.name == "empty" and self._wire.retries_empty and empty <= EMPTY_RETRIES:

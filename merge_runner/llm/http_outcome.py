@@ -228,10 +228,6 @@ class TryAgain(MergeRunnerError):
         self.delay_s = delay_s
 
 
-class RequestFailed(MergeRunnerError):
-    """The provider rejects this one request; asking again would not help."""
-
-
 class OutOfTime(MergeRunnerError):
     """A call's deadline would pass before the next attempt."""
 
