@@ -26,6 +26,7 @@ import diskcache
 from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
+from merge_runner.llm.content_hashes import DAMAGED, check_body, check_call
 from merge_runner.llm.ledger import LedgerFile
 from merge_runner.llm.model_lock import ModelLocks
 from merge_runner.llm.sqlite_files import connect, making
@@ -38,7 +39,6 @@ from merge_runner.llm.text_disk import (
     open_texts,
     refuse_others,
 )
-from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.llm.write_batcher import BatchWriter, Operation, ResultT
 from merge_runner.records import Attempt, ChatRequest
 
