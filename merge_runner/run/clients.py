@@ -6,7 +6,6 @@ import os
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
-from types import MappingProxyType
 
 from merge_runner.config import (
     ModelEntry,
@@ -82,7 +81,7 @@ def live_clients(
     *,
     stack: AsyncExitStack,
     rounds: Rounds | None = None,
-    urls: Mapping[str, str] = MappingProxyType({}),
+    urls: Mapping[str, str] | None = None,
     share: float = 1.0,
     limiters: dict[str, Limiter] | None = None,
 ) -> dict[str, LlmClient]:
@@ -107,7 +106,7 @@ def live_clients(
     costs = trial_costs(plan, earlier, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
     _allow_open_files(options.connections + SPARE_FILES)
-    env = {**os.environ, **urls}
+    env = {**os.environ, **(urls or {})}
     in_process = None
     if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
         from merge_runner.emulator.handler import Emulator, InProcess

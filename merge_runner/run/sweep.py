@@ -209,10 +209,8 @@ class Sweep:
         return bool(self._misses)
 
     def _note_misses(self, record: TrialRecord) -> None:
-        trial_id = record.spec.trial_id
-        self._misses += [
-            Miss(trial_id, call.request) for call in record.failed_calls if call.missed
-        ]
+        missed = [call.request for call in record.failed_calls if call.missed]
+        self._misses += [Miss(record.spec.trial_id, request) for request in missed]
 
     def _explain(self, outcome: Outcome) -> None:
         for line in explain(self._misses, self._cache.entries()) if self._misses else ():
