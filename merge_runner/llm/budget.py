@@ -5,10 +5,10 @@ right before it is sent. PaidAttempt says where the money goes when the attempt 
 ends.
 
 So that money finishes trials instead of beginning ever more of them, a trial begins only where what
-it is expected to cost (trial_costs.py) fits beside what the trials that have begun are still
-expected to cost. Expectations err, so the oldest trial goes first: an attempt leaves room for what
-older trials need, and for no younger one's. So the oldest trial has all the money that is left, and
-is suspended only where that does not pay for a single attempt.
+it is expected to cost fits beside what the trials that have begun are still expected to cost.
+Expectations err, so the oldest trial goes first: an attempt leaves room for what older trials need,
+and for no younger one's. So the oldest trial has all the money that is left, and is suspended only
+where that does not pay for a single attempt.
 
 A server may ignore the output cap. What a reply cost beyond its worst case is taken from what is
 left, and from then on the worst case is multiplied by as much as that driver's most expensive reply
@@ -21,20 +21,66 @@ from __future__ import annotations
 import asyncio
 import bisect
 import contextlib
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from operator import itemgetter
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.cache import CachedCall
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger, Spending
-from merge_runner.llm.trial_costs import TrialCosts
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.records import Attempt
 
 # An older trial that has money kept for it may wait for a call of a younger one, which waits for
 # money: after this long, with nothing in flight, it is no longer counted on.
 PATIENCE_S = 90.0
+# Trials that turn out longer, and attempts that are charged but bring no answer.
+MARGIN = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class TrialCalls:
+    """A model's calls in one trial: how many there usually are, how many at most.
+
+    ``worst_usd`` is the worst case of one of them.
+    """
+
+    usual: float
+    most: int
+    worst_usd: float
+
+
+@dataclass(slots=True)
+class TrialCosts:
+    """The expected costs of trials, which are named by their order in the sweep.
+
+    ``calls`` returns a trial's by model. What answers cost decides which trials begin, never what
+    may be spent.
+    """
+
+    calls: Callable[[int], Mapping[str, TrialCalls]]
+    _answers: Counter[str] = field(default_factory=Counter)
+    _usd: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+    def count(self, model: str, usd: float, answers: int = 1) -> None:
+        """Count answers of a model to such requests, of earlier runs, too, and their cost."""
+        self._answers[model] += answers
+        self._usd[model] += usd
+
+    def usd(self, trial: int) -> float:
+        """Return the USD that a trial is expected to cost: all it can, before any answer."""
+        sum_usd = 0.0
+        for model, calls in self.calls(trial).items():
+            expected_usd = calls.most * calls.worst_usd
+            if answers := self._answers[model]:
+                # The worst case counts as one more answer: a few cheap ones prove little.
+                mean_usd = (self._usd[model] + calls.worst_usd) / (answers + 1)
+                # Up to its last call a trial must be able to reserve that call's worst case.
+                usual_usd = MARGIN * calls.usual * mean_usd + calls.worst_usd
+                expected_usd = min(expected_usd, usual_usd)
+            sum_usd += expected_usd
+        return sum_usd
 
 
 @dataclass(slots=True)
@@ -88,7 +134,7 @@ class PaidAttempt:
         kept = await self.ledger.cache.put(entry)
         await self._pay(entry.attempts[-1])
         if self.cost_usd is not None:
-            self.budget.costs.answers[self.asked.model].add(self.cost_usd)
+            self.budget.costs.count(self.asked.model, self.cost_usd)
         return kept
 
     async def _pay(self, attempt: Attempt) -> None:
@@ -100,8 +146,8 @@ class PaidAttempt:
         self.budget.in_flight -= 1
         if self.queued:
             self.budget.queued_usd -= self.aside_usd
-            self.budget.charge(self.trial, -self.aside_usd)
-        elif self.cost_usd is not None:
+            self.cost_usd = 0.0
+        if self.cost_usd is not None:
             self.budget.charge(self.trial, self.cost_usd - self.aside_usd)
         self.budget.wake()
 
@@ -123,7 +169,6 @@ class Budget:
         self.queued_usd = 0.0
         self._largest_usd = 0.0
         self._spent_before = ledger.spending.committed_usd > 0
-        self._asked: set[str] = set()
         self._charged_usd: dict[int, float] = {}  # by trial that has begun, with reservations
         self._left: set[int] = set()
         # The lowest place first: attempts come before trials that wait to begin, and older trials,
@@ -155,12 +200,9 @@ class Budget:
         if self.cap_usd is not None:
             await self._in_turn((False, trial), partial(self._pays, trial, asked))
         usd = self._worst_usd(asked)
-        self.in_flight += 1
         self.queued_usd += usd
         self._largest_usd = max(self._largest_usd, usd)
-        self._asked.add(asked.model)
-        self.charge(trial, usd)
-        return PaidAttempt(self, self.ledger, trial, key, asked, usd)
+        return self._paid(PaidAttempt(self, self.ledger, trial, key, asked, usd))
 
     def going_on(self, trial: int, key: str, asked: Asked, scope: str) -> PaidAttempt:
         """Return the money of an attempt that an earlier run has begun under a ledger's name.
@@ -168,9 +210,12 @@ class Budget:
         The caller closes it.
         """
         ledger = Ledger(self.ledger.cache, scope) if self.ledger.scope else self.ledger
-        paid = PaidAttempt(self, ledger, trial, key, asked, ledger.aside_usd(key), queued=False)
+        usd = ledger.aside_usd(key)
+        return self._paid(PaidAttempt(self, ledger, trial, key, asked, usd, queued=False))
+
+    def _paid(self, paid: PaidAttempt) -> PaidAttempt:
         self.in_flight += 1
-        self.charge(trial, paid.aside_usd)
+        self.charge(paid.trial, paid.aside_usd)
         return paid
 
     def charge(self, trial: int, usd: float) -> None:
@@ -180,8 +225,8 @@ class Budget:
 
     def wake(self) -> None:
         """Let the first in the queue see whether it may go on by now."""
-        for _, changed in self._queue[:1]:
-            changed.set()
+        if self._queue:
+            self._queue[0][1].set()
 
     def _begins(self, trial: int) -> bool:
         """Begin a trial if there is money for it beside all that have begun."""
@@ -189,38 +234,38 @@ class Budget:
             raise TrialSuspended("its trial is suspended")
         if trial in self._charged_usd:  # its other driver stood in the queue, too
             return True
-        needed_usd, spending = self.costs.usd(trial), self.ledger.read()
-        left_usd = self._left_usd(spending) - needed_usd + TOLERANCE_USD
-        if left_usd < 0 and not self._charged_usd and not self.in_flight:
-            if self._spent_before or not self._asked.isdisjoint(self.costs.calls(trial)):
-                raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD", spending)
-            # The first one of a model shows what a trial costs; each attempt must still fit.
-        elif left_usd < self._needed_usd(self._charged_usd):
+        needed_usd, left_usd = self.costs.usd(trial), self._left_usd()
+        if left_usd < needed_usd and not self._charged_usd and not self.in_flight:
+            # The first one shows what a trial costs; each attempt must still fit.
+            if self._spent_before or self._left:
+                raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD")
+        elif left_usd < needed_usd + self._needed_usd(self._charged_usd):
             return False
         self._charged_usd[trial] = 0.0
         return True
 
     def _pays(self, trial: int, asked: Asked, waited_s: float) -> bool:
         """Return whether there is money for an attempt."""
-        spending = self.ledger.read()
+        left_usd = self._left_usd()  # reads what the worst case is by now
         worst_usd = self._worst_usd(asked)
-        left_usd = self._left_usd(spending) - worst_usd + TOLERANCE_USD
-        if left_usd < 0 and not self.in_flight:
-            raise self._suspended(f"the next call may cost {worst_usd:.4f} USD", spending)
+        if left_usd < worst_usd and not self.in_flight:
+            raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
         counted_on = self.in_flight or waited_s < PATIENCE_S
         older = (each for each in self._charged_usd if each < trial and counted_on)
         # A server that ignores the output cap is known only by its first expensive reply, when the
         # others are sent already: all in flight may cost twice as much.
         twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
-        return left_usd >= max(self._needed_usd(older), twice_usd if self.in_flight else 0.0)
+        return left_usd - worst_usd >= max(
+            self._needed_usd(older), twice_usd if self.in_flight else 0.0
+        )
 
     def _worst_usd(self, asked: Asked) -> float:
         """Return the worst case, scaled by this driver's largest observed cost overrun."""
-        return asked.honest_usd * self.ledger.spending.times(asked.driver)
+        return asked.honest_usd * self.ledger.spending.overruns.get(asked.driver, 1.0)
 
-    def _left_usd(self, spending: Spending) -> float:
+    def _left_usd(self) -> float:
         assert self.cap_usd is not None
-        return self.cap_usd - spending.committed_usd - self.queued_usd
+        return self.cap_usd - self.ledger.read().committed_usd - self.queued_usd + TOLERANCE_USD
 
     def _needed_usd(self, trials: Iterable[int]) -> float:
         """Return what these begun trials are still expected to cost."""
@@ -243,16 +288,13 @@ class Budget:
             self._queue.remove(own)
             self.wake()
 
-    def _suspended(self, what: str, spending: Spending) -> TrialSuspended:
+    def _suspended(self, what: str) -> TrialSuspended:
+        """Return the error of a trial that cannot be paid."""
+        spending, kept_usd = self.ledger.spending, self._needed_usd(self._charged_usd)
         reserved_usd = spending.reserved_usd + self.queued_usd
-        kept_usd = self._needed_usd(self._charged_usd)
-        set_aside = (
-            f", {reserved_usd:.4f} set aside for {spending.open_attempts} attempts whose cost is "
-            "not known: `merge-runner ledger`"
-        )
-        kept = f"; {kept_usd:.4f} more are kept for the trials that have begun"
         return TrialSuspended(
             f"{what}, and {spending.spent_usd + reserved_usd:.4f} of {self.cap_usd:g} USD are "
-            f"spent or set aside ({spending.spent_usd:.4f} spent"
-            f"{set_aside if reserved_usd > TOLERANCE_USD else ''}){kept if kept_usd else ''}"
+            f"spent or set aside ({spending.spent_usd:.4f} spent, {reserved_usd:.4f} set aside for "
+            f"{spending.open_attempts} attempts whose cost is not known: `merge-runner ledger`); "
+            f"{kept_usd:.4f} more are kept for the trials that have begun"
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+import re
 
 from pydantic import JsonValue
 
@@ -17,6 +17,7 @@ from merge_runner.records import ChatRequest, Slot
 
 KEY_VERSION = 1
 SPEC_VERSION = 2  # since then one valid array in a reply is enough
+_TEXT = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"')
 _CANONICAL = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
 )
@@ -67,20 +68,4 @@ def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, sl
 
 def without_prompt(body: str) -> str:
     """Return a canonical body without its longest text, which is the prompt."""
-    prompt = max(_texts(json.loads(body)), key=len, default="")
-    return body.replace(canonical_json(prompt), '""')
-
-
-def manner(path: str, empty_body: str) -> str:
-    """Return the short hash of all that is sent but the prompt."""
-    return hashlib.sha256(f"{path} {empty_body}".encode()).hexdigest()[:16]
-
-
-def _texts(value: JsonValue) -> Iterator[str]:
-    waiting = [value]
-    while waiting:
-        part = waiting.pop()
-        if isinstance(part, str):
-            yield part
-        elif isinstance(part, dict | list):
-            waiting += part.values() if isinstance(part, dict) else part
+    return body.replace(max(_TEXT.findall(body), key=len, default='""'), '""')

@@ -8,6 +8,8 @@ other settings than ours is refused before diskcache opens it.
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import os
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -73,9 +75,21 @@ def open_texts(folder: Path) -> diskcache.Cache:
     return diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
 
 
-def connect(folder: Path, mode: str = "ro") -> sqlite3.Connection:
-    """Return a connection of our own to a folder's file; ``mode`` is SQLite's."""
-    uri = f"{(folder / FILE).absolute().as_uri()}?mode={mode}"
+@contextlib.contextmanager
+def making(folder: Path) -> Iterator[None]:
+    """Keep other processes from making a file in a folder; its name is durable afterwards."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
+    """Return a connection of our own to an SQLite file, for any thread; ``mode`` is SQLite's."""
+    uri = f"{file.absolute().as_uri()}?mode={mode}"
     return sqlite3.connect(
         uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
     )
@@ -94,13 +108,11 @@ def refuse_others(folder: Path, connection: sqlite3.Connection) -> None:
             )
     sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
     (mark,) = connection.execute(sql, [FORMAT_KEY]).fetchone() or (b"1",)
-    if (
-        mark is not None and mark.isascii() and mark != FORMAT.encode()
-    ):  # of a damaged one each entry is checked
+    # Where the mark is damaged, each entry is checked all the same.
+    if mark is not None and mark.isascii() and mark != FORMAT.encode():
         raise UsageError(
             f"the cache {folder} has format {one_line(mark.decode()[:9])}, and this merge-runner "
-            f"has format {FORMAT}: name another folder with --cache; `merge-runner recording "
-            "import FILE --cache NEW` makes one from a recording of its replies"
+            f"has format {FORMAT}: `merge-runner recording import FILE --cache NEW` makes a new one"
         )
 
 

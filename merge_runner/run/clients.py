@@ -10,29 +10,27 @@ from contextlib import AsyncExitStack
 from merge_runner.config import (
     ModelEntry,
     check_network,
-    driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
 )
+from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.journal import Journal
-from merge_runner.llm.batch.lines import Batches
-from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.rounds import Batches, Rounds
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.call import Call
-from merge_runner.llm.call_totals import CallTotals, call_totals
-from merge_runner.llm.client import LlmClient
-from merge_runner.llm.content_hashes import canonical_json, manner
+from merge_runner.llm.client import Call, LlmClient
+from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
-from merge_runner.llm.prices import is_known
-from merge_runner.run.estimate import trial_costs
-from merge_runner.run.plan import Options, Plan, most_prompts
+from merge_runner.llm.prices import cost_usd
+from merge_runner.records import Usage
+from merge_runner.run.estimate import CallTotals, call_totals, trial_costs
+from merge_runner.run.plan import Options, Plan
 from merge_runner.run.rehearsal import SPEED, behaviour
 
 # For the database, the cache, the log and what libraries open for themselves.
@@ -61,14 +59,14 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, CallTotals]:
     A model whose endpoint has never given an answer is not among them.
     """
     totals = call_totals(cache.entries())
-    answered = {(model, endpoint) for model, endpoint, _ in totals}
+    answered = {(model, endpoint) for model, endpoint, *_ in totals}
     earlier = {}
     for name, entry in plan.entries.items():
         place = entry.id, plan.endpoints[name]
         if place in answered:
             sent = FORMATS[entry.format].request(entry, "")
-            asked = manner(sent.path, canonical_json(sent.body))
-            earlier[name] = totals.get((*place, asked), CallTotals())
+            asked = *place, sent.path, canonical_json(sent.body)
+            earlier[name] = totals.get(asked, CallTotals())
     return earlier
 
 
@@ -95,24 +93,23 @@ def live_clients(
     from merge_runner.llm.http import HttpTransport
 
     for name, entry in plan.entries.items():
-        if options.max_cost_usd is not None and not is_known(entry):
+        unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
+        if options.max_cost_usd is not None and unknown:
             raise UsageError(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
-        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
     costs = trial_costs(plan, earlier, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
     _allow_open_files(options.connections + SPARE_FILES)
     env = {**os.environ, **(urls or {})}
     in_process = None
     if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
-        from merge_runner.emulator.handler import Emulator, InProcess
+        from merge_runner.emulator.handler import Emulator
 
-        faults = behaviour(plan) if plan.is_rehearsal else options.faults
-        in_process = InProcess(Emulator(faults))
+        in_process = Emulator(behaviour(plan) if plan.is_rehearsal else Behaviour()).transport()
     limiters = {} if limiters is None else limiters
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
@@ -175,7 +172,7 @@ def _batches(
     if rounds is None or terms is None:
         return None
     money = Budget(Ledger(cache, "")) if entry.price == "free" else budget
-    return Batches(rounds, model, budget.ledger.scope, money, terms.price_factor)
+    return Batches(rounds, model, money, terms.price_factor)
 
 
 def open_rounds(
@@ -185,27 +182,18 @@ def open_rounds(
     journal = Journal(cache)
     models = set(plan.registered.values())
     left = [each for each in journal.batches() if each.model in models and journal.waits(each)]
-    own = [each for each in left if each.ledger == plan.ledger]
     if options.dask is not None:
-        if own:
+        if left:
             raise UsageError(
                 "calls wait in batches of an earlier run: run the same command without --dask "
                 "until they have ended"
             )
         return None
-    if own and not options.batch:
+    if left and not options.batch:
         say("calls that wait in batches of an earlier run are not asked again")
-    if others := sorted({each.ledger for each in left} - {plan.ledger}):
-        say(f"calls that wait in batches of {', '.join(others)} are not asked again")
     if not options.batch and not left:
         return None
-    most = max((most_prompts(arm) for arm in plan.arms), default=1)
-    free = {
-        plan.registered[name]
-        for name, entry in plan.entries.items()
-        if plan.is_rehearsal or entry.price == "free"
-    }
-    return Rounds(journal, {}, submits=options.batch, most_rounds=most, free=free, say=say)
+    return Rounds(journal, {}, submits=options.batch, say=say)
 
 
 def check_batches(plan: Plan, options: Options) -> None:
@@ -218,6 +206,9 @@ def check_batches(plan: Plan, options: Options) -> None:
         raise UsageError("--batch plays in this process: leave --dask out")
     if not plan.entries:
         raise UsageError("no language model is asked: leave --batch out")
+    runs = os.environ.get("EMULATOR_BASE_URL")
+    if not runs and any(entry.provider == "emulator" for entry in plan.entries.values()):
+        raise UsageError("the emulator has no batch mode: leave --batch out")
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         require_batch(plan.registered[name], entry, registry)

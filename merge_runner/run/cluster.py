@@ -37,15 +37,13 @@ from merge_runner.errors import (
     UsageError,
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Wait
-from merge_runner.llm.call_totals import CallTotals
+from merge_runner.llm.client import Meter, Wait
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.meter import Meter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec
 from merge_runner.registry import in_use, plugin_sources, use
 from merge_runner.run.clients import live_clients
-from merge_runner.run.estimate import trial_costs
+from merge_runner.run.estimate import CallTotals, trial_costs
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.local_runner import Ended, LocalRunner, Room
 from merge_runner.run.plan import Options, Plan
@@ -209,7 +207,7 @@ async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Pla
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
         replies = stack.enter_context(closing(ResponseCache(folder)))
         ledger = Ledger(replies, task.plan.ledger)
-        replies.run_now([lambda: replies.keep_all(task.recorded, task.unanswered)])
+        replies.put_now(task.recorded, task.unanswered.items())
         ledger.settle_share("", [(driver, 0, 0, ratio) for driver, ratio in task.overruns], [])
         try:
             clients = live_clients(
@@ -387,7 +385,7 @@ class DaskTasks:
 
     def _keep(self, task: Task, played: Played) -> None:
         """Keep what a task has brought: its replies first."""
-        self._cache.run_now([lambda: self._cache.keep_all(played.replies, played.unanswered)])
+        self._cache.put_now(played.replies, played.unanswered.items())
         self._ledger.settle_share(task.name, played.spent, played.opened)
         for model, meter in played.meters.items():
             self.meters[model].add(meter)

@@ -13,8 +13,7 @@ from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import ProviderDown, TrialSuspended
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.call import Wait
-from merge_runner.llm.client import LlmClient
+from merge_runner.llm.client import LlmClient, Wait
 from merge_runner.records import SIDES, ChatReply, Slot, TrialRecord, TrialSpec
 from merge_runner.run.clients import sealed_clients
 from merge_runner.run.first_decisions import FirstDecisions

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import tempfile
 import time
-from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
@@ -26,10 +25,9 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.call_totals import CallTotals
+from merge_runner.llm.client import Meter
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.ledger import Ledger, Spending, scopes
-from merge_runner.llm.meter import Meter
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.progress_file import ProgressFile
@@ -45,11 +43,11 @@ from merge_runner.run.clients import (
     open_rounds,
 )
 from merge_runner.run.cluster import DaskTasks, connected
-from merge_runner.run.estimate import Estimate, estimate
+from merge_runner.run.estimate import CallTotals, Estimate, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, Flusher
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.model_names import check_served, recorded_name, served_name
+from merge_runner.run.model_names import recorded_name, served_name
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
@@ -175,7 +173,7 @@ class Sweep:
 
         ``whole``: what all trials take, as if none were stored or recorded yet.
         """
-        trials: Counter[str] = Counter()
+        trials = 0
         arms = self._plan.by_label()
         calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in arms.items()}
         runner = LocalRunner.sealed(self._plan, self._cache)
@@ -184,7 +182,7 @@ class Sweep:
             record = await runner.play_one(spec) if arm.entries and not whole else None
             if record is not None and record.status != "failed":
                 continue
-            trials[spec.arm] += 1
+            trials += 1
             for side, name in arm.asked.items():
                 if name in arm.entries:
                     answered = sum(row.side == side for row in record.decisions) if record else 0
@@ -196,7 +194,6 @@ class Sweep:
             trials=trials,
             calls=calls,
             facts={**nothing, **earlier_answers(self._plan, self._cache)},
-            spending=self._ledger.spending,
         )
 
     async def _nothing_is_recorded(self) -> bool:
@@ -321,7 +318,7 @@ class Sweep:
             outcome.fail(
                 TrialSuspended.exit_code,
                 f"{len(suspended)} trials wait for money: {suspended[-1]}. Their replies are kept: "
-                f"raise {self._plan.capped_by} and run the same command again",
+                "raise --max-cost, or the study's budget, and run the same command again",
             )
 
     async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> bool:
@@ -417,8 +414,6 @@ async def open_sweep(
         stored = [spec for key, spec in specs.items() if key in ended]
         todo = [spec for key, spec in specs.items() if key not in ended]
         if todo and not options.sends_nothing:
-            if options.dask is None:  # workers may see other servers
-                await check_served(entries)
             options = _less_what_is_spent(plan, options, cache, say)
             cache.locks.take({f"{e.id} at {endpoints[name]}" for name, e in entries.items()})
         yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger))
@@ -430,7 +425,7 @@ async def _named(
     """The entry with its model's name: as told, as recorded, or as its server says."""
     found = model_id(entry)
     if not found and options.sends_nothing:
-        found = recorded_name(name, entry, cache=cache, strict=options.replay)
+        found = recorded_name(entry, cache)
     elif not found:
         found = await served_name(name, entry, say=say)
     return entry.model_copy(update={"id": found})
@@ -439,8 +434,6 @@ async def _named(
 def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
     """The endpoint's identity: in a replay, the one under which the model is recorded."""
     entry, configured = plan.entries[name], plan.endpoints[name]
-    if entry.provider == "emulator":
-        configured += options.faults.identity
     if not options.replay:
         return configured
     recorded = sorted({r.endpoint for r in cache.recorded(lambda r: r.model == entry.id)})

@@ -14,11 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import TrialSuspended, UsageError
-from merge_runner.llm.budget import Budget
+from merge_runner.llm.budget import Budget, TrialCalls, TrialCosts
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.llm.trial_costs import TrialCalls, TrialCosts
 from merge_runner.records import Attempt, ChatRequest, Slot
 from tests.harness import each
 
@@ -243,18 +241,6 @@ async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_fo
     await attempt(budget, 2, 3.0, 3.0)
 
 
-async def test_the_first_trial_of_a_model_begins_though_another_model_has_spent(ledger):
-    asked, new = {"m": TrialCalls(1, 1, 1.0)}, {"n": TrialCalls(20, 40, 1.0)}
-    budget = Budget(ledger, 10.0, TrialCosts({1: asked, 2: new, 3: new}.__getitem__))
-    await answer(budget, 1, 0.5)
-    budget.leave(1)
-    await asyncio.wait_for(budget.admit(2), 1)  # or it would never be known that it costs less
-    await attempt(budget, 2, 1.0, None, model="n")
-    budget.leave(2)
-    with pytest.raises(TrialSuspended, match=r"a whole trial may cost 40\.00 USD"):
-        await budget.admit(3)
-
-
 async def test_trials_begin_in_their_order_and_the_first_is_never_overtaken(ledger):
     budget = Budget(ledger, 5.0, each(4.0))
     begun = []
@@ -376,23 +362,6 @@ async def test_what_is_released_counts_no_longer(ledger, cache):
     await set_aside(Budget(again, 1.0), 1, 0.5)
 
 
-async def test_an_answer_that_was_kept_right_before_a_kill_is_settled_by_the_next_run(
-    ledger, cache
-):
-    slot = Slot("N_0_0", 1, "left", 0, 0)
-    request = make_request(
-        provider="openai", endpoint="e", model="m", path="/p", headers={}, body={}, slot=slot
-    )
-    for key in (request.key, "another"):
-        ledger.reserve(key, 1, 0.25, None, O3)
-    await cache.put(CachedCall(request, (Attempt(1, "ok", 200, cost_usd=0.125, reply="{}"),)))
-    ledger.settle_kept({"another driver"})
-    assert ledger.read().spent_usd == 0
-    ledger.settle_kept({O3.driver})
-    spending = ledger.read()
-    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.125, 0.25, 1)
-
-
 async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledger, tmp_path):
     cache = ResponseCache(tmp_path)
     task = Ledger(cache, "task")
@@ -403,7 +372,7 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
     ledger.settle_share("task 1", *task.rows())
     assert ledger.read() == task.read()
     assert (ledger.spending.spent_usd, ledger.spending.reserved_usd) == (0.5, 0.25)
-    assert ledger.spending.times(O3.driver) == 2
+    assert ledger.spending.overruns[O3.driver] == 2
     cache.close()
 
 
@@ -421,7 +390,7 @@ async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_a
         await paid.begin([])
         # A reply within what is now set aside does not count as another overrun of it.
         await paid.settle(tried(0.5))
-    assert ledger.spending.times(O3.driver) == 3
+    assert ledger.spending.overruns[O3.driver] == 3
 
 
 async def test_several_are_in_flight_only_while_twice_their_worst_cases_fit(ledger):

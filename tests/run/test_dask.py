@@ -21,7 +21,6 @@ import psutil
 import pytest
 from aiohttp import web
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
@@ -31,6 +30,7 @@ from merge_runner.run.plan import Options, make_plan
 from tests.gate import HANGS_S, Gate
 from tests.harness import FAST, PROJECT, environment, watched
 from tests.llm.test_limiter import fullest_window
+from tests.mock_server import FaultPlan
 from tests.zygote import Zygote
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")

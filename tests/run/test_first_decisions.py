@@ -4,11 +4,11 @@ import asyncio
 
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import NoValidDecision
 from merge_runner.records import Decision
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from tests.harness import watched
+from tests.mock_server import FaultPlan
 
 SWEEP = ("sweep", "baseline", "--json")
 PROSE = FaultPlan(rates={"malformed": 1.0})
