@@ -200,12 +200,8 @@ def check_batches(plan: Plan, options: Options) -> None:
     """Raise UsageError where a run cannot use batches as it is told to."""
     if not options.batch:
         return
-    if options.replay:
-        raise UsageError("a replay asks nothing: leave --batch out")
-    if options.dask is not None:
-        raise UsageError("--batch plays in this process: leave --dask out")
-    if not plan.entries:
-        raise UsageError("no language model is asked: leave --batch out")
+    if options.replay or options.dask is not None or not plan.entries:
+        raise UsageError("--batch asks models from this process: leave it, --replay or --dask out")
     runs = os.environ.get("EMULATOR_BASE_URL")
     if not runs and any(entry.provider == "emulator" for entry in plan.entries.values()):
         raise UsageError("the emulator has no batch mode: leave --batch out")
