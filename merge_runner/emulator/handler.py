@@ -16,6 +16,7 @@ from typing import Any
 
 import httpx
 
+from merge_runner.chance import draw_index
 from merge_runner.config import validated
 from merge_runner.emulator import Behaviour, driver
 from merge_runner.emulator.formats import SERVED, Completion, ServedFormat
@@ -134,11 +135,17 @@ class Emulator:
             text = driver.random_answer(prompt, slot)
         else:
             text = driver.answer(prompt, slot, effect)
+        # A token is about four bytes.
+        tokens_in, visible = len(prompt.encode()) // 4, len(text.encode()) // 4
+        reasoning = 200 + draw_index(600, "reasoning", prompt)
+        if typical := self.behaviour.output_tokens:
+            drawn = typical // 2 + draw_index(typical, "reasoning", prompt)
+            reasoning = max(0, drawn - visible)
         # Only the same attempt at the same request gets the same id: the audit takes one that
         # comes back for an answer that was given twice.
         which = f"{asked.path} {asked.where} {attempt}".encode()
         reply = hashlib.sha256(asked.raw + which).hexdigest()[:24]
-        said = Completion(reply, model, prompt, text, self.behaviour.output_tokens)
+        said = Completion(reply, model, text, tokens_in, visible, reasoning)
         request = {"body_sha256": asked.body_sha256, "slot": slot and slot.as_dict()}
         return {**asked.wire.answer(said), ANSWERED_FIELD: request, SCRIPTED_FIELD: True}
 
