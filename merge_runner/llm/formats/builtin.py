@@ -22,18 +22,12 @@ from merge_runner.llm.formats.base import (
 )
 from merge_runner.records import Usage
 
-OPENAI_QUOTA = frozenset(
-    {
-        "insufficient_quota",
-        "billing_hard_limit_reached",
-        "credit_balance_exhausted",
-        "organization_spend_limit_exceeded",
-        "project_spend_limit_exceeded",
-        "organization_usage_limit_exceeded",
-        "budget_exceeded",  # LiteLLM's own
-    }
-)
-ANTHROPIC_QUOTA = frozenset({"enforced_spend_limit_reached", "contract_spend_limit_reached"})
+OPENAI_QUOTA = {
+    *("insufficient_quota", "billing_hard_limit_reached", "credit_balance_exhausted"),
+    *("organization_spend_limit_exceeded", "project_spend_limit_exceeded"),
+    *("organization_usage_limit_exceeded", "budget_exceeded"),  # the latter is LiteLLM's own
+}
+ANTHROPIC_QUOTA = {"enforced_spend_limit_reached", "contract_spend_limit_reached"}
 # Anthropic reports these as invalid requests.
 SPENT = ("credit balance is too low", "spend limit")
 # What ends an answer of Gemini that was refused.
