@@ -99,10 +99,8 @@ def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) 
         action, why = 0.0, "I do not see the other car, and keep my speed."
     elif seen.distance_to_merge is None:
         action, why = _on_straight(seen)
-    elif draws.goes_first:
-        action, why = _go_first(seen, draws)
     else:
-        action, why = _yield(seen, draws)
+        action, why = _approach(seen, draws)
     normalised = round(min(1.0, max(-1.0, action / MAX_ACCELERATION_MPS2)), 2) + 0.0
     plan = ", ".join([f"{normalised:.2f}"] * seen.plan_actions)
     token = ("M\n\n" if draws.goes_first else "Y\n\n") if seen.asks_tactical else ""
@@ -198,35 +196,43 @@ def _chance_left_first(effect: PlantedEffect, condition: str, noise: float) -> f
     return 1 / (1 + math.exp(-max(logit, -700.0)))  # exp of more than 709 overflows
 
 
-def _go_first(seen: Seen, draws: Draws) -> tuple[float, str]:
-    if seen.other_distance_to_merge <= 0:
+def _approach(seen: Seen, draws: Draws) -> tuple[float, str]:
+    """Return the acceleration before the merge point, and the reason for it."""
+    other_distance = seen.other_distance_to_merge
+    if other_distance <= 0 and draws.goes_first:
         return 0.0, "The other car is through already, so I keep my speed and stay behind it."
-    leading = seen.projected_lead_m
+    if other_distance <= 0:
+        return _on_straight(seen)
+    lead = seen.projected_lead_m if draws.goes_first else -seen.projected_lead_m
     if draws.misjudges:
-        catch_up = _even_acceleration(-leading, seen.distance_to_merge, seen.own_speed)
+        catch_up = _even_acceleration(-lead, seen.distance_to_merge, seen.own_speed)
         return min(MAX_ACCELERATION_MPS2, max(0.0, seen.other_acceleration + catch_up)), (
             f"{draws.opening} I take the gap: with enough speed I reach the merge point before the "
             "other car, which should let me in. I keep an eye on it."
         )
-    metres = draws.leader_share * _lacking_m(leading, seen, draws)
-    push = _even_acceleration(metres, seen.distance_to_merge, seen.own_speed)
-    return _settled(min(HARDEST_PUSH_MPS2, max(0.0, push)), seen, draws), (
-        f"{draws.opening} At present speeds I would be {leading:.1f} m ahead at the merge point. I "
-        "go first and make the gap clear by my speed, and hold this acceleration."
-    )
-
-
-def _yield(seen: Seen, draws: Draws) -> tuple[float, str]:
-    other_distance = seen.other_distance_to_merge
-    if other_distance <= 0:
-        return _on_straight(seen)
-    behind = -seen.projected_lead_m
-    metres = (1 - draws.leader_share) * _lacking_m(behind, seen, draws)
-    brake = -_even_acceleration(metres, other_distance, seen.other_speed)
-    return _settled(min(0.0, max(HARDEST_BRAKING_MPS2, brake)), seen, draws), (
-        f"{draws.opening} The other car will be about {behind:.1f} m ahead at the merge point if "
-        "nobody acts. I let it go first and slow down evenly to leave a safe gap."
-    )
+    # What the leader's projected lead lacks; a leader from behind acts at once.
+    lacking = draws.target_gap_m + seen.vehicle_length - lead + max(0.0, 1.0 - lead)
+    if draws.goes_first:
+        metres = draws.leader_share * lacking
+        push = _even_acceleration(metres, seen.distance_to_merge, seen.own_speed)
+        action = min(HARDEST_PUSH_MPS2, max(0.0, push))
+        why = (
+            f"At present speeds I would be {lead:.1f} m ahead at the merge point. I go first and "
+            "make the gap clear by my speed, and hold this acceleration."
+        )
+    else:
+        metres = (1 - draws.leader_share) * lacking
+        brake = -_even_acceleration(metres, other_distance, seen.other_speed)
+        action = min(0.0, max(HARDEST_BRAKING_MPS2, brake))
+        why = (
+            f"The other car will be about {lead:.1f} m ahead at the merge point if nobody acts. I "
+            "let it go first and slow down evenly to leave a safe gap."
+        )
+    # The level of the previous plan is held unless the need has moved away from it.
+    held = None if seen.previous is None else seen.previous * MAX_ACCELERATION_MPS2
+    if held is None or abs(action - held) >= 0.25:
+        held = action + draws.wobble
+    return held, f"{draws.opening} {why}"
 
 
 def _on_straight(seen: Seen) -> tuple[float, str]:
@@ -241,17 +247,6 @@ def _on_straight(seen: Seen) -> tuple[float, str]:
             f"The other car is {gap:.1f} m ahead and slower. I brake until I match its speed."
         )
     return 0.0, "The other car is ahead at a sufficient distance. I keep my speed and follow it."
-
-
-def _settled(action: float, seen: Seen, draws: Draws) -> float:
-    """Return the level of the previous plan unless the need has moved away from it."""
-    held = None if seen.previous is None else seen.previous * MAX_ACCELERATION_MPS2
-    return held if held is not None and abs(action - held) < 0.25 else action + draws.wobble
-
-
-def _lacking_m(lead: float, seen: Seen, draws: Draws) -> float:
-    """Return what the leader's projected lead lacks; a leader from behind acts at once."""
-    return draws.target_gap_m + seen.vehicle_length - lead + max(0.0, 1.0 - lead)
 
 
 def _even_acceleration(metres: float, distance: float | None, speed: float) -> float:
