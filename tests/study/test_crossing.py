@@ -180,8 +180,6 @@ def test_plain_sweeps_have_one_arm_for_each_prompt():
             ["o3"],
             "o3 takes no parameter top_k; valid: max_output_tokens",
         ),
-        ('[factors]\ntemperature = ["hot"]\n', [], "temperature = 'hot' is no number from 0 to 2"),
-        ("[factors]\ntemperature = [3]\n", [], "temperature = 3 is no number from 0 to 2"),
         ("[factors]\nskip = [1]\n", [], "unknown factor 'skip'; valid: prompt, opp"),
         ('[factors]\nopponent = ["self", "emulator"]\n', [], "are the same trials: leave one out"),
         ("[factors]\ntemperature = [0.2]\n", ["o3"], "no parameter temperature but its default"),
