@@ -41,7 +41,6 @@ from merge_runner.scenarios.merge.conditions import (
     HUMAN_CONDITIONS,
     MEAN_SPEED_MPS,
     NUMBER,
-    Condition,
     condition_name,
 )
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -188,15 +187,11 @@ class Plan(BaseModel):
         return sum(arm.repetitions for arm in self.arms) * len(self.conditions)
 
     @property
-    def calls_of_a_trial(self) -> float:
-        """How many calls a trial usually takes, on the average over the arms."""
-        calls = sum(
-            arm.repetitions
-            * usual_prompts(arm)
-            * sum(name in arm.entries for name in arm.asked.values())
-            for arm in self.arms
-        )
-        return calls / sum(arm.repetitions for arm in self.arms)
+    def usual_calls(self) -> float:
+        """How many calls all trials usually take."""
+        asked = {arm.label: sum(n in arm.entries for n in arm.asked.values()) for arm in self.arms}
+        calls = (a.repetitions * usual_prompts(a) * asked[a.label] for a in self.arms)
+        return sum(calls) * len(self.conditions)
 
     @property
     def scripted(self) -> bool:
@@ -417,15 +412,9 @@ def grid_conditions(text: str) -> list[str]:
 
     ``h`` or ``dv`` may be one number, or be left out for that of the usual grid. Raises UsageError.
     """
-    axes = dict(map(_axis, USUAL_GRID.split(",")))
-    given = list(map(_axis, [] if text == "usual" else text.split(",")))
-    if len({name for name, _ in given}) < len(given):
-        raise UsageError(f"--grid: {text!r} has an axis twice; write it once, as FROM:TO:STEP")
-    names = []
-    for headway_m, velocity_mps in product(*(axes | dict(given)).values()):
-        Condition(headway_m, velocity_mps)  # raises where a vehicle would not drive forwards
-        names.append(condition_name(headway_m, velocity_mps))
-    return names
+    parts = USUAL_GRID if text == "usual" else f"{USUAL_GRID},{text}"
+    axes = dict(map(_axis, parts.split(",")))
+    return [condition_name(*point) for point in product(*axes.values())]
 
 
 def _axis(text: str) -> tuple[str, list[float]]:

@@ -97,7 +97,7 @@ class Progress:
         """
         total = self.planned - self.stored
         calls = sum(m.calls_live + m.calls_cached for m in self.runner.meters.values())
-        expected_calls = total * self.plan.calls_of_a_trial
+        expected_calls = self.plan.usual_calls * total / self.plan.trials
         by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
         part = max(ended / total, by_calls) if ended < total else 0.0
         return elapsed_s / part - elapsed_s if part else None
