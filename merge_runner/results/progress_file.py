@@ -25,37 +25,23 @@ MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 class Standing(BaseModel):
     """Snapshot of a sweep, for its display and for other processes.
 
-    ``ended`` trials have an outcome, those that were ``stored_before`` this run among them.
-    ``committed_usd`` counts against ``cap_usd``, over all runs.
-    ``left_s`` is the estimated time left, None while there is no estimate. ``waiting`` says what
-    its calls wait for, ``warnings`` what its user should know.
+    ``ended`` trials have an outcome, those that were stored before this run among them. ``left_s``
+    is the estimated time left, None while there is no estimate. ``rows`` are what is shown, each
+    with its name: ``WARNING``, ``waiting`` (for what), ``trials``, ``cost`` and so on.
     """
 
     model_config = ConfigDict(frozen=True)
 
     sweep_id: str
-    name: str
-    model: str
     pid: Annotated[int, Field(ge=1, lt=2**31)]
     machine: str
-    started_at: AwareDatetime
     updated_at: AwareDatetime
     doing: Literal["playing", "checking"]
-    trials: NonNegativeInt
-    stored_before: NonNegativeInt
-    running: NonNegativeInt
-    workers: NonNegativeInt | None
     ended: NonNegativeInt
     failed: NonNegativeInt
-    calls_live: NonNegativeInt
-    calls_cached: NonNegativeInt
     cost_usd: float
-    cap_usd: float | None
-    committed_usd: float
     left_s: float | None
-    worst_stall_s: float
-    waiting: tuple[str, ...]
-    warnings: tuple[str, ...]
+    rows: tuple[tuple[str, str], ...]
 
     @property
     def alive(self) -> bool:

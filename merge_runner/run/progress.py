@@ -62,41 +62,51 @@ class Progress:
         elapsed_s = (now - self.began_at).total_seconds()
         failed = self.outcome_counts["failed"]
         ended = self.outcome_counts.total() - self.outcome_counts["suspended"] - failed
+        live, cached = (sum(m.calls_live for m in meters), sum(m.calls_cached for m in meters))
+        cost_usd = sum(meter.cost_usd for meter in meters)
         batches = _first(self.batches(), "others")
+        # How long a batch takes nobody knows.
+        left_s = None if batches else self._left_s(elapsed_s, ended + failed, live + cached)
+        before = f" (+{self.stored} stored before)" if self.stored else ""
+        workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
+        cap = ""
+        if self.cap_usd is not None:
+            cap = f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+        rows = [
+            *(("WARNING", text) for text in self._warnings()),
+            (
+                "trials",
+                f"{ended + failed}/{self.planned - self.stored} ended{before}, "
+                f"{self.runner.running} running{workers}",
+            ),
+            ("failed", str(failed)),
+            ("calls", f"{live} live, {cached} from recordings"),
+            ("cost", f"{cost_usd:.2f} USD{cap}"),
+            *(("waiting", text) for text in batches + [CLOSE_IT] * bool(batches) + self._waits()),
+            (
+                "time",
+                f"{elapsed_s:.0f} s" + ("" if left_s is None else f", about {left_s:.0f} s left"),
+            ),
+        ]
         return Standing(
             sweep_id=sweep_id,
-            name=self.plan.name,
-            model=self.plan.driver + " (a mock)" * self.plan.scripted,
             pid=os.getpid(),
             machine=MACHINE,
-            started_at=self.began_at,
             updated_at=now,
             doing=self.doing,
-            trials=self.planned,
-            stored_before=self.stored,
-            running=self.runner.running,
-            workers=self.runner.workers,
             ended=self.stored + ended,
             failed=failed,
-            calls_live=sum(meter.calls_live for meter in meters),
-            calls_cached=sum(meter.calls_cached for meter in meters),
-            cost_usd=sum(meter.cost_usd for meter in meters),
-            cap_usd=self.cap_usd,
-            committed_usd=self.ledger.spending.committed_usd,
-            # How long a batch takes nobody knows.
-            left_s=None if batches else self._left_s(elapsed_s, ended + failed),
-            worst_stall_s=self.worst_stall_s,
-            waiting=tuple(map(printable, [*batches, *[CLOSE_IT] * bool(batches), *self._waits()])),
-            warnings=tuple(map(printable, self._warnings())),
+            cost_usd=cost_usd,
+            left_s=left_s,
+            rows=tuple((name, printable(text)) for name, text in rows),
         )
 
-    def _left_s(self, elapsed_s: float, ended: int) -> float | None:
+    def _left_s(self, elapsed_s: float, ended: int, calls: int) -> float | None:
         """The estimated time left in s; None while there is nothing to estimate it from.
 
         Trials that run in step all end late, so early in a run the calls are a better basis.
         """
         total = self.planned - self.stored
-        calls = sum(m.calls_live + m.calls_cached for m in self.runner.meters.values())
         expected_calls = self.plan.usual_calls * total / self.plan.trials
         by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
         part = max(ended / total, by_calls) if ended < total else 0.0
@@ -189,47 +199,22 @@ async def _show(progress: Progress, stop: asyncio.Event, *, quiet: bool) -> None
             for note in _notes(progress):
                 say(note)
             if live is not None:
-                live.update(table_of(progress.standing("")), refresh=True)
+                live.update(table_of(progress), refresh=True)
             elif not quiet:
-                rows = rows_of(progress.standing(""))
-                say("; ".join(f"{name}: {text}" for name, text in rows))
+                say("; ".join(f"{name}: {text}" for name, text in progress.standing("").rows))
             if stop.is_set():
                 return
 
 
-def rows_of(now: Standing) -> list[tuple[str, str]]:
-    """Name and text of every figure that is shown."""
-    this_run = now.ended + now.failed - now.stored_before
-    before = f" (+{now.stored_before} stored before)" if now.stored_before else ""
-    workers = "" if now.workers is None else f" on {now.workers} workers"
-    cap = ""
-    if now.cap_usd is not None:
-        cap = f", {now.committed_usd:.2f} of {now.cap_usd:g} over all runs"
-    left = "" if now.left_s is None else f", about {now.left_s:.0f} s left"
-    elapsed_s = (now.updated_at - now.started_at).total_seconds()
-    return [
-        *(("WARNING", text) for text in now.warnings),
-        (
-            "trials",
-            f"{this_run}/{now.trials - now.stored_before} ended{before}, {now.running} "
-            f"running{workers}",
-        ),
-        ("failed", str(now.failed)),
-        ("calls", f"{now.calls_live} live, {now.calls_cached} from recordings"),
-        ("cost", f"{now.cost_usd:.2f} USD{cap}"),
-        *(("waiting", text) for text in now.waiting),
-        ("time", f"{elapsed_s:.0f} s{left}"),
-    ]
-
-
-def table_of(now: Standing) -> Table:
-    """The same as a table for a terminal."""
+def table_of(progress: Progress) -> Table:
+    """What is shown on a terminal."""
     from rich.table import Table
     from rich.text import Text
 
-    title = Text(printable(f"{now.name}: {now.model}"))
+    mock = " (a mock)" if progress.plan.scripted else ""
+    title = Text(printable(f"{progress.plan.name}: {progress.plan.driver}{mock}"))
     table = Table(title=title, title_justify="left", show_header=False, box=None)
-    for name, text in rows_of(now):
+    for name, text in progress.standing("").rows:
         table.add_row(name, Text(text))  # text from a server must not be read as markup
     return table
 
