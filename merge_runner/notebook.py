@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from merge_runner.drivers.base import Driver
-from merge_runner.drivers.program_seat import Parameter, ProgramSeat
+from merge_runner.drivers.program_seat import ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
@@ -160,14 +160,10 @@ class Study:
         name: str,
         driver: Callable[[ProgramSeat], Driver],
         meaning: str,
-        parameters: Mapping[str, Parameter] | None = None,
-        rate_hz: float | None = None,
-        *,
-        chance: bool = False,
+        **more: Any,  # noqa: ANN401 # fields of Program
     ) -> None:
-        """Add a driver; see ``Program``. Where its source is edited, it is another driver."""
-        program = Program(driver, meaning, parameters or {}, rate_hz, chance=chance)
-        self.register(PROGRAMS, name, program)
+        """Add a driver, with fields of ``Program``. Where its source is edited, it is another."""
+        self.register(PROGRAMS, name, Program(driver, meaning, **more))
 
     def plan(self, *, first: bool = False, grid: str | None = None) -> Plan:
         """What would be played, or only asked ``first``; raises UsageError."""

@@ -221,12 +221,9 @@ class Plan(BaseModel):
 
     def within_budget(self, options: Options) -> Options:
         """Return the options with the cap of the study's budget; ``--max-cost`` goes before it."""
-        budget_usd = self.study.file.budget.total_usd
-        return (
-            options
-            if options.max_cost_usd is not None
-            else replace(options, max_cost_usd=budget_usd)
-        )
+        if options.max_cost_usd is not None:
+            return options
+        return replace(options, max_cost_usd=self.study.file.budget.total_usd)
 
     def by_label(self) -> dict[str, Arm]:
         """The arms by the labels that their trials carry."""
