@@ -41,6 +41,7 @@ from merge_runner.scenarios.merge.conditions import (
     HUMAN_CONDITIONS,
     MEAN_SPEED_MPS,
     NUMBER,
+    Condition,
     condition_name,
 )
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -411,7 +412,10 @@ def grid_conditions(text: str) -> list[str]:
     """
     parts = USUAL_GRID if text == "usual" else f"{USUAL_GRID},{text}"
     axes = dict(map(_axis, parts.split(",")))
-    return [condition_name(*point) for point in product(*axes.values())]
+    points = list(product(*axes.values()))
+    for point in points:
+        Condition(*point)  # raises where a vehicle would not drive forwards
+    return [condition_name(*point) for point in points]
 
 
 def _axis(text: str) -> tuple[str, list[float]]:
