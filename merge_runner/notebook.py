@@ -11,7 +11,7 @@ import asyncio
 import threading
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import partialmethod, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -89,28 +89,21 @@ class StudyOutcome:
 
         return load_trials(self.db, self.sweep_id)
 
-    def decisions(self) -> pd.DataFrame:
-        """One row a decision."""
-        return self._rows("decisions")
+    def rows(self, table: str) -> pd.DataFrame:
+        """The rows of one of the tables that hold its trials."""
+        from merge_runner.results.frames import load_of_sweep
 
-    def calls(self) -> pd.DataFrame:
-        """One row an attempt at a call."""
-        return self._rows("calls")
+        return load_of_sweep(self.db, self.sweep_id, table)
 
-    def states(self) -> pd.DataFrame:
-        """One row a vehicle and step."""
-        return self._rows("states")
+    # One row a decision, an attempt at a call, a vehicle and step.
+    decisions = partialmethod(rows, "decisions")
+    calls, states = partialmethod(rows, "calls"), partialmethod(rows, "states")
 
     def sql(self, query: str) -> pd.DataFrame:
         """The rows of one read-only query over the whole database; raises UsageError."""
         from merge_runner.results.frames import load
 
         return load(self.db, query)
-
-    def _rows(self, table: str) -> pd.DataFrame:
-        from merge_runner.results.frames import load_of_sweep
-
-        return load_of_sweep(self.db, self.sweep_id, table)
 
 
 class Study:

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import platform
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 from urllib.parse import quote
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, NonNegativeInt, ValidationError
 
-# While a sweep checks what it stored, the file is silent: only its process shows that it lives.
+# While a sweep checks what it stored, the file is silent.
 STALE_S = {"playing": 10.0, "checking": 600.0}
 MOST_BYTES = 1_000_000
-# Identifies the machine among those that share a folder: process ids mean nothing on another one.
-MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 class Standing(BaseModel):
@@ -33,8 +29,6 @@ class Standing(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     sweep_id: str
-    pid: Annotated[int, Field(ge=1, lt=2**31)]
-    machine: str
     updated_at: AwareDatetime
     doing: Literal["playing", "checking"]
     ended: NonNegativeInt
@@ -45,9 +39,7 @@ class Standing(BaseModel):
 
     @property
     def alive(self) -> bool:
-        """Whether the sweep is still running, by its file and its process."""
-        if self.machine == MACHINE and not _exists(self.pid):
-            return False
+        """Whether the sweep was heard of lately."""
         return (datetime.now(UTC) - self.updated_at).total_seconds() < STALE_S[self.doing]
 
 
@@ -115,11 +107,3 @@ def _read(path: Path) -> Standing | None:
             return Standing.model_validate_json(file.read(MOST_BYTES))
     except (OSError, ValidationError):
         return None
-
-
-def _exists(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except OSError as exc:
-        return isinstance(exc, PermissionError)
-    return True

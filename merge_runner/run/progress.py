@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import os
 import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 from merge_runner.llm.call import Wait
 from merge_runner.llm.ledger import Ledger
-from merge_runner.results.progress_file import MACHINE, ProgressFile, Standing, clear_dead
+from merge_runner.results.progress_file import ProgressFile, Standing, clear_dead
 from merge_runner.run.plan import Plan
 from merge_runner.text_safety import printable
 
@@ -90,8 +89,6 @@ class Progress:
         ]
         return Standing(
             sweep_id=sweep_id,
-            pid=os.getpid(),
-            machine=MACHINE,
             updated_at=now,
             doing=self.doing,
             ended=self.stored + ended,

@@ -7,7 +7,7 @@ import json
 import re
 from collections import Counter
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime
 from urllib.parse import parse_qs, urlsplit
 
 import duckdb
@@ -267,7 +267,7 @@ def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(stud
 
 
 def test_a_sweep_that_slept_goes_on_on_the_same_page(study):
-    running(study, pid=2**22 + 1)
+    running(study, updated_at=datetime(2026, 1, 1, tzinfo=UTC))
     client = browser(study)
     shown = client.get(URL).text
     assert "Stopped without a word" in shown
