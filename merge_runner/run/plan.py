@@ -478,16 +478,14 @@ def _repetitions(
     if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
     given = study.file.repetitions
-    wanted: dict[str, int] = {}
+    wanted = {}
     for variant in file_prompts(study.file) if variants is None else variants:
         blocks_of(variant)  # raises where there is none
-        repetitions = chosen or given.get(variant, given.get(EVERY_PROMPT))
-        if repetitions is None:
-            raise UsageError(
-                f"the sweep {study.name} has no variant {variant}; it has {', '.join(given)}. "
-                "With --reps N any variant can be run."
-            )
-        wanted[variant] = repetitions
-    if not wanted:
-        raise UsageError(f"the sweep {study.name} has no variant; valid: {', '.join(VARIANTS)}")
+        wanted[variant] = chosen or given.get(variant, given.get(EVERY_PROMPT, 0))
+    lacking = [variant for variant, repetitions in wanted.items() if not repetitions]
+    if lacking or not wanted:
+        raise UsageError(
+            f"the sweep {study.name} has no variant{' '.join(['', *lacking])}; valid: "
+            f"{', '.join(VARIANTS)}. With --reps N any variant can be run."
+        )
     return wanted
