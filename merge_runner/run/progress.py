@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, nullcontext, suppress
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
@@ -24,9 +23,10 @@ if TYPE_CHECKING:
     from merge_runner.run.dask_tasks import DaskTasks
     from merge_runner.run.local_runner import LocalRunner
 
+PUBLISHED_EVERY_S = 1.0
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
-PULSE_S, PULSES = 0.05, 20  # between two writings of the file
+PULSE_S = 0.05
 NOTES_SHOWN = 10
 REASONS_SHOWN = 3
 CLOSE_IT = "you may close this: the same command goes on"
@@ -139,22 +139,14 @@ def _first(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[st
 
 @asynccontextmanager
 async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
-    """Keep a sweep's progress file up to date while the body runs; remove the file at the end.
+    """Keep a sweep's progress file up to date while the body runs; remove the file at the end."""
 
-    Also measures how late the event loop wakes a task that sleeps.
-    """
-
-    async def publish() -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            file.write(progress.standing(file.sweep_id))
-            for _ in range(PULSES):
-                due = loop.time() + PULSE_S
-                await asyncio.sleep(PULSE_S)
-                progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
+    def publish() -> None:
+        file.write(progress.standing(file.sweep_id))
 
     clear_dead(file.db)
-    publishing = asyncio.create_task(publish())
+    publish()
+    publishing = asyncio.create_task(_repeat(progress, PUBLISHED_EVERY_S, publish))
     try:
         yield
     finally:
@@ -168,39 +160,44 @@ async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[
 
     ``quiet``: only the clients' messages.
     """
-    stop = asyncio.Event()
-    display = asyncio.create_task(_show(progress, stop, quiet=quiet))
-    try:
-        yield
-    finally:
-        stop.set()
-        try:
-            await display
-        except OSError as exc:
-            if exc.errno != errno.EIO:  # that of a terminal that is closed
-                raise
-
-
-async def _show(progress: Progress, stop: asyncio.Event, *, quiet: bool) -> None:
     live = None
     if not quiet and sys.stderr.isatty():
         from rich.console import Console
         from rich.live import Live
 
         live = Live(console=Console(stderr=True), auto_refresh=False)
-    with live or nullcontext():  # the table stays below what is printed meanwhile
-        while True:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(LIVE_EVERY_S if live else PLAIN_EVERY_S):
-                    await stop.wait()
+        live.start()  # the table stays below what is printed meanwhile
+
+    def show() -> None:
+        with suppress(OSError):  # the terminal may be closed
             for note in _notes(progress):
                 say(note)
             if live is not None:
                 live.update(table_of(progress), refresh=True)
             elif not quiet:
                 say("; ".join(f"{name}: {text}" for name, text in progress.standing("").rows))
-            if stop.is_set():
-                return
+
+    every_s = PLAIN_EVERY_S if live is None else LIVE_EVERY_S
+    showing = asyncio.create_task(_repeat(progress, every_s, show))
+    try:
+        yield
+    finally:
+        showing.cancel()
+        show()
+        with suppress(OSError):
+            if live is not None:
+                live.stop()
+
+
+async def _repeat(progress: Progress, every_s: float, do: Callable[[], None]) -> None:
+    """Do it so often, and measure how late the event loop wakes a task that sleeps."""
+    loop = asyncio.get_running_loop()
+    while True:
+        for _ in range(round(every_s / PULSE_S)):
+            due = loop.time() + PULSE_S
+            await asyncio.sleep(PULSE_S)
+            progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
+        do()
 
 
 def table_of(progress: Progress) -> Table:
