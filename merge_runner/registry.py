@@ -91,17 +91,14 @@ class Registry(Mapping[str, T]):
         return ChainMap(in_use().parts.get(self.kind, {}), self._things)
 
     def __getitem__(self, name: str) -> T:
-        """The thing of this name; raises KeyError."""
         load_plugins()
         return self._all[name]
 
     def __iter__(self) -> Iterator[str]:
-        """All names."""
         load_plugins()
         return iter(self._all)
 
     def __len__(self) -> int:
-        """How many there are."""
         load_plugins()
         return len(self._all)
 

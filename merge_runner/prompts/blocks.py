@@ -154,20 +154,6 @@ numbers, one for every {step_s} s. Each number lies between -1 and 1, where 1 st
 acceleration of {max_acceleration} m/s^2 and -1 for a deceleration of {max_acceleration} m/s^2. \
 Write the list in a Python code block that holds nothing but the list."""
 
-BLOCKS = Registry[Block]("prompt block")
-for _name, _meaning, _merge, _straight in (
-    ("C0", "situation", _APPROACHING, _MERGED),
-    ("C1", "history", _HISTORY, _HISTORY),
-    ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
-    ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
-    ("C3.human", "drive like a human", _HUMAN, _HUMAN),
-    ("C3.distance", "keep a distance", _DISTANCE, _DISTANCE),
-    ("C3.reassess", "reassess", _REASSESS, _REASSESS),
-    ("C4", "tactical decision", _TACTICAL, None),
-    (OUTPUT_FORMAT, "output format", _SCHEMA, _SCHEMA),
-):
-    BLOCKS.register(_name, Block(_meaning, _merge, _straight, in_baseline=True, before=None))
-
 _HEADWAY = """\
 Projected headway (which car is ahead when the first of you reaches the merge point at present \
 speeds): {projected_headway}"""
@@ -179,8 +165,20 @@ _GAP = "Time gap (how long the car behind takes to where the car ahead is now): 
 _FASTER = "Relative speed: {relative_speed_in_words}"
 _KMH = "In km/h: your speed is {own_speed_kmh}, the speed of the other car {other_speed_kmh}"
 _MPH = "In mph: your speed is {own_speed_mph}, the speed of the other car {other_speed_mph}"
+
+_PAPER = (
+    ("C0", "situation", _APPROACHING, _MERGED),
+    ("C1", "history", _HISTORY, _HISTORY),
+    ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
+    ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
+    ("C3.human", "drive like a human", _HUMAN, _HUMAN),
+    ("C3.distance", "keep a distance", _DISTANCE, _DISTANCE),
+    ("C3.reassess", "reassess", _REASSESS, _REASSESS),
+    ("C4", "tactical decision", _TACTICAL, None),
+    (OUTPUT_FORMAT, "output format", _SCHEMA, _SCHEMA),
+)
 _TABLES = _tabled(_APPROACHING), _tabled(_MERGED)
-for _name, _meaning, _merge, _straight in (
+_READY = (
     ("state.projected_headway", "projected headway", _HEADWAY, None),
     ("state.time_to_merge", "times to the merge point", _TIMES, None),
     ("state.time_gap", "time gap", _GAP, _GAP),
@@ -188,8 +186,12 @@ for _name, _meaning, _merge, _straight in (
     ("state.kmh", "speeds in km/h", _KMH, _KMH),
     ("state.mph", "speeds in mph", _MPH, _MPH),
     ("state.table", "situation as a table, in place of C0", *_TABLES),
-):
-    BLOCKS.register(_name, Block(_meaning, _merge, _straight, before="C1"))
+)
+BLOCKS = Registry[Block]("prompt block")
+for _before, _blocks in ((None, _PAPER), ("C1", _READY)):
+    for _name, _meaning, _merge, _straight in _blocks:
+        _block = Block(_meaning, _merge, _straight, _before is None, _before)
+        BLOCKS.register(_name, _block)
 
 VARIANTS = Registry[Variant]("variant")
 VARIANTS.register("baseline", Variant(title="Baseline"))
