@@ -10,16 +10,16 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import dropwhile
 from string import Formatter
-from typing import get_args
 
 from merge_runner.errors import UsageError
 from merge_runner.prompts.fields import FIELDS
-from merge_runner.records import Road
-from merge_runner.registry import Registry
+from merge_runner.registry import Registry, require
 
 OUTPUT_FORMAT = "C5"
 LAST = "the end"
+TO_MERGE = "distance_to_merge"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,18 +40,10 @@ class Block:
     before: str | None = OUTPUT_FORMAT
 
     def __post_init__(self) -> None:
-        for road in get_args(Road):
-            fields = [name for name in FIELDS if (road, name) != ("straight", "distance_to_merge")]
-            for name in named(self.template(road) or ""):
-                if name not in fields:
-                    raise UsageError(
-                        f"the block {self.meaning!r} names {{{name}}} on the road {road}; valid: "
-                        + ", ".join(fields)
-                    )
-
-    def template(self, road: Road) -> str | None:
-        """The block's text on a road."""
-        return self.merge if road == "merge" else self.straight
+        for road, template in (("merge", self.merge), ("straight", self.straight)):
+            fields = {n: f for n, f in FIELDS.items() if (road, n) != ("straight", TO_MERGE)}
+            for name in named(template or ""):
+                require(fields, f"field on the road {road} of the block {self.meaning!r}:", name)
 
     @property
     def digest(self) -> str:
@@ -81,11 +73,11 @@ def named(template: str) -> list[str]:
     """What a template names in braces; raises UsageError."""
     try:
         parts = [part for part in Formatter().parse(template) if part[1] is not None]
+        # Fields are texts already; a width could be so large that it fills the memory.
+        if any(spec or conversion for _, _, spec, conversion in parts):
+            raise ValueError("a field stands alone in its braces")
     except ValueError as exc:
         raise UsageError(f"a prompt block cannot be read, {exc}: {template!r}") from exc
-    # Fields are texts already; a width could be so large that it fills the memory.
-    if any(spec or conversion for _, _, spec, conversion in parts):
-        raise UsageError(f"in a prompt block a field stands alone in its braces: {template!r}")
     return [name for _, name, _, _ in parts if name is not None]
 
 
@@ -239,12 +231,9 @@ def with_block(
     follows there; else at the end. Raises UsageError for a place that there is not.
     """
     if anchor is None and block.before is not None:
-        paper = [each for each, known in BLOCKS.items() if known.before is None]
-        if block.before not in paper:
-            raise UsageError(
-                f"the prompt block {name} stands before {block.before}; valid: {', '.join(paper)}"
-            )
-        later = paper[paper.index(block.before) :]
+        paper = {each: known for each, known in BLOCKS.items() if known.before is None}
+        require(paper, f"place of the prompt block {name}, before", block.before)
+        later = dropwhile(lambda each: each != block.before, paper)
         anchor = next((each for each in later if each in blocks), None)
     names = list(blocks)
     place = len(names) if anchor is None else names.index(anchor) + after
