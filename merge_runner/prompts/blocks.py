@@ -27,16 +27,15 @@ class Block:
     """One paragraph of the prompt.
 
     ``meaning`` says in a few words what it is for. ``merge`` and ``straight`` are its templates
-    before and after the merge point, None where it is left out. It is in the prompt of every
-    variant that does not remove it if ``in_baseline``, else of those that add it, and stands
-    before the block ``before``, None for those of the paper, which stand as they are registered.
-    Raises UsageError where a template names what there is not.
+    before and after the merge point, None where it is left out. Those of the paper have no
+    ``before``: they are in the prompt of every variant that does not remove them, as they are
+    registered. Any other stands before the block ``before`` in those variants that add it. Raises
+    UsageError where a template names what there is not.
     """
 
     meaning: str
     merge: str | None
     straight: str | None
-    in_baseline: bool = False
     before: str | None = OUTPUT_FORMAT
 
     def __post_init__(self) -> None:
@@ -182,8 +181,7 @@ _READY = (
 BLOCKS = Registry[Block]("prompt block")
 for _before, _blocks in ((None, _PAPER), ("C1", _READY)):
     for _name, _meaning, _merge, _straight in _blocks:
-        _block = Block(_meaning, _merge, _straight, _before is None, _before)
-        BLOCKS.register(_name, _block)
+        BLOCKS.register(_name, Block(_meaning, _merge, _straight, _before))
 
 VARIANTS = Registry[Variant]("variant")
 VARIANTS.register("baseline", Variant(title="Baseline"))
@@ -209,10 +207,10 @@ def blocks_of(variant: str) -> dict[str, Block]:
         return dict(chosen.blocks)
     for name in sorted(chosen.removes | chosen.adds):
         BLOCKS.require(name, f"the variant {variant} names it")
-    kept = {n: b for n, b in BLOCKS.items() if b.in_baseline and n not in chosen.removes}
-    blocks = {name: block for name, block in kept.items() if block.before is None}
+    paper = {name: block for name, block in BLOCKS.items() if block.before is None}
+    blocks = {name: block for name, block in paper.items() if name not in chosen.removes}
     # In the order of names, which is that of no import.
-    for name in sorted({*kept, *chosen.adds} - blocks.keys()):
+    for name in sorted(chosen.adds - blocks.keys()):
         blocks = with_block(blocks, name, BLOCKS[name])
     return {name: BLOCKS[name] for name in blocks}
 
