@@ -14,7 +14,7 @@ from pydantic import JsonValue
 from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, ego_side, validated
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
-from merge_runner.errors import UsageError, unknown_name
+from merge_runner.errors import UsageError
 from merge_runner.llm.formats.parameters import known_parameters, with_parameter
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES, Side, other_side
@@ -232,9 +232,8 @@ def _arm(
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
     programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
-    parameters = {
-        name: level for name, level in levels.items() if _is_parameter(name) and level != DEFAULT
-    }
+    others = {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields}
+    parameters = {n: x for n, x in levels.items() if n not in others and x != DEFAULT}
     if parameters and not changed & {*registry}:
         raise UsageError(f"{model} is a program and takes no {min(parameters)}, only {DEFAULT!r}")
     asked, entries = dict(sides), {}
@@ -301,17 +300,12 @@ def _world_step(scenario: ScenarioConfig, programs: Mapping[str, Program]) -> di
     return {} if usual else {"step_s": step_s, "plan_step_s": scenario.action_s}
 
 
-def _is_parameter(name: str) -> bool:
-    return name not in {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields}
-
-
 def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     """Raise UsageError for a factor that there is not, and for a name that is taken."""
-    switches = ScenarioConfig.model_fields
     parameters = sorted(known_parameters(registry.values()))
-    valid = (PROMPT, OPPONENT, PERCEPTION, *parameters, *switches)
-    if unknown := [name for name in file.factors if name not in valid]:
-        raise unknown_name("factor", unknown[0], valid, "models and skip stand above [factors]")
+    valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
+    for name in file.factors:
+        require(valid, "factor", name, "models and skip stand above [factors]")
     taken = [f"drivers.{name}" for name in file.drivers if name in registry]
     taken += [f"{PERCEPTION}.{name}" for name in file.perception if name == PERFECT_ONE]
     if taken:
