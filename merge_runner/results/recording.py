@@ -26,8 +26,13 @@ from pydantic import TypeAdapter
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import KEY_VERSION, canonical_json
-from merge_runner.llm.verify import DAMAGED, check_body, check_call
+from merge_runner.llm.content_hashes import (
+    DAMAGED,
+    KEY_VERSION,
+    canonical_json,
+    check_body,
+    check_call,
+)
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
 from merge_runner.results.database import Settings, fetched, in_memory

@@ -23,10 +23,9 @@ from merge_runner.config import ModelEntry
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed, MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
+from merge_runner.llm.content_hashes import DAMAGED, make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply, judge
-from merge_runner.llm.verify import DAMAGED
 from merge_runner.prompts.blocks import blocks_of
 from merge_runner.records import ANSWERS, SIDES, Attempt, Slot, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import in_use, require, use
@@ -123,8 +122,8 @@ def _audit(
     try:
         plan = Plan.model_validate_json(config)
         # The stored plug-ins are somebody's code and never run.
-        if plan.study.is_own and not in_use().text:
-            use(declared_catalogue(plan.study.text))
+        if not in_use().text:
+            use(declared_catalogue(plan.study.file))
         stored, members = json.loads(config), plan.model_dump(mode="json").items()
         if wrong := [name for name, value in members if stored.get(name, value) != value]:
             text = f"it disagrees with itself in {', '.join(wrong)}"
