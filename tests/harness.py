@@ -14,11 +14,12 @@ from pathlib import Path
 
 from aiohttp import web
 
-from merge_runner.emulator.server import HOST, application
+from merge_runner.emulator.server import HOST
 from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 from merge_runner.registry import GROUP
 from merge_runner.run.plan import Options, Plan
 from merge_runner.run.sweep import Outcome, open_sweep
+from tests.mock_server import application
 
 PROJECT = Path(__file__).parent.parent
 PROGRAM = Path(sys.executable).with_name("merge-runner")

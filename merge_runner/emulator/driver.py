@@ -4,6 +4,9 @@ Who goes first is drawn from the human logistic odds, or from those that a reque
 (``planted_effect``), once for a trial and shared by both sides. Both hold piecewise constant
 accelerations that open a gap. In every third repetition, in one condition, the driver
 that should yield misjudges: it keeps level with the other, and they collide.
+
+Beside it a driver that understands nothing draws its answers to any prompt at random: it rehearses
+a study whose prompts the scripted driver cannot read.
 """
 
 from __future__ import annotations
@@ -31,6 +34,8 @@ NEEDED = (
     "exactly N numbers",
 )
 HARDEST_BRAKING_MPS2, HARDEST_PUSH_MPS2 = -2.2, 1.4
+# The most actions of a plan, and the lengths that it usually has, for the random driver.
+MOST_ACTIONS, USUAL_LENGTHS = 200, range(1, 31)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +92,20 @@ def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) 
     plan = ", ".join([f"{normalised:.2f}"] * seen.plan_actions)
     token = ("M\n\n" if temper.goes_first else "Y\n\n") if seen.asks_tactical else ""
     return f"{token}{why}\n\n```python\n[{plan}]\n```"
+
+
+def random_answer(prompt: str, slot: Slot | None) -> str:
+    """Return M or Y and a plan, both drawn at random; without a slot by the prompt alone."""
+    drawn_for = (prompt, *(() if slot is None else slot.as_dict().values()))
+    word = "M" if draw("word", *drawn_for) < 0.5 else "Y"
+    action = f"{round(draw_between(-1, 1, 'action', *drawn_for), 2) + 0.0:.2f}"
+    lengths = {int(number) for number in re.findall(r"exactly (\d+) numbers", prompt)}
+    if not lengths:
+        # The parser takes the list of the right length, whatever others stand beside it.
+        mentioned = map(int, re.findall(r"(?<![\d.])\d{1,3}(?!\.?\d)", prompt))
+        lengths = {*USUAL_LENGTHS, *(n for n in mentioned if 0 < n <= MOST_ACTIONS)}
+    plans = "\n".join(f"[{', '.join([action] * length)}]" for length in sorted(lengths))
+    return f"{word}\n\nI draw lots and hold what I draw.\n\n```python\n{plans}\n```"
 
 
 def read_prompt(prompt: str) -> Seen | str:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
-from merge_runner.llm.batch.terms import batch_terms
+from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import without_prompt
 from merge_runner.llm.prices import cost_usd

@@ -8,14 +8,14 @@ from urllib.parse import urlsplit
 import aiohttp
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.server import run, serve
+from merge_runner.emulator.server import run
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import read_error
 from merge_runner.llm.formats.delays import server_delay_s
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import ANSWERED_FIELD, SCRIPTED_FIELD, SCRIPTED_HEADER
+from tests.mock_server import FaultPlan, serve
 
 WIRES = ("openai-chat", "openai-responses", "gemini", "anthropic")
 PATHS = {
@@ -440,7 +440,7 @@ async def test_the_models_are_listed(emulator):
 
 async def test_it_announces_its_url_serves_and_closes_its_port_when_cancelled(driving_prompt):
     announced = asyncio.get_running_loop().create_future()
-    serving = asyncio.create_task(run(0, FaultPlan(), announce=announced.set_result))
+    serving = asyncio.create_task(run(0, announce=announced.set_result))
     async with asyncio.timeout(10):
         url = await announced
         status, _, _ = await ask(url, "openai-chat", driving_prompt)

@@ -18,7 +18,6 @@ import pytest
 from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry, Price
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
@@ -41,6 +40,7 @@ from tests.llm.test_scenarios import (  # noqa: F401 # fixtures
     _idle_connections_grow_old_in_virtual_time,
     _no_settings_of_the_user,
 )
+from tests.mock_server import FaultPlan
 from tests.virtual_time import in_virtual_time
 
 PRICE = Price(input=2, output=8, source="test")

@@ -84,11 +84,11 @@ def stock(cache, folder):
 
 texts = st.text(st.characters(exclude_categories=["Cs"]))
 counts = st.none() | st.integers(0, 10**9)
-numbers = st.floats(allow_nan=False, allow_infinity=False)
+numbers = st.floats(0, 2**31 - 1)
 attempts = st.builds(
     Attempt,
     number=st.integers(1, 99),
-    outcome=texts,
+    outcome=st.from_regex("[a-z][a-z0-9_]{0,39}", fullmatch=True),
     http_status=st.none() | st.integers(100, 599),
     model_served=st.none() | texts,
     finish_reason=st.none() | texts,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from merge_runner.llm.formats.anthropic import AnthropicMessages
 from merge_runner.llm.formats.base import WireFormat
-from merge_runner.llm.formats.gemini import GeminiGenerateContent
-from merge_runner.llm.formats.openai import OpenAIChat, OpenAIResponses
+from merge_runner.llm.formats.builtin import (
+    AnthropicMessages,
+    GeminiGenerateContent,
+    OpenAIChat,
+    OpenAIResponses,
+)
 from merge_runner.registry import Registry
 
 FORMATS: Registry[WireFormat] = Registry("wire format")
