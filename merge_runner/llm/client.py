@@ -305,7 +305,7 @@ class LlmClient:
             if not self.sealed:
                 return None
             raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-        return recorded and self._read(recorded, len(recorded.attempts))
+        return self._read(recorded, len(recorded.attempts)) if recorded else None
 
     def _count(self, reply: ChatReply) -> None:
         """Count an answer that a trial uses, and who gave it where it is another model."""
