@@ -184,9 +184,9 @@ class LlmClient:
     ``endpoint`` is the identity that enters the keys. ``budget`` is None for a model that costs
     nothing. ``first`` is the run's first call to the endpoint, which goes alone. ``sealed`` says
     that nothing may be asked anew, so that there is no ``transport``; ``strict`` that an answer of
-    another model stops the sweep. ``model`` is its name in the registry where ``name`` also tells
-    its parameters. ``batches`` are those in which it may be asked, or where its calls may wait
-    already. ``driver`` is its name, with the endpoint where that is not the provider's own.
+    another model stops the sweep. ``batches`` are those in which it may be asked, or where its
+    calls may wait already. ``driver`` is its name, with the endpoint where that is not the
+    provider's own.
 
     ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
     its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
@@ -202,7 +202,6 @@ class LlmClient:
     budget: Budget | None = None
     sealed: bool = False
     strict: bool = False
-    model: str = ""
     first: FirstCall = field(default_factory=lambda: FirstCall(passed=True))
     batches: Batches | None = None
     under_way: dict[str, Call] = field(default_factory=dict)
@@ -329,7 +328,7 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
         worst_usd = cost_usd(self.entry, worst) or 0.0
-        asked = Asked(self.driver, str(request.slot), worst_usd, self.model or self.name)
+        asked = Asked(self.driver, str(request.slot), worst_usd)
         call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call

@@ -56,16 +56,8 @@ def make_request(
 ) -> ChatRequest:
     """Return a request with its key."""
     text = canonical_json(body)
-    return ChatRequest(
-        key=call_key(endpoint=endpoint, path=path, headers=headers, body=text, slot=slot),
-        provider=provider,
-        endpoint=endpoint,
-        model=model,
-        path=path,
-        headers=headers,
-        body=text,
-        slot=slot,
-    )
+    key = call_key(endpoint=endpoint, path=path, headers=headers, body=text, slot=slot)
+    return ChatRequest(key, provider, endpoint, model, path, headers, text, slot)
 
 
 def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, slot: Slot) -> str:

@@ -6,7 +6,6 @@ import os
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
-from types import MappingProxyType
 
 from merge_runner.config import (
     ModelEntry,
@@ -80,7 +79,7 @@ def live_clients(
     *,
     stack: AsyncExitStack,
     rounds: Rounds | None = None,
-    urls: Mapping[str, str] = MappingProxyType({}),
+    urls: Mapping[str, str] | None = None,
     share: float = 1.0,
     limiters: dict[str, Limiter] | None = None,
 ) -> dict[str, LlmClient]:
@@ -105,7 +104,7 @@ def live_clients(
     costs = trial_costs(plan, earlier, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
     _allow_open_files(options.connections + SPARE_FILES)
-    env = {**os.environ, **urls}
+    env = {**os.environ, **(urls or {})}
     in_process = None
     if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
         from merge_runner.emulator.handler import Emulator
@@ -153,7 +152,6 @@ def live_clients(
             limiter=limiters[model],
             budget=None if entry.price == "free" else budget,
             strict=options.strict_model,
-            model=model,
             first=FirstCall(
                 # A round is asked at once: no call of it waits for another one's answer.
                 passed=rounds is not None and rounds.submits,
@@ -201,12 +199,8 @@ def check_batches(plan: Plan, options: Options) -> None:
     """Raise UsageError where a run cannot use batches as it is told to."""
     if not options.batch:
         return
-    if options.replay:
-        raise UsageError("a replay asks nothing: leave --batch out")
-    if options.dask is not None:
-        raise UsageError("--batch plays in this process: leave --dask out")
-    if not plan.entries:
-        raise UsageError("no language model is asked: leave --batch out")
+    if options.replay or options.dask is not None or not plan.entries:
+        raise UsageError("--batch asks models from this process: leave it, --replay or --dask out")
     runs = os.environ.get("EMULATOR_BASE_URL")
     if not runs and any(entry.provider == "emulator" for entry in plan.entries.values()):
         raise UsageError("the emulator has no batch mode: leave --batch out")

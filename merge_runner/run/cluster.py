@@ -73,10 +73,9 @@ VALID = (
 async def connected(where: str) -> AsyncIterator[Client]:
     """Connect to the cluster that ``--dask`` names, or start a local one; raises UsageError."""
     named = _WHERE.fullmatch(where)
-    if named is None:
+    is_file = Path(where).is_file()  # noqa: ASYNC240 # nothing else runs yet
+    if named is None or (named["file"] and not is_file):
         raise UsageError(f"--dask {where!r} names no cluster; {VALID}")
-    if named["file"] and not Path(where).is_file():  # noqa: ASYNC240 # nothing else runs yet
-        raise UsageError(f"there is no scheduler file {where}; {VALID}")
     try:
         import distributed
     except ModuleNotFoundError as exc:
@@ -86,12 +85,10 @@ async def connected(where: str) -> AsyncIterator[Client]:
     async with AsyncExitStack() as stack:
         scheduler = {"scheduler_file" if named["file"] else "address": where}
         if named["workers"]:
-            cluster = await stack.enter_async_context(_local_cluster(int(named["workers"])))
-            scheduler = {"address": cluster}
+            scheduler = {"address": await _local_cluster(int(named["workers"]), stack)}
+        client = distributed.Client(**scheduler, asynchronous=True, timeout=CONNECT_TIMEOUT_S)
         try:
-            client = await distributed.Client(
-                **scheduler, asynchronous=True, timeout=CONNECT_TIMEOUT_S
-            )
+            await client
         except (OSError, ValueError) as exc:
             raise UsageError(
                 f"no Dask scheduler answers at {where} within {CONNECT_TIMEOUT_S} s; start one "
@@ -101,32 +98,30 @@ async def connected(where: str) -> AsyncIterator[Client]:
         yield client
 
 
-@asynccontextmanager
-async def _local_cluster(workers: int) -> AsyncIterator[str]:
-    """Start worker processes, and yield their scheduler's address."""
+async def _local_cluster(workers: int, stack: AsyncExitStack) -> str:
+    """Start worker processes, which end with ``stack``; return their scheduler's address."""
     from multiprocessing import resource_tracker
 
     from distributed import LocalCluster
 
     os.environ["PYTHONSAFEPATH"] = "1"  # they import nothing of this folder
-    cluster = LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address=None,
-        silence_logs=logging.CRITICAL,
-        asynchronous=True,
-    )
     # A terminal's Ctrl-C reaches this process alone, which stops them in order: children inherit
     # what is blocked. The tracker, if it were started meanwhile, would unblock it again.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
     try:
-        await cluster
+        cluster = await stack.enter_async_context(
+            LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+                asynchronous=True,
+            )
+        )
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    async with cluster:
-        yield cluster.scheduler_address
+    return str(cluster.scheduler_address)
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,7 +316,7 @@ class DaskTasks:
         name = f"task {secrets.token_hex(8)}"
         cap_usd = self._options.max_cost_usd
         if any(entry.price != "free" for entry in self._plan.entries.values()):
-            usd = sum(self._costs.usd(spec.order) for spec in specs)
+            usd = sum((self._costs(spec.order) for spec in specs), 0.0)
             if cap_usd is not None:
                 usd = cap_usd = max(0.0, cap_usd - self._ledger.read().committed_usd) / idle
             asked = Asked(f"Dask worker {address}", specs[0].trial_id, usd)

@@ -6,19 +6,18 @@ import asyncio
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 
 from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import ProviderDown, TrialSuspended
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import LlmClient, Meter, Wait
+from merge_runner.llm.client import LlmClient, Wait
 from merge_runner.records import SIDES, ChatReply, Slot, TrialRecord, TrialSpec
 from merge_runner.run.clients import sealed_clients
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.plan import Plan
-from merge_runner.study.crossing import Arm
 from merge_runner.trial import play_trial
 
 # Called with each trial that ends, or is suspended for lack of money.
@@ -47,6 +46,15 @@ class LocalRunner:
     # Keyed by model and its number of answered calls, so that an answer starts a new count.
     _failures_in_a_row: Counter[tuple[str, int]] = field(default_factory=Counter)
 
+    def __post_init__(self) -> None:
+        self.meters = {name: client.meter for name, client in self.clients.items()}
+        self._arms = self.plan.by_label()
+        models = {
+            name: LanguageModel(partial(self._ask, name), partial(self.first.count, name))
+            for name in self.clients
+        }
+        self._drivers: dict[str, MakeDriver] = {**PROGRAMS, **models}
+
     @classmethod
     def sealed(cls, plan: Plan, cache: ResponseCache, in_flight: int = 1) -> LocalRunner:
         """Return one that plays from recorded replies alone.
@@ -54,25 +62,6 @@ class LocalRunner:
         They come at once: more trials in flight would only wait for each other.
         """
         return cls(plan, sealed_clients(plan, cache), in_flight)
-
-    @cached_property
-    def arms(self) -> Mapping[str, Arm]:
-        """The arms of the study by their labels."""
-        return self.plan.by_label()
-
-    @cached_property
-    def drivers(self) -> Mapping[str, MakeDriver]:
-        """Makers of drivers by name: of a program, or of a model that one of the clients asks."""
-        models = {
-            name: LanguageModel(partial(self._ask, name), partial(self.first.count, name))
-            for name in self.clients
-        }
-        return {**PROGRAMS, **models}
-
-    @property
-    def meters(self) -> Mapping[str, Meter]:
-        """The meters of the clients."""
-        return {name: client.meter for name, client in self.clients.items()}
 
     @property
     def waits(self) -> Sequence[Wait]:
@@ -119,11 +108,12 @@ class LocalRunner:
 
     async def play_one(self, spec: TrialSpec) -> TrialRecord:
         """Play a trial; raises TrialSuspended where there is no money for it."""
-        arm = self.arms[spec.arm]
+        arm = self._arms[spec.arm]
         asked = {*arm.asked.values()}
         async with self.first.turn(self.clients.keys() & asked):
             drivers = {
-                side: self.drivers[arm.asked[side]].make(arm.scenario, spec, side) for side in SIDES
+                side: self._drivers[arm.asked[side]].make(arm.scenario, spec, side)
+                for side in SIDES
             }
             self.running += 1
             try:
@@ -143,7 +133,7 @@ class LocalRunner:
 
     def _watch_for_outage(self, record: TrialRecord) -> None:
         """Stop when trials keep failing for one model that answers no call in between."""
-        asked = self.arms[record.spec.arm].asked
+        asked = self._arms[record.spec.arm].asked
         for name in {asked[failed.side] for failed in record.failed_calls}:
             if self.clients[name].sealed:
                 continue

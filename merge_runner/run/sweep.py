@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 from merge_runner.audit.checks import audit_sweep
@@ -34,7 +34,6 @@ from merge_runner.results.progress_file import ProgressFile
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recorded_study import described
 from merge_runner.results.recording import Spilled
-from merge_runner.results.rows import factor_rows
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     check_batches,
@@ -52,7 +51,6 @@ from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
 from merge_runner.signals import on_interrupt
-from merge_runner.study.crossing import Arm
 
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
@@ -110,6 +108,7 @@ class Sweep:
     _stored: list[TrialSpec]
     _todo: list[TrialSpec]
     _say: Callable[[str], None]
+    _ledger: Ledger
     _misses: list[Miss] = field(default_factory=list)
     _rounds: Rounds | None = None
 
@@ -130,10 +129,11 @@ class Sweep:
             return outcome
         self._misses.clear()
         async with AsyncExitStack() as stack:
-            runner = await self._runner(stack)
+            store = Store(self._options.db)
+            runner = await self._runner(store, stack)
             with unreadable_is_usage():
-                outcome.sweep_id = await self._begin()
-            flusher = Flusher(self._store, outcome.sweep_id, self._say)
+                outcome.sweep_id = await self._begin(store)
+            flusher = Flusher(store, outcome.sweep_id, self._say)
             progress = Progress(
                 plan=self._plan,
                 planned=len(self._stored) + len(self._todo),
@@ -164,7 +164,7 @@ class Sweep:
             progress.doing = "checking"
             file.write(progress.standing(outcome.sweep_id))
             if is_stored:
-                self._check(runner.first, outcome)
+                self._check(store, runner.first, outcome)
         return outcome
 
     async def estimate(self, *, whole: bool = False) -> Estimate:
@@ -173,10 +173,11 @@ class Sweep:
         ``whole``: what all trials take, as if none were stored or recorded yet.
         """
         trials = 0
-        calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in self._arms.items()}
+        arms = self._plan.by_label()
+        calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in arms.items()}
         runner = LocalRunner.sealed(self._plan, self._cache)
         for spec in [*self._stored, *self._todo] if whole else self._todo:
-            arm = self._arms[spec.arm]
+            arm = arms[spec.arm]
             record = await runner.play_one(spec) if arm.entries and not whole else None
             if record is not None and record.status != "failed":
                 continue
@@ -194,18 +195,6 @@ class Sweep:
             facts={**nothing, **earlier_answers(self._plan, self._cache)},
         )
 
-    @cached_property
-    def _arms(self) -> Mapping[str, Arm]:
-        return self._plan.by_label()
-
-    @cached_property
-    def _ledger(self) -> Ledger:
-        return Ledger(self._cache, self._plan.ledger)
-
-    @cached_property
-    def _store(self) -> Store:
-        return Store(self._options.db)
-
     async def _nothing_is_recorded(self) -> bool:
         """Whether all calls are missing, of which the first of each trial are noted."""
         runner = LocalRunner.sealed(self._plan, self._cache)
@@ -216,16 +205,14 @@ class Sweep:
         return bool(self._misses)
 
     def _note_misses(self, record: TrialRecord) -> None:
-        trial_id = record.spec.trial_id
-        self._misses += [
-            Miss(trial_id, call.request) for call in record.failed_calls if call.missed
-        ]
+        missed = [call.request for call in record.failed_calls if call.missed]
+        self._misses += [Miss(record.spec.trial_id, request) for request in missed]
 
     def _explain(self, outcome: Outcome) -> None:
         for line in explain(self._misses, self._cache.entries()) if self._misses else ():
             outcome.fail(ReplayMiss.exit_code, line)
 
-    async def _begin(self) -> str:
+    async def _begin(self, store: Store) -> str:
         started_at = datetime.now(UTC).replace(tzinfo=None)
         commit, dirty = await asyncio.to_thread(git_state)
         row = SweepRow(
@@ -239,15 +226,10 @@ class Sweep:
             git_dirty=dirty,
             versions=canonical_json(versions()),
         )
-        self._store.begin_sweep(
-            row,
-            self._plan.specs(),
-            [(spec.trial_id, spec.spec_hash) for spec in self._stored],
-            [factors for spec in self._stored for factors in factor_rows(spec)],
-        )
+        store.begin_sweep(row, self._plan.specs(), self._stored)
         return row.sweep_id
 
-    async def _runner(self, stack: AsyncExitStack) -> LocalRunner | DaskTasks:
+    async def _runner(self, store: Store, stack: AsyncExitStack) -> LocalRunner | DaskTasks:
         """What plays the trials: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if options.sends_nothing or not plan.entries:
@@ -258,10 +240,10 @@ class Sweep:
         first = FirstDecisions()
         if not options.keep_going:
             first = FirstDecisions(MOST_INVALID, one_by_one=rounds is None)
-            arms = {spec.spec_hash: self._arms[spec.arm] for spec in self._stored}
-            stored = self._store.decisions_by_spec(arms) if arms else []
+            labels = {spec.spec_hash: spec.arm for spec in self._stored}
+            stored = store.decisions_by_spec(labels) if labels else []
             for spec_hash, side, *decisions in stored:
-                if (model := arms[spec_hash].asked[side]) in plan.entries:
+                if (model := plan.by_label()[labels[spec_hash]].asked[side]) in plan.entries:
                     first.add(model, *decisions)
         if options.dask is not None:
             client = await stack.enter_async_context(connected(options.dask))
@@ -283,13 +265,12 @@ class Sweep:
         outcome: Outcome,
     ) -> None:
         """Run the trials until all have ended, or the sweep is stopped or interrupted."""
-        suspended: TrialSuspended | None = None
+        suspended: list[TrialSuspended] = []
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
-            nonlocal suspended
             if isinstance(record, TrialSuspended):
                 progress.outcome_counts["suspended"] += 1
-                suspended = record
+                suspended.append(record)
                 return
             progress.outcome_counts[record.status] += 1
             self._note_misses(record)
@@ -326,11 +307,11 @@ class Sweep:
             outcome.fail(INTERRUPTED, f"Interrupted. {GO_ON}")
         else:
             outcome.fail_by(work.exception())
-        if suspended is not None:
-            outcome.suspended = progress.outcome_counts["suspended"]
+        outcome.suspended = len(suspended)
+        if suspended:
             outcome.fail(
                 TrialSuspended.exit_code,
-                f"{outcome.suspended} trials wait for money: {suspended}. Their replies are kept: "
+                f"{len(suspended)} trials wait for money: {suspended[-1]}. Their replies are kept: "
                 "raise --max-cost, or the study's budget, and run the same command again",
             )
 
@@ -380,7 +361,7 @@ class Sweep:
             else:
                 outcome.fail_by(exc)
 
-    def _check(self, first: FirstDecisions, outcome: Outcome) -> None:
+    def _check(self, store: Store, first: FirstDecisions, outcome: Outcome) -> None:
         """Read back what the database holds of the sweep, audit it, and note how it ended."""
         db, sweep_id = self._options.db, outcome.sweep_id
         keys = [(spec.trial_id, spec.spec_hash) for spec in self._plan.trial_specs()]
@@ -396,7 +377,7 @@ class Sweep:
                 outcome.fail(1, f"the audit found {len(findings)} faults: `merge-runner audit`")
             outcome.messages += map(str, findings[:SHOWN])
             ended_at = datetime.now(UTC).replace(tzinfo=None)
-            self._store.end_sweep(sweep_id, ended_at, outcome.exit_code)
+            store.end_sweep(sweep_id, ended_at, outcome.exit_code)
         except (StoreError, UsageError) as exc:
             outcome.fail_by(exc)
 
@@ -429,7 +410,7 @@ async def open_sweep(
         if todo and not options.sends_nothing:
             options = _less_what_is_spent(plan, options, cache, say)
             cache.locks.take({f"{e.id} at {endpoints[name]}" for name, e in entries.items()})
-        yield Sweep(plan, options, cache, stored, todo, say)
+        yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger))
 
 
 async def _named(
