@@ -389,9 +389,10 @@ class DaskTasks:
         self._ledger.settle_share(task.name, played.spent, played.opened)
         for model, meter in played.meters.items():
             self.meters[model].add(meter)
+        arms = self._plan.by_label()
         for record in played.records:
             self._ended(record.spec, record)
-            asked = self._plan.by_label()[record.spec.arm].asked
+            asked = arms[record.spec.arm].asked
             for row in record.decisions:
                 if asked[row.side] in self._plan.entries:
                     self.first.count(asked[row.side], row.decision)
