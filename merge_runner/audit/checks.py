@@ -13,7 +13,7 @@ from pathlib import Path
 
 import duckdb
 
-from merge_runner.audit.findings import Audit, Finding, Sharing
+from merge_runner.audit.findings import Audit, Finding
 from merge_runner.errors import RecordingError, StoreError
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import canonical_json, spec_hash, without_prompt
@@ -51,6 +51,7 @@ JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
+SHOWN = 3
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 
@@ -103,7 +104,15 @@ def audit_sweep(path: Path, sweep_id: str, planned: Sequence[TrialKey], *, finis
     """Audit a sweep that has just been played; see ``check_sweep``."""
     with audited_database(path) as connection:
         audit = check_sweep(connection, sweep_id, planned, finished=finished)
-        audit.sharings += calls_in_common(connection)
+        shared = connection.execute("SELECT count(*), sum(calls) FROM calls_in_common").fetchall()
+        ((pairs, calls),) = shared
+        if pairs > SHOWN:
+            audit.notes.append(
+                f"{pairs} pairs of arms share {calls} calls, where they asked the same in the "
+                "same slots: `merge-runner audit` names them"
+            )
+        else:
+            audit.notes += _in_common(connection)
         return audit
 
 
@@ -126,8 +135,6 @@ def check_sweep(
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
     audit = Audit(sweep_id, counts, [*_findings(connection, "findings", sweep_id)])
     audit.notes += _notes(connection)
-    for earlier, trials in connection.execute("FROM taken_over").fetchall():
-        audit.sharings.append(Sharing("trials", sweep_id, earlier, trials))
     connection.execute("INSERT INTO done FROM audited")
     return audit
 
@@ -147,15 +154,14 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
         str(path),
         counts,
         list(_findings(connection, orphans)),
-        calls_in_common(connection),
-        [] if counts["sweeps"] else ["there is no sweep in this database"],
+        _in_common(connection) if counts["sweeps"] else ["there is no sweep in this database"],
     )
 
 
-def calls_in_common(connection: duckdb.DuckDBPyConnection) -> list[Sharing]:
-    """Return the calls that several specs share, since their requests were identical."""
+def _in_common(connection: duckdb.DuckDBPyConnection) -> list[str]:
+    """Return notes on calls that several specs share, since their requests were identical."""
     rows = connection.execute("FROM calls_in_common").fetchall()
-    return [Sharing("calls", *row) for row in rows]
+    return [f"{first} and {second} share {calls} calls" for first, second, calls in rows]
 
 
 def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:

@@ -267,14 +267,7 @@ FROM (
     ) GROUP BY model_left, model_right, side, prompt_hash
 );
 
--- Trials that a sweep did not play, since earlier ones had, and identical requests of the same slot.
-CREATE OR REPLACE TEMP VIEW taken_over AS
-SELECT earlier.sweep_id, count(*) AS trials
-FROM linked JOIN (SELECT DISTINCT * FROM sweep_trials) AS links USING (trial_id, spec_hash)
-JOIN sweeps AS earlier USING (sweep_id)
-WHERE started_at < (SELECT started_at FROM sweeps SEMI JOIN subject USING (sweep_id))
-GROUP BY ALL ORDER BY ALL;
-
+-- Identical requests of the same slot.
 CREATE OR REPLACE TEMP VIEW calls_in_common AS
 WITH used AS (
     SELECT DISTINCT call_key, spec_hash, driver || '/' || variant AS name
@@ -283,7 +276,7 @@ WITH used AS (
 )
 SELECT if(a.name = b.name, format('{} ({})', a.name, a.spec_hash), a.name),
     if(a.name = b.name, format('{} ({})', b.name, b.spec_hash), b.name),
-    count(DISTINCT call_key)
+    count(DISTINCT call_key) AS calls
 FROM used AS a JOIN used AS b USING (call_key)
 WHERE (a.name, a.spec_hash) < (b.name, b.spec_hash)
     AND (a.spec_hash IN (SELECT spec_hash FROM audited)
@@ -307,6 +300,14 @@ CREATE OR REPLACE TEMP VIEW notes AS
 SELECT format('unfinished: {} of {} trials are missing, {} failed; the same command again plays them',
     missing, (SELECT count(*) FROM planned), failed) AS text
 FROM counts, subject WHERE NOT finished AND missing + failed > 0
+UNION ALL FROM (
+    -- Trials that it did not play, since earlier ones had.
+    SELECT format('{} and {} share {} trials', subject.sweep_id, earlier.sweep_id, count(*))
+    FROM linked JOIN (SELECT DISTINCT * FROM sweep_trials) AS links USING (trial_id, spec_hash)
+    JOIN sweeps AS earlier USING (sweep_id), subject JOIN sweeps AS own ON own.sweep_id = subject.sweep_id
+    WHERE earlier.started_at < own.started_at
+    GROUP BY subject.sweep_id, earlier.sweep_id ORDER BY ALL
+)
 UNION ALL SELECT format('{} of its trials were played by another sweep', count(*))
 FROM unplayed WHERE elsewhere HAVING count(*) > 0
 UNION ALL SELECT format('{} of its trials are checked with a later sweep that has them too', count(*))

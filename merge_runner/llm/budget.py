@@ -1,14 +1,12 @@
 """A cap on what a sweep spends, over all its runs, that holds whatever happens.
 
 The worst case of an attempt is reserved when it queues for its turn, and durably, in the ledger,
-right before it is sent. PaidAttempt says where the money goes when the attempt ends, however it
-ends.
+right before it is sent; see PaidAttempt.
 
 So that money finishes trials instead of beginning ever more of them, a trial begins only where what
 it is expected to cost fits beside what the trials that have begun are still expected to cost.
-Expectations err, so the oldest trial goes first: an attempt leaves room for what older trials need,
-and for no younger one's. So the oldest trial has all the money that is left, and is suspended only
-where that does not pay for a single attempt.
+Expectations err, so an attempt leaves room for what older trials need, and for no younger one's:
+the oldest trial is suspended only where all the money left does not pay for a single attempt.
 
 A server may ignore the output cap. What a reply cost beyond its worst case is taken from what is
 left, and from then on the worst case is multiplied by as much as that driver's most expensive reply
@@ -21,9 +19,8 @@ from __future__ import annotations
 import asyncio
 import bisect
 import contextlib
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
 
@@ -35,67 +32,17 @@ from merge_runner.records import Attempt
 # An older trial that has money kept for it may wait for a call of a younger one, which waits for
 # money: after this long, with nothing in flight, it is no longer counted on.
 PATIENCE_S = 90.0
-# Trials that turn out longer, and attempts that are charged but bring no answer.
-MARGIN = 1.5
-
-
-@dataclass(frozen=True, slots=True)
-class TrialCalls:
-    """A model's calls in one trial: how many there usually are, how many at most.
-
-    ``worst_usd`` is the worst case of one of them.
-    """
-
-    usual: float
-    most: int
-    worst_usd: float
-
-
-@dataclass(slots=True)
-class TrialCosts:
-    """The expected costs of trials, which are named by their order in the sweep.
-
-    ``calls`` returns a trial's by model. What answers cost decides which trials begin, never what
-    may be spent.
-    """
-
-    calls: Callable[[int], Mapping[str, TrialCalls]]
-    _answers: Counter[str] = field(default_factory=Counter)
-    _usd: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-
-    def count(self, model: str, usd: float, answers: int = 1) -> None:
-        """Count answers of a model to such requests, of earlier runs, too, and their cost."""
-        self._answers[model] += answers
-        self._usd[model] += usd
-
-    def usd(self, trial: int) -> float:
-        """Return the USD that a trial is expected to cost: all it can, before any answer."""
-        sum_usd = 0.0
-        for model, calls in self.calls(trial).items():
-            expected_usd = calls.most * calls.worst_usd
-            if answers := self._answers[model]:
-                # The worst case counts as one more answer: a few cheap ones prove little.
-                mean_usd = (self._usd[model] + calls.worst_usd) / (answers + 1)
-                # Up to its last call a trial must be able to reserve that call's worst case.
-                usual_usd = MARGIN * calls.usual * mean_usd + calls.worst_usd
-                expected_usd = min(expected_usd, usual_usd)
-            sum_usd += expected_usd
-        return sum_usd
 
 
 @dataclass(slots=True)
 class PaidAttempt:
     """The money of one attempt, from its reservation to ``close``, the end of the attempt.
 
-    ``aside_usd`` is reserved in this process, and from ``begin`` on in the ledger. An attempt that
-    ends
-
-    - before ``begin`` (cancelled while waiting, refused by the cap) gives all of it back;
-    - after it (it may have been charged) leaves it in the ledger, until a user releases it;
-    - after ``settle`` or ``keep`` has what is not spent of it given back by the ledger, where the
-      cost is known.
-
-    What it gives back its trial may spend again.
+    ``aside_usd`` is reserved in this process while it is ``queued``, and from ``begin`` on in the
+    ledger. An attempt that ends before ``begin`` (cancelled while waiting, refused by the cap)
+    gives all of it back to its trial. After ``settle`` or ``keep`` it gives back what was not
+    spent, where the cost is known. Otherwise it may have been charged: all of it stays in the
+    ledger until a user releases it.
     """
 
     budget: Budget
@@ -106,6 +53,11 @@ class PaidAttempt:
     aside_usd: float
     queued: bool = True
     cost_usd: float | None = None
+
+    def __post_init__(self) -> None:
+        self.budget.in_flight += 1
+        self.budget.queued_usd += self.aside_usd if self.queued else 0.0
+        self.budget.charge(self.trial, self.aside_usd)
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
         """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
@@ -133,8 +85,6 @@ class PaidAttempt:
         """Keep the answer that the attempt brought, then settle what it cost."""
         kept = await self.ledger.cache.put(entry)
         await self._pay(entry.attempts[-1])
-        if self.cost_usd is not None:
-            self.budget.costs.count(self.asked.model, self.cost_usd)
         return kept
 
     async def _pay(self, attempt: Attempt) -> None:
@@ -155,16 +105,20 @@ class PaidAttempt:
 class Budget:
     """Spending under a cap in USD; without one nothing is refused, and all of it recorded.
 
-    A trial is named by its order in the sweep. ``in_flight`` counts the attempts that have money,
-    ``queued_usd`` is reserved in this process alone.
+    A trial is named by its order in the sweep; ``trial_usd`` returns the USD that one is expected
+    to cost. ``in_flight`` counts the attempts that have money, ``queued_usd`` is reserved in this
+    process alone.
     """
 
     def __init__(
-        self, ledger: Ledger, cap_usd: float | None = None, costs: TrialCosts | None = None
+        self,
+        ledger: Ledger,
+        cap_usd: float | None = None,
+        trial_usd: Callable[[int], float] = lambda _: 0.0,
     ) -> None:
         self.ledger = ledger
         self.cap_usd = cap_usd
-        self.costs = costs or TrialCosts(lambda _: {})
+        self.trial_usd = trial_usd
         self.in_flight = 0
         self.queued_usd = 0.0
         self._largest_usd = 0.0
@@ -200,23 +154,14 @@ class Budget:
         if self.cap_usd is not None:
             await self._in_turn((False, trial), partial(self._pays, trial, asked))
         usd = self._worst_usd(asked)
-        self.queued_usd += usd
         self._largest_usd = max(self._largest_usd, usd)
-        return self._paid(PaidAttempt(self, self.ledger, trial, key, asked, usd))
+        return PaidAttempt(self, self.ledger, trial, key, asked, usd)
 
     def going_on(self, trial: int, key: str, asked: Asked, scope: str) -> PaidAttempt:
-        """Return the money of an attempt that an earlier run has begun under a ledger's name.
-
-        The caller closes it.
-        """
+        """Return the money of an attempt that an earlier run has begun under a ledger's name."""
         ledger = Ledger(self.ledger.cache, scope) if self.ledger.scope else self.ledger
         usd = ledger.aside_usd(key)
-        return self._paid(PaidAttempt(self, ledger, trial, key, asked, usd, queued=False))
-
-    def _paid(self, paid: PaidAttempt) -> PaidAttempt:
-        self.in_flight += 1
-        self.charge(paid.trial, paid.aside_usd)
-        return paid
+        return PaidAttempt(self, ledger, trial, key, asked, usd, queued=False)
 
     def charge(self, trial: int, usd: float) -> None:
         """Count what a trial that has begun spends or sets aside, or gives back."""
@@ -234,9 +179,9 @@ class Budget:
             raise TrialSuspended("its trial is suspended")
         if trial in self._charged_usd:  # its other driver stood in the queue, too
             return True
-        needed_usd, left_usd = self.costs.usd(trial), self._left_usd()
+        needed_usd, left_usd = self.trial_usd(trial), self._left_usd()
         if left_usd < needed_usd and not self._charged_usd and not self.in_flight:
-            # The first one shows what a trial costs; each attempt must still fit.
+            # The first one begins all the same: it may cost less, and each attempt must still fit.
             if self._spent_before or self._left:
                 raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD")
         elif left_usd < needed_usd + self._needed_usd(self._charged_usd):
@@ -269,7 +214,7 @@ class Budget:
 
     def _needed_usd(self, trials: Iterable[int]) -> float:
         """Return what these begun trials are still expected to cost."""
-        return sum(max(0.0, self.costs.usd(each) - self._charged_usd[each]) for each in trials)
+        return sum(max(0.0, self.trial_usd(each) - self._charged_usd[each]) for each in trials)
 
     async def _in_turn(self, place: tuple[bool, int], may_go: Callable[[float], bool]) -> None:
         """Wait in the queue until ``may_go``, which is told for how many s this waits, is True."""

@@ -1,9 +1,9 @@
 """Recorded replies on disk: one text entry per call key, never evicted, never pickled.
 
-An entry is the JSON of a request, its slot and every attempt, the answering one last, behind a
-checksum. It is durable before anyone sees it: each batch of writes is one synchronous SQLite
-transaction. Beside the entries lie the attempts of calls that have no answer yet, the notes of
-batches, and damaged entries in quarantine. What was spent lies in the ledger's file (ledger.py).
+An entry is the JSON of a request and every attempt, the answering one last, behind a checksum.
+It is durable before anyone sees it: each batch of writes is one synchronous SQLite transaction.
+Beside the entries lie the attempts of calls that have no answer yet, the notes of batches, and
+damaged entries in quarantine.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import os
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import islice
@@ -25,20 +26,19 @@ import diskcache
 from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
+from merge_runner.llm.content_hashes import DAMAGED, check_body, check_call
 from merge_runner.llm.ledger import LedgerFile
 from merge_runner.llm.model_lock import ModelLocks
+from merge_runner.llm.sqlite_files import connect, making
 from merge_runner.llm.text_disk import (
     FILE,
     FORMAT,
     FORMAT_KEY,
+    NEW_CACHE,
     TextDisk,
-    connect,
-    damage_told,
-    making,
     open_texts,
     refuse_others,
 )
-from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.llm.write_batcher import BatchWriter, Operation, ResultT
 from merge_runner.records import Attempt, ChatRequest
 
@@ -78,9 +78,8 @@ class CachedCall:
         try:
             return _STORED.validate_json(text, strict=True).entry
         except ValidationError as exc:
-            raise RecordingError(
-                f"the recorded reply is damaged: {exc.errors()[0]['msg']}"
-            ) from exc
+            why = exc.errors()[0]["msg"]
+            raise RecordingError(f"the recorded reply is damaged: {why}") from exc
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,21 +122,12 @@ class ResponseCache:
         try:
             if not read_only:
                 _make(folder)
+            refuse_others(folder)
+            self._opened = self._file
             self._reading = connect(folder / FILE)
-            with contextlib.ExitStack() as stack:
-                stack.callback(self._reading.close)
-                refuse_others(folder, self._reading)
-                self._opened = self._file
-                if not read_only:
-                    self._texts = stack.enter_context(contextlib.closing(open_texts(folder)))
-                    with self._texts.transact():  # raises where nothing can be written
-                        self._texts.set("opened", "")
-                self._closing = stack.pop_all()
+            self._texts: Any = None if read_only else open_texts(folder)
         except FAILURES as exc:
-            raise UsageError(
-                f"the cache {folder} cannot be used: {exc}. Put a copy of it back, or fill another "
-                "one: `merge-runner recording import FILE --cache NEW`"
-            ) from exc
+            raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
 
     @cached_property
     def _overlay(self) -> Mapping[str, CachedCall]:
@@ -148,10 +138,7 @@ class ResponseCache:
         return self._overlay.get(key) or self._kept(key)
 
     async def put(self, entry: CachedCall) -> CachedCall:
-        """Keep an entry; returns the one that is kept when it is durable.
-
-        That is another one where an import was first: a kept reply is never replaced.
-        """
+        """Keep an entry durably; returns what is kept, another one where an import was first."""
         while (kept := await self.write(partial(self._keep, entry))) is None:
             self.set_damage_aside(entry.request.key)
         return kept
@@ -180,10 +167,7 @@ class ResponseCache:
         return added, seen - added
 
     def set_damage_aside(self, key: str) -> list[str]:
-        """Move a damaged entry, or list of attempts, to quarantine, byte for byte.
-
-        Returns the names of what was moved.
-        """
+        """Move a damaged entry or list of attempts to quarantine as it is; returns their names."""
         damaged = []
         for name, check in ((key, self._kept), (_UNANSWERED + key, self._tried)):
             try:
@@ -191,20 +175,14 @@ class ResponseCache:
             except RecordingError:
                 damaged.append(name)
         for name in damaged:
-            before = len(self.names(_DAMAGED + name))
-            aside = f"{_DAMAGED}{name} {before + 1}" if before else _DAMAGED + name
-            with (
-                self._told("written"),
-                contextlib.closing(connect(self.folder / FILE, "rw")) as own,
-            ):
+            aside = _DAMAGED + name
+            aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
+            with self._told("written"), closing(connect(self.folder / FILE, "rw")) as own:
                 own.execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
         return damaged
 
     def unanswered(self, key: str) -> Attempts:
-        """Return the attempts at a call that earlier runs made without an answer.
-
-        Those that a run began before it died are among them, with an unknown outcome.
-        """
+        """Return the attempts of earlier runs at a call without an answer, also unknown ones."""
         tried = self._tried(key)
         return (*tried, *self.money.begun(key, len(tried)))
 
@@ -230,13 +208,10 @@ class ResponseCache:
         return results
 
     def read(self, name: str) -> str | None:
-        """Return the text that was kept under a name, behind its checksum, or None.
-
-        Raises RecordingError where it is damaged, CacheFailed where the folder cannot be read.
-        """
-        with self._told("read"), damage_told():
-            row = self._reading.execute(_GET, [name]).fetchone()
-        return None if row is None else _checked(self._disk.fetch(*row))
+        """Return the text under a name, or None; raises RecordingError where it is damaged."""
+        with self._told("read"):
+            rows = self._reading.rows(_GET, name)
+        return _checked(self._disk.fetch(*rows[0])) if rows else None
 
     def replace(self, name: str, text: str) -> None:
         """Keep a text under a name that is no call key, behind a checksum; an operation."""
@@ -249,7 +224,7 @@ class ResponseCache:
     def names(self, prefix: str) -> list[str]:
         """Return the names, none of a call, that begin with a prefix."""
         with self._told("read"):
-            rows = self._reading.execute(_KEYS, [prefix, prefix + chr(0x10FFFF)]).fetchall()
+            rows = self._reading.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
         return [name.decode(errors="replace") for (name,) in rows]
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
@@ -260,8 +235,8 @@ class ResponseCache:
         with self._told("read"):
             for row in self._reading.execute(_CALLS):
                 try:
-                    with damage_told():
-                        key, raw, *value = self._reading.execute(_CALL, row).fetchone()
+                    with self._told("read"):
+                        ((key, raw, *value),) = self._reading.rows(_CALL, *row)
                     key, text = self._disk.get(key, raw), self._disk.fetch(*value)
                     entry = _verified(key, _checked(text))
                     check_body(entry.request.body)
@@ -286,7 +261,8 @@ class ResponseCache:
         self.locks.close()
         self.money.close()
         self._reading.close()  # first, since the last one to write ends the journal
-        self._closing.close()
+        if self._texts is not None:
+            self._texts.close()
 
     def _keep(self, entry: CachedCall) -> CachedCall | None:
         """Keep an entry unless there is one; None where that is damaged; an operation."""
@@ -313,17 +289,18 @@ class ResponseCache:
 
     @contextlib.contextmanager
     def _told(self, done: str) -> Iterator[None]:
-        """Raise CacheFailed where the folder cannot be read or written."""
+        """Raise CacheFailed where the folder cannot be used, RecordingError for what is no text."""
         try:
             yield
         except (diskcache.Timeout, *FAILURES) as exc:
+            if "utf-8" in str(exc).lower():  # SQLite says no more of it
+                raise RecordingError("the recorded reply is damaged: it is no text") from exc
             why = f"cannot be {done}: {str(exc) or 'another program writes'}"
             if self._file != self._opened:
-                why = "was removed, moved or replaced while it was in use, with what it kept"
+                why = "was removed, moved or replaced while it was in use"
             raise CacheFailed(
                 f"the cache {self.folder} {why}. When that is mended, or a copy of it put back, "
-                "run the same command again: what is in no cache is asked again. The database is "
-                "not affected"
+                "run the same command again: what is in no cache is asked again"
             ) from exc
 
     @property
@@ -338,11 +315,10 @@ class ResponseCache:
 def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
     """Add what the cache lacks of another folder's replies; returns (added, already there).
 
-    Each is verified, and the folder is only read. Raises RecordingError, when all others are added,
-    if any was damaged or none of ours.
+    The folder is only read. Raises RecordingError, when all others are added, if any was damaged.
     """
     left_out: list[str] = []
-    with contextlib.closing(ResponseCache(folder, read_only=True)) as source:
+    with closing(ResponseCache(folder, read_only=True)) as source:
         added, there = cache.add_missing(source.entries(left_out))
     if left_out:
         raise RecordingError(
@@ -360,17 +336,13 @@ def _make(folder: Path) -> None:
         return
     with making(folder), tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:
         if not (folder / FILE).exists():
-            with contextlib.closing(open_texts(Path(new))) as made:
+            with closing(open_texts(Path(new))) as made:
                 made.set(FORMAT_KEY, FORMAT)
             os.replace(Path(new) / FILE, folder / FILE)
 
 
 def _verified(key: str, text: str) -> CachedCall:
-    """Return the entry that a row holds.
-
-    Raises RecordingError unless it is whole and belongs to its key: a reply to one request must
-    never answer another.
-    """
+    """Return the entry that a row holds; raises RecordingError unless it belongs to its key."""
     entry = CachedCall.from_json(text)
     try:
         check_call(key, entry.request, entry.attempts)

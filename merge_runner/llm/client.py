@@ -31,7 +31,7 @@ from merge_runner.llm.batch.journal import OpenBatch
 from merge_runner.llm.batch.rounds import Batches
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
+from merge_runner.llm.content_hashes import make_request, reply_object
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import WireFormat
 from merge_runner.llm.http_outcome import (
@@ -41,10 +41,8 @@ from merge_runner.llm.http_outcome import (
     FirstCall,
     OutOfTime,
     RawReply,
-    RequestFailed,
     TransportFailure,
     TryAgain,
-    advice,
     backoff_s,
     if_nobody,
     judge,
@@ -54,7 +52,6 @@ from merge_runner.llm.http_outcome import (
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.llm.prices import cost_usd
-from merge_runner.llm.verify import reply_object
 from merge_runner.records import (
     SCRIPTED_HEADER,
     Attempt,
@@ -74,7 +71,6 @@ LONG_WAIT_S = 5.0
 # How often a format that knows empty answers as a fault is asked again after one; and how many
 # refusals by an endpoint that has answered before mean the configuration.
 EMPTY_RETRIES, SEVERAL = 2, 3
-MINUTE_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +147,7 @@ class Call:
 
 @dataclass(slots=True)
 class Meter:
-    """Counts of calls, attempts, tokens and cost; ``events`` holds the last minute's attempts.
+    """Counts of calls, attempts, tokens and cost.
 
     ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name; ``damaged``
     are the keys of recorded replies that could not be read.
@@ -159,6 +155,7 @@ class Meter:
 
     calls_live: int = 0
     calls_cached: int = 0
+    tokens: int = 0
     cost_usd: float = 0.0
     cost_unknown: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
@@ -166,30 +163,18 @@ class Meter:
     stand_ins: int = 0
     notes: deque[str] = field(default_factory=deque)
     damaged: list[str] = field(default_factory=list)
-    events: deque[tuple[float, int]] = field(default_factory=deque)
 
     def count_attempt(self, attempt: Attempt) -> None:
         """Count one live attempt."""
         self.outcomes[attempt.outcome] += 1
         self.cost_usd += attempt.cost_usd or 0.0
         self.cost_unknown += attempt.cost_usd is None
-        tokens = (attempt.usage.input_tokens or 0) + (attempt.usage.output_tokens or 0)
-        self.events.append((time.monotonic(), tokens))
+        self.tokens += (attempt.usage.input_tokens or 0) + (attempt.usage.output_tokens or 0)
 
     def add(self, other: Meter) -> None:
         """Add what another meter has counted."""
-        # The other's clock may be another machine's: what it has just counted counts as of now.
-        now = time.monotonic()
-        counted = replace(other, events=deque((now, tokens) for _, tokens in other.events))
         for each in fields(self):
-            setattr(self, each.name, getattr(self, each.name) + getattr(counted, each.name))
-
-    def last_minute(self) -> tuple[int, int]:
-        """Return the requests and tokens of the last minute."""
-        now = time.monotonic()
-        while self.events and now - self.events[0][0] > MINUTE_S:
-            self.events.popleft()
-        return len(self.events), sum(tokens for _, tokens in self.events)
+            setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
 
 
 @dataclass(slots=True)
@@ -199,9 +184,9 @@ class LlmClient:
     ``endpoint`` is the identity that enters the keys. ``budget`` is None for a model that costs
     nothing. ``first`` is the run's first call to the endpoint, which goes alone. ``sealed`` says
     that nothing may be asked anew, so that there is no ``transport``; ``strict`` that an answer of
-    another model stops the sweep. ``model`` is its name in the registry where ``name`` also tells
-    its parameters. ``batches`` are those in which it may be asked, or where its calls may wait
-    already. ``driver`` is its name, with the endpoint where that is not the provider's own.
+    another model stops the sweep. ``batches`` are those in which it may be asked, or where its
+    calls may wait already. ``driver`` is its name, with the endpoint where that is not the
+    provider's own.
 
     ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
     its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
@@ -217,7 +202,6 @@ class LlmClient:
     budget: Budget | None = None
     sealed: bool = False
     strict: bool = False
-    model: str = ""
     first: FirstCall = field(default_factory=lambda: FirstCall(passed=True))
     batches: Batches | None = None
     under_way: dict[str, Call] = field(default_factory=dict)
@@ -344,7 +328,7 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
         worst_usd = cost_usd(self.entry, worst) or 0.0
-        asked = Asked(self.driver, str(request.slot), worst_usd, self.model or self.name)
+        asked = Asked(self.driver, str(request.slot), worst_usd)
         call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call
@@ -411,15 +395,17 @@ class LlmClient:
 
         try:
             return await deadline.keep(partial(self._attempt, call, deadline), sleep=sleep)
-        except (OutOfTime, RequestFailed) as exc:
-            why = f"{exc} ({call.last_failure}), {len(call.own_attempts)} attempts"
-            if isinstance(exc, OutOfTime) and not self.first.passed:
-                raise ProviderDown(
-                    f"{self.driver}: the first call of this run: {why}: nothing else is asked. "
-                    "When the service answers again, run the same command"
-                ) from exc
-            attempts = tuple(call.attempts)
-            raise CallFailed(f"{self.name}: {why}", call.request, attempts, call.earlier) from exc
+        except OutOfTime as exc:
+            if self.first.passed:
+                raise self._failed(call, str(exc)) from exc
+            raise ProviderDown(
+                f"{self.driver}: the first call of this run: {exc} ({call.last_failure}): nothing "
+                "else is asked. When the service answers again, run the same command"
+            ) from exc
+
+    def _failed(self, call: Call, why: str) -> CallFailed:
+        why = f"{self.name}: {why} ({call.last_failure}), {len(call.own_attempts)} attempts"
+        return CallFailed(why, call.request, tuple(call.attempts), call.earlier)
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; return its answer, which is kept, or raise what follows from it."""
@@ -484,27 +470,14 @@ class LlmClient:
 
     def _error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
-        if not self.first.passed and (stop := self._end_of_run(call, outcome)):
+        if stop := self._end_of_run(call, outcome):
             return stop
-        message, delay_s = outcome.message or outcome.name, outcome.delay_s or 0.0
-        why = ""
-        if outcome.action == "quota":
-            why = "the account's quota is exhausted"
-        elif outcome.pause and delay_s > self.entry.deadline_s:
-            why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
-        if why:
-            return QuotaExhausted(
-                f"{self.driver}: {why} ({message}). Every reply so far is saved; run the same "
-                "command later to go on."
-            )
+        message = outcome.message or outcome.name
         match outcome.action:
             case "retry":
                 return TryAgain(message, outcome.delay_s)
             case "fail":
-                return RequestFailed("nothing that is asked again would help")
-            case "refused":
-                what = advice(self.name, self.entry, outcome)
-                return EndpointRefused(f"{self.driver}: {what} ({message})")
+                return self._failed(call, "nothing that is asked again would help")
         self.first.passed = self.first.known = True
         empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
         if outcome.name == "empty" and self._wire.retries_empty and empty <= EMPTY_RETRIES:
@@ -513,20 +486,34 @@ class LlmClient:
 
     def _end_of_run(self, call: Call, outcome: AttemptOutcome) -> SweepStopped | None:
         """Return the error that ends a run whose other calls would fare no better."""
-        first = self.first
-        if outcome.raw is None:
+        first, delay_s, why = self.first, outcome.delay_s or 0.0, None
+        if outcome.action == "refused" or not first.passed:
+            why = why_refused(self.name, self.entry, outcome)
+        if why is not None:
+            first.refused += outcome.action == "fail"
+            # An endpoint that has answered before may mean this prompt alone.
+            known = first.known and outcome.action != "refused"
+            return (
+                None
+                if known and first.refused < SEVERAL
+                else EndpointRefused(f"{self.driver}: {why}")
+            )
+        if outcome.name == "no_connection" and not first.passed:
             # A server that is just starting is waited for, but only for seconds.
-            waited_s = asyncio.get_running_loop().time() - call.began_s
-            if outcome.name != "no_connection" or waited_s < NOBODY_S:
+            if asyncio.get_running_loop().time() - call.began_s < NOBODY_S:
                 return None
             what = if_nobody(self.name, self.entry)
-            return ProviderDown(f"{self.driver}: {call.last_failure}: {what}")
-        why = why_refused(self.name, self.entry, outcome)
-        first.refused += why is not None and outcome.action == "fail"
-        # An endpoint that has answered before may mean this prompt alone.
-        if why is None or (first.known and first.refused < SEVERAL):
+            return ProviderDown(f"{self.driver}: {outcome.message}: {what}")
+        if outcome.action == "quota":
+            why = "the account's quota is exhausted"
+        elif outcome.pause and delay_s > self.entry.deadline_s:
+            why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
+        if why is None:
             return None
-        return EndpointRefused(f"{self.driver}: {why}")
+        return QuotaExhausted(
+            f"{self.driver}: {why} ({outcome.message}). Every reply so far is saved; run the same "
+            "command later to go on."
+        )
 
     def _tell_overrun(self, call: Call, aside_usd: float) -> None:
         spent_usd = call.attempts[-1].cost_usd or 0.0

@@ -9,7 +9,6 @@ import select
 import ssl
 import zlib
 from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping
-from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 from urllib.request import getproxies, proxy_bypass
 from uuid import uuid4
@@ -31,7 +30,8 @@ if TYPE_CHECKING:
 
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
-MOST_BYTES = 16_000_000
+# Of a reply, and of the results of a whole batch.
+MOST_BYTES, MOST_LINES_BYTES = 16_000_000, 1_000_000_000
 KEPT_S = 5.0
 MOST_UNPACKED = 2**18  # bytes at a time
 ENCODINGS = ("", "identity", "gzip", "x-gzip", "deflate")
@@ -135,49 +135,18 @@ class HttpTransport:
         timeout_s: float,
         most_bytes: int | None = None,
     ) -> RawReply:
-        """Ask for anything; raises TransportFailure."""
-        async with self._exchange(method, path, headers, body, timeout_s) as (reply, _):
-            return await self._read(reply, most_bytes or self._most_bytes)
-
-    async def lines(
-        self, path: str, headers: Mapping[str, str], *, timeout_s: float
-    ) -> AsyncGenerator[str | TransportFailure]:
-        """Get a body of lines, each up to ``most_bytes`` long, or why it is refused.
-
-        No line may take longer than ``timeout_s``. Raises ErrorReply where the status is not 200,
-        and TransportFailure.
-        """
-        loop, most = asyncio.get_running_loop(), self._most_bytes
-        async with self._exchange("GET", path, headers, b"", timeout_s) as (reply, limit):
-            if reply.status_code != 200:
-                raise ErrorReply(await self._read(reply, most))
-            async for line in split_lines(_unpacked(reply), most):
-                limit.reschedule(loop.time() + timeout_s)
-                yield _too_long(most) if line is None else self._mask(_decoded(line))
-
-    async def close(self) -> None:
-        """Close all connections."""
-        await self._carrier.aclose()
-
-    @asynccontextmanager
-    async def _exchange(
-        self, method: str, path: str, headers: Mapping[str, str], body: bytes, timeout_s: float
-    ) -> AsyncIterator[tuple[httpx.Response, asyncio.Timeout]]:
-        """Yield the reply to a request, with its body unread, and the time limit of both.
-
-        Turns every error of the libraries into a TransportFailure.
-        """
+        """Ask for anything; turns every error of the libraries into a TransportFailure."""
         own_id = self._own + next(self._ids)
         sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
         sent |= dict.fromkeys(ID_HEADERS, own_id)
         sent["connection"] = "close" if self.one_each else "keep-alive"
         request = httpx.Request(method, self._url(path), headers=sent, content=body)
         try:
-            async with asyncio.timeout(timeout_s) as limit:
+            async with asyncio.timeout(timeout_s):
                 reply = await self._carrier.handle_async_request(request)
                 try:
                     self._refuse_others(reply, own_id)
-                    yield reply, limit
+                    return await self._read(reply, most_bytes or self._most_bytes)
                 finally:
                     await reply.aclose()
         except TransportFailure:
@@ -188,6 +157,23 @@ class HttpTransport:
             raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
         except (httpx.RequestError, aiohttp.ClientError, zlib.error) as exc:
             raise self._failure(exc) from exc
+
+    async def lines(
+        self, path: str, headers: Mapping[str, str], *, timeout_s: float
+    ) -> AsyncGenerator[str | TransportFailure]:
+        """Get a body of lines, each up to ``most_bytes`` long, or why it is refused.
+
+        Raises ErrorReply where the status is not 200, and TransportFailure.
+        """
+        raw = await self.ask("GET", path, headers, timeout_s=timeout_s, most_bytes=MOST_LINES_BYTES)
+        if raw.status != 200:
+            raise ErrorReply(raw)
+        for line in raw.body.split("\n"):
+            yield line.strip() if len(line) <= self._most_bytes else _too_long(self._most_bytes)
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._carrier.aclose()
 
     def _refuse_others(self, reply: httpx.Response, own_id: str) -> None:
         """Raise TransportFailure where an answer names another request of this transport."""
@@ -204,8 +190,9 @@ class HttpTransport:
             if size > most_bytes:
                 raise _too_long(most_bytes)
             pieces.append(piece)
-        # A provider may echo the key in an error; it must not get into a log or a database.
-        body = self._mask(_decoded(b"".join(pieces)))
+        # UTF-8 is the encoding of JSON, whatever a header says. A provider may echo the key in an
+        # error; it must not get into a log or a database.
+        body = self._mask(b"".join(pieces).decode("utf-8-sig", errors="replace"))
         headers = {name.lower(): value for name, value in reply.headers.items()}
         return RawReply(reply.status_code, headers, body)
 
@@ -304,11 +291,6 @@ def _refused(why: str) -> TransportFailure:
     return TransportFailure("reply_refused", f"the reply is refused: {why}", action="fail")
 
 
-def _decoded(body: bytes) -> str:
-    """Decode a body as UTF-8, the encoding of JSON, whatever a header says."""
-    return body.decode("utf-8-sig", errors="replace")
-
-
 async def _unpacked(reply: httpx.Response) -> AsyncIterator[bytes]:
     """Yield the decompressed pieces of a body, which may be a thousand times as long."""
     encoding = reply.headers.get("content-encoding", "").strip().lower()
@@ -330,19 +312,3 @@ async def _unpacked(reply: httpx.Response) -> AsyncIterator[bytes]:
             await asyncio.sleep(0)  # other calls go on while a large body is unpacked
     if packed and not unpacking.eof:
         raise TransportFailure("connection_lost", f"the reply is cut within its {encoding}")
-
-
-async def split_lines(chunks: AsyncIterator[bytes], most_bytes: int) -> AsyncIterator[bytes | None]:
-    """Yield the lines of a body, or None for one of more than ``most_bytes``.
-
-    Their ends, which may be CRLF, are left out.
-    """
-    line = bytearray()  # of one that is too long no more than that is kept
-    async for chunk in chunks:
-        *ended, last = chunk.split(b"\n")
-        for part in ended:
-            line += part
-            yield bytes(line).removesuffix(b"\r") if len(line) <= most_bytes else None
-            line.clear()
-        line += last[: most_bytes + 1 - len(line)]
-    yield bytes(line).removesuffix(b"\r") if len(line) <= most_bytes else None

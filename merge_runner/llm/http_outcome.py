@@ -228,10 +228,6 @@ class TryAgain(MergeRunnerError):
         self.delay_s = delay_s
 
 
-class RequestFailed(MergeRunnerError):
-    """The provider rejects this one request; asking again would not help."""
-
-
 class OutOfTime(MergeRunnerError):
     """A call's deadline would pass before the next attempt."""
 
@@ -336,37 +332,34 @@ class FirstCall:
 
 def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | None:
     """Return why all calls of a run would fail, and what to set; None: they might not."""
-    raw, base_url = outcome.raw, set_base_url(name, entry)
-    assert raw is not None
-    if raw.is_web_page and raw.status == 200:
-        return f"a web page answers there, and no language model: {base_url}"
-    if outcome.name == "bad_body" and isinstance(raw.payload, dict):
-        return f"what answers there does not speak {entry.format}: {base_url}"
-    if outcome.action != "fail" or outcome.of_prompt:
-        return None
-    if raw.status not in REQUEST_ITSELF:
-        return f"no language model answers there: {base_url} ({outcome.message})"
-    said = f"{as_dict(as_dict(raw.first).get('error')).get('param')} {outcome.message}"
-    named = next((f"`parameters.{each}` of " for each in entry.parameters if each in said), "")
-    return f"the request is refused: look at {named}[{name}] in {REGISTRY} ({outcome.message})"
-
-
-def advice(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:
-    """Return what a user can do if the endpoint refuses all calls."""
-    if outcome.name == "not_allowed":
-        key_envs = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
-        key = " or ".join(key_envs) or f"`key_env` of [{name}] in {REGISTRY}"
-        return f"the endpoint does not accept the key; set {key} to a valid one"
+    raw, base_url, place = outcome.raw, set_base_url(name, entry), f"[{name}] in {REGISTRY}"
+    why = None
     if outcome.name == "bad_certificate":
-        return (
+        why = (
             "the endpoint's certificate cannot be trusted, and nothing was sent; check the base "
             "URL, or set SSL_CERT_FILE to the certificates of whoever signed it"
         )
-    retired = f", which was announced to shut down on {entry.shutdown}" if entry.shutdown else ""
-    return (
-        f"the endpoint has no model {entry.id!r}{retired}; see `merge-runner models`, or "
-        f"{set_base_url(name, entry)}"
-    )
+    elif raw is None or outcome.of_prompt:
+        return None
+    elif raw.is_web_page and raw.status == 200:
+        return f"a web page answers there, and no language model: {base_url}"
+    elif outcome.name == "bad_body" and isinstance(raw.payload, dict):
+        return f"what answers there does not speak {entry.format}: {base_url}"
+    elif outcome.action == "refused" and outcome.name == "not_allowed":
+        key_envs = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
+        key = " or ".join(key_envs) or f"`key_env` of {place}"
+        why = f"the endpoint does not accept the key; set {key} to a valid one"
+    elif outcome.action == "refused":
+        until = f", which was announced to shut down on {entry.shutdown}" if entry.shutdown else ""
+        model = f"the endpoint has no model {entry.id!r}{until}"
+        why = f"{model}; see `merge-runner models`, or {base_url}"
+    elif outcome.action == "fail" and raw.status not in REQUEST_ITSELF:
+        why = f"no language model answers there: {base_url}"
+    elif outcome.action == "fail":
+        said = f"{as_dict(as_dict(raw.first).get('error')).get('param')} {outcome.message}"
+        named = next((f"`parameters.{each}` of " for each in entry.parameters if each in said), "")
+        why = f"the request is refused: look at {named}{place}"
+    return why and f"{why} ({outcome.message})"
 
 
 def if_nobody(name: str, entry: ModelEntry) -> str:

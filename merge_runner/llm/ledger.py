@@ -18,7 +18,7 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.text_disk import connect, making
+from merge_runner.llm.sqlite_files import Connection, connect, making
 from merge_runner.llm.write_batcher import BatchWriter, Operation
 from merge_runner.records import Attempt
 
@@ -55,14 +55,10 @@ INSERT INTO spent VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET usd = usd + e
 overrun_usd = overrun_usd + excluded.overrun_usd,
 most_overrun = max(most_overrun, excluded.most_overrun)
 """
-_NOTE = """
-UPDATE open SET outcome = ? WHERE rowid =
-(SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
-"""
 _CLOSE = """
 DELETE FROM open WHERE rowid =
 (SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
-RETURNING usd, worst_usd
+RETURNING usd, driver, slot, worst_usd, since
 """
 _REASONS = """
 SELECT driver, outcome, count(*), sum(usd), min(since), max(since), min(slot) FROM open
@@ -72,15 +68,11 @@ WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Who is asked, for which slot, and the most that costs if the output cap is respected.
-
-    ``model`` is its name in the registry; ``driver`` names its endpoint, too.
-    """
+    """Which driver at which endpoint is asked, for which slot, and the most that honestly costs."""
 
     driver: str = ""
     slot: str = ""
     honest_usd: float = 0.0
-    model: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +106,7 @@ class LedgerFile:
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / FILE
-        self._connections: dict[str, sqlite3.Connection] = {}
+        self._connections: dict[str, Connection] = {}
         self._one_at_a_time = RLock()
         self.writer = BatchWriter(self.run_now)
 
@@ -124,7 +116,7 @@ class LedgerFile:
             # Its first transaction makes all tables: until then it is empty.
             if not self._connections and not (self._file.exists() and self._file.stat().st_size):
                 return []
-            return self._connection("ro").execute(sql, values).fetchall()
+            return self._connection("ro").rows(sql, *values)
 
     def spending(self, scope: str, ask: Callable[..., Rows]) -> Spending:
         """Return the sums of a sweep, by ``read`` or ``write``; raises UsageError for odd ones."""
@@ -132,7 +124,7 @@ class LedgerFile:
             # What is reserved first: what is settled meanwhile counts twice rather than never.
             ((reserved_usd, attempts),) = ask(_RESERVED, scope) or [(0.0, 0)]
             spent = ask(_SPENT, scope)
-            spent_usd, overrun_usd = (sum(row[column] for row in spent) for column in (1, 2))
+            spent_usd, overrun_usd = (sum((r[column] for r in spent), 0.0) for column in (1, 2))
             if not (spent_usd >= 0 and reserved_usd >= 0):
                 raise sqlite3.IntegrityError("no sweep can have spent that")
         overruns = {driver: most for driver, _, _, most in spent if most > 0}
@@ -140,7 +132,7 @@ class LedgerFile:
 
     def write(self, sql: str, *values: object) -> Rows:
         """Execute a statement within a transaction, and return its rows."""
-        return self._connection("rwc").execute(sql, values).fetchall()
+        return self._connection("rwc").rows(sql, *values)
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -173,7 +165,7 @@ class LedgerFile:
         while self._connections:
             self._connections.popitem()[1].close()
 
-    def _connection(self, mode: str) -> sqlite3.Connection:
+    def _connection(self, mode: str) -> Connection:
         """Return a connection of its own to read or write: the event loop reads while one syncs."""
         if mode not in self._connections:
             self._connections[mode] = connection = connect(self._file, mode)
@@ -212,13 +204,14 @@ class Ledger:
         self.spending = Spending()
         self.scope = scope
         self.cache = cache
+        self._money = cache.money
         # A damaged record is an error only where money is to be spent: a replay needs none.
         with contextlib.suppress(UsageError):
             self.read()
 
     def read(self) -> Spending:
         """Return the current state; raises UsageError where its record is damaged."""
-        self.spending = self.cache.money.spending(self.scope, self.cache.money.read)
+        self.spending = self._money.spending(self.scope, self._money.read)
         return self.spending
 
     def reserve(
@@ -227,70 +220,58 @@ class Ledger:
         """Reserve the worst case of an attempt at a call; False if that exceeds the cap."""
         if not self.scope:
             return True
-        money = self.cache.money
-        with money.transaction():
-            committed_usd = money.spending(self.scope, money.write).committed_usd
+        with self._money.transaction():
+            committed_usd = self._money.spending(self.scope, self._money.write).committed_usd
             if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
                 return False
             since = datetime.now(UTC).isoformat(timespec="milliseconds")
             place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
-            money.write(_OPEN, self.scope, key, number, usd, *place)
+            self._money.write(_OPEN, self.scope, key, number, usd, *place)
         return True
 
     def aside_usd(self, key: str) -> float:
         """Return the USD reserved for the last attempt at a call; 0 where nothing is."""
         sql = "SELECT usd FROM open WHERE scope = ? AND call = ? ORDER BY attempt DESC LIMIT 1"
-        rows = self.cache.money.read(sql, self.scope, key)
+        rows = self._money.read(sql, self.scope, key)
         return float(rows[0][0]) if rows else 0.0
 
     async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
         """Settle an attempt at a call; its reservation stays where the cost is unknown."""
         if self.scope:
-            await self.cache.money.writer.write(partial(self._settled, key, attempt, driver))
+            await self._money.writer.write(partial(self._settled, key, attempt, driver))
             self.read()
 
     def _settled(self, key: str, attempt: Attempt, driver: str) -> None:
-        money, place, cost_usd = (
-            self.cache.money,
-            (self.scope, key, attempt.number),
-            attempt.cost_usd,
-        )
-        if cost_usd is None:  # it may have been charged
-            money.write(_NOTE, attempt.outcome, *place)
-            return
-        rows = money.write(_CLOSE, *place)
-        # A batch may end after its money was released: then nothing is known to compare with.
-        usd, worst_usd = rows[0] if rows else (cost_usd, cost_usd)
-        overran = cost_usd > usd + TOLERANCE_USD
-        over = (cost_usd - usd, cost_usd / max(worst_usd, TOLERANCE_USD)) if overran else (0.0, 0.0)
-        money.write(_PAY, self.scope, driver, cost_usd, *over)
+        place, cost_usd, over = (self.scope, key, attempt.number), attempt.cost_usd, (0.0, 0.0)
+        # It may be gone: a batch may end after its money was released.
+        for row in self._money.write(_CLOSE, *place):
+            if cost_usd is None:  # it may have been charged
+                self._money.write(_OPEN, *place, *row, attempt.outcome)
+            elif cost_usd > row[0] + TOLERANCE_USD:
+                over = (cost_usd - row[0], cost_usd / max(row[3], TOLERANCE_USD))
+        if cost_usd is not None:
+            self._money.write(_PAY, self.scope, driver, cost_usd, *over)
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""
-        read = self.cache.money.read
-        opened = read("SELECT * FROM open WHERE scope = ?", self.scope)
-        return read(_SPENT, self.scope), [row[1:] for row in opened]
+        opened = self._money.read("SELECT * FROM open WHERE scope = ?", self.scope)
+        return self._money.read(_SPENT, self.scope), [row[1:] for row in opened]
 
     def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
         """Put what a task has spent, and has open, in the place of the share reserved for it."""
-        money = self.cache.money
-        with money.transaction():
-            money.write("DELETE FROM open WHERE scope = ? AND call = ?", self.scope, name)
+        with self._money.transaction():
+            self._money.write("DELETE FROM open WHERE scope = ? AND call = ?", self.scope, name)
             for sql, rows in ((_PAY, spent), (_OPEN, opened)):
                 for row in rows:
-                    money.write(sql, self.scope, *row)
+                    self._money.write(sql, self.scope, *row)
 
     def reasons(self) -> list[dict[str, Any]]:
-        """Return the reservations by driver and outcome, the largest sum in USD first.
-
-        ``first`` and ``last`` are UTC in ISO 8601; ``slot`` is one of those that they are for.
-        """
+        """Return the reservations by driver and outcome, with times in UTC and one of the slots."""
         names = ("driver", "outcome", "attempts", "usd", "first", "last", "slot")
-        rows = self.cache.money.read(_REASONS, self.scope)
-        return [dict(zip(names, row, strict=True)) for row in rows]
+        return [dict(zip(names, r, strict=True)) for r in self._money.read(_REASONS, self.scope)]
 
     def release(self) -> None:
         """Count no longer what is reserved; nobody may be asking meanwhile."""
-        with self.cache.money.transaction():
-            self.cache.money.write("DELETE FROM open WHERE scope = ?", self.scope)
+        with self._money.transaction():
+            self._money.write("DELETE FROM open WHERE scope = ?", self.scope)
         self.read()

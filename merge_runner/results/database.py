@@ -145,9 +145,8 @@ def _attach(
             connection.execute(f"ATTACH {file}")
         except duckdb.Error as exc:
             busy, waited_s = any(words in str(exc) for words in _BUSY), time.monotonic() - began
-            if not busy or waited_s >= patience_s:
-                instance.drop()
             if not busy:
+                instance.drop()
                 raise StoreError(
                     f"{path} cannot be opened as a database: {first_line(exc)}"
                 ) from exc

@@ -26,8 +26,13 @@ from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import KEY_VERSION, canonical_json
-from merge_runner.llm.verify import DAMAGED, check_body, check_call
+from merge_runner.llm.content_hashes import (
+    DAMAGED,
+    KEY_VERSION,
+    canonical_json,
+    check_body,
+    check_call,
+)
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
 from merge_runner.results.database import Settings, fetched, in_memory
@@ -93,9 +98,10 @@ class Summary:
 def export_recording(
     file: Path, cache: ResponseCache, keys: list[str], provenance: dict[str, str]
 ) -> int:
-    """Write the entries under these keys; returns their number. Raises RecordingError.
+    """Write the entries under these keys, in their order; returns their number.
 
-    Damaged entries are left out; once the others are written, the error names them.
+    Raises RecordingError. Damaged entries are left out; once the others are written, the error
+    names them.
     """
     if file.is_dir():
         raise UsageError(f"{file} is a folder: name a file")
@@ -109,14 +115,25 @@ def export_recording(
         ):
             connection.execute(f"ATTACH {quoted(f'{folder}/calls.duckdb')} AS file; USE file")
             columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
-            connection.execute(f"CREATE TABLE unordered ({columns})")
-            appender = connection.appender("unordered")
-            for rows in _parts(_exported_rows(cache, keys, damaged)):
-                appender.append_rows(rows)
-                appender.flush()
-            order = ", ".join((*SLOT, "call_key"))
-            connection.execute(f"CREATE TABLE calls AS FROM unordered ORDER BY {order}")
-            metadata = _signed(connection, provenance)
+            connection.execute(f"CREATE TABLE calls ({columns})")
+            appender = connection.appender("calls")
+            content, calls, size = hashlib.sha256(), 0, 0
+            for row in _exported_rows(cache, keys, damaged):
+                appender.append_rows([row])
+                content.update(_fingerprint(row[0], row[-1]))
+                calls, size = calls + 1, size + len(row[-1]) + len(row[-2])
+                if size > PART_BYTES:
+                    appender.flush()
+                    size = 0
+            appender.flush()
+            metadata = {
+                **provenance,
+                "format": FORMAT,
+                "key_version": str(KEY_VERSION),
+                "calls": str(calls),
+                "content_sha256": content.hexdigest(),
+            }
+            metadata[PROVENANCE_HASH] = _provenance_hash(metadata)
             pairs = ", ".join(f"{quoted(name)}: {quoted(text)}" for name, text in metadata.items())
             options = f"COMPRESSION zstd, ROW_GROUP_SIZE {BLOCK}, KV_METADATA {{{pairs}}}"
             connection.execute(
@@ -153,35 +170,6 @@ def _exported_rows(cache: ResponseCache, keys: list[str], damaged: list[str]) ->
             "attempts": ATTEMPTS.dump_json(entry.attempts).decode(),
         }
         yield tuple(columns[name] for name in COLUMNS)
-
-
-def _parts(rows: Iterable[Row]) -> Iterator[list[Row]]:
-    """Yield rows together, as many as have PART_BYTES of requests and attempts."""
-    part: list[Row] = []
-    size = 0
-    for row in rows:
-        part.append(row)
-        size += len(row[-1]) + len(row[-2])
-        if size > PART_BYTES:
-            yield part
-            part, size = [], 0
-    yield part
-
-
-def _signed(connection: duckdb.DuckDBPyConnection, provenance: dict[str, str]) -> dict[str, str]:
-    """Return all metadata of a recording of the table ``calls``, with their hashes."""
-    content, calls = hashlib.sha256(), 0
-    for key, attempts in fetched(connection.execute("SELECT call_key, attempts FROM calls")):
-        content.update(_fingerprint(key, attempts))
-        calls += 1
-    metadata = {
-        **provenance,
-        "format": FORMAT,
-        "key_version": str(KEY_VERSION),
-        "calls": str(calls),
-        "content_sha256": content.hexdigest(),
-    }
-    return metadata | {PROVENANCE_HASH: _provenance_hash(metadata)}
 
 
 def read_recording(file: Path) -> Iterator[CachedCall]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -17,7 +16,7 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import UsageError
-from merge_runner.records import TrialRecord
+from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.registry import require
 from merge_runner.results.comparison import FACTORS, PLACES, TrialKey, rows_of_trials, stored_rows
 from merge_runner.results.database import (
@@ -36,7 +35,7 @@ from merge_runner.results.database import (
     unreadable_is_usage,
     write_database,
 )
-from merge_runner.results.rows import Row, rows_of
+from merge_runner.results.rows import Row, factor_rows, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.measures import measures_sql
 from merge_runner.served_model import other_models
@@ -45,10 +44,12 @@ from merge_runner.served_model import other_models
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
 FACTS = Path(__file__).with_name("facts.sql")
 SWEEPS = "FROM sweeps ORDER BY started_at"
+# By their slots.
 CALLS_OF = """
-SELECT DISTINCT call_key FROM decisions
+SELECT DISTINCT condition, rep, side, decision, sample_set, call_key
+FROM decisions JOIN trials USING (trial_id, spec_hash)
 SEMI JOIN (FROM sweep_trials WHERE list_contains(?, sweep_id)) USING (trial_id, spec_hash)
-WHERE call_key IS NOT NULL ORDER BY call_key
+WHERE call_key IS NOT NULL ORDER BY ALL
 """
 # The first and the third of these columns order the rows of a trial.
 OF_THE_DIGEST = {
@@ -58,7 +59,6 @@ OF_THE_DIGEST = {
     "decisions": "decision, time_s, side, valid, failure, tactical, rationale, plan, applied, "
     "fallback, prompt",
 }
-AGAIN_S = 0.1  # after which a query that has not ended is told so again
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,21 +96,18 @@ class Store:
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
 
     def begin_sweep(
-        self,
-        sweep: SweepRow,
-        specs: dict[str, str],
-        stored: Sequence[TrialKey],
-        factors: Sequence[Row] = (),
+        self, sweep: SweepRow, specs: dict[str, str], stored: Sequence[TrialSpec]
     ) -> None:
         """Add a sweep, what its spec hashes stand for, and those of its trials already stored.
 
-        ``factors`` are the levels of these trials, which another study may have stored without.
+        Their levels are added, too, which another study may have stored without.
         """
         with write_database(self.path) as connection:
             connection.execute("INSERT INTO sweeps BY NAME SELECT unnest(?)", [asdict(sweep)])
             _add_specs(connection, specs)
-            append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
-            _add_factors(connection, factors)
+            links = ((sweep.sweep_id, spec.trial_id, spec.spec_hash) for spec in stored)
+            append(connection, "sweep_trials", links)
+            _add_factors(connection, [*chain.from_iterable(map(factor_rows, stored))])
 
     def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
         """Note when and how a sweep ended."""
@@ -190,11 +187,16 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
     """The result of a query, to be fetched; the database is locked until the block ends."""
     # The settings hold for a whole instance, and cannot be taken back.
-    with (
-        read_database(path, Instance()) as connection,
-        answering(connection, sql) as result,
-    ):
-        yield result
+    with read_database(path, Instance()) as connection:
+        # DuckDB looks at no signal while several of its threads work on a query.
+        connection.execute("SET threads = 1")
+        try:
+            with answering(connection, sql) as result:
+                yield result
+        except RuntimeError as exc:
+            if "interrupted" not in str(exc):
+                raise
+            raise KeyboardInterrupt from exc
 
 
 @contextmanager
@@ -217,7 +219,7 @@ def answering(
                 "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
                 "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
             )
-        _execute(connection, statements[0])
+        connection.execute(statements[0])
         yield connection
     except duckdb.IOException:
         raise  # a query reaches no file but the database, so it is the database that is damaged
@@ -229,22 +231,6 @@ def answering(
     except duckdb.Error as exc:
         hint = "; cast times with a zone, as in now()::TIMESTAMP" if "pytz" in str(exc) else ""
         raise UsageError(f"the query failed: {exc}{hint}") from exc
-
-
-def _execute(connection: duckdb.DuckDBPyConnection, statement: duckdb.Statement) -> None:
-    """Run a statement in a thread, so that Ctrl-C ends it.
-
-    DuckDB looks at no signal while several of its threads work on a query.
-    """
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(connection.execute, statement)
-        try:
-            running.result()
-        except KeyboardInterrupt:
-            while not running.done():  # a query that is about to begin forgets that it was to end
-                connection.interrupt()
-                wait([running], AGAIN_S)
-            raise
 
 
 def _reads(statement: duckdb.Statement) -> bool:
@@ -285,7 +271,7 @@ def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str
         wanted = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
         rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in wanted]
         keys = connection.execute(CALLS_OF, [wanted]).fetchall()
-    return rows, [key for (key,) in keys]
+    return rows, [key for *_, key in keys]
 
 
 @dataclass(frozen=True, slots=True)

@@ -152,7 +152,6 @@ def live_clients(
             limiter=limiters[model],
             budget=None if entry.price == "free" else budget,
             strict=options.strict_model,
-            model=model,
             first=FirstCall(
                 # A round is asked at once: no call of it waits for another one's answer.
                 passed=rounds is not None and rounds.submits,

@@ -316,7 +316,7 @@ class DaskTasks:
         name = f"task {secrets.token_hex(8)}"
         cap_usd = self._options.max_cost_usd
         if any(entry.price != "free" for entry in self._plan.entries.values()):
-            usd = sum(self._costs.usd(spec.order) for spec in specs)
+            usd = sum((self._costs(spec.order) for spec in specs), 0.0)
             if cap_usd is not None:
                 usd = cap_usd = max(0.0, cap_usd - self._ledger.read().committed_usd) / idle
             asked = Asked(f"Dask worker {address}", specs[0].trial_id, usd)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
 from merge_runner.llm.batch.providers import batch_terms
-from merge_runner.llm.budget import TrialCalls, TrialCosts
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import without_prompt
 from merge_runner.llm.prices import cost_usd
@@ -23,6 +22,8 @@ from merge_runner.study.crossing import Arm
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
 PROMPT_MARGIN = 1.25
+# Trials that turn out longer, and attempts that are charged but bring no answer.
+TRIAL_MARGIN = 1.5
 
 
 @dataclass(slots=True)
@@ -197,39 +198,25 @@ def _part(entry: ModelEntry, *, batch: bool) -> float:
     return 1.0 if terms is None else terms.price_factor
 
 
-def trial_costs(plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = False) -> TrialCosts:
-    """Return what the trials of a plan are expected to cost, in a ``batch`` run or not.
+def trial_costs(
+    plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = False
+) -> Callable[[int], float]:
+    """Return what tells by a trial's order the USD that it is expected to cost, perhaps in batches.
 
-    ``facts`` is as for ``estimate``.
+    They are its usual calls, with a margin, and one worst case, which the last call must be able to
+    reserve. ``facts`` is as for ``estimate``.
     """
-    labels = {spec.order: spec.arm for spec in plan.trial_specs()}
-    calls = {arm.label: _trial_calls(plan, arm, batch=batch) for arm in plan.arms}
-    costs = TrialCosts(lambda order: calls[labels[order]])
-    for name, totals in facts.items():
-        if totals.mean is not None:
-            entry, model = plan.entries[name], plan.registered[name]
-            usd = (cost_usd(entry, totals.mean) or 0.0) * _part(entry, batch=batch)
-            costs.count(model, totals.measured * usd, totals.measured)
-    return costs
-
-
-def _trial_calls(plan: Plan, arm: Arm, *, batch: bool) -> dict[str, TrialCalls]:
-    """Return the calls of each model in a trial: at most up to the timeout, all at their caps.
-
-    A model that drives on both sides with different parameters counts with the dearer ones.
-    """
-    # No tokeniser makes more tokens than bytes.
-    read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
-    usual, most = usual_prompts(arm), most_prompts(arm)
-    calls: dict[str, TrialCalls] = {}
-    for name in filter(arm.entries.get, arm.asked.values()):
-        entry, model = arm.entries[name], plan.registered[name]
-        worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
-        worst_usd = (cost_usd(entry, worst) or 0.0) * _part(entry, batch=batch)
-        other = calls.get(model, TrialCalls(0, 0, 0.0))
-        worst_usd = max(worst_usd, other.worst_usd)
-        calls[model] = TrialCalls(other.usual + usual, other.most + most, worst_usd)
-    return calls
+    by_arm: defaultdict[str, float] = defaultdict(float)
+    for arm in plan.arms:
+        # No tokeniser makes more tokens than bytes.
+        read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
+        for name in filter(arm.entries.get, arm.asked.values()):
+            entry, calls = arm.entries[name], _calls(plan, arm, name, 1, facts[name])
+            worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
+            usual_usd, worst_usd = (cost_usd(entry, each) or 0.0 for each in (calls.usage, worst))
+            usd = TRIAL_MARGIN * usual_prompts(arm) * usual_usd + worst_usd
+            by_arm[arm.label] += usd * _part(entry, batch=batch)
+    return {spec.order: by_arm[spec.arm] for spec in plan.trial_specs()}.__getitem__
 
 
 def typical_prompt(plan: Plan, arm: Arm) -> str:

@@ -23,10 +23,9 @@ from merge_runner.config import ModelEntry
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed, MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
+from merge_runner.llm.content_hashes import DAMAGED, make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply, judge
-from merge_runner.llm.verify import DAMAGED
 from merge_runner.prompts.blocks import blocks_of
 from merge_runner.records import ANSWERS, SIDES, Attempt, Slot, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import in_use, require, use
@@ -44,7 +43,7 @@ from merge_runner.run.clients import sealed_clients
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.study.crossing import MOST_TRIALS, Arm
+from merge_runner.study.crossing import Arm
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import one_line
 
@@ -121,7 +120,10 @@ def _audit(
     planned: dict[str, str] = {}
     specs: list[TrialSpec] = []
     try:
-        plan = _plan(config)
+        plan = Plan.model_validate_json(config)
+        # The stored plug-ins are somebody's code and never run.
+        if plan.study.is_own and not in_use().text:
+            use(declared_catalogue(plan.study.text))
         stored, members = json.loads(config), plan.model_dump(mode="json").items()
         if wrong := [name for name, value in members if stored.get(name, value) != value]:
             text = f"it disagrees with itself in {', '.join(wrong)}"
@@ -155,22 +157,6 @@ def _audit(
     return audit
 
 
-def _plan(config: str) -> Plan:
-    """Read a sweep's plan, and use the parts that its study declares; raises one of DAMAGED."""
-    plan = Plan.model_validate_json(config)
-    # The stored plug-ins are somebody's code and never run.
-    if plan.study.is_own and not in_use().text:
-        use(declared_catalogue(plan.study.text))
-    if plan.trials > MOST_TRIALS:
-        raise ValueError(f"it has {plan.trials} trials")
-    for name, entry in plan.entries.items():
-        if entry.format not in FORMATS:
-            raise ValueError(
-                f"its model {name} has the format {entry.format!r}, which there is not"
-            )
-    return plan
-
-
 def _installed_specs(connection: duckdb.DuckDBPyConnection, plan: Plan) -> list[TrialSpec]:
     """Return the specs of a plan whose parts are all installed, else raise UsageError.
 
@@ -202,33 +188,28 @@ def _replayable(
     hashes = dict(connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall())
     stored = dict(connection.execute("SELECT spec_hash, spec::VARCHAR FROM specs").fetchall())
     wanted = plan.specs()
-    others: dict[tuple[str, str], list[str]] = {}
     for spec in specs:
         actual = hashes.get(spec.trial_id, spec.spec_hash)
-        if actual != spec.spec_hash:
-            others.setdefault((actual, spec.spec_hash), []).append(spec.trial_id)
-    for (actual, expected), trials in others.items():
-        try:
-            old, new = _members(stored.get(actual, "{}")), _members(wanted[expected])
-            names = {name for name in old.keys() | new.keys() if old.get(name) != new.get(name)}
-        except (*DAMAGED, AttributeError):
-            names = {"everything"}
-        listed = ", ".join(sorted(names))
-        if names <= OF_THE_PROGRAM:
-            notes[f"they were made by another version or other data: {listed}"] += len(trials)
+        if actual == spec.spec_hash:
+            continue
+        old, new = _members(stored.get(actual, "{}")), _members(wanted[spec.spec_hash])
+        names = sorted(name for name in {**old, **new} if old.get(name) != new.get(name))
+        if OF_THE_PROGRAM.issuperset(names):
+            notes[f"they were made by another version or other data: {', '.join(names)}"] += 1
         else:
-            text = f"its spec is not what the sweep says in {listed}"
-            audit.findings.append(Finding("spec", text, audit.subject, trials[0]))
+            text = f"its spec is not what the sweep says in {', '.join(names)}"
+            audit.findings.append(Finding("spec", text, audit.subject, spec.trial_id))
     return [spec for spec in specs if hashes.get(spec.trial_id) == spec.spec_hash]
 
 
 def _members(text: str) -> dict[str, Any]:
-    """Return the members of a spec, those of drivers one by one."""
-    spec: dict[str, Any] = json.loads(text)
-    drivers = {
-        f"{side}.{name}": value for side in SIDES for name, value in spec.pop(side, {}).items()
-    }
-    return spec | drivers
+    """Return the members of a spec, those of drivers one by one; none of a damaged one."""
+    try:
+        spec: dict[str, Any] = json.loads(text)
+        drivers = [(side, spec.pop(side).items()) for side in SIDES]
+    except (*DAMAGED, AttributeError):
+        return {}
+    return spec | {f"{side}.{name}": value for side, items in drivers for name, value in items}
 
 
 def _replay(
@@ -320,34 +301,25 @@ def _attempt(number: int, row: Mapping[str, Any], entry: ModelEntry) -> Attempt:
     A failed attempt is taken as it is stored: its outcome depends on headers, which are not. The
     mark of a stand-in may have been a header too, so that a stored ``scripted`` is believed.
     """
-    body = row["reply"] or ""
-    with suppress(ValueError, RecursionError):
+    body = row["reply"]
+    with suppress(TypeError, ValueError, RecursionError):
         if isinstance(text := json.loads(body), str):
             body = text  # a body that is no JSON is stored as a JSON string
-    status = row["http_status"]
-    outcome = judge(RawReply(status or 0, {}, body), FORMATS[entry.format])
-    attempt = Attempt(
-        number,
-        row["outcome"],
-        status,
-        row["model_served"],
-        row["finish_reason"],
-        Usage(*(row[name.name] for name in fields(Usage))),
-        reply=None if row["reply"] is None else body,
-        error=row["error"],
-        scripted=row["scripted"],
+    names = ("outcome", "http_status", "model_served", "finish_reason", "error", "scripted")
+    usage = Usage(*(row[field.name] for field in fields(Usage)))
+    attempt = Attempt(number, **{name: row[name] for name in names}, usage=usage, reply=body)
+    outcome = judge(RawReply(attempt.http_status or 0, {}, body or ""), FORMATS[entry.format])
+    if outcome.action != "accept" and attempt.outcome not in ANSWERS:
+        return attempt
+    reading = outcome.reading
+    return replace(
+        attempt,
+        outcome=outcome.name,
+        error=outcome.message,
+        model_served=reading.model_served,
+        finish_reason=reading.finish_reason,
+        usage=reading.usage,
     )
-    if outcome.action == "accept" or row["outcome"] in ANSWERS:
-        reading = outcome.reading
-        return replace(
-            attempt,
-            outcome=outcome.name,
-            error=outcome.message,
-            model_served=reading.model_served,
-            finish_reason=reading.finish_reason,
-            usage=reading.usage,
-        )
-    return attempt
 
 
 def _findings(
@@ -382,17 +354,14 @@ def _findings(
 def _finding(kind: str, difference: Difference, trial_id: str, sweep_id: str) -> Finding:
     place = difference.place
     at = f" at step {place['step']}" if "step" in place else ""
-    more = f", and {difference.rows - 1} more in the trial" if difference.rows > 1 else ""
     if difference.column is None:
-        text = f"{difference.name} are missing or too many{at}{more}"
+        text = f"{difference.name} are missing or too many{at}"
     elif difference.column in LONG.get(difference.table, ()):
-        text = f"{difference.name} is not what it is replayed{more}"
+        text = f"{difference.name} is not what it is replayed"
     else:
-        stored, wanted = _short(difference.stored), _short(difference.wanted)
-        text = f"{difference.name}{at} is {stored}, and {wanted} replayed{more}"
+        values = (difference.stored, difference.wanted)
+        stored, wanted = ("NULL" if value is None else str(value)[:SHOWN] for value in values)
+        text = f"{difference.name}{at} is {stored}, and {wanted} replayed"
+    if difference.rows > 1:
+        text += f", and {difference.rows - 1} more in the trial"
     return Finding(kind, text, sweep_id, trial_id, place.get("side"), place.get("decision"))
-
-
-def _short(value: object) -> str:
-    text = "NULL" if value is None else str(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."

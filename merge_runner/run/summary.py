@@ -232,7 +232,7 @@ def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
 def _audited(audit: Audit) -> Iterator[str]:
     checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
     yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
-    notes = [f"note: {each}" for each in (*audit.notes, *audit.sharings)]
+    notes = [f"note: {each}" for each in audit.notes]
     yield from _first(notes, "more notes: `merge-runner audit`")
 
 

@@ -34,7 +34,6 @@ from merge_runner.results.progress_file import ProgressFile
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recorded_study import described
 from merge_runner.results.recording import Spilled
-from merge_runner.results.rows import factor_rows
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     check_batches,
@@ -227,12 +226,7 @@ class Sweep:
             git_dirty=dirty,
             versions=canonical_json(versions()),
         )
-        store.begin_sweep(
-            row,
-            self._plan.specs(),
-            [(spec.trial_id, spec.spec_hash) for spec in self._stored],
-            [factors for spec in self._stored for factors in factor_rows(spec)],
-        )
+        store.begin_sweep(row, self._plan.specs(), self._stored)
         return row.sweep_id
 
     async def _runner(self, store: Store, stack: AsyncExitStack) -> LocalRunner | DaskTasks:

@@ -119,7 +119,7 @@ def test_whole_sweeps_pass_and_what_was_checked_is_counted(made):
     assert counts["decisions"] >= counts["calls"] == counts["reply ids"] > 100
     assert found.audits[3]["counts"]["calls"] == 0
     assert found.audits[4]["counts"]["invalid"] > 0
-    assert found.notes.splitlines() == [
+    assert [note for note in found.notes.splitlines() if " share " not in note] == [
         f"emulator/{prompt}: not judged: 21 of the 76 decisions of emulator are invalid (27.6 %, "
         "more than 20 %)"
         for prompt in ("A7", "baseline")
@@ -128,10 +128,8 @@ def test_whole_sweeps_pass_and_what_was_checked_is_counted(made):
 
 @pytest.mark.slow
 def test_identical_requests_of_two_variants_are_listed_and_no_finding(made):
-    sharings = audit("--db", made / "results/merge.duckdb").audits[-1]["sharings"]
-    names = {(s["what"], s["first"], s["second"]) for s in sharings}
-    assert ("calls", "emulator/A7", "emulator/baseline") in names
-    assert all(sharing["count"] > 0 for sharing in sharings)
+    notes = audit("--db", made / "results/merge.duckdb").audits[-1]["notes"]
+    assert any(re.match("emulator/A7 and emulator/baseline share [1-9]", note) for note in notes)
 
 
 @pytest.mark.slow
@@ -578,9 +576,7 @@ def test_what_another_sweep_has_played_since_is_not_missing(db):
     found = audit("--db", db)
     assert found.code == 0
     assert "7 of its trials were played by another sweep" in found.notes
-    assert found.audits[1]["sharings"][0] == {
-        "what": "trials", "first": found.audits[1]["subject"], "second": stopped, "count": 1,
-    }  # fmt: skip
+    assert f"{found.audits[1]['subject']} and {stopped} share 1 trials" in found.notes
 
 
 def caching(kept: dict[str, dict], **changes: object):

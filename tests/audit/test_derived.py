@@ -121,7 +121,7 @@ def test_a_format_that_there_is_not_is_a_finding_and_switches_nothing_off_in_sil
     change(db, "UPDATE sweeps SET config = replace(config::VARCHAR, 'openai-chat', 'zz')::JSON")
     (finding,) = findings(db)
     assert finding.kind == "config"
-    assert "has the format 'zz', which there is not" in finding.text
+    assert finding.text.endswith("'zz'")
 
 
 @pytest.mark.parametrize(

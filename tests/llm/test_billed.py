@@ -165,7 +165,7 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
             cache=cache,
             transport=transport,
             limiter=Limiter(),
-            budget=Budget(Ledger(cache, name), cap * worst, each(worst, "my-model")),
+            budget=Budget(Ledger(cache, name), cap * worst, each(worst)),
             first=first or FirstCall(passed=True),
         )
 

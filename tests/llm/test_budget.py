@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import math
 import tempfile
 from pathlib import Path
@@ -14,14 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import TrialSuspended, UsageError
-from merge_runner.llm.budget import Budget, TrialCalls, TrialCosts
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.budget import Budget
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.records import Attempt, ChatRequest, Slot
+from merge_runner.records import Attempt
 from tests.harness import each
 
 CAP = 100
-KEYS = itertools.count()
 calls = st.lists(
     st.tuples(
         st.integers(0, 8),  # the trial
@@ -46,8 +44,8 @@ def ledger(cache, request):
     return Ledger(cache, request.node.name)
 
 
-def asked(worst, driver="", model="m"):
-    return Asked(driver, "", worst, model)
+def asked(worst, driver=""):
+    return Asked(driver, "", worst)
 
 
 def tried(actual, outcome="server_error"):
@@ -57,7 +55,7 @@ def tried(actual, outcome="server_error"):
 async def attempt(budget, trial, worst, actual, turns=0, model="m"):
     """Spend on one attempt as a client does."""
     await budget.admit(trial)
-    paid = await budget.set_aside(trial, f"key {model}", asked(worst, model=model))
+    paid = await budget.set_aside(trial, f"key {model}", asked(worst))
     with contextlib.closing(paid):
         await paid.begin([])
         for _ in range(turns):
@@ -185,37 +183,6 @@ async def test_attempts_that_cost_nothing_do_not_use_up_an_allowance(ledger):
     budget.leave(1)
     with pytest.raises(TrialSuspended):
         await other
-
-
-async def answer(budget, trial, usd, worst=1.0, model="m"):
-    """Pay for one answer as a client does."""
-    await budget.admit(trial)
-    key = f"key {next(KEYS)}"
-    with contextlib.closing(await budget.set_aside(trial, key, asked(worst, model=model))) as paid:
-        await paid.begin([])
-        request = ChatRequest(
-            key, "openai", "openai", model, "/p", {}, "{}", Slot("N_0_0", 1, "left", 0, 0)
-        )
-        await paid.keep(CachedCall(request, (Attempt(1, "ok", cost_usd=usd, reply="{}"),)))
-
-
-def costs(**models):
-    """Trials of 20 calls, or 40 at most, by model and with this worst case of a call."""
-    calls = {model: TrialCalls(20, 40, worst) for model, worst in models.items()}
-    return TrialCosts(lambda _: calls)
-
-
-async def test_once_answers_are_cheap_trials_begin_that_their_worst_case_kept_waiting(ledger):
-    budget = Budget(ledger, 50.0, costs(m=1.0))
-    await budget.admit(1)
-    others = [await soon(budget.admit(trial)) for trial in range(2, 7)]
-    assert not any(other.done() for other in others)
-    await answer(budget, 1, 0.01)  # by now a trial is expected to cost 16 USD
-    await asyncio.sleep(0.01)
-    assert [other.done() for other in others] == [True, True, False, False, False]
-    for _ in range(20):
-        await answer(budget, 1, 0.01)
-    await asyncio.gather(*others)
 
 
 async def test_the_oldest_trial_may_spend_what_is_kept_for_younger_ones(ledger):
@@ -447,6 +414,6 @@ async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
     with pytest.raises(error):
         await ended()
     spending = budget.ledger.read()
-    allowed_usd = budget.costs.usd(1) - budget._charged_usd[1]
+    allowed_usd = budget.trial_usd(1) - budget._charged_usd[1]
     assert (allowed_usd, spending.reserved_usd, spending.spent_usd) == money
     assert (budget.in_flight, budget.queued_usd) == (0, 0)
