@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from merge_runner.chance import draw, draw_between
+from merge_runner.chance import draw
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -14,7 +14,7 @@ class Behaviour:
 
     ``rates`` are the probabilities of errors per attempt: ``rate_limit``, ``server_error``,
     ``overloaded``, and ``malformed`` for prose without a plan. Every answer takes ``latency_s``. A
-    rate limit asks to wait about ``delay_s``. An answer has about ``output_tokens`` with its
+    rate limit asks to wait ``delay_s``. An answer has about ``output_tokens`` with its
     reasoning, or a few hundred.
     """
 
@@ -32,7 +32,3 @@ class Behaviour:
             if chance < 0:
                 return fault
         return None
-
-    def wait_s(self, where: str, attempt: int) -> float:
-        """Return the delay in s that a rate limit asks for."""
-        return round(draw_between(0.5, 1.5, "delay", self.seed, where, attempt) * self.delay_s, 6)

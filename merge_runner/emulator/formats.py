@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from merge_runner.chance import draw_index
-
 CREATED = 1_760_000_000
 Body = dict[str, Any]
 # What OpenAI, Gemini and Anthropic call an error of a status.
@@ -24,35 +22,17 @@ ERROR_NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class Completion:
-    """An answer of the model to a prompt; ``reply`` becomes part of its id.
+    """An answer of the model; ``reply`` becomes part of its id.
 
-    Its token counts are about a quarter of the bytes, and as many for the reasoning as bring its
-    output to about ``typical_output``, or a few hundred.
+    ``visible`` are the output tokens of the text, ``reasoning`` those that no reply shows.
     """
 
     reply: str
     model: str
-    prompt: str
     text: str
-    typical_output: int | None
-
-    @property
-    def tokens_in(self) -> int:
-        """Input tokens."""
-        return len(self.prompt.encode()) // 4
-
-    @property
-    def visible(self) -> int:
-        """Output tokens of the text."""
-        return len(self.text.encode()) // 4
-
-    @property
-    def reasoning(self) -> int:
-        """Output tokens of the reasoning, which no reply shows."""
-        if self.typical_output is None:
-            return 200 + draw_index(600, "reasoning", self.prompt)
-        drawn = self.typical_output // 2 + draw_index(self.typical_output, "reasoning", self.prompt)
-        return max(0, drawn - self.visible)
+    tokens_in: int
+    visible: int
+    reasoning: int
 
     @property
     def output(self) -> int:
@@ -198,15 +178,12 @@ def _openai_error(status: int, message: str, delay_s: float) -> tuple[Body, dict
 
 
 def _gemini_error(status: int, message: str, delay_s: float) -> tuple[Body, dict[str, str]]:
-    """Tell the delay in the message and in the details; a quota per minute passes by waiting."""
+    """Tell the delay in the message and in the details."""
     details: list[Body] = []
     if delay_s:
         message = f"{message} Please retry in {delay_s:.9f}s."
-        kind, quota = "type.googleapis.com/google.rpc.", "GenerateRequestsPerMinutePerProject"
-        details = [
-            {"@type": f"{kind}QuotaFailure", "violations": [{"quotaId": quota}]},
-            {"@type": f"{kind}RetryInfo", "retryDelay": f"{delay_s:.9f}s"},
-        ]
+        kind = "type.googleapis.com/google.rpc.RetryInfo"
+        details = [{"@type": kind, "retryDelay": f"{delay_s:.9f}s"}]
     name = ERROR_NAMES[status][1]
     error = {"code": status, "message": message, "status": name, "details": details}
     return {"error": error}, {}

@@ -16,6 +16,7 @@ from typing import Any
 
 import httpx
 
+from merge_runner.chance import draw_index
 from merge_runner.config import validated
 from merge_runner.emulator import Behaviour, driver
 from merge_runner.emulator.formats import SERVED, Completion, ServedFormat
@@ -31,11 +32,10 @@ from merge_runner.records import (
 )
 
 MODEL, RANDOM_MODEL = "scripted-driver", "random-driver"
-ID_HEADER = "x-request-id"
 # What anything but a chat request can raise: refused with 400.
 UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
-# The faults that are errors of the provider.
-STATUSES = {"rate_limit": 429, "server_error": 500, "overloaded": 503}
+# The faults that are errors of the provider, beside a rate limit.
+ERRORS = {"server_error": 500, "overloaded": 503}
 PROSE = "M\n\nI would rather describe my plan in words than write a list of numbers."
 
 
@@ -73,13 +73,7 @@ class Emulator:
 
     def transport(self) -> httpx.MockTransport:
         """Return a transport that carries requests here: no server, no socket."""
-
-        async def handle(request: httpx.Request) -> httpx.Response:
-            response = await self.respond(request)
-            response.headers.update(headers_of(request.headers))
-            return response
-
-        return httpx.MockTransport(handle)
+        return httpx.MockTransport(self.respond)
 
     async def respond(self, request: httpx.Request) -> httpx.Response:
         """Answer a request of any kind."""
@@ -108,7 +102,7 @@ class Emulator:
         except UsageError as exc:
             return as_error(asked.wire, 400, str(exc))
         await asyncio.sleep(self.behaviour.latency_s)
-        return await self.deliver(asked, attempt, fault, answer)
+        return await self.deliver(asked, fault, answer)
 
     def attempt(self, asked: Asked) -> int:
         """Return the attempt's number: the client's own count, or how often this was asked."""
@@ -134,29 +128,36 @@ class Emulator:
             text = driver.random_answer(prompt, slot)
         else:
             text = driver.answer(prompt, slot, effect)
+        # A token is about four bytes.
+        tokens_in, visible = len(prompt.encode()) // 4, len(text.encode()) // 4
+        reasoning = 200 + draw_index(600, "reasoning", prompt)
+        if typical := self.behaviour.output_tokens:
+            drawn = typical // 2 + draw_index(typical, "reasoning", prompt)
+            reasoning = max(0, drawn - visible)
         # Only the same attempt at the same request gets the same id: the audit takes one that
         # comes back for an answer that was given twice.
         which = f"{asked.path} {asked.where} {attempt}".encode()
         reply = hashlib.sha256(asked.raw + which).hexdigest()[:24]
-        said = Completion(reply, model, prompt, text, self.behaviour.output_tokens)
+        said = Completion(reply, model, text, tokens_in, visible, reasoning)
         request = {"body_sha256": asked.body_sha256, "slot": slot and slot.as_dict()}
         return {**asked.wire.answer(said), ANSWERED_FIELD: request, SCRIPTED_FIELD: True}
 
     async def deliver(
-        self, asked: Asked, attempt: int, fault: str | None, answer: dict[str, Any]
+        self, asked: Asked, fault: str | None, answer: dict[str, Any]
     ) -> httpx.Response:
         """Return the response with an answer, or the error that takes its place."""
-        if fault not in STATUSES:
-            return as_json(answer)
         if fault == "rate_limit":
-            delay_s = self.behaviour.wait_s(asked.where, attempt)
-            return as_error(asked.wire, 429, "Rate limit reached.", delay_s)
-        return as_error(asked.wire, STATUSES[fault], "An emulated fault.")
+            return as_error(asked.wire, 429, "Rate limit reached.", self.behaviour.delay_s)
+        if fault in ERRORS:
+            return as_error(asked.wire, ERRORS[fault], "An emulated fault.")
+        return as_json(answer)
 
 
 def as_response(body: bytes, status: int, headers: Mapping[str, str]) -> httpx.Response:
-    """Return a response that the client reads as it reads any other: as a stream."""
-    return httpx.Response(status, headers=headers, stream=httpx.ByteStream(body))
+    """Return a response that says that a mock model made it, even an error or what is no JSON."""
+    # The client reads a stream as it reads any other response.
+    stream = httpx.ByteStream(body)
+    return httpx.Response(status, headers={**headers, SCRIPTED_HEADER: "true"}, stream=stream)
 
 
 def as_json(
@@ -171,13 +172,3 @@ def as_error(wire: ServedFormat, status: int, message: str, delay_s: float = 0.0
     """Return an error in a provider's form."""
     body, headers = wire.error(status, message, delay_s)
     return as_json({**body, SCRIPTED_FIELD: True}, status, headers)
-
-
-def headers_of(asked: Mapping[str, str]) -> dict[str, str]:
-    """Return the headers of each response to a request with the headers ``asked``.
-
-    They say that a mock model made it, even an error or what is no JSON, and repeat the request's
-    id, as many gateways do.
-    """
-    scripted = {SCRIPTED_HEADER: "true"}
-    return {**scripted, ID_HEADER: asked[ID_HEADER]} if ID_HEADER in asked else scripted

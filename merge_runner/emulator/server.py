@@ -8,12 +8,14 @@ from collections.abc import Awaitable, Callable
 import httpx
 from aiohttp import web
 
-from merge_runner.emulator.handler import Emulator, headers_of
+from merge_runner.emulator.handler import Emulator
 from merge_runner.errors import UsageError
+from merge_runner.records import SCRIPTED_HEADER
 
 HOST = "127.0.0.1"
 # The names under which a browser or a client may reach it.
 OWN_NAMES = ("127.0.0.1", "localhost", "[::1]")
+ID_HEADER = "x-request-id"
 MOST_BYTES = 2**29
 
 
@@ -36,7 +38,10 @@ def application(emulator: Emulator | None = None) -> web.Application:
 
 
 async def _add_headers(request: web.Request, response: web.StreamResponse) -> None:
-    response.headers.update(headers_of(request.headers))
+    """Say that a mock model made it, and repeat the request's id, as many gateways do."""
+    response.headers[SCRIPTED_HEADER] = "true"
+    if ID_HEADER in request.headers:
+        response.headers[ID_HEADER] = request.headers[ID_HEADER]
 
 
 @web.middleware

@@ -122,8 +122,8 @@ def _audit(
     try:
         plan = Plan.model_validate_json(config)
         # The stored plug-ins are somebody's code and never run.
-        if plan.study.is_own and not in_use().text:
-            use(declared_catalogue(plan.study.text))
+        if not in_use().text:
+            use(declared_catalogue(plan.study.file))
         stored, members = json.loads(config), plan.model_dump(mode="json").items()
         if wrong := [name for name, value in members if stored.get(name, value) != value]:
             text = f"it disagrees with itself in {', '.join(wrong)}"

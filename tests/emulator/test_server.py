@@ -240,12 +240,11 @@ async def test_a_rate_limit_says_in_the_providers_way_how_long_to_wait(
     headers = headers_for(attempt=3)
     status, got, body = await ask(await emulator(plan), wire, driving_prompt, headers)
     assert status == 429
-    wait_s = plan.wait_s(headers["x-merge-runner-slot"], 3)
+    wait_s = plan.delay_s
     error = body["error"]
     if wire == "gemini":
         details = {detail["@type"].rpartition(".")[2]: detail for detail in error["details"]}
         assert details["RetryInfo"]["retryDelay"] == f"{wait_s:.9f}s"
-        assert "PerMinute" in details["QuotaFailure"]["violations"][0]["quotaId"]
         assert f"retry in {wait_s:.9f}s" in error["message"]
     elif wire == "anthropic":
         assert float(got["retry-after"]) == wait_s

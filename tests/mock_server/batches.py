@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import httpx
 
 from merge_runner.chance import draw, draw_between, draw_index
+from merge_runner.emulator import handler as served
 from merge_runner.emulator.formats import CHAT, GEMINI, MESSAGES, RESPONSES, ServedFormat
 from merge_runner.emulator.handler import UNREADABLE, Asked, as_error, as_json, as_response
 from merge_runner.errors import UsageError
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 ID = "(?P<name>[^/]+?)"
 # The faults that are errors of the provider, beside a rate limit.
-ERRORS = {"request_timeout": 408, "conflict": 409, "server_error": 500, "overloaded": 503}
+ERRORS = {**served.ERRORS, "request_timeout": 408, "conflict": 409}
 FAILURES = (429, 500, 503)
 GRPC_CODES = {400: 3, 429: 8, 500: 13, 503: 14}
 Handler = Callable[..., httpx.Response]
@@ -282,8 +283,7 @@ class BatchMode:
         requests[where] += 1
         fault = faults.fault(where, requests[where])
         if fault == "rate_limit":
-            delay_s = faults.wait_s(where, requests[where])
-            return as_error(self.wire, 429, "Rate limit reached.", delay_s)
+            return as_error(self.wire, 429, "Rate limit reached.", faults.delay_s)
         if fault in ERRORS:
             return as_error(self.wire, ERRORS[fault], "An emulated fault.")
         try:

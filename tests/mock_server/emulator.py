@@ -68,7 +68,7 @@ class FaultyEmulator(Emulator):
         return body
 
     async def deliver(
-        self, asked: Asked, attempt: int, fault: str | None, answer: dict[str, Any]
+        self, asked: Asked, fault: str | None, answer: dict[str, Any]
     ) -> httpx.Response:
         """The response, or what takes its place; raises BrokenOff."""
         if fault == "hang":
@@ -80,7 +80,7 @@ class FaultyEmulator(Emulator):
             return as_response(page, 502, {"content-type": "text/plain"})
         if fault in ERRORS:
             return as_error(asked.wire, ERRORS[fault], "An emulated fault.")
-        response = await super().deliver(asked, attempt, fault, answer)
+        response = await super().deliver(asked, fault, answer)
         if fault == "truncated_json":
             return as_response((await response.aread())[:-20], 200, response.headers)
         return response

@@ -22,18 +22,13 @@ from merge_runner.llm.formats.base import (
 )
 from merge_runner.records import Usage
 
-OPENAI_QUOTA = frozenset(
-    {
-        "insufficient_quota",
-        "billing_hard_limit_reached",
-        "credit_balance_exhausted",
-        "organization_spend_limit_exceeded",
-        "project_spend_limit_exceeded",
-        "organization_usage_limit_exceeded",
-        "budget_exceeded",  # LiteLLM's own
-    }
-)
-ANTHROPIC_QUOTA = frozenset({"enforced_spend_limit_reached", "contract_spend_limit_reached"})
+# How an error names an exhausted quota: at OpenAI, LiteLLM (the seventh) and Anthropic.
+QUOTA = {
+    *("insufficient_quota", "billing_hard_limit_reached", "credit_balance_exhausted"),
+    *("organization_spend_limit_exceeded", "project_spend_limit_exceeded"),
+    *("organization_usage_limit_exceeded", "budget_exceeded"),
+    *("enforced_spend_limit_reached", "contract_spend_limit_reached"),
+}
 # Anthropic reports these as invalid requests.
 SPENT = ("credit balance is too low", "spend limit")
 # What ends an answer of Gemini that was refused.
@@ -51,7 +46,10 @@ def plain(*names: str) -> dict[str, tuple[str, ...]]:
 
 
 class BuiltIn(WireFormat):
-    """A format of which a table says where the counts and the model's name stand in an answer."""
+    """A format of which a table says where the counts and the model's name stand in an answer.
+
+    Gateways pass on the errors of others, so that each of these formats reads those of all.
+    """
 
     model_at: ClassVar[str] = "model"
     usage_in: ClassVar[str] = "usage"
@@ -83,33 +81,39 @@ class BuiltIn(WireFormat):
             Usage(**counts),
         )
 
-
-class OpenAI(BuiltIn):
-    """A format of OpenAI, with the errors of Azure, OpenRouter and LiteLLM."""
-
     def meaning(self, error: ServerError) -> Meaning | None:
-        """Tell filters, quotas, unknown models and what can never be sent."""
+        """Tell filters, quotas, unknown models and what can never be sent, at any provider."""
+        status, names = error.status, error.names
         # Azure's content filter, and OpenRouter's moderation.
-        if error.status == 400 and "content_filter" in error.names:
+        if status == 400 and "content_filter" in names:
             return "refusal"
-        if error.status == 403 and "flagged_input" in error.body:
+        if status == 403 and "flagged_input" in error.body:
             return "refusal"
         # OpenRouter's want of credit while other requests run: it passes when they end.
-        in_flight = error.status == 402 and "openrouter_in_flight_budget" in error.body
+        in_flight = status == 402 and "openrouter_in_flight_budget" in error.body
         if in_flight and "retry-after" in error.headers:
             return "rate_limited"
-        if error.names & OPENAI_QUOTA:
+        # Gemini's quota per day has the words of one per minute, and does not pass.
+        violations = [v for detail in error.details for v in as_dicts(detail.get("violations"))]
+        per_day = any("PerDay" in str(violation.get("quotaId")) for violation in violations)
+        spent = status == 400 and any(words in error.message for words in SPENT)
+        if names & QUOTA or spent or (status == 429 and per_day):
             return "quota_exhausted"
-        if "model_not_found" in error.names and error.status in (400, 401, 403, 404):
+        if status in (400, 401, 403, 404) and "model_not_found" in names:
             return "unknown_model"
-        if error.status == 429 and error.message.startswith("Request too large"):
+        if status == 429 and error.message.startswith("Request too large"):
             return "request_too_large"
-        if error.status == 400 and "invalid_prompt" in error.names:
+        if status == 400 and "invalid_prompt" in names:
             return "bad_prompt"
-        return None
+        return "not_allowed" if status == 400 and "API_KEY_INVALID" in names else None
+
+    def delay_s(self, error: ServerError) -> float | None:
+        """Read Gemini's RetryInfo among the details."""
+        delays = (as_text(detail.get("retryDelay")) or "" for detail in error.details)
+        return next((float(found[1]) for d in delays if (found := DURATION.fullmatch(d))), None)
 
 
-class OpenAIChat(OpenAI):
+class OpenAIChat(BuiltIn):
     """``POST /chat/completions``; the path can be overridden, as Azure's classic form needs."""
 
     parameters = plain(
@@ -153,7 +157,7 @@ class OpenAIChat(OpenAI):
         )
 
 
-class OpenAIResponses(OpenAI):
+class OpenAIResponses(BuiltIn):
     """``POST /responses``, not stored at the provider."""
 
     parameters: ClassVar = {
@@ -249,19 +253,6 @@ class GeminiGenerateContent(BuiltIn):
             refused=bool(blocked) or finish in REFUSALS,
         )
 
-    def meaning(self, error: ServerError) -> Meaning | None:
-        """Tell a quota per day, which has the words of one per minute and does not pass."""
-        if error.status == 400 and "API_KEY_INVALID" in error.names:
-            return "not_allowed"
-        violations = [v for detail in error.details for v in as_dicts(detail.get("violations"))]
-        per_day = any("PerDay" in str(violation.get("quotaId")) for violation in violations)
-        return "quota_exhausted" if error.status == 429 and per_day else None
-
-    def delay_s(self, error: ServerError) -> float | None:
-        """Read the RetryInfo among the details."""
-        delays = (as_text(detail.get("retryDelay")) or "" for detail in error.details)
-        return next((float(found[1]) for d in delays if (found := DURATION.fullmatch(d))), None)
-
 
 class AnthropicMessages(BuiltIn):
     """``POST /v1/messages`` with the API version as a header."""
@@ -310,8 +301,3 @@ class AnthropicMessages(BuiltIn):
             truncated=finish in ("max_tokens", "model_context_window_exceeded"),
             refused=finish == "refusal",
         )
-
-    def meaning(self, error: ServerError) -> Meaning | None:
-        """Tell a spend limit, also from an invalid request."""
-        spent = error.status == 400 and any(words in error.message for words in SPENT)
-        return "quota_exhausted" if spent or error.names & ANTHROPIC_QUOTA else None

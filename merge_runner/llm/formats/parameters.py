@@ -11,14 +11,6 @@ from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.formats import FORMATS
 
 CAP, EFFORT = "max_output_tokens", "reasoning_effort"
-# From the least to the most that any provider takes.
-RANGES = {
-    "temperature": (0, 2),
-    "top_p": (0, 1),
-    "min_p": (0, 1),
-    "presence_penalty": (-2, 2),
-    "frequency_penalty": (-2, 2),
-}
 
 
 def known_parameters(entries: Iterable[ModelEntry]) -> set[str]:
@@ -39,10 +31,6 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
         if type(level) is not int or level < 1:
             raise UsageError(f"{CAP} is a whole number from 1")
         return entry.model_copy(update={CAP: level})
-    if parameter in RANGES:
-        low, high = RANGES[parameter]
-        if type(level) not in (int, float) or not low <= level <= high:  # type: ignore[operator]
-            raise UsageError(f"{parameter} = {level!r} is no number from {low} to {high}")
     if parameter == EFFORT and entry.efforts:
         if level not in entry.efforts:
             raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)
