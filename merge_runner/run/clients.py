@@ -53,14 +53,18 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     }
 
 
-def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, CallTotals]:
-    """Return what the cache knows of each model's answers to requests like those of a plan.
+class EarlierAnswers(dict[str, CallTotals]):
+    """Totals of each model's answers; a model whose endpoint has never answered is missing."""
 
-    A model whose endpoint has never given an answer is not among them.
-    """
+    def __missing__(self, name: str) -> CallTotals:
+        return CallTotals()
+
+
+def earlier_answers(plan: Plan, cache: ResponseCache) -> EarlierAnswers:
+    """Return what the cache knows of the models' answers to requests like those of a plan."""
     totals = call_totals(cache.entries())
     answered = {(model, endpoint) for model, endpoint, *_ in totals}
-    earlier = {}
+    earlier = EarlierAnswers()
     for name, entry in plan.entries.items():
         place = entry.id, plan.endpoints[name]
         if place in answered:
@@ -73,7 +77,7 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, CallTotals]:
 def live_clients(
     plan: Plan,
     options: Options,
-    earlier: Mapping[str, CallTotals],
+    earlier: EarlierAnswers,
     cache: ResponseCache,
     ledger: Ledger,
     *,

@@ -239,10 +239,10 @@ class Sweep:
         first = FirstDecisions()
         if not options.keep_going:
             first = FirstDecisions(MOST_INVALID, one_by_one=rounds is None)
-            labels = {spec.spec_hash: spec.arm for spec in self._stored}
-            stored = store.decisions_by_spec(labels) if labels else []
-            for spec_hash, side, *decisions in stored:
-                if (model := plan.by_label()[labels[spec_hash]].asked[side]) in plan.entries:
+            labels = plan.by_label()
+            arms = {spec.spec_hash: labels[spec.arm] for spec in self._stored}
+            for spec_hash, side, *decisions in store.decisions_by_spec(arms) if arms else ():
+                if (model := arms[spec_hash].asked[side]) in plan.entries:
                     first.add(model, *decisions)
         if options.dask is not None:
             client = await stack.enter_async_context(connected(options.dask))
