@@ -260,8 +260,6 @@ def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
             yield f"The model `{model}` is a scripted stand-in, no language model."
         else:
             yield f"{driver}: a scripted stand-in answered, not {model}"
-    if outcome.meter.cost_usd and facts.stand_ins:
-        yield "replies of stand-ins are priced as the model's; nobody charges for them"
     for name, entry in outcome.plan.entries.items():
         if entry.note and entry.provider != EMULATOR:
             yield f"{name}: {entry.note}"
