@@ -56,7 +56,8 @@ async def play(
     expected = None
     options = plan.within_budget(options)
     async with open_sweep(plan, options, say=say) as sweep:
-        if sweep.trials_to_play and not (options.replay or plan.is_free):
+        is_free = all(entry.price == "free" for entry in plan.entries.values())
+        if sweep.trials_to_play and not (options.replay or is_free):
             expected = await sweep.estimate()
             agree(expected)
         outcome = await sweep.run()
