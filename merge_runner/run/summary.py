@@ -298,6 +298,6 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     if (batch := expected.batch) is not None:
         yield (
             f"batch   {about(batch.cost_usd)} in about {batch.rounds} rounds, at most "
-            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour; "
-            "after two the rest is asked singly"
+            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour, "
+            "a day at most"
         )
