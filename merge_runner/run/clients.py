@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 from merge_runner.config import (
     Endpoint,
-    ModelEntry,
     base_urls,
     check_network,
     driver_name,
@@ -21,7 +20,7 @@ from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
-from merge_runner.llm.batch.rounds import Batches, Rounds
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.call import Call
@@ -143,7 +142,7 @@ def live_clients(
     clients: dict[str, LlmClient] = {}
     under_way: dict[str, Call] = {}  # two names of one model may ask the same
     for name, entry in plan.entries.items():
-        model = plan.registered[name]
+        model, terms = plan.registered[name], batch_terms(entry)
         if model not in transports:
             endpoint = _endpoint(plan, name, endpoint_plan.urls)
             check_network(endpoint.base_url)
@@ -154,7 +153,7 @@ def live_clients(
                 carrier=in_process if endpoint.is_emulator else None,
             )
             stack.push_async_callback(transports[model].close)
-            if rounds is not None and batch_terms(entry) is not None:
+            if rounds is not None and terms is not None:
                 service = SERVICES[entry.format]
                 rounds.services[model] = service(transports[model], endpoint, FORMATS[entry.format])
         clients[name] = LlmClient(
@@ -172,7 +171,8 @@ def live_clients(
                 passed=rounds is not None and rounds.submits,
                 known=name in endpoint_plan.known,
             ),
-            batches=_batches(model, entry, budget, cache, rounds),
+            rounds=rounds if terms else None,
+            batch_price=terms.price_factor if terms else 1.0,
             under_way=under_way,
         )
     return clients
@@ -182,17 +182,6 @@ def _endpoint(plan: Plan, name: str, urls: Mapping[str, str]) -> Endpoint:
     if plan.is_rehearsal:
         return rehearsal_endpoint(plan.entries[name])
     return resolve_endpoint(name, plan.entries[name], {**os.environ, **urls})
-
-
-def _batches(
-    model: str, entry: ModelEntry, budget: Budget, cache: ResponseCache, rounds: Rounds | None
-) -> Batches | None:
-    """The batches in which a model is asked; None where it has none."""
-    terms = batch_terms(entry)
-    if rounds is None or terms is None:
-        return None
-    money = Budget(Ledger(cache, "")) if entry.price == "free" else budget
-    return Batches(rounds, model, money, terms.price_factor)
 
 
 def open_rounds(

@@ -58,7 +58,14 @@ class Journal:
 
     def waits(self, batch: OpenBatch) -> bool:
         """Whether a call of the batch waits there yet, and in no later one."""
-        return any(self.batch_of(key) is batch and self._waits(key, batch) for key in batch.lines)
+        for key in (each for each in batch.lines if self.batch_of(each) is batch):
+            try:
+                tried = self._cache.unanswered(key)
+                if batch.holds(key, tried) and self._cache.get(key) is None:
+                    return True
+            except RecordingError:
+                return True  # whoever asks for the call will set what is damaged aside
+        return False
 
     async def begin(self, batch: OpenBatch, begins: Callable[[str], bool]) -> OpenBatch:
         """Note that a batch is about to be created, with those of its calls that may begin.
@@ -70,13 +77,11 @@ class Journal:
             with self._cache.money.transaction():
                 begun = {key: attempt for key, attempt in batch.lines.items() if begins(key)}
             taken = batch.model_copy(update={"lines": begun})
-            if begun:
-                self._write(taken)
+            self._write(taken)
             return taken
 
         taken = await self._cache.write(operation)
-        if taken.lines:
-            self._open[taken.mark] = taken
+        self._open[taken.mark] = taken
         return taken
 
     async def note(self, batch: OpenBatch) -> None:
@@ -94,12 +99,6 @@ class Journal:
 
         if self._open:
             await self._cache.write(operation)
-
-    def _waits(self, key: str, batch: OpenBatch) -> bool:
-        try:
-            return batch.holds(key, self._cache.unanswered(key)) and self._cache.get(key) is None
-        except RecordingError:
-            return True  # whoever asks for the call will set what is damaged aside
 
     def _read(self, name: str) -> OpenBatch | None:
         """Return the batch in a row; a damaged one is none."""

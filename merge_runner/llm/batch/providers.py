@@ -16,7 +16,6 @@ from merge_runner.llm.batch.service import (
     BatchFailed,
     BatchService,
     BatchStatus,
-    Page,
     id_of,
     json_object,
 )
@@ -24,7 +23,6 @@ from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import (
     as_count,
     as_dict,
-    as_dicts,
     as_text,
     first_of,
     read_error,
@@ -35,7 +33,6 @@ from merge_runner.records import ChatRequest
 
 # Where a provider's addresses stand, whatever the base URL of the server is.
 OPENAI, GEMINI = "/v1", "/v1beta"
-MARK = "merge_runner_mark"
 NOT_ASKED = frozenset({"batch_expired", "batch_cancelled"})
 # Of ASCII, as a URL is; it may carry a long token.
 UPLOAD_PATH = re.compile("/[!-~]{1,8000}")
@@ -54,13 +51,12 @@ CANCELLED = 499
 class OpenAIBatches(BatchService):
     """``/files`` and ``/batches`` of OpenAI, and of servers that speak like it."""
 
+    template = (
+        f'{{{{"custom_id":"{{key}}","method":"POST","url":"{OPENAI}{{path}}",'
+        '"body":{body}{slot}}}\n'
+    )
     path, pages, cursor = "/batches", "limit=100", "after"
-
-    def line(self, request: ChatRequest) -> bytes:
-        """See BatchService."""
-        url, slot = canonical_json(OPENAI + request.path), self.slot_members(request)
-        members = f'"method":"POST","url":{url},"body":{request.body}{slot}'
-        return f'{{"custom_id":"{request.key}",{members}}}\n'.encode()
+    list_member, next_member, mark_member = "data", "last_id", "merge_runner_mark"
 
     async def upload(self, content: bytes, mark: str) -> str:
         """See BatchService."""
@@ -79,15 +75,9 @@ class OpenAIBatches(BatchService):
             "input_file_id": file,
             "endpoint": OPENAI + requests[0].path,
             "completion_window": "24h",
-            "metadata": {MARK: mark},
+            "metadata": {self.mark_member: mark},
         }
         return self.path, canonical_json(batch).encode()
-
-    def page_of(self, page: dict[str, Any]) -> Page:
-        """See BatchService; the mark is among the metadata."""
-        batches = as_dicts(page.get("data"))
-        listed = [(as_dict(batch.get("metadata")).get(MARK), batch) for batch in batches]
-        return listed, as_text(page.get("last_id")) if page.get("has_more") else None
 
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
@@ -121,13 +111,9 @@ class OpenAIBatches(BatchService):
 class AnthropicBatches(BatchService):
     """``/v1/messages/batches``, with all requests in the body; a batch takes no mark."""
 
+    template = '{{"custom_id":"{key}","params":{body}{slot}}}'
     takes_mark = False
     path = "/v1/messages/batches"
-
-    def line(self, request: ChatRequest) -> bytes:
-        """See BatchService."""
-        slot = self.slot_members(request)
-        return f'{{"custom_id":"{request.key}","params":{request.body}{slot}}}'.encode()
 
     def creation(self, requests: Sequence[ChatRequest], file: str, mark: str) -> tuple[str, bytes]:
         """See BatchService."""
@@ -168,14 +154,11 @@ class GeminiBatches(BatchService):
     results has the key of its request.
     """
 
+    template = '{{"key":"{key}","request":{body}{slot}}}\n'
     # A page has few batches, since one may come with all its results.
     path, pages, cursor = f"{GEMINI}/batches", "pageSize=10", "pageToken"
+    list_member, next_member, mark_member = "operations", "nextPageToken", "displayName"
     id_member, key_member = "name", "key"
-
-    def line(self, request: ChatRequest) -> bytes:
-        """See BatchService."""
-        slot = self.slot_members(request)
-        return f'{{"key":"{request.key}","request":{request.body}{slot}}}\n'.encode()
 
     async def upload(self, content: bytes, mark: str) -> str:
         """See BatchService."""
@@ -202,12 +185,6 @@ class GeminiBatches(BatchService):
         batch = {"displayName": mark, "inputConfig": {"fileName": file}}
         path = requests[0].path.replace(":generateContent", ":batchGenerateContent")
         return path, canonical_json({"batch": batch}).encode()
-
-    def page_of(self, page: dict[str, Any]) -> Page:
-        """See BatchService; the mark is the display name."""
-        batches = as_dicts(page.get("operations"))
-        listed = [(as_dict(batch.get("metadata")).get("displayName"), batch) for batch in batches]
-        return listed, as_text(page.get("nextPageToken")) or None
 
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService; of an operation that is done the word may be one that nobody knows."""
@@ -288,10 +265,8 @@ def require_batch(name: str, entry: ModelEntry, entries: Mapping[str, ModelEntry
     terms = batch_terms(entry)
     if terms is None:
         valid = ", ".join(each for each, its in entries.items() if batch_terms(its))
-        where = endpoint_identity(entry)
-        at = "" if where == entry.provider else f" at {where}"
         raise UsageError(
-            f"{name} has no batch mode that is known{at}; valid with --batch: {valid}. Leave "
+            f"{name} has no batch mode that is known; valid with --batch: {valid}. Leave "
             "--batch out, or give the entry in experiments/models.toml `batch = "
             "{ price_factor = 0.5, source = ... }` where its server has one in the same format"
         )

@@ -13,11 +13,11 @@ import itertools
 import math
 import secrets
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from merge_runner.errors import (
     EndpointRefused,
@@ -28,9 +28,9 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.journal import Journal, OpenBatch
 from merge_runner.llm.batch.service import BatchFailed, BatchService
-from merge_runner.llm.budget import Budget, PaidAttempt
-from merge_runner.llm.http_outcome import RawReply, backoff_s
-from merge_runner.records import Attempt
+from merge_runner.llm.budget import PaidAttempt
+from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
+from merge_runner.records import Attempt, ChatRequest
 
 if TYPE_CHECKING:
     from merge_runner.llm.call import Call
@@ -52,96 +52,36 @@ ENDING_S = 3600.0
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
-class LineEnd:
-    """How a line ended.
-
-    Without a ``raw`` reply ``outcome`` names why, and nothing was charged unless it is ``unclear``.
-    Then it is asked singly. An ``error`` ends the sweep.
-    """
-
-    raw: RawReply | None = None
-    outcome: str = ""
-    message: str = ""
-    unclear: bool = False
-    error: MergeRunnerError | None = None
-
-
 @dataclass(slots=True, eq=False)
 class Line:
-    """A call whose next attempt waits for a batch to be created, or to end.
-
-    ``model`` is its name in the registry, ``batch`` will be the one that it goes to.
-    """
+    """A call whose next attempt waits for a batch; ``batch`` will be the one that it goes to."""
 
     call: Call
-    model: str
     paid: PaidAttempt
-    batch: asyncio.Future[Batch] = field(init=False)
-
-    @property
-    def key(self) -> str:
-        """That of its request, which is its id at the provider."""
-        return self.call.request.key
-
-    def begins(self) -> bool:
-        """Set its money aside durably, unless that is done; False if the cap is used up."""
-        return not self.paid.queued or self.paid.set_aside(self.call.attempts)
+    batch: asyncio.Future[Batch]
 
 
 @dataclass(slots=True, eq=False)
 class Batch:
     """A batch of this process, whose ``work`` ends with it.
 
-    Then ``ends`` has the lines with a result, by key, until they are taken, and ``rest`` is the end
-    of all others; None: they go with the next round. While its work ``sleeps`` nothing of it is on
-    its way.
+    Then ``ends`` has what became of the lines with a result, by key, until it is taken, and
+    ``rest`` what became of all others; None: they go with the next round. An ``error`` ends the
+    sweep. While its work ``sleeps`` nothing of it is on its way.
     """
 
     note: OpenBatch
-    ends: dict[str, LineEnd] = field(default_factory=dict)
-    rest: LineEnd | None = None
+    ends: dict[str, AttemptOutcome] = field(default_factory=dict)
+    rest: AttemptOutcome | None = None
+    error: MergeRunnerError | None = None
     sleeps: bool = False
     work: asyncio.Task[None] = field(init=False)
-
-    @property
-    def age_s(self) -> float:
-        """How long ago it was submitted."""
-        return (datetime.now(UTC) - self.note.submitted_at).total_seconds()
 
     async def sleep(self, seconds: float) -> None:
         """Wait, while others may go on."""
         self.sleeps = True
         await asyncio.sleep(seconds)
         self.sleeps = False
-
-
-@dataclass(frozen=True, slots=True)
-class Batches:
-    """How one model, by its name in the registry, is asked in rounds, and with whose money."""
-
-    rounds: Rounds
-    model: str
-    money: Budget
-    price_factor: float
-
-    def takes_up(self, call: Call) -> bool:
-        """Whether a call waits in a batch already, so that its trial has begun."""
-        if self.rounds.open_batch(call.request.key) is None:
-            return False
-        self.money.begin_anew(call.order)
-        return True
-
-    async def line(self, call: Call) -> Line:
-        """Return the next attempt at a call with its money, which the caller closes."""
-        asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.price_factor)
-        who = (call.order, call.request.key, asked)
-        if call.open is None:
-            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid = await self.money.set_aside(*who)
-        else:
-            paid = self.money.going_on(*who, call.open.ledger)
-        return Line(call, self.model, paid)
 
 
 class Rounds:
@@ -164,7 +104,6 @@ class Rounds:
         self._say = say
         self._forming: list[Line] = []
         self._batches: dict[str, Batch] = {}
-        self._creations: set[asyncio.Task[None]] = set()
         # Models of which a batch was refused: the most calls of the next. They go one by one.
         self._most: dict[str, int] = {}
 
@@ -175,21 +114,24 @@ class Rounds:
             return None
         return batch
 
-    async def ask(self, line: Line) -> tuple[LineEnd, OpenBatch]:
-        """Wait for the end of a line, in the next round or in the batch where it waits already."""
-        note = line.call.open
-        batch = await self._next_round(line) if note is None else self._taken_up(note)
+    async def ask(self, call: Call, paid: PaidAttempt) -> tuple[AttemptOutcome, Batch]:
+        """Return what became of a call's next attempt, in the next round or where it waits."""
+        if call.open is None:
+            batch = await self._next_round(call, paid)
+        elif call.open.mark in self._batches:
+            batch = self._batches[call.open.mark]
+        else:
+            batch = self._start(call.open)
         while True:
             await asyncio.shield(batch.work)
-            if line.key not in batch.note.lines:
+            if call.request.key not in batch.note.lines:
                 raise TrialSuspended("another run spends from the same cap, and has used it up")
-            end = batch.ends.pop(line.key, batch.rest)
+            end = batch.ends.pop(call.request.key, batch.rest)
+            if end is None and not self.submits:
+                end = _no_answer("not_created", "the run ended before", charged=False)
             if end is not None:
-                return end, batch.note
-            if not self.submits:
-                end = LineEnd(outcome="not_created", message="the run ended before")
-                return end, batch.note
-            batch = await self._next_round(line)
+                return end, batch
+            batch = await self._next_round(call, paid)
 
     async def watch(self, is_idle: Callable[[], bool]) -> None:
         """Close each round when nothing else goes on; ``is_idle`` says whether that is so."""
@@ -216,7 +158,7 @@ class Rounds:
         work = [batch.work for batch in self._batches.values()]
         for task in work:
             task.cancel()
-        await asyncio.gather(*work, *self._creations, return_exceptions=True)
+        await asyncio.gather(*work, return_exceptions=True)
         await self._journal.tidy()
 
     def _open(self, model: str | None = None) -> list[Batch]:
@@ -224,8 +166,8 @@ class Rounds:
         every = self._batches.values()
         return [b for b in every if not b.work.done() and model in (None, b.note.model)]
 
-    async def _next_round(self, line: Line) -> Batch:
-        line.batch = asyncio.get_running_loop().create_future()
+    async def _next_round(self, call: Call, paid: PaidAttempt) -> Batch:
+        line = Line(call, paid, asyncio.get_running_loop().create_future())
         self._forming.append(line)
         return await line.batch
 
@@ -233,7 +175,7 @@ class Rounds:
         groups: defaultdict[tuple[str, str], list[Line]] = defaultdict(list)
         for line in self._forming:
             if not line.batch.done():  # somebody waits for it yet
-                groups[line.model, line.paid.ledger.scope].append(line)
+                groups[line.call.asked.model, line.paid.ledger.scope].append(line)
         self._forming = []
         for (model, ledger), lines in groups.items():
             most = self._most.get(model, MOST_CALLS)
@@ -248,89 +190,90 @@ class Rounds:
                     model=model,
                     ledger=ledger,
                     submitted_at=datetime.now(UTC),
-                    lines={line.key: len(line.call.attempts) + 1 for line in part},
+                    lines={each.call.request.key: len(each.call.attempts) + 1 for each in part},
                 )
-                batch = Batch(note)
-                self._start(batch, self._submit(batch, part))
+                batch = self._start(note, part)
                 for line in part:
                     line.batch.set_result(batch)
 
-    def _start(self, batch: Batch, work: Coroutine[Any, Any, None]) -> None:
-        """Do something for a batch in a task of its own; what it raises is raised for its lines."""
+    def _start(self, note: OpenBatch, lines: Sequence[Line] = ()) -> Batch:
+        """Submit lines, or go on with a batch that an earlier run has submitted, or was about to.
 
-        async def do() -> None:
+        That is a task of its own; what it raises is raised for all who wait for it.
+        """
+        batch = self._batches[note.mark] = Batch(note)
+
+        async def work() -> None:
             try:
-                await work
+                if lines:
+                    is_there = await self._submit(batch, lines)
+                else:
+                    is_there = bool(note.batch_id) or await self._arrived(batch)
+                if is_there:
+                    await self._follow(batch)
             except BatchFailed as exc:
                 self._lost(batch, exc)
 
-        batch.work = asyncio.create_task(do())
-        self._batches[batch.note.mark] = batch
+        batch.work = asyncio.create_task(work())
+        return batch
 
-    def _taken_up(self, note: OpenBatch) -> Batch:
-        """Go on with a batch that an earlier run has submitted, or was about to."""
+    async def _submit(self, batch: Batch, lines: Sequence[Line]) -> bool:
+        """Note a batch with those of its lines that may begin, and create it; False if it is not.
 
-        async def go_on() -> None:
-            if not note.batch_id and not self.services[note.model].takes_mark:
-                why = "the run ended before its id was known"
-                batch.rest = LineEnd(outcome="batch_lost", message=why, unclear=True)
-            elif note.batch_id or await self._arrived(batch):
-                await self._follow(batch)
+        Their money is set aside in the same transaction, unless that was done.
+        """
+        by_key = {line.call.request.key: line for line in lines}
 
-        if note.mark not in self._batches:
-            batch = Batch(note)
-            self._start(batch, go_on())
-        return self._batches[note.mark]
+        def begins(key: str) -> bool:
+            paid = by_key[key].paid
+            return not paid.queued or paid.set_aside(by_key[key].call.attempts)
 
-    async def _submit(self, batch: Batch, lines: Sequence[Line]) -> None:
-        """Note a batch with those of its lines that may begin, create it, and follow it."""
-        by_key = {line.key: line for line in lines}
-        batch.note = await self._journal.begin(batch.note, lambda key: by_key[key].begins())
+        batch.note = await self._journal.begin(batch.note, begins)
         begun = [by_key[key] for key in batch.note.lines]
         for line in begun:
             if line.paid.queued:
                 line.paid.begun()
         if not begun:
-            return
+            return False
+        requests = [line.call.request for line in begun]
         try:
-            await self._patiently(batch, partial(self._create, batch, begun), OUTAGE_S)
+            await self._patiently(batch, partial(self._create, batch, requests), OUTAGE_S)
         except BatchFailed as exc:
-            model = batch.note.model
-            if exc.kind == "lost" and not self.services[model].takes_mark:
-                batch.rest = LineEnd(None, "batch_lost", str(exc), unclear=True)
-            elif exc.kind in ("again", "lost"):
+            if exc.kind == "lost":
+                raise
+            if exc.kind == "again":
                 # It may be there all the same: the next run looks for it, and nothing is settled.
                 raise ProviderDown(
-                    f"{model}: no batch can be submitted ({exc}): nothing else is asked. "
-                    "When the service answers again, run the same command"
+                    f"{batch.note.model}: no batch can be submitted ({exc}): nothing else is "
+                    "asked. When the service answers again, run the same command"
                 ) from exc
-            else:
-                await self._not_asked(batch, exc, "not_created")
-        else:
-            await self._follow(batch)
+            await self._not_asked(batch, exc, "not_created")
+            return False
+        return True
 
-    async def _create(self, batch: Batch, lines: Sequence[Line]) -> None:
+    async def _create(self, batch: Batch, requests: Sequence[ChatRequest]) -> None:
         """Create a batch; where its answer is lost, look for it."""
-        service = self.services[batch.note.model]
 
         async def create() -> None:
-            requests = [line.call.request for line in lines]
+            service = self.services[batch.note.model]
             await self._note(batch, await service.create(requests, batch.note.mark))
 
         creation = asyncio.create_task(create())
-        self._creations.add(creation)
-        creation.add_done_callback(self._creations.discard)
         try:
-            await asyncio.shield(creation)  # its id is noted even if the run ends now
+            await asyncio.shield(creation)
+        except asyncio.CancelledError:
+            await asyncio.wait([creation])  # its id is noted even if the run ends now
+            raise
         except BatchFailed as exc:
-            if exc.sent and not service.takes_mark:
-                raise BatchFailed("lost", f"whether it was created is not known ({exc})") from exc
             if not (exc.sent and await self._arrived(batch)):
                 raise
 
     async def _arrived(self, batch: Batch) -> bool:
         """Look for a batch until its creation, if it was ever sent, must be in effect."""
-        find = partial(self.services[batch.note.model].find, batch.note.mark)
+        service = self.services[batch.note.model]
+        if not service.takes_mark:
+            raise BatchFailed("lost", "whether it was created is not known")
+        find = partial(service.find, batch.note.mark)
         for pause_s in (0.0, *ARRIVAL_S):
             await batch.sleep(pause_s)
             if (batch_id := await self._patiently(batch, find)) is not None:
@@ -347,8 +290,8 @@ class Rounds:
         note, message = batch.note, "the batch has ended without a result for it"
         ask = partial(self.services[note.model].status, note.batch_id)
         while not (status := await self._patiently(batch, ask)).ended and not status.failure:
-            pause_s = min(LONGEST_POLL_S, POLL_SHARE * batch.age_s)
-            await batch.sleep(max(SHORTEST_POLL_S, pause_s))
+            age_s = (datetime.now(UTC) - note.submitted_at).total_seconds()
+            await batch.sleep(max(SHORTEST_POLL_S, min(LONGEST_POLL_S, POLL_SHARE * age_s)))
         if status.failure:
             await self._not_asked(batch, status.failure, "batch_failed")
             return
@@ -358,7 +301,7 @@ class Rounds:
             if exc.kind != "again":
                 raise
             message = str(exc)
-        batch.rest = LineEnd(outcome="no_result", message=message, unclear=True)
+        batch.rest = _no_answer("no_result", message)
         if note.model in self._most:
             self._most[note.model] = max(self._most[note.model], 2 * len(note.lines))
 
@@ -370,7 +313,9 @@ class Rounds:
             raise BatchFailed("again", "a batch that has ended is said to go on")
         foreign = broken = 0
         async for key, raw in service.results(note.batch_id, status):
-            end = LineEnd(raw) if raw else LineEnd(None, "expired", "it was not asked in time")
+            end = _no_answer("expired", "it was not asked in time", charged=False)
+            if raw:  # no limit of single calls is meant, and no call waits for one
+                end = replace(judge(raw, service.wire), pause=False, delay_s=None)
             broken += not key
             foreign += bool(key) and (
                 key not in note.lines or batch.ends.setdefault(key, end) != end
@@ -389,10 +334,9 @@ class Rounds:
         """End a batch of which the provider asks no line, or let its lines go in smaller ones."""
         model, calls = batch.note.model, len(batch.note.lines)
         is_alone = self._open(model) == [batch]
-        error: MergeRunnerError | None = None
         if exc.kind in ("quota", "refused"):
             kind = QuotaExhausted if exc.kind == "quota" else EndpointRefused
-            error = kind(
+            batch.error = kind(
                 f"{model}: its batch mode refuses: {exc}. Every reply so far is saved: correct "
                 "that, or leave --batch out, and run the same command to go on"
             )
@@ -405,14 +349,15 @@ class Rounds:
             # It counts as open, so that no other one is submitted meanwhile.
             await batch.sleep(exc.delay_s or 1.0)
             return
-        batch.rest = LineEnd(None, outcome, str(exc), error=error)
+        batch.rest = _no_answer(outcome, str(exc), charged=False)
 
     def _lost(self, batch: Batch, exc: BatchFailed) -> None:
         """End a batch that cannot be read: what was set aside for it stays so."""
-        note = batch.note
+        note, service = batch.note, self.services[batch.note.model]
+        is_unknown = not (note.batch_id or service.takes_mark)
         # A key that is refused is another account's, perhaps: there the batch goes on.
-        if self.services[note.model].forgets or (not self.submits and exc.kind == "lost"):
-            batch.rest = LineEnd(outcome="batch_lost", message=str(exc), unclear=True)
+        if is_unknown or service.forgets or (not self.submits and exc.kind == "lost"):
+            batch.rest = _no_answer("batch_lost", str(exc))
             return
         raise EndpointRefused(
             f"{note.model}: {note.batch_id} is refused to this key ({exc}): set the key of the "
@@ -439,3 +384,8 @@ class Rounds:
                     self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
                 tries += 1
                 await batch.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
+
+
+def _no_answer(name: str, why: str, *, charged: bool = True) -> AttemptOutcome:
+    """Return what became of a line without a result, which is asked singly."""
+    return AttemptOutcome("retry", name, why, charged=charged)

@@ -14,7 +14,7 @@ from urllib.parse import quote
 from merge_runner.config import Endpoint, is_own_host
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.llm.formats.base import ServerError, WireFormat, as_dict, as_text
+from merge_runner.llm.formats.base import ServerError, WireFormat, as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import (
     ErrorReply,
     RawReply,
@@ -34,8 +34,6 @@ LONGEST_MESSAGE = 500
 # What a server answers of a batch that it does not have, or no longer.
 GONE = frozenset({301, 302, 303, 307, 308, 404, 410})
 ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
-# Batches of a list, each with its mark, and the cursor of the next page, if any.
-Page = tuple[list[tuple[object, dict[str, Any]]], str | None]
 FailureKind = Literal["again", "smaller", "quota", "refused", "lost"]
 
 
@@ -51,7 +49,7 @@ class BatchFailed(MergeRunnerError):
     def __init__(
         self, kind: FailureKind, message: str, *, delay_s: float | None = None, sent: bool = True
     ) -> None:
-        super().__init__(message)
+        super().__init__(message[:LONGEST_MESSAGE])
         self.kind = kind
         self.delay_s = delay_s
         self.sent = sent
@@ -76,14 +74,20 @@ class BatchService(ABC):
 
     Where a batch takes no mark, one whose id was lost cannot be found. Batches are at ``path``,
     where ``pages`` is the query for a page of their list, and ``cursor`` that for the one after it.
-    A batch has its id as ``id_member``, a result the key of its request as ``key_member``: 64
-    hexadecimal digits, as many characters as Anthropic takes.
+    A page has its batches as ``list_member`` and the cursor of the next one as ``next_member``. A
+    batch has its id as ``id_member``, and its mark as ``mark_member`` of its metadata. A line is
+    made by ``template``. A result has the key of its request as ``key_member``: 64 hexadecimal
+    digits, as many characters as Anthropic takes.
     """
 
+    template: ClassVar[str]
     takes_mark: ClassVar[bool] = True
     path: ClassVar[str]
     pages: ClassVar[str]
     cursor: ClassVar[str]
+    list_member: ClassVar[str]
+    next_member: ClassVar[str]
+    mark_member: ClassVar[str]
     id_member: ClassVar[str] = "id"
     key_member: ClassVar[str] = "custom_id"
 
@@ -93,9 +97,15 @@ class BatchService(ABC):
         self.wire = wire
         self.forgets = endpoint.is_emulator  # what waits there ends with the emulator
 
-    @abstractmethod
     def line(self, request: ChatRequest) -> bytes:
         """Return a line as it is sent, with the body as it is hashed."""
+        slot = canonical_json(request.slot.as_dict())
+        # Only our own emulator is told the slot.
+        told = f',"{SLOT_HEADER}":{slot}' if self.endpoint.is_emulator else ""
+        line = self.template.format(
+            key=request.key, path=request.path, body=request.body, slot=told
+        )
+        return line.encode()
 
     async def upload(self, content: bytes, mark: str) -> str:
         """Return the name of a file with these lines; empty where the creation has them."""
@@ -125,16 +135,12 @@ class BatchService(ABC):
         while cursor is not None and cursor not in seen:  # ends where a server knows no pages
             seen.add(cursor)
             after = f"&{self.cursor}={quote(cursor, safe='')}" if cursor else ""
-            page = await self.ask("GET", f"{self.path}?{self.pages}{after}")
-            listed, cursor = self.page_of(json_object(page))
-            for its, batch in listed:
-                if its == mark:
+            page = json_object(await self.ask("GET", f"{self.path}?{self.pages}{after}"))
+            cursor = as_text(page.get(self.next_member))
+            for batch in as_dicts(page.get(self.list_member)):
+                if as_dict(batch.get("metadata")).get(self.mark_member) == mark:
                     return self._batch_id(batch)
         return None
-
-    def page_of(self, page: dict[str, Any]) -> Page:
-        """Return what a page of the list says."""
-        raise NotImplementedError
 
     async def status(self, batch_id: str) -> BatchStatus:
         """Return the state of a batch."""
@@ -161,10 +167,8 @@ class BatchService(ABC):
     ) -> AsyncIterator[tuple[str, RawReply | None]]:
         """Yield the results of a batch that has ended, by key; it is empty where one is broken.
 
-        Where one file cannot be read, those of the other come all the same. Raises BatchFailed with
-        the kind ``again`` where they can be read from the beginning.
+        Raises BatchFailed with the kind ``again`` where they can be read from the beginning.
         """
-        failure: BatchFailed | None = None
         for path in self.result_paths(batch_id, status.batch):
             try:
                 body = self.transport.lines(path, self.wire.headers, timeout_s=TIMEOUT_S)
@@ -176,10 +180,9 @@ class BatchService(ABC):
                 failure = self._refused(exc.raw, exists=True)
                 if exc.raw.status == 404:  # it belongs to a batch that is there
                     failure.kind = "again"
+                raise failure from exc
             except TransportFailure as exc:
-                failure = _unanswered(exc)
-        if failure is not None:
-            raise failure
+                raise _unanswered(exc) from exc
 
     def failure_of(self, error: ServerError) -> BatchFailed:
         """Return the failure of a batch that is not created, or fails as a whole."""
@@ -190,13 +193,7 @@ class BatchService(ABC):
             kind = "smaller"
         elif action in ("retry", "quota"):
             kind = "again" if action == "retry" else "quota"
-        return BatchFailed(kind, error.message[:LONGEST_MESSAGE])
-
-    def slot_members(self, request: ChatRequest) -> str:
-        """Return what our own emulator alone is told of a line, as a member of its JSON object."""
-        if not self.endpoint.is_emulator:
-            return ""
-        return f',"{SLOT_HEADER}":{canonical_json(request.slot.as_dict())}'
+        return BatchFailed(kind, error.message)
 
     async def ask(
         self, method: str, path: str, body: bytes = b"", headers: Mapping[str, str] | None = None
@@ -224,7 +221,7 @@ class BatchService(ABC):
         own = is_own_host(self.endpoint.provider, self.endpoint.identity)
         sent = may_be_charged(raw, self.endpoint.provider if own else None)
         sent = sent or (self.takes_mark and raw.status >= 500)
-        message = f"HTTP {raw.status}: {raw.error.message[:LONGEST_MESSAGE]}"
+        message = f"HTTP {raw.status}: {raw.error.message}"
         return BatchFailed(kind, message, delay_s=outcome.delay_s, sent=sent)
 
     def _batch_id(self, batch: dict[str, Any]) -> str:

@@ -356,7 +356,7 @@ async def test_a_batch_that_may_exist_is_never_asked_singly(
 
 
 @pytest.mark.parametrize(("status", "kind"), [(404, "again"), (410, "lost"), (500, "again")])
-async def test_a_file_of_answers_that_is_not_there_hides_no_file_of_errors(
+async def test_a_file_of_answers_that_is_not_there_yet_is_asked_for_again(
     server, service_at, status, kind
 ):
     ended = {"status": "completed", "output_file_id": "f1", "error_file_id": "f2"}
@@ -365,7 +365,7 @@ async def test_a_file_of_answers_that_is_not_there_hides_no_file_of_errors(
     line = {"custom_id": "b", "response": {"status_code": 429, "body": error()}}
     server.replies[ERRORS] = (200, jsonl(line))
     keys, failed = await read(service_at(server.url, "openai-chat"))
-    assert (keys, failed.kind) == (["b"], kind)
+    assert (keys, failed.kind) == ([], kind)
 
 
 async def test_results_that_are_no_longer_kept_are_lost(server, service_at):

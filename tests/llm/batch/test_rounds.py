@@ -25,11 +25,12 @@ from merge_runner.errors import (
     QuotaExhausted,
 )
 from merge_runner.llm.batch.journal import Journal
-from merge_runner.llm.batch.rounds import Batches, Rounds
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.service import BatchFailed, BatchStatus
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
@@ -62,6 +63,7 @@ class Memory:
 
     takes_mark = True
     forgets = False
+    wire = FORMATS["openai-chat"]
 
     def __init__(self):
         self.batches = {}
@@ -152,7 +154,8 @@ class Run:
             transport=self.alone,
             limiter=Limiter(),
             budget=budget,
-            batches=Batches(self.rounds, "m", budget, 0.5),
+            rounds=self.rounds,
+            batch_price=0.5,
         )
 
     async def ask(self, repetitions=1, decision=0):
@@ -522,8 +525,8 @@ async def killed(run, repetitions, when):
     asking = asyncio.create_task(run.ask(repetitions))
     await when.wait()
     asking.cancel()
-    for task in (*[each.work for each in run.rounds._batches.values()], *run.rounds._creations):
-        task.cancel()
+    for batch in run.rounds._batches.values():
+        batch.work.cancel()
     await run.client.drain()
 
 
