@@ -190,7 +190,7 @@ def open_rounds(
     """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
     journal = Journal(cache)
     models = set(plan.registered.values())
-    left = [each for each in journal.batches() if each.model in models and journal.waits(each)]
+    left = any(each.model in models for each in journal.batches.values())
     if options.dask is not None:
         if left:
             raise UsageError(

@@ -7,7 +7,9 @@ cache, so that it knows all rows of its models once it has read them.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable
+from functools import partial
 
 from pydantic import AwareDatetime, BaseModel, ValidationError
 
@@ -40,23 +42,47 @@ class OpenBatch(BaseModel, frozen=True):
 
 
 class Journal:
-    """The open batches of a cache."""
+    """The open batches of a cache, by mark, the oldest first; those that have ended are removed."""
 
     def __init__(self, cache: ResponseCache) -> None:
         self._cache = cache
-        found = filter(None, map(self._read, cache.names(_BATCH)))
-        ordered = sorted(found, key=lambda batch: batch.submitted_at)
-        self._open = {batch.mark: batch for batch in ordered}
-
-    def batches(self) -> list[OpenBatch]:
-        """Return all open batches, the oldest first."""
-        return [*self._open.values()]
+        noted = []
+        for name in cache.names(_BATCH):
+            with contextlib.suppress(RecordingError, ValidationError):  # a damaged one is none
+                noted.append(OpenBatch.model_validate_json(cache.read(name) or ""))
+        noted.sort(key=lambda batch: batch.submitted_at)
+        self.batches = {batch.mark: batch for batch in noted}
+        if ended := [batch.mark for batch in noted if not self._waits(batch)]:
+            cache.run_now([partial(cache.remove, _BATCH + mark) for mark in ended])
+        for mark in ended:
+            del self.batches[mark]
 
     def batch_of(self, key: str) -> OpenBatch | None:
         """Return where a call was submitted last; None: nowhere."""
-        return next((each for each in reversed(self._open.values()) if key in each.lines), None)
+        return next((each for each in reversed(self.batches.values()) if key in each.lines), None)
 
-    def waits(self, batch: OpenBatch) -> bool:
+    async def note(
+        self, batch: OpenBatch, begins: Callable[[str], bool] | None = None
+    ) -> OpenBatch:
+        """Note what is known of a batch by now; returns what is noted.
+
+        That is of those of its calls alone which may begin, as ``begins``, an operation on the
+        cache, says of the key of each; all is one transaction.
+        """
+
+        def operation() -> OpenBatch:
+            noted = batch
+            if begins is not None:
+                with self._cache.money.transaction():
+                    begun = {key: attempt for key, attempt in batch.lines.items() if begins(key)}
+                noted = batch.model_copy(update={"lines": begun})
+            self._cache.replace(_BATCH + batch.mark, noted.model_dump_json())
+            return noted
+
+        noted = self.batches[batch.mark] = await self._cache.write(operation)
+        return noted
+
+    def _waits(self, batch: OpenBatch) -> bool:
         """Whether a call of the batch waits there yet, and in no later one."""
         for key in (each for each in batch.lines if self.batch_of(each) is batch):
             try:
@@ -66,46 +92,3 @@ class Journal:
             except RecordingError:
                 return True  # whoever asks for the call will set what is damaged aside
         return False
-
-    async def begin(self, batch: OpenBatch, begins: Callable[[str], bool]) -> OpenBatch:
-        """Note that a batch is about to be created, with those of its calls that may begin.
-
-        ``begins``, an operation on the cache, is told the key of each; all is one transaction.
-        """
-
-        def operation() -> OpenBatch:
-            with self._cache.money.transaction():
-                begun = {key: attempt for key, attempt in batch.lines.items() if begins(key)}
-            taken = batch.model_copy(update={"lines": begun})
-            self._write(taken)
-            return taken
-
-        taken = await self._cache.write(operation)
-        self._open[taken.mark] = taken
-        return taken
-
-    async def note(self, batch: OpenBatch) -> None:
-        """Note what is known of a batch by now."""
-        await self._cache.write(lambda: self._write(batch))
-        self._open[batch.mark] = batch
-
-    async def tidy(self) -> None:
-        """Remove the batches of which no call waits any more."""
-
-        def operation() -> None:
-            for batch in self.batches():
-                if not self.waits(batch):
-                    self._cache.remove(_BATCH + batch.mark)
-
-        if self._open:
-            await self._cache.write(operation)
-
-    def _read(self, name: str) -> OpenBatch | None:
-        """Return the batch in a row; a damaged one is none."""
-        try:
-            return OpenBatch.model_validate_json(self._cache.read(name) or "")
-        except (RecordingError, ValidationError):
-            return None
-
-    def _write(self, batch: OpenBatch) -> None:
-        self._cache.replace(_BATCH + batch.mark, batch.model_dump_json())

@@ -30,7 +30,7 @@ from merge_runner.llm.batch.journal import Journal, OpenBatch
 from merge_runner.llm.batch.service import BatchFailed, BatchService
 from merge_runner.llm.budget import PaidAttempt
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
-from merge_runner.records import Attempt, ChatRequest
+from merge_runner.records import Attempt
 
 if TYPE_CHECKING:
     from merge_runner.llm.call import Call
@@ -84,44 +84,35 @@ class Batch:
         self.sleeps = False
 
 
+@dataclass(slots=True, eq=False)
 class Rounds:
     """The rounds of a run; ``services`` are the batch modes of its models, by registered name.
 
-    A run that does not ``submits`` takes only what earlier runs have submitted.
+    A run that does not ``submits`` takes only what earlier runs have submitted. ``_most`` has the
+    models of which a batch was refused, and the most calls of the next: they go one by one.
     """
 
-    def __init__(
-        self,
-        journal: Journal,
-        services: dict[str, BatchService],
-        *,
-        submits: bool,
-        say: Callable[[str], None],
-    ) -> None:
-        self.submits = submits
-        self.services = services
-        self._journal = journal
-        self._say = say
-        self._forming: list[Line] = []
-        self._batches: dict[str, Batch] = {}
-        # Models of which a batch was refused: the most calls of the next. They go one by one.
-        self._most: dict[str, int] = {}
+    journal: Journal
+    services: dict[str, BatchService]
+    submits: bool
+    say: Callable[[str], None]
+    _forming: list[Line] = field(default_factory=list)
+    _batches: dict[str, Batch] = field(default_factory=dict)
+    _most: dict[str, int] = field(default_factory=dict)
 
     def open_batch(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenBatch | None:
         """Return where a call with these attempts waits; None: nowhere that can be reached."""
-        batch = self._journal.batch_of(key)
+        batch = self.journal.batch_of(key)
         if batch is None or not batch.holds(key, attempts) or batch.model not in self.services:
             return None
         return batch
 
     async def ask(self, call: Call, paid: PaidAttempt) -> tuple[AttemptOutcome, Batch]:
         """Return what became of a call's next attempt, in the next round or where it waits."""
-        if call.open is None:
-            batch = await self._next_round(call, paid)
-        elif call.open.mark in self._batches:
-            batch = self._batches[call.open.mark]
+        if call.open:
+            batch = self._batches.get(call.open.mark) or self._start(call.open)
         else:
-            batch = self._start(call.open)
+            batch = await self._next_round(call, paid)
         while True:
             await asyncio.shield(batch.work)
             if call.request.key not in batch.note.lines:
@@ -159,7 +150,6 @@ class Rounds:
         for task in work:
             task.cancel()
         await asyncio.gather(*work, return_exceptions=True)
-        await self._journal.tidy()
 
     def _open(self, model: str | None = None) -> list[Batch]:
         """Return the batches that have not ended: they take room at their provider."""
@@ -228,45 +218,35 @@ class Rounds:
             paid = by_key[key].paid
             return not paid.queued or paid.set_aside(by_key[key].call.attempts)
 
-        batch.note = await self._journal.begin(batch.note, begins)
-        begun = [by_key[key] for key in batch.note.lines]
-        for line in begun:
-            if line.paid.queued:
-                line.paid.begun()
-        if not begun:
+        batch.note = await self.journal.note(batch.note, begins)
+        for key in batch.note.lines:
+            if by_key[key].paid.queued:
+                by_key[key].paid.begun()
+        if not batch.note.lines:
             return False
-        requests = [line.call.request for line in begun]
-        try:
-            await self._patiently(batch, partial(self._create, batch, requests), OUTAGE_S)
-        except BatchFailed as exc:
-            if exc.kind == "lost":
+        service = self.services[batch.note.model]
+        requests = [by_key[key].call.request for key in batch.note.lines]
+
+        async def create() -> None:
+            await self._note(batch, await service.create(requests, batch.note.mark))
+
+        async def created() -> None:
+            creation = asyncio.create_task(create())
+            try:
+                await asyncio.shield(creation)
+            except asyncio.CancelledError:
+                await asyncio.wait([creation])  # its id is noted even if the run ends now
                 raise
-            if exc.kind == "again":
-                # It may be there all the same: the next run looks for it, and nothing is settled.
-                raise ProviderDown(
-                    f"{batch.note.model}: no batch can be submitted ({exc}): nothing else is "
-                    "asked. When the service answers again, run the same command"
-                ) from exc
+            except BatchFailed as exc:
+                if not (exc.sent and await self._arrived(batch)):
+                    raise
+
+        try:
+            await self._patiently(batch, created, OUTAGE_S)
+        except BatchFailed as exc:
             await self._not_asked(batch, exc, "not_created")
             return False
         return True
-
-    async def _create(self, batch: Batch, requests: Sequence[ChatRequest]) -> None:
-        """Create a batch; where its answer is lost, look for it."""
-
-        async def create() -> None:
-            service = self.services[batch.note.model]
-            await self._note(batch, await service.create(requests, batch.note.mark))
-
-        creation = asyncio.create_task(create())
-        try:
-            await asyncio.shield(creation)
-        except asyncio.CancelledError:
-            await asyncio.wait([creation])  # its id is noted even if the run ends now
-            raise
-        except BatchFailed as exc:
-            if not (exc.sent and await self._arrived(batch)):
-                raise
 
     async def _arrived(self, batch: Batch) -> bool:
         """Look for a batch until its creation, if it was ever sent, must be in effect."""
@@ -283,7 +263,7 @@ class Rounds:
 
     async def _note(self, batch: Batch, batch_id: str) -> None:
         batch.note = batch.note.model_copy(update={"batch_id": batch_id})
-        await self._journal.note(batch.note)
+        await self.journal.note(batch.note)
 
     async def _follow(self, batch: Batch) -> None:
         """Wait for the end of a batch, and read its results until no more can be had."""
@@ -311,29 +291,30 @@ class Rounds:
         status = await service.status(note.batch_id)
         if not status.ended:
             raise BatchFailed("again", "a batch that has ended is said to go on")
-        foreign = broken = 0
+        broken = 0
         async for key, raw in service.results(note.batch_id, status):
             end = _no_answer("expired", "it was not asked in time", charged=False)
             if raw:  # no limit of single calls is meant, and no call waits for one
                 end = replace(judge(raw, service.wire), pause=False, delay_s=None)
             broken += not key
-            foreign += bool(key) and (
-                key not in note.lines or batch.ends.setdefault(key, end) != end
-            )
-        if broken or foreign:
-            self._say(
-                f"{note.model}: {broken + foreign} results of batch {note.batch_id} are ignored: "
-                "they are broken, of none of its calls, or differ from an earlier one"
-            )
-        if len(batch.ends) + broken < min(status.results, len(note.lines)):
-            raise BatchFailed(
-                "again", f"{len(batch.ends)} of the {status.results} results are there"
-            )
+            if key in note.lines:  # others are of other batches; of two the first counts
+                batch.ends.setdefault(key, end)
+        there = len(batch.ends) + broken
+        if there < min(status.results, len(note.lines)):
+            raise BatchFailed("again", f"{there} of the {status.results} results are there")
 
     async def _not_asked(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
         """End a batch of which the provider asks no line, or let its lines go in smaller ones."""
         model, calls = batch.note.model, len(batch.note.lines)
         is_alone = self._open(model) == [batch]
+        if exc.kind == "lost":
+            raise exc
+        if exc.kind == "again" and outcome == "not_created":
+            # It may be there all the same: the next run looks for it, and nothing is settled.
+            raise ProviderDown(
+                f"{model}: no batch can be submitted ({exc}): nothing else is asked. When the "
+                "service answers again, run the same command"
+            )
         if exc.kind in ("quota", "refused"):
             kind = QuotaExhausted if exc.kind == "quota" else EndpointRefused
             batch.error = kind(
@@ -341,10 +322,10 @@ class Rounds:
                 "that, or leave --batch out, and run the same command to go on"
             )
         elif is_alone and calls == 1:
-            self._say(f"{model}: a call is asked singly, at the full price ({exc})")
+            self.say(f"{model}: a call is asked singly, at the full price ({exc})")
         else:
             if model not in self._most:
-                self._say(f"{model}: {calls} calls go in smaller batches: {exc}")
+                self.say(f"{model}: {calls} calls go in smaller batches: {exc}")
             self._most[model] = max(1, calls // 2) if is_alone else calls
             # It counts as open, so that no other one is submitted meanwhile.
             await batch.sleep(exc.delay_s or 1.0)
@@ -381,7 +362,7 @@ class Rounds:
                 if exc.kind != "again" or clock_s() - began_s > patience_s:
                     raise
                 if not tries:
-                    self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
+                    self.say(f"{batch.note.model}: {exc}; it is asked again until it answers")
                 tries += 1
                 await batch.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 TIMEOUT_S = 300.0
 MOST_BYTES = 256_000_000
 LONGEST_MESSAGE = 500
-# What a server answers of a batch that it does not have, or no longer.
-GONE = frozenset({301, 302, 303, 307, 308, 404, 410})
 ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
 FailureKind = Literal["again", "smaller", "quota", "refused", "lost"]
 
@@ -213,7 +211,7 @@ class BatchService(ABC):
     def _refused(self, raw: RawReply, *, exists: bool) -> BatchFailed:
         outcome = judge_error(raw.error, self.wire)
         kind = self.failure_of(raw.error).kind
-        if exists and raw.status in GONE:
+        if exists and raw.status in (404, 410):  # it does not have the batch, or no longer
             kind = "lost"
         elif exists and outcome.action not in ("quota", "refused"):
             kind = "again"

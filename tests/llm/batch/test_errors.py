@@ -339,7 +339,6 @@ async def used(service, what):
     [
         (404, "lost"),
         (410, "lost"),
-        (302, "lost"),
         (405, "again"),
         (413, "again"),
         (429, "again"),
