@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 
 from merge_runner.errors import CallFailed
-from merge_runner.llm.batch.journal import OpenBatch
+from merge_runner.llm.batch.rounds import Batch
 from merge_runner.llm.ledger import Asked
 from merge_runner.records import Attempt, ChatReply, ChatRequest, Slot, Usage
 
@@ -51,7 +51,7 @@ class Call:
     wait: Wait | None = None
     asking: int = 0
     singly: bool = False
-    open: OpenBatch | None = None
+    open: Batch | None = None
     task: asyncio.Task[ChatReply] = field(init=False)
 
     @property

@@ -277,7 +277,9 @@ class LlmClient:
         if self.rounds is not None:
             call.open = self.rounds.open_batch(key, earlier)
         opened = call.open  # the attempt that has begun there is the one that goes on
-        call.attempts = [each for each in earlier if not opened or each.number < opened.lines[key]]
+        call.attempts = [
+            each for each in earlier if not opened or each.number < opened.note.lines[key]
+        ]
         call.earlier = len(call.attempts)
 
     async def _attempts(self, call: Call) -> ChatReply:
@@ -424,7 +426,7 @@ class LlmClient:
             with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
                 paid = await self._money.set_aside(*who)
         else:
-            paid = self._money.going_on(*who, call.open.ledger)
+            paid = self._money.going_on(*who, call.open.note.ledger)
         with closing(paid):
             with call.waiting(f"for batches of {asked.model}", idle=True):
                 outcome, batch = await rounds.ask(call, paid)

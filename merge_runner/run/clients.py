@@ -18,7 +18,6 @@ from merge_runner.config import (
 )
 from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.budget import Budget
@@ -188,9 +187,9 @@ def open_rounds(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
 ) -> Rounds | None:
     """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
-    journal = Journal(cache)
+    rounds = Rounds(cache, {}, submits=options.batch, say=say)
     models = set(plan.registered.values())
-    left = any(each.model in models for each in journal.batches.values())
+    left = any(each.note.model in models for each in rounds.batches.values())
     if options.dask is not None:
         if left:
             raise UsageError(
@@ -202,7 +201,7 @@ def open_rounds(
         say("calls that wait in batches of an earlier run are not asked again")
     if not options.batch and not left:
         return None
-    return Rounds(journal, {}, submits=options.batch, say=say)
+    return rounds
 
 
 def check_batches(plan: Plan, options: Options) -> None:

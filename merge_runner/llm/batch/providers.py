@@ -158,7 +158,6 @@ class GeminiBatches(BatchService):
     # A page has few batches, since one may come with all its results.
     path, pages, cursor = f"{GEMINI}/batches", "pageSize=10", "pageToken"
     list_member, next_member, mark_member = "operations", "nextPageToken", "displayName"
-    id_member, key_member = "name", "key"
 
     async def upload(self, content: bytes, mark: str) -> str:
         """See BatchService."""

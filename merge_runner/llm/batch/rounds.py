@@ -2,13 +2,19 @@
 
 A round is closed when nothing can go on before an answer comes, so that all trials advance by one
 decision at a time, and a sweep takes as many rounds as its longest trial has decisions. A line that
-failed is asked singly. The journal knows of a batch before its provider does: a call that waits in
-an open batch is not asked anew, it joins those that wait there.
+failed is asked singly.
+
+A batch is noted in the cache before its provider knows of it. A process that is killed leaves there
+what the next one needs: the batch to look for, or to wait for, and under which of its attempts each
+call waits there. A call that waits in an open batch is not asked anew, it joins those that wait
+there. One process at a time asks a model in a cache, so that it knows all notes of its models once
+it has read them.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import math
 import secrets
@@ -19,22 +25,27 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
+from pydantic import AwareDatetime, BaseModel, ValidationError
+
 from merge_runner.errors import (
     EndpointRefused,
     MergeRunnerError,
     ProviderDown,
     QuotaExhausted,
+    RecordingError,
     TrialSuspended,
 )
-from merge_runner.llm.batch.journal import Journal, OpenBatch
 from merge_runner.llm.batch.service import BatchFailed, BatchService
 from merge_runner.llm.budget import PaidAttempt
+from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
-from merge_runner.records import Attempt
+from merge_runner.records import Attempt, ChatRequest
 
 if TYPE_CHECKING:
     from merge_runner.llm.call import Call
 
+# The prefix of names in the cache.
+_BATCH = "batch "
 # How often it is looked whether a round can be closed: what is seen then decides, not the time.
 LOOK_S = 0.05
 # A task that can go on shows that when the loop has come round once; a chain of them, soon after.
@@ -52,18 +63,25 @@ ENDING_S = 3600.0
 T = TypeVar("T")
 
 
-@dataclass(slots=True, eq=False)
-class Line:
-    """A call whose next attempt waits for a batch; ``batch`` will be the one that it goes to."""
+class OpenBatch(BaseModel, frozen=True):
+    """What is noted of a batch that was created, or is about to be.
 
-    call: Call
-    paid: PaidAttempt
-    batch: asyncio.Future[Batch]
+    ``mark`` is its name at the provider, ``batch_id`` its id, empty until the provider has told it.
+    ``lines`` has the number of the attempt by the key of each call. ``model`` is its name in the
+    registry, ``ledger`` that of the money. ``submitted_at`` is UTC.
+    """
+
+    mark: str
+    model: str
+    ledger: str
+    submitted_at: AwareDatetime
+    lines: dict[str, int]
+    batch_id: str = ""
 
 
 @dataclass(slots=True, eq=False)
 class Batch:
-    """A batch of this process, whose ``work`` ends with it.
+    """A batch, whose ``work`` ends with it; None where nobody has asked for a call of it yet.
 
     Then ``ends`` has what became of the lines with a result, by key, until it is taken, and
     ``rest`` what became of all others; None: they go with the next round. An ``error`` ends the
@@ -75,7 +93,12 @@ class Batch:
     rest: AttemptOutcome | None = None
     error: MergeRunnerError | None = None
     sleeps: bool = False
-    work: asyncio.Task[None] = field(init=False)
+    work: asyncio.Task[None] | None = None
+
+    def holds(self, key: str, attempts: Iterable[Attempt]) -> bool:
+        """Whether its attempt at a call, as far as these tell, has not ended."""
+        number = self.note.lines[key]
+        return all(each.number != number or each.outcome == "unknown" for each in attempts)
 
     async def sleep(self, seconds: float) -> None:
         """Wait, while others may go on."""
@@ -85,36 +108,59 @@ class Batch:
 
 
 @dataclass(slots=True, eq=False)
+class Line:
+    """A call whose next attempt waits for a batch; ``batch`` will be the one that it goes to."""
+
+    call: Call
+    paid: PaidAttempt
+    batch: asyncio.Future[Batch]
+
+
 class Rounds:
     """The rounds of a run; ``services`` are the batch modes of its models, by registered name.
 
-    A run that does not ``submits`` takes only what earlier runs have submitted. ``_most`` has the
-    models of which a batch was refused, and the most calls of the next: they go one by one.
+    A run that does not ``submits`` takes only what earlier runs have submitted. ``batches`` are
+    all that calls of this cache wait in, by mark, the oldest first.
     """
 
-    journal: Journal
-    services: dict[str, BatchService]
-    submits: bool
-    say: Callable[[str], None]
-    _forming: list[Line] = field(default_factory=list)
-    _batches: dict[str, Batch] = field(default_factory=dict)
-    _most: dict[str, int] = field(default_factory=dict)
+    def __init__(
+        self,
+        cache: ResponseCache,
+        services: dict[str, BatchService],
+        *,
+        submits: bool,
+        say: Callable[[str], None],
+    ) -> None:
+        self.services = services
+        self.submits = submits
+        self._cache = cache
+        self._say = say
+        self._forming: list[Line] = []
+        # Models of which a batch was refused: the most calls of the next. They go one by one.
+        self._most: dict[str, int] = {}
+        noted = []
+        for name in cache.names(_BATCH):
+            with contextlib.suppress(RecordingError, ValidationError):  # a damaged one is none
+                noted.append(OpenBatch.model_validate_json(cache.read(name) or ""))
+        noted.sort(key=lambda note: note.submitted_at)
+        self.batches = {note.mark: Batch(note) for note in noted}
+        ended = [mark for mark, batch in self.batches.items() if not self._waits(batch)]
+        cache.run_now([partial(cache.remove, _BATCH + mark) for mark in ended])
+        for mark in ended:
+            del self.batches[mark]
 
-    def open_batch(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenBatch | None:
+    def open_batch(self, key: str, attempts: Iterable[Attempt] = ()) -> Batch | None:
         """Return where a call with these attempts waits; None: nowhere that can be reached."""
-        batch = self.journal.batch_of(key)
-        if batch is None or not batch.holds(key, attempts) or batch.model not in self.services:
+        batch = self._last(key)
+        if batch is None or not batch.holds(key, attempts) or batch.note.model not in self.services:
             return None
         return batch
 
     async def ask(self, call: Call, paid: PaidAttempt) -> tuple[AttemptOutcome, Batch]:
         """Return what became of a call's next attempt, in the next round or where it waits."""
-        if call.open:
-            batch = self._batches.get(call.open.mark) or self._start(call.open)
-        else:
-            batch = await self._next_round(call, paid)
+        batch = call.open or await self._next_round(call, paid)
         while True:
-            await asyncio.shield(batch.work)
+            await asyncio.shield(batch.work or self._start(batch))
             if call.request.key not in batch.note.lines:
                 raise TrialSuspended("another run spends from the same cap, and has used it up")
             end = batch.ends.pop(call.request.key, batch.rest)
@@ -146,15 +192,34 @@ class Rounds:
 
     async def close(self) -> None:
         """End the waiting; batches that are being created get their ids noted first."""
-        work = [batch.work for batch in self._batches.values()]
+        work = [batch.work for batch in self.batches.values() if batch.work]
         for task in work:
             task.cancel()
         await asyncio.gather(*work, return_exceptions=True)
 
     def _open(self, model: str | None = None) -> list[Batch]:
         """Return the batches that have not ended: they take room at their provider."""
-        every = self._batches.values()
-        return [b for b in every if not b.work.done() and model in (None, b.note.model)]
+        return [
+            batch
+            for batch in self.batches.values()
+            if batch.work and not batch.work.done() and model in (None, batch.note.model)
+        ]
+
+    def _last(self, key: str) -> Batch | None:
+        """Return where a call was submitted last."""
+        every = reversed(self.batches.values())
+        return next((batch for batch in every if key in batch.note.lines), None)
+
+    def _waits(self, batch: Batch) -> bool:
+        """Whether a call of a batch waits there yet, and in no later one."""
+        for key in (each for each in batch.note.lines if self._last(each) is batch):
+            try:
+                tried = self._cache.unanswered(key)
+                if batch.holds(key, tried) and self._cache.get(key) is None:
+                    return True
+            except RecordingError:
+                return True  # whoever asks for the call will set what is damaged aside
+        return False
 
     async def _next_round(self, call: Call, paid: PaidAttempt) -> Batch:
         line = Line(call, paid, asyncio.get_running_loop().create_future())
@@ -182,50 +247,58 @@ class Rounds:
                     submitted_at=datetime.now(UTC),
                     lines={each.call.request.key: len(each.call.attempts) + 1 for each in part},
                 )
-                batch = self._start(note, part)
+                batch = self.batches[note.mark] = Batch(note)
+                self._start(batch, part)
                 for line in part:
                     line.batch.set_result(batch)
 
-    def _start(self, note: OpenBatch, lines: Sequence[Line] = ()) -> Batch:
+    def _start(self, batch: Batch, lines: Sequence[Line] = ()) -> asyncio.Task[None]:
         """Submit lines, or go on with a batch that an earlier run has submitted, or was about to.
 
         That is a task of its own; what it raises is raised for all who wait for it.
         """
-        batch = self._batches[note.mark] = Batch(note)
 
         async def work() -> None:
             try:
                 if lines:
-                    is_there = await self._submit(batch, lines)
+                    requests = await self._begin(batch, lines)
+                    is_there = bool(requests) and await self._submit(batch, requests)
                 else:
-                    is_there = bool(note.batch_id) or await self._arrived(batch)
+                    is_there = bool(batch.note.batch_id) or await self._arrived(batch)
                 if is_there:
                     await self._follow(batch)
             except BatchFailed as exc:
                 self._lost(batch, exc)
 
         batch.work = asyncio.create_task(work())
-        return batch
+        return batch.work
 
-    async def _submit(self, batch: Batch, lines: Sequence[Line]) -> bool:
-        """Note a batch with those of its lines that may begin, and create it; False if it is not.
+    async def _begin(self, batch: Batch, lines: Sequence[Line]) -> list[ChatRequest]:
+        """Note a batch with those of its lines that may begin; returns their requests.
 
         Their money is set aside in the same transaction, unless that was done.
         """
         by_key = {line.call.request.key: line for line in lines}
 
-        def begins(key: str) -> bool:
-            paid = by_key[key].paid
-            return not paid.queued or paid.set_aside(by_key[key].call.attempts)
+        def operation() -> OpenBatch:
+            begun = {}
+            with self._cache.money.transaction():
+                for key, line in by_key.items():
+                    if not line.paid.queued or line.paid.set_aside(line.call.attempts):
+                        begun[key] = batch.note.lines[key]
+            note = batch.note.model_copy(update={"lines": begun})
+            self._write(note)
+            return note
 
-        batch.note = await self.journal.note(batch.note, begins)
+        batch.note = await self._cache.write(operation)
         for key in batch.note.lines:
             if by_key[key].paid.queued:
                 by_key[key].paid.begun()
-        if not batch.note.lines:
-            return False
+        return [by_key[key].call.request for key in batch.note.lines]
+
+    async def _submit(self, batch: Batch, requests: Sequence[ChatRequest]) -> bool:
+        """Create a batch, or find it where the answer is lost; False if it is not created."""
         service = self.services[batch.note.model]
-        requests = [by_key[key].call.request for key in batch.note.lines]
 
         async def create() -> None:
             await self._note(batch, await service.create(requests, batch.note.mark))
@@ -263,7 +336,10 @@ class Rounds:
 
     async def _note(self, batch: Batch, batch_id: str) -> None:
         batch.note = batch.note.model_copy(update={"batch_id": batch_id})
-        await self.journal.note(batch.note)
+        await self._cache.write(lambda: self._write(batch.note))
+
+    def _write(self, note: OpenBatch) -> None:
+        self._cache.replace(_BATCH + note.mark, note.model_dump_json())
 
     async def _follow(self, batch: Batch) -> None:
         """Wait for the end of a batch, and read its results until no more can be had."""
@@ -322,10 +398,10 @@ class Rounds:
                 "that, or leave --batch out, and run the same command to go on"
             )
         elif is_alone and calls == 1:
-            self.say(f"{model}: a call is asked singly, at the full price ({exc})")
+            self._say(f"{model}: a call is asked singly, at the full price ({exc})")
         else:
             if model not in self._most:
-                self.say(f"{model}: {calls} calls go in smaller batches: {exc}")
+                self._say(f"{model}: {calls} calls go in smaller batches: {exc}")
             self._most[model] = max(1, calls // 2) if is_alone else calls
             # It counts as open, so that no other one is submitted meanwhile.
             await batch.sleep(exc.delay_s or 1.0)
@@ -362,7 +438,7 @@ class Rounds:
                 if exc.kind != "again" or clock_s() - began_s > patience_s:
                     raise
                 if not tries:
-                    self.say(f"{batch.note.model}: {exc}; it is asked again until it answers")
+                    self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
                 tries += 1
                 await batch.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
 

@@ -72,10 +72,9 @@ class BatchService(ABC):
 
     Where a batch takes no mark, one whose id was lost cannot be found. Batches are at ``path``,
     where ``pages`` is the query for a page of their list, and ``cursor`` that for the one after it.
-    A page has its batches as ``list_member`` and the cursor of the next one as ``next_member``. A
-    batch has its id as ``id_member``, and its mark as ``mark_member`` of its metadata. A line is
-    made by ``template``. A result has the key of its request as ``key_member``: 64 hexadecimal
-    digits, as many characters as Anthropic takes.
+    A page has its batches as ``list_member``, each with its mark as ``mark_member`` of its
+    metadata, and the cursor of the next page as ``next_member``. A line is made by ``template``,
+    with the key of its request: 64 hexadecimal digits, as many characters as Anthropic takes.
     """
 
     template: ClassVar[str]
@@ -86,8 +85,6 @@ class BatchService(ABC):
     list_member: ClassVar[str]
     next_member: ClassVar[str]
     mark_member: ClassVar[str]
-    id_member: ClassVar[str] = "id"
-    key_member: ClassVar[str] = "custom_id"
 
     def __init__(self, transport: HttpTransport, endpoint: Endpoint, wire: WireFormat) -> None:
         self.transport = transport
@@ -175,23 +172,25 @@ class BatchService(ABC):
                         if line:
                             yield self._result(line)
             except ErrorReply as exc:
-                failure = self._refused(exc.raw, exists=True)
+                failure = self.failure_of(exc.raw.error, exists=True)
                 if exc.raw.status == 404:  # it belongs to a batch that is there
                     failure.kind = "again"
                 raise failure from exc
             except TransportFailure as exc:
                 raise _unanswered(exc) from exc
 
-    def failure_of(self, error: ServerError) -> BatchFailed:
-        """Return the failure of a batch that is not created, or fails as a whole."""
-        action = judge_error(error, self.wire).action
+    def failure_of(self, error: ServerError, *, exists: bool = False) -> BatchFailed:
+        """Return the failure of a batch that is not created, fails as a whole, or ``exists``."""
+        outcome = judge_error(error, self.wire)
+        kinds: dict[str, FailureKind] = {"retry": "again", "quota": "quota", "refused": "refused"}
+        kind = kinds.get(outcome.action, "again" if exists else "refused")
         enqueued = "token_limit_exceeded" in error.names or "enqueued" in error.message.lower()
-        kind: FailureKind = "refused"
-        if enqueued or error.status == 413:
+        if exists and error.status in (404, 410):  # its server does not have it, or no longer
+            kind = "lost"
+        elif not exists and (enqueued or error.status == 413):
             kind = "smaller"
-        elif action in ("retry", "quota"):
-            kind = "again" if action == "retry" else "quota"
-        return BatchFailed(kind, error.message)
+        message = f"HTTP {error.status}: {error.message}"
+        return BatchFailed(kind, message, delay_s=outcome.delay_s)
 
     async def ask(
         self, method: str, path: str, body: bytes = b"", headers: Mapping[str, str] | None = None
@@ -204,31 +203,23 @@ class BatchService(ABC):
             )
         except TransportFailure as exc:
             raise _unanswered(exc) from exc
-        if not 200 <= raw.status < 300:
-            raise self._refused(raw, exists=method == "GET")
-        return raw
-
-    def _refused(self, raw: RawReply, *, exists: bool) -> BatchFailed:
-        outcome = judge_error(raw.error, self.wire)
-        kind = self.failure_of(raw.error).kind
-        if exists and raw.status in (404, 410):  # it does not have the batch, or no longer
-            kind = "lost"
-        elif exists and outcome.action not in ("quota", "refused"):
-            kind = "again"
+        if 200 <= raw.status < 300:
+            return raw
+        failure = self.failure_of(raw.error, exists=method == "GET")
         # Without a mark it cannot be looked for: what the provider says of itself decides.
         own = is_own_host(self.endpoint.provider, self.endpoint.identity)
-        sent = may_be_charged(raw, self.endpoint.provider if own else None)
-        sent = sent or (self.takes_mark and raw.status >= 500)
-        message = f"HTTP {raw.status}: {raw.error.message}"
-        return BatchFailed(kind, message, delay_s=outcome.delay_s, sent=sent)
+        failure.sent = may_be_charged(raw, self.endpoint.provider if own else None)
+        failure.sent |= self.takes_mark and raw.status >= 500
+        raise failure
 
     def _batch_id(self, batch: dict[str, Any]) -> str:
-        return id_of(batch, self.id_member).rpartition("/")[2]
+        return id_of({"id": batch.get("id", batch.get("name"))}).rpartition("/")[2]
 
     def _result(self, line: str | TransportFailure) -> tuple[str, RawReply | None]:
         try:
             value = as_dict(json.loads(line) if isinstance(line, str) else None)
-            return as_text(value.get(self.key_member)) or "", self.read(value)
+            key = value.get("custom_id", value.get("key"))
+            return as_text(key) or "", self.read(value)
         except ValueError:
             return "", None
 

@@ -459,8 +459,5 @@ async def test_a_failed_batch_says_why_and_what_to_do(server, service_at, form, 
     batch.setdefault("message", "odd")
     server.replies[BATCH[form]] = (200, told[form])
     status = await service_at(server.url, form).status("b1")
-    assert (status.ended, status.failure.kind, str(status.failure)) == (
-        False,
-        kind,
-        batch["message"],
-    )
+    assert (status.ended, status.failure.kind) == (False, kind)
+    assert batch["message"] in str(status.failure)

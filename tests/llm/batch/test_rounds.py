@@ -24,7 +24,6 @@ from merge_runner.errors import (
     ProviderDown,
     QuotaExhausted,
 )
-from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.service import BatchFailed, BatchStatus
 from merge_runner.llm.budget import Budget
@@ -136,7 +135,7 @@ class Run:
         self.said = []
         self.alone = Alone()
         self.rounds = Rounds(
-            Journal(cache),
+            cache,
             {"m": service},
             submits=submits,
             say=self.said.append,
@@ -204,7 +203,7 @@ async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
     assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
     assert (run.ledger.read().reserved_usd, run.alone.asked) == (0.0, [])
     await run.end()
-    assert not Journal(cache).batches
+    assert not Run(cache, service).rounds.batches
 
 
 @in_virtual_time
@@ -280,7 +279,7 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cac
     assert service.sizes[3:] == [8]  # there is room again
     assert not run.ledger.read().reserved_usd
     await run.end()
-    assert not Journal(cache).batches
+    assert not Run(cache, service).rounds.batches
 
 
 @in_virtual_time
@@ -320,7 +319,7 @@ async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache,
     assert texts(await later.ask(2)) == ["batched 1", "batched 2"]
     assert (service.sizes, later.alone.asked) == ([2], [])
     await later.end()
-    assert not Journal(cache).batches
+    assert not Run(cache, service).rounds.batches
 
 
 async def left_behind(cache, service, repetitions=1, **options):
@@ -479,7 +478,7 @@ async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothin
     spending = run.ledger.read()
     assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.0, 0.0, 0)
     await run.end()
-    assert not Journal(cache).batches
+    assert not Run(cache, service).rounds.batches
 
 
 @in_virtual_time
@@ -521,8 +520,8 @@ async def killed(run, repetitions, when):
     asking = asyncio.create_task(run.ask(repetitions))
     await when.wait()
     asking.cancel()
-    for batch in run.rounds._batches.values():
-        batch.work.cancel()
+    for batch in run.rounds.batches.values():
+        batch.work and batch.work.cancel()
     await run.client.drain()
 
 
@@ -563,7 +562,7 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
     assert spending.spent_usd == pytest.approx(5 * ONE_USD / 2)
     assert (spending.reserved_usd, spending.open_attempts) == (0.0, 0)
     await second.end()
-    assert not Journal(cache).batches
+    assert not Run(cache, service).rounds.batches
 
 
 @in_virtual_time
