@@ -123,15 +123,8 @@ class Rounds:
     all that calls of this cache wait in, by mark, the oldest first.
     """
 
-    def __init__(
-        self,
-        cache: ResponseCache,
-        services: dict[str, BatchService],
-        *,
-        submits: bool,
-        say: Callable[[str], None],
-    ) -> None:
-        self.services = services
+    def __init__(self, cache: ResponseCache, *, submits: bool, say: Callable[[str], None]) -> None:
+        self.services: dict[str, BatchService] = {}
         self.submits = submits
         self._cache = cache
         self._say = say
