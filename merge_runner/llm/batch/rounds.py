@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import math
 import secrets
 from collections import defaultdict
@@ -227,12 +226,11 @@ class Rounds:
         self._forming = []
         for (model, ledger), lines in groups.items():
             most = self._most.get(model, MOST_CALLS)
-            parts = [lines[at : at + most] for at in range(0, len(lines), most)]
             if model in self._most:
-                later = parts if self._open(model) else parts[1:]
-                parts = parts[: len(parts) - len(later)]
-                self._forming += itertools.chain.from_iterable(later)
-            for part in parts:
+                now = 0 if self._open(model) else most
+                self._forming += lines[now:]
+                del lines[now:]
+            for part in (lines[at : at + most] for at in range(0, len(lines), most)):
                 note = OpenBatch(
                     mark=secrets.token_hex(16),
                     model=model,
