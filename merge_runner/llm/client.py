@@ -275,7 +275,7 @@ class LlmClient:
             )
         earlier = self.cache.unanswered(key)
         if self.rounds is not None:
-            call.open = self.rounds.open_batch(key, earlier)
+            call.open = self.rounds.open_batch(key)
         opened = call.open  # the attempt that has begun there is the one that goes on
         call.attempts = [
             each for each in earlier if not opened or each.number < opened.note.lines[key]

@@ -187,9 +187,9 @@ def open_rounds(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
 ) -> Rounds | None:
     """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
-    rounds = Rounds(cache, submits=options.batch, say=say)
     models = set(plan.registered.values())
-    left = any(each.note.model in models for each in rounds.batches.values())
+    rounds = Rounds(cache, models, submits=options.batch, say=say)
+    left = bool(rounds.batches)
     if options.dask is not None:
         if left:
             raise UsageError(

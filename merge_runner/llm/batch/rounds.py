@@ -18,7 +18,7 @@ import contextlib
 import math
 import secrets
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -38,7 +38,7 @@ from merge_runner.llm.batch.service import BatchFailed, BatchService
 from merge_runner.llm.budget import PaidAttempt
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
-from merge_runner.records import Attempt, ChatRequest
+from merge_runner.records import ChatRequest
 
 if TYPE_CHECKING:
     from merge_runner.llm.call import Call
@@ -94,11 +94,6 @@ class Batch:
     sleeps: bool = False
     work: asyncio.Task[None] | None = None
 
-    def holds(self, key: str, attempts: Iterable[Attempt]) -> bool:
-        """Whether its attempt at a call, as far as these tell, has not ended."""
-        number = self.note.lines[key]
-        return all(each.number != number or each.outcome == "unknown" for each in attempts)
-
     async def sleep(self, seconds: float) -> None:
         """Wait, while others may go on."""
         self.sleeps = True
@@ -119,10 +114,17 @@ class Rounds:
     """The rounds of a run; ``services`` are the batch modes of its models, by registered name.
 
     A run that does not ``submits`` takes only what earlier runs have submitted. ``batches`` are
-    all that calls of this cache wait in, by mark, the oldest first.
+    all that calls of its ``models`` wait in, by mark, the oldest first.
     """
 
-    def __init__(self, cache: ResponseCache, *, submits: bool, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        cache: ResponseCache,
+        models: Collection[str],
+        *,
+        submits: bool,
+        say: Callable[[str], None],
+    ) -> None:
         self.services: dict[str, BatchService] = {}
         self.submits = submits
         self._cache = cache
@@ -135,17 +137,22 @@ class Rounds:
             with contextlib.suppress(RecordingError, ValidationError):  # a damaged one is none
                 noted.append(OpenBatch.model_validate_json(cache.read(name) or ""))
         noted.sort(key=lambda note: note.submitted_at)
-        self.batches = {note.mark: Batch(note) for note in noted}
+        self.batches = {note.mark: Batch(note) for note in noted if note.model in models}
         ended = [mark for mark, batch in self.batches.items() if not self._waits(batch)]
         cache.run_now([partial(cache.remove, _BATCH + mark) for mark in ended])
         for mark in ended:
             del self.batches[mark]
 
-    def open_batch(self, key: str, attempts: Iterable[Attempt] = ()) -> Batch | None:
-        """Return where a call with these attempts waits; None: nowhere that can be reached."""
-        batch = self._last(key)
-        if batch is None or not batch.holds(key, attempts) or batch.note.model not in self.services:
+    def open_batch(self, key: str) -> Batch | None:
+        """Return where a call was submitted last, unless its attempt there has ended."""
+        every = reversed(self.batches.values())
+        batch = next((batch for batch in every if key in batch.note.lines), None)
+        if batch is None:
             return None
+        with contextlib.suppress(RecordingError):  # damaged: nothing is known of its attempts
+            tried = {each.number: each.outcome for each in self._cache.unanswered(key)}
+            if tried.get(batch.note.lines[key], "unknown") != "unknown":
+                return None
         return batch
 
     async def ask(self, call: Call, paid: PaidAttempt) -> tuple[AttemptOutcome, Batch]:
@@ -197,20 +204,14 @@ class Rounds:
             if batch.work and not batch.work.done() and model in (None, batch.note.model)
         ]
 
-    def _last(self, key: str) -> Batch | None:
-        """Return where a call was submitted last."""
-        every = reversed(self.batches.values())
-        return next((batch for batch in every if key in batch.note.lines), None)
-
     def _waits(self, batch: Batch) -> bool:
         """Whether a call of a batch waits there yet, and in no later one."""
-        for key in (each for each in batch.note.lines if self._last(each) is batch):
-            try:
-                tried = self._cache.unanswered(key)
-                if batch.holds(key, tried) and self._cache.get(key) is None:
-                    return True
-            except RecordingError:
-                return True  # whoever asks for the call will set what is damaged aside
+        for key in batch.note.lines:
+            with contextlib.suppress(RecordingError):  # damaged: it is asked anew
+                if self._cache.get(key) is not None:
+                    continue
+            if self.open_batch(key) is batch:
+                return True
         return False
 
     async def _next_round(self, call: Call, paid: PaidAttempt) -> Batch:

@@ -134,7 +134,7 @@ class Run:
     def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", submits=True):
         self.said = []
         self.alone = Alone()
-        self.rounds = Rounds(cache, submits=submits, say=self.said.append)
+        self.rounds = Rounds(cache, {"m"}, submits=submits, say=self.said.append)
         self.rounds.services["m"] = service
         self.ledger = Ledger(cache, scope)
         budget = Budget(self.ledger, cap)
