@@ -87,13 +87,10 @@ class OpenAIBatches(BatchService):
         why = read_error(400, {}, "", {"error": error})
         why = replace(why, status=status_within(why) if why.names else 400)
         failure = self.failure_of(why) if word == "FAILED" else None
-        ended = word in ("COMPLETED", "EXPIRED", "CANCELLED")
-        return BatchStatus(ended, answered, failure, batch)
-
-    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
-        """Return those of its files of answers and of errors."""
+        if word not in ("COMPLETED", "EXPIRED", "CANCELLED"):
+            return BatchStatus(failure=failure)
         names = [name for name in ("output_file_id", "error_file_id") if batch.get(name)]
-        return [f"/files/{id_of(batch, name)}/content" for name in names]
+        return BatchStatus([f"/files/{id_of(batch, name)}/content" for name in names], answered)
 
     def read(self, line: dict[str, Any]) -> RawReply | None:
         """See BatchService."""
@@ -121,16 +118,14 @@ class AnthropicBatches(BatchService):
 
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        ended = (as_text(batch.get("processing_status")) or "").upper() == "ENDED"
-        counts = as_dict(batch.get("request_counts")).values()
-        return BatchStatus(ended, sum(as_count(count) or 0 for count in counts), batch=batch)
-
-    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
-        """See BatchService."""
+        if (as_text(batch.get("processing_status")) or "").upper() != "ENDED":
+            return BatchStatus()
         if batch.get("archived_at"):
             raise BatchFailed("lost", "the results of the batch are no longer kept")
+        counts = as_dict(batch.get("request_counts")).values()
         # Not at the URL that the batch names: the key goes to the configured host alone.
-        return [f"{self.path}/{batch_id}/results"]
+        path = f"{self.path}/{id_of(batch)}/results"
+        return BatchStatus([path], sum(as_count(count) or 0 for count in counts))
 
     def read(self, line: dict[str, Any]) -> RawReply | None:
         """See BatchService."""
@@ -187,28 +182,25 @@ class GeminiBatches(BatchService):
 
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService; of an operation that is done the word may be one that nobody knows."""
-        word, done, error = _word(batch), batch.get("done") is True, as_dict(batch.get("error"))
-        ended = word in ("SUCCEEDED", "PARTIALLY_SUCCEEDED", "CANCELLED", "EXPIRED")
-        failed = not ended and (word == "FAILED" or (done and bool(error)))
-        why = read_error(_status_of(error) if error else 400, {}, "", batch)
-        stats = as_dict(as_dict(batch.get("metadata")).get("batchStats"))
-        answered = str(stats.get("successfulRequestCount"))  # 64-bit numbers are texts
-        return BatchStatus(
-            ended=ended or (done and not failed),
-            results=int(answered) if re.fullmatch("[0-9]{1,18}", answered) else 0,
-            failure=self.failure_of(why) if failed else None,
-            batch=batch,
-        )
-
-    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
-        """See BatchService."""
-        metadata = as_dict(batch.get("metadata"))
+        metadata, error = as_dict(batch.get("metadata")), as_dict(batch.get("error"))
+        # It says JOB_STATE_ or BATCH_STATE_ before it.
+        word = (as_text(metadata.get("state")) or "").upper().rpartition("_STATE_")[2]
+        done = batch.get("done") is True
+        if word not in ("SUCCEEDED", "PARTIALLY_SUCCEEDED", "CANCELLED", "EXPIRED"):
+            if word == "FAILED" or (done and error):
+                why = read_error(_status_of(error) if error else 400, {}, "", batch)
+                return BatchStatus(failure=self.failure_of(why))
+            if not done:
+                return BatchStatus()
         output = as_dict(metadata.get("output")) or as_dict(batch.get("response"))
-        if not output and _word(batch).endswith("SUCCEEDED"):
+        if not output and word.endswith("SUCCEEDED"):
             raise BatchFailed("again", "the results are not there yet")
-        if not output.get("responsesFile"):
-            return []
-        return [f"{GEMINI}/{id_of(output, 'responsesFile')}:download?alt=media"]
+        file = id_of(output, "responsesFile") if output.get("responsesFile") else ""
+        answered = str(as_dict(metadata.get("batchStats")).get("successfulRequestCount"))
+        return BatchStatus(
+            [f"{GEMINI}/{file}:download?alt=media"] if file else [],
+            int(answered) if re.fullmatch("[0-9]{1,18}", answered) else 0,  # numbers are texts
+        )
 
     def read(self, line: dict[str, Any]) -> RawReply | None:
         """See BatchService."""
@@ -224,12 +216,6 @@ class GeminiBatches(BatchService):
 def _reply(status: int, body: dict[str, Any]) -> RawReply:
     # In ASCII, since JSON can spell half of a surrogate pair, which no file can hold.
     return RawReply(status, {}, json.dumps(body))
-
-
-def _word(batch: Mapping[str, Any]) -> str:
-    """Gemini's word for a state, whether it says JOB_STATE_ or BATCH_STATE_ before it."""
-    word = as_text(as_dict(batch.get("metadata")).get("state")) or ""
-    return word.upper().rpartition("_STATE_")[2]
 
 
 def _status_of(error: dict[str, Any]) -> int:

@@ -34,7 +34,7 @@ from merge_runner.errors import (
     RecordingError,
     TrialSuspended,
 )
-from merge_runner.llm.batch.service import BatchFailed, BatchService
+from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus
 from merge_runner.llm.budget import PaidAttempt
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
@@ -337,7 +337,7 @@ class Rounds:
         """Wait for the end of a batch, and read its results until no more can be had."""
         note, message = batch.note, "the batch has ended without a result for it"
         ask = partial(self.services[note.model].status, note.batch_id)
-        while not (status := await self._patiently(batch, ask)).ended and not status.failure:
+        while (status := await self._patiently(batch, ask)) == BatchStatus():
             age_s = (datetime.now(UTC) - note.submitted_at).total_seconds()
             await batch.sleep(max(SHORTEST_POLL_S, min(LONGEST_POLL_S, POLL_SHARE * age_s)))
         if status.failure:
@@ -357,10 +357,10 @@ class Rounds:
         """Take the results of a batch; raises BatchFailed where there should be others."""
         note, service = batch.note, self.services[batch.note.model]
         status = await service.status(note.batch_id)
-        if not status.ended:
+        if status.paths is None:
             raise BatchFailed("again", "a batch that has ended is said to go on")
         broken = 0
-        async for key, raw in service.results(note.batch_id, status):
+        async for key, raw in service.results(status.paths):
             end = _no_answer("expired", "it was not asked in time", charged=False)
             if raw:  # no limit of single calls is meant, and no call waits for one
                 end = replace(judge(raw, service.wire), pause=False, delay_s=None)

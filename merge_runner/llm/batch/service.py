@@ -7,7 +7,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import aclosing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from urllib.parse import quote
 
@@ -55,16 +55,16 @@ class BatchFailed(MergeRunnerError):
 
 @dataclass(frozen=True, slots=True)
 class BatchStatus:
-    """The state of a batch, and in ``batch`` all that its server says of it.
+    """The state of a batch.
 
-    One that ``ended``, or expired or was cancelled, has results to fetch, at least ``results``,
-    perhaps not of all lines. Where there is a ``failure`` no line was asked or charged.
+    One that has ended, or expired or was cancelled, has its results at ``paths``: JSONL, in any
+    order, at least ``results`` of them, perhaps not of all lines. Where there is a ``failure`` no
+    line was asked or charged. One that goes on has neither.
     """
 
-    ended: bool
+    paths: Sequence[str] | None = None
     results: int = 0
     failure: BatchFailed | None = None
-    batch: Mapping[str, Any] = field(default_factory=dict)
 
 
 class BatchService(ABC):
@@ -146,10 +146,6 @@ class BatchService(ABC):
         """Return the state of a batch as its server describes it."""
 
     @abstractmethod
-    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
-        """Return where the results of a batch that has ended are: JSONL, in any order."""
-
-    @abstractmethod
     def read(self, line: dict[str, Any]) -> RawReply | None:
         """Return what the plain endpoint would have replied: an answer (status 200) or an error.
 
@@ -157,14 +153,12 @@ class BatchService(ABC):
         ValueError where the line has no known form.
         """
 
-    async def results(
-        self, batch_id: str, status: BatchStatus
-    ) -> AsyncIterator[tuple[str, RawReply | None]]:
+    async def results(self, paths: Sequence[str]) -> AsyncIterator[tuple[str, RawReply | None]]:
         """Yield the results of a batch that has ended, by key; it is empty where one is broken.
 
         Raises BatchFailed with the kind ``again`` where they can be read from the beginning.
         """
-        for path in self.result_paths(batch_id, status.batch):
+        for path in paths:
             try:
                 body = self.transport.lines(path, self.wire.headers, timeout_s=TIMEOUT_S)
                 async with aclosing(body) as lines:

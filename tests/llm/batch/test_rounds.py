@@ -89,13 +89,13 @@ class Memory:
     async def status(self, batch_id):
         if batch_id not in self.batches:
             raise BatchFailed("lost", "HTTP 404: no such batch", sent=False)
-        step = self.states.pop(0) if self.states else BatchStatus(ended=True)
+        step = self.states.pop(0) if self.states else BatchStatus([batch_id])
         if isinstance(step, BatchFailed):
             raise step
         return step
 
-    async def results(self, batch_id, status):
-        for line in reversed(self.batches[batch_id]):
+    async def results(self, paths):
+        for line in reversed(self.batches[paths[0]]):
             repetition = line.slot.repetition
             fates = self.fates.get(repetition, [])
             fate = fates.pop(0) if fates else answer(f"batched {repetition}")
@@ -281,7 +281,7 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cac
 @in_virtual_time
 async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
     service = Memory()
-    service.states = [BatchStatus(ended=False, failure=BatchFailed("smaller", "enqueued"))]
+    service.states = [BatchStatus(failure=BatchFailed("smaller", "enqueued"))]
     run = Run(cache, service)
     replies = await run.ask(4)
     assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
@@ -320,7 +320,7 @@ async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache,
 
 async def left_behind(cache, service, repetitions=1, **options):
     """A run that is interrupted while a batch waits."""
-    service.states = [BatchStatus(ended=False)] * 1000
+    service.states = [BatchStatus()] * 1000
     run = Run(cache, service, **options)
     asking = asyncio.create_task(run.ask(repetitions))
     await asyncio.sleep(5)
@@ -335,7 +335,7 @@ async def left_behind(cache, service, repetitions=1, **options):
 async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
     class Slow(Memory):
         async def status(self, batch_id):
-            return BatchStatus(ended=batch_id != "batch-0")
+            return BatchStatus(None if batch_id == "batch-0" else [batch_id])
 
     service = Slow()
     service.creations = [None, BatchFailed("again", "HTTP 504")]
@@ -403,11 +403,11 @@ async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(ca
         looks = 0
 
         async def status(self, batch_id):
-            return BatchStatus(ended=True, results=3)
+            return BatchStatus([batch_id], 3)
 
-        async def results(self, batch_id, status):
+        async def results(self, paths):
             self.looks += 1
-            whole = [each async for each in super().results(batch_id, status)]
+            whole = [each async for each in super().results(paths)]
             for result in whole if self.looks > 1 else whole[:1]:
                 yield result
 
@@ -418,7 +418,7 @@ async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(ca
 
 
 class WithoutResults(Memory):
-    async def results(self, batch_id, status):
+    async def results(self, paths):
         raise BatchFailed("again", "HTTP 503")
         yield
 
@@ -449,7 +449,7 @@ async def test_results_that_never_come_are_waited_for_an_hour(cache):
 @in_virtual_time
 async def test_what_a_batch_answered_unreadably_stays_set_aside(cache):
     class Broken(Memory):
-        async def results(self, batch_id, status):
+        async def results(self, paths):
             yield "", None
             yield "", None
 
@@ -538,7 +538,7 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
         async def status(self, batch_id):
             if not died.is_set():
                 died.set()
-                return BatchStatus(ended=False)
+                return BatchStatus()
             return await super().status(batch_id)
 
     died = asyncio.Event()
@@ -664,8 +664,8 @@ class Dear(Memory):
         self.chance = random.Random(seed)
         self.bill_usd = 0.0
 
-    async def results(self, batch_id, status):
-        async for key, raw in super().results(batch_id, status):
+    async def results(self, paths):
+        async for key, raw in super().results(paths):
             read = 10
             written = self.chance.randint(0, 100)
             kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])
@@ -701,7 +701,7 @@ def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
 @in_virtual_time
 async def test_what_is_pending_is_told_by_model_and_batch(cache):
     service = Memory()
-    service.states = [BatchStatus(ended=False)] * 10**4
+    service.states = [BatchStatus()] * 10**4
     run = Run(cache, service)
     asking = asyncio.create_task(run.ask(3))
     await asyncio.sleep(5)
