@@ -409,9 +409,9 @@ class Rounds:
             batch.rest = _no_answer("batch_lost", str(exc))
             return
         raise EndpointRefused(
-            f"{note.model}: {note.batch_id} is refused to this key ({exc}): set the key of the "
-            "account that has submitted it. If it is gone, the same command without --batch asks "
-            "its calls anew"
+            f"{note.model}: batch {note.batch_id or note.mark} is refused to this key ({exc}): set "
+            "that of the account that has submitted it. If it is gone, the same command without "
+            "--batch asks its calls anew"
         ) from exc
 
     async def _patiently(
