@@ -8,14 +8,12 @@
 from __future__ import annotations
 
 import asyncio
-import sys
 import threading
-from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, TypedDict, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from merge_runner.drivers.base import Driver
 from merge_runner.drivers.program_seat import Parameter, ProgramSeat
@@ -26,11 +24,9 @@ from merge_runner.registry import Registry
 from merge_runner.run import summary
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
-from merge_runner.run.recorded_plan import replayed
-from merge_runner.run.seat import first_situations, grid_conditions
-from merge_runner.run.sweep import Sweep, open_sweep, unsent
+from merge_runner.run.progress import say
+from merge_runner.run.sweep import unsent
 from merge_runner.study.crossing import level_text
-from merge_runner.text_safety import printable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,6 +35,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 PARTS = ("repetitions", "conditions", "variants")
+# The catalogue in use is that of the whole process, so one study is played at a time.
 _playing = threading.Lock()
 
 
@@ -57,19 +54,7 @@ def sync(method: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
     return blocking
 
 
-class RunOptions(TypedDict, total=False):
-    """How a run goes on, without a change of its results: the options of ``merge-runner sweep``."""
-
-    in_flight: int
-    rpm: int | None
-    tpm: int | None
-    max_cost_usd: float | None
-    strict_model: bool
-    keep_going: bool
-    batch: bool
-
-
-@dataclass(frozen=True, repr=False)
+@dataclass(repr=False)
 class StudyOutcome:
     """What a run did, and its trials as data frames, those that were stored before among them.
 
@@ -77,12 +62,14 @@ class StudyOutcome:
     wrong. ``facts`` is the summary that ``merge-runner sweep --json`` prints.
     """
 
-    exit_code: int
-    messages: list[str]
     facts: dict[str, Any]
-    db: Path
-    sweep_id: str
     text: str
+
+    def __post_init__(self) -> None:
+        self.exit_code: int = self.facts["exit_code"]
+        self.messages: list[str] = self.facts["messages"]
+        self.db = Path(self.facts["db"])
+        self.sweep_id: str = self.facts["sweep_id"]
 
     @property
     def ok(self) -> bool:
@@ -134,7 +121,8 @@ class Study:
     drivers both ways round; ``db`` and ``cache`` lie beside the file; ``trust`` agrees to the code
     of the study, and to where its models.toml sends keys. ``arun``, ``aseat_first``, ``areplay``
     and ``adry_run`` are awaited, as in a notebook; ``run``, ``seat_first``, ``replay`` and
-    ``dry_run`` are for scripts.
+    ``dry_run`` are for scripts. How a run goes on is said by the fields of ``Options``, as
+    ``in_flight=50, max_cost_usd=20``.
 
     All of them raise UsageError for what cannot be run as it is asked for. What goes wrong on the
     way is in the outcome, beside the trials that ended: the same call goes on from there.
@@ -146,28 +134,18 @@ class Study:
         *,
         db: Path | str | None = None,
         cache: Path | str | None = None,
-        models: Sequence[str] | str = (),
         only: Mapping[str, JsonValue] | None = None,
-        mirror: bool = False,
-        repetitions: int | None = None,
-        conditions: Sequence[str] | None = None,
         prompts: Sequence[str] | None = None,
-        sample_set: int = 0,
-        trust: bool = False,
+        **wanted: Any,  # noqa: ANN401 # as for make_plan
     ) -> None:
         self.file = str(file)
         home = home_of(self.file)
         self.db, self.cache = Path(db or home / DEFAULT_DB), Path(cache or home / DEFAULT_CACHE)
-        self._wanted: dict[str, Any] = {
-            "models": models,
-            "repetitions": repetitions,
-            "conditions": conditions,
-            "variants": prompts,
-            "sample_set": sample_set,
-            "only": {name: _texts(levels) for name, levels in (only or {}).items()},
-            "mirror": mirror,
-            "trust": trust,
+        levels = {
+            name: [level_text(level) for level in (given if isinstance(given, list) else [given])]
+            for name, given in (only or {}).items()
         }
+        self._wanted: dict[str, Any] = {"only": levels, "variants": prompts, **wanted}
 
     def register(self, registry: Registry[T], name: str, thing: T) -> T:
         """Add a prompt, a condition, a metric, ... to its registry, and return it.
@@ -191,102 +169,56 @@ class Study:
         program = Program(driver, meaning, parameters or {}, rate_hz, chance=chance)
         self.register(PROGRAMS, name, program)
 
-    def plan(self) -> Plan:
-        """What would be played; raises UsageError."""
-        return make_plan(self.file, db=self.db, **self._wanted)
+    def plan(self, *, first: bool = False, grid: str | None = None) -> Plan:
+        """What would be played, or only asked ``first``; raises UsageError."""
+        return make_plan(self.file, db=self.db, first=first, grid=grid, **self._wanted)
 
     async def adry_run(self, max_cost_usd: float | None = None) -> Estimate:
         """The trials, calls, tokens, cost and time of a run; nothing is sent."""
         plan = self.plan()
-        return await unsent(plan, self._options(plan, max_cost_usd=max_cost_usd), say=_say)
+        options = Options(self.db, self.cache, max_cost_usd=max_cost_usd)
+        return await unsent(plan, plan.within_budget(options), say=say)
 
-    async def arun(self, *, yes: bool = False, **how: Unpack[RunOptions]) -> StudyOutcome:
-        """Play all trials that are not stored yet; ``yes`` lets it spend money."""
-        with _alone():
-            return await self._run(self.plan(), yes=yes, **how)
-
-    async def aseat_first(
-        self, grid: str | None = None, *, yes: bool = False, **how: Unpack[RunOptions]
+    async def arun(
+        self,
+        *,
+        yes: bool = False,
+        first: bool = False,
+        grid: str | None = None,
+        **how: Any,  # noqa: ANN401 # fields of Options
     ) -> StudyOutcome:
+        """Play all trials that are not stored yet; ``yes`` lets it spend money.
+
+        ``first`` and ``grid`` are as for ``plan``.
+        """
+
+        def agree(expected: Estimate) -> None:
+            if not yes:
+                lines = "; ".join(summary.estimate_lines(expected))
+                raise UsageError(f"this run spends money; yes=True goes ahead: {lines}")
+
+        if not _playing.acquire(blocking=False):
+            raise UsageError("another study is running in this process: wait for its end")
+        try:
+            plan = self.plan(first=first, grid=grid)
+            options = Options(self.db, self.cache, **how)
+            whole = any(self._wanted.get(each) is not None for each in PARTS)
+            return StudyOutcome(
+                *await summary.play(plan, options, whole=whole, say=say, agree=agree)
+            )
+        finally:
+            _playing.release()
+
+    async def aseat_first(self, grid: str | None = None, **how: Any) -> StudyOutcome:  # noqa: ANN401 # as arun
         """Ask only what drivers do first, as ``sweep --first``; ``grid`` is its --grid.
 
         Each situation is asked as often as the study has repetitions.
         """
-        wanted = dict(self._wanted)
-        if grid is not None:
-            if wanted["conditions"] is not None:
-                raise UsageError("a grid takes the place of the conditions: give one of them")
-            wanted["conditions"] = grid_conditions(grid)
-        with _alone():
-            plan = first_situations(make_plan(self.file, db=self.db, **wanted))
-            return await self._run(plan, yes=yes, **how)
+        return await self.arun(first=True, grid=grid, **how)
 
     async def areplay(self, *recordings: Path | str) -> StudyOutcome:
         """Play all trials from recorded replies alone, those of the files first; sends nothing."""
-        with _alone():
-            plan = self.plan()
-            files = tuple(map(Path, recordings))
-            options = Options(self.db, self.cache, replay=True, recordings=files)
-            whole = any(self._wanted[each] is not None for each in PARTS)
-            plan, options, notes = replayed(plan, options, whole=whole)
-            for note in notes:
-                _say(note)
-            async with open_sweep(plan, options, say=_say) as prepared:
-                return await _played(prepared, options)
+        return await self.arun(replay=True, recordings=tuple(map(Path, recordings)))
 
     dry_run, run = sync(adry_run), sync(arun)
     seat_first, replay = sync(aseat_first), sync(areplay)
-
-    async def _run(self, plan: Plan, *, yes: bool, **how: Unpack[RunOptions]) -> StudyOutcome:
-        """Play what is not stored yet of a plan; ``yes`` lets it spend money."""
-        options = self._options(plan, **how)
-        async with open_sweep(plan, options, say=_say) as prepared:
-            if prepared.trials_to_play:
-                await _check(plan, prepared, may_spend=yes)
-            return await _played(prepared, options)
-
-    def _options(self, plan: Plan, **how: Unpack[RunOptions]) -> Options:
-        return plan.within_budget(Options(self.db, self.cache, **how))
-
-
-def _texts(levels: JsonValue) -> list[str]:
-    return [level_text(level) for level in (levels if isinstance(levels, list) else [levels])]
-
-
-@contextmanager
-def _alone() -> Iterator[None]:
-    """The catalogue in use is that of the whole process, so one study is played at a time."""
-    if not _playing.acquire(blocking=False):
-        raise UsageError("another study is running in this process: wait for its end")
-    try:
-        yield
-    finally:
-        _playing.release()
-
-
-async def _check(plan: Plan, prepared: Sweep, *, may_spend: bool) -> None:
-    """Raise UsageError where money is spent without leave."""
-    if may_spend or all(entry.price == "free" for entry in plan.entries.values()):
-        return
-    expected = await prepared.estimate()
-    cost = "an unknown sum" if expected.cost_usd is None else f"about {expected.cost_usd} USD"
-    raise UsageError(
-        f"this run spends {cost} for {expected.trials} trials: yes=True goes ahead, dry_run() "
-        "tells more"
-    )
-
-
-async def _played(prepared: Sweep, options: Options) -> StudyOutcome:
-    outcome = await prepared.run()
-    return StudyOutcome(
-        exit_code=outcome.exit_code,
-        messages=outcome.messages,
-        facts=summary.as_dict(outcome, options, None),
-        db=options.db,
-        sweep_id=outcome.sweep_id,
-        text="\n".join(summary.as_lines(outcome, options, None)),
-    )
-
-
-def _say(text: str) -> None:
-    print(printable(text), file=sys.stderr, flush=True)  # noqa: T201 # messages beside the results

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from math import exp, inf, sqrt, tanh
@@ -42,7 +41,8 @@ class ErrorProcess:
         return self._values[place]
 
     def _drawn(self, place: int) -> float:
-        chance = _normal(*self.stream, place)
+        uniform = draw(*self.stream, place)
+        chance = NormalDist().inv_cdf(0.5 + (uniform - 0.5) * (1 - 2**-52))
         if place == 0:
             return chance
         aside = place & -place  # to the neighbours of which it is the middle
@@ -53,11 +53,6 @@ class ErrorProcess:
         variance = tanh(ratio)
         ends = self._standard(place - aside) + self._standard(place + aside)
         return ends / 2 * sqrt(1 - variance**2) + sqrt(variance) * chance
-
-
-def _normal(*what: object) -> float:
-    """A standard normal number that depends on the arguments' texts alone."""
-    return NormalDist().inv_cdf(0.5 + (draw(*what) - 0.5) * (1 - 2**-52))
 
 
 class Eyes:
@@ -91,52 +86,42 @@ class Eyes:
         now_s, truth = (len(self._truth) - 1) * self._step_s, self._truth[-1]
         if draw(self._seed, "received", round(1000 * now_s)) >= self._perception.dropout:
             self._received = self._perceived(now_s - self._perception.delay_s)
-        other = self._received
+        own_speed_mps = _forwards(truth.own_speed_mps + self._own_speed.at(now_s))
         farther_m = self._own_distance.at(now_s)
         to_merge_m = truth.distance_to_merge_m
-        own_speed_mps = _forwards(truth.own_speed_mps + self._own_speed.at(now_s))
-        own = replace(
-            truth,
-            own_speed_mps=own_speed_mps,
-            own_position_m=truth.own_position_m + farther_m,
-            distance_to_merge_m=None if to_merge_m is None else to_merge_m - farther_m,
-        )
+        other = self._received
         if not other.other_seen:
-            return replace(
-                own,
-                other_seen=False,
+            other = replace(
+                other,
                 other_speed_mps=own_speed_mps,
                 relative_distance_m=-FAR_BEHIND_M,
                 other_speeds_mps=(),
                 other_acceleration_mps2=0.0,
             )
         return replace(
-            own,
-            other_speed_mps=other.other_speed_mps,
-            relative_distance_m=other.relative_distance_m,
-            other_speeds_mps=other.other_speeds_mps,
-            other_acceleration_mps2=other.other_acceleration_mps2,
+            other,
+            road=truth.road,
+            own_speed_mps=own_speed_mps,
+            own_position_m=truth.own_position_m + farther_m,
+            distance_to_merge_m=None if to_merge_m is None else to_merge_m - farther_m,
+            own_accelerations_mps2=truth.own_accelerations_mps2,
         )
 
     def _perceived(self, time_s: float) -> Observation:
-        """The other as it appeared at a time."""
+        """The other as it appeared at a time, with its speeds since it came into sight."""
         truth = self._at(time_s)
+        newest_first = [
+            (time_s - steps * self._step_s, speed)
+            for steps, speed in enumerate(reversed(truth.other_speeds_mps), start=1)
+        ]
+        seen = takewhile(lambda sample: self._in_sight(self._at(sample[0])), newest_first)
         return replace(
             truth,
             other_seen=self._in_sight(truth),
             other_speed_mps=self._appears(truth.other_speed_mps, time_s),
             relative_distance_m=truth.relative_distance_m + self._distance.at(time_s),
-            other_speeds_mps=self._history(truth.other_speeds_mps, time_s),
+            other_speeds_mps=tuple(self._appears(speed, then_s) for then_s, speed in seen)[::-1],
         )
-
-    def _history(self, speeds_mps: Sequence[float], end_s: float) -> tuple[float, ...]:
-        """How the speeds of the steps before a time appeared, since the other came into sight."""
-        newest_first = [
-            (end_s - steps * self._step_s, speed)
-            for steps, speed in enumerate(reversed(speeds_mps), start=1)
-        ]
-        seen = takewhile(lambda sample: self._in_sight(self._at(sample[0])), newest_first)
-        return tuple(self._appears(speed, time_s) for time_s, speed in seen)[::-1]
 
     def _appears(self, speed_mps: float, time_s: float) -> float:
         return _forwards(speed_mps + self._speed.at(time_s))

@@ -132,7 +132,7 @@ async def test_a_running_loop_is_told_what_to_await(folder):
 @pytest.mark.slow
 async def test_money_is_spent_only_with_leave(folder):
     study = Study("study.toml", models="dear", only={"opponent": "self", "memory_s": 2.0})
-    with pytest.raises(UsageError, match=r"spends about .* USD for 4 trials: yes=True"):
+    with pytest.raises(UsageError, match=r"spends money; yes=True goes ahead: .*trials  4 "):
         await study.arun()
     expected = await study.adry_run()
     assert expected.trials == 4

@@ -334,9 +334,9 @@ async def test_the_first_decision_of_a_program_at_20_hz_is_seen_as_the_first_of_
         ({"speed_sd_mps": -1.0}, "greater than or equal to 0"),
         ({"range_m": 0.0}, "greater than 0"),
         ({"own": "yes"}, "valid boolean"),
-        ({"own": True}, "own needs an error: set position_sd_m or speed_sd_mps"),
-        ({"own": True, "delay_s": 0.2}, "own needs an error: set position_sd_m or speed_sd_mps"),
-        ({"autocorrelation_s": 2.0}, "autocorrelation_s needs an error: set position_sd_m or"),
+        ({"own": True}, "own need an error: set position_sd_m or speed_sd_mps"),
+        ({"own": True, "delay_s": 0.2}, "own need an error: set position_sd_m or speed_sd_mps"),
+        ({"autocorrelation_s": 2.0}, "own need an error: set position_sd_m or"),
     ],
 )
 def test_a_perception_that_cannot_be_is_refused(perception, said):

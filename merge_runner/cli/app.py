@@ -8,16 +8,15 @@ import os
 import sys
 from collections.abc import Callable
 from copy import copy
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from merge_runner import __version__
 from merge_runner.cli.ledger import ledger
-from merge_runner.cli.models import models
+from merge_runner.cli.options import flag
 from merge_runner.cli.output import print_out, say
-from merge_runner.cli.recording import recording_app
-from merge_runner.cli.results import audit, digest, forget, sql
+from merge_runner.cli.results import audit, digest, forget, models, recording_app, sql
 from merge_runner.cli.stand_in import emulate
 from merge_runner.cli.sweep import init, replay, sweep
 from merge_runner.errors import MergeRunnerError, UsageError
@@ -27,24 +26,14 @@ OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)
 COMPLETION = "_MERGE_RUNNER_COMPLETE"  # set by the shell's script that typer installs
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        print_out(f"merge-runner {__version__}")
-        raise typer.Exit
-
-
 def common(
-    debug: Annotated[
-        bool, typer.Option("--debug", help="Show a traceback on errors.")
-    ] = False,  # typer's way to declare a flag
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", help="Print the version.", callback=_print_version, is_eager=True
-        ),
-    ] = False,
+    debug: Annotated[bool, flag("--debug", "Show a traceback on errors.")] = False,
+    version: Annotated[bool, flag("--version", "Print the version.")] = False,
 ) -> None:
     """Finds out whether a language model drives like a human."""
+    if version:
+        print_out(f"merge-runner {__version__}")
+        raise typer.Exit
 
 
 app = typer.Typer(
@@ -55,7 +44,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-app.callback()(common)
+app.callback(invoke_without_command=True)(common)
 for _command in (init, sweep, replay, sql, digest, audit, ledger, forget, models, emulate):
     app.command()(_command)
 app.add_typer(recording_app, name="recording")
@@ -71,17 +60,11 @@ def alone(command: str | None) -> typer.Typer:
     for info in light.registered_commands:
         if info.callback is not None and command != (info.name or info.callback.__name__):
             info.callback = _without_options(info.callback)
-    light.registered_groups = [copy(info) for info in app.registered_groups]
-    for group in light.registered_groups:
-        if group.typer_instance is not None and command != group.name:
-            group.typer_instance = copy(group.typer_instance)
-            group.typer_instance.registered_commands = []
     return light
 
 
-def _without_options(command: Callable[..., Any]) -> Callable[[], None]:
-    def bare() -> None:
-        raise AssertionError("unreachable: the command that runs has its options")
+def _without_options(command: Callable[..., object]) -> Callable[[], None]:
+    def bare() -> None: ...
 
     bare.__name__, bare.__doc__ = command.__name__, command.__doc__
     return bare
@@ -97,23 +80,26 @@ def main() -> None:
     words = (argument for argument in sys.argv[1:] if not argument.startswith("-"))
     try:
         (app if completing else alone(next(words, None)))(prog_name="merge-runner")
-    except MergeRunnerError as exc:
-        if debug:
+    except Exception as exc:
+        code, text = _told(exc)
+        if debug or not text:
             raise
-        say(f"error: {exc}")
-        sys.exit(exc.exit_code)
-    except ModuleNotFoundError as exc:
-        if debug or str(exc.name).startswith(("merge_runner", "analysis")):
-            raise
-        say(f"error: this needs {exc.name}, which is not installed: pip install {exc.name}")
-        sys.exit(UsageError.exit_code)
-    except RuntimeError as exc:
-        if debug or str(exc) != "Query interrupted":  # what DuckDB raises on Ctrl-C
-            raise
-        say("interrupted: run the same command again")
-        sys.exit(130)
-    except OSError as exc:
-        if debug or exc.errno not in OUTPUT_ERRORS:
-            raise
-        say(f"error: the output cannot be written: {exc.strerror}")
-        sys.exit(1)
+        say(text)
+        sys.exit(code)
+
+
+def _told(exc: Exception) -> tuple[int, str]:
+    """The exit code and the line of an error that a user can act on; no line for any other."""
+    match exc:
+        case MergeRunnerError():
+            return exc.exit_code, f"error: {exc}"
+        case ModuleNotFoundError(name=str(name)) if not name.startswith(
+            ("merge_runner", "analysis")
+        ):
+            text = f"error: this needs {name}, which is not installed: pip install {name}"
+            return UsageError.exit_code, text
+        case OSError() if exc.errno in OUTPUT_ERRORS:
+            return 1, f"error: the output cannot be written: {exc.strerror}"
+        case RuntimeError() if str(exc) == "Query interrupted":  # what DuckDB raises on Ctrl-C
+            return 130, "interrupted: run the same command again"
+    return 1, ""

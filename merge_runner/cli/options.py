@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import home_of
+
+
+def option(metavar: str, text: str, *names: str, **more: Any) -> Any:  # noqa: ANN401 # as typer's
+    """An option with a value, named as its parameter unless ``names`` are given."""
+    return typer.Option(*names, metavar=metavar, help=text, **more)
+
+
+def flag(name: str, text: str) -> Any:  # noqa: ANN401 # as typer's
+    """An option without a value."""
+    return typer.Option(name, help=text)
 
 
 def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> Path:
@@ -27,79 +37,44 @@ def beside_study(ctx: typer.Context, param: typer.CallbackParam, path: Path) -> 
     return homes.pop() / path
 
 
-DbOption = Annotated[
-    Path,
-    typer.Option(
-        "--db",
-        metavar="FILE",
-        callback=beside_study,
-        help="The results database; that of a study's file lies beside it.",
-    ),
-]
-CacheOption = Annotated[
-    Path,
-    typer.Option(
-        "--cache",
-        metavar="DIR",
-        callback=beside_study,
-        help="The folder of recorded replies; that of a study's file lies beside it.",
-    ),
-]
-
-
-def _drivers() -> list[str]:
-    from merge_runner.drivers.registry import PROGRAMS
-    from merge_runner.llm.models import load_models
-
-    return [*load_models(), *PROGRAMS]
-
-
+DB = "The results database; that of a study's file lies beside it."
+CACHE = "The folder of recorded replies; that of a study's file lies beside it."
+DbOption = Annotated[Path, option("FILE", DB, "--db", callback=beside_study)]
+CacheOption = Annotated[Path, option("DIR", CACHE, "--cache", callback=beside_study)]
 ModelOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "NAME",
+        "A model of the registry, a program, or LEFT+RIGHT; may be repeated. Else those of the "
+        "study's file, or the emulator.",
         "--model",
-        metavar="NAME",
-        autocompletion=_drivers,
-        help="A model of the registry, a program, or LEFT+RIGHT; may be given more than once. "
-        "Else those of the study's file, or the emulator.",
     ),
 ]
 OnlyOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--only",
-        metavar="FACTOR=LEVEL",
-        help="A part of the study: a level of a factor, or of model or prompt; may be given more "
-        "than once.",
+    option(
+        "FACTOR=LEVEL", "A level of a factor, or of model or prompt; may be repeated.", "--only"
     ),
 ]
-RepsOption = Annotated[
-    int | None,
-    typer.Option("--reps", metavar="N", help="Repetitions per condition, for every variant."),
-]
+RepsOption = Annotated[int | None, option("N", "Repetitions per condition and variant.", "--reps")]
 ConditionsOption = Annotated[
-    str | None,
-    typer.Option("--conditions", metavar="A,B", help="Conditions, separated by commas."),
+    str | None, option("A,B", "Conditions, separated by commas.", "--conditions")
 ]
 VariantsOption = Annotated[
-    str | None,
-    typer.Option("--variants", metavar="A,B", help="Prompt variants, separated by commas."),
+    str | None, option("A,B", "Prompt variants, separated by commas.", "--variants")
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+JsonOption = Annotated[bool, flag("--json", "Print the result as JSON.")]
+YesOption = Annotated[bool, flag("--yes", "Do not ask before money is spent or rows are removed.")]
 TrustOption = Annotated[
-    bool,
-    typer.Option(
-        "--trust",
-        help="Run the study's code and send keys where its models.toml says, unasked.",
-    ),
+    bool, flag("--trust", "Run the study's code and send keys where its models.toml says, unasked.")
 ]
 StudyOption = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "FILE",
+        "A study's file: tables, figures and reports are of its trials alone, its plug-ins run, "
+        "and its prompts, conditions, drivers and metrics are known.",
         "--study",
-        metavar="FILE",
-        help="A study's file: tables, figures and reports are of its trials alone, its plug-ins "
-        "run, and its prompts, conditions, drivers and metrics are known.",
     ),
 ]
 
@@ -114,13 +89,13 @@ def use_study(file: str | None, *, trust: bool) -> None:
 
 def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:
     """The levels of each factor that an option names; raises UsageError."""
-    found: dict[str, list[str]] = {}
+    levels: dict[str, list[str]] = {}
     for each in given:
         factor, equals, level = each.partition("=")
         if not equals:
             raise UsageError(f"{option} {each}: write FACTOR=LEVEL, as in {option} temperature=0.2")
-        found.setdefault(factor.strip(), []).append(level.strip())
-    return found
+        levels.setdefault(factor.strip(), []).append(level.strip())
+    return levels
 
 
 def listed(text: str | None) -> list[str] | None:

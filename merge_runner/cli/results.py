@@ -1,4 +1,4 @@
-"""The commands on results that are there."""
+"""The commands on results and recordings that are there, and the list of models."""
 
 from __future__ import annotations
 
@@ -6,17 +6,37 @@ import json
 import shutil
 import sys
 import tempfile
+from dataclasses import asdict
+from datetime import UTC, datetime
 from enum import StrEnum
-from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from merge_runner.cli.options import DbOption, JsonOption, StudyOption, TrustOption, use_study
+from merge_runner.cli.options import (
+    CacheOption,
+    DbOption,
+    JsonOption,
+    StudyOption,
+    TrustOption,
+    YesOption,
+    option,
+    use_study,
+)
 from merge_runner.cli.output import agree, print_out, say
 from merge_runner.errors import UsageError
-from merge_runner.paths import DEFAULT_DB
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+
+CACHE = "Also compare every attempt with this cache folder."
+COLUMNS = ("name", "provider", "key", "usd_per_m_in", "usd_per_m_out", "shutdown", "id", "prices")
+
+SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
+RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
+
+recording_app = typer.Typer(
+    help="Portable recordings: one Parquet file that anyone can replay.", no_args_is_help=True
+)
 
 
 class Format(StrEnum):
@@ -52,36 +72,25 @@ def digest(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
     from merge_runner.results.store import results_digest
 
     value, trials = results_digest(db)
-    if as_json:
-        print_out(json.dumps({"digest": value, "trials": trials}))
-    else:
-        print_out(f"{value}  {trials} trials")
+    as_text = f"{value}  {trials} trials"
+    print_out(json.dumps({"digest": value, "trials": trials}) if as_json else as_text)
 
 
 def audit(
     db: DbOption = DEFAULT_DB,
     sweep_id: Annotated[
-        str | None,
-        typer.Option("--sweep", metavar="ID", help="A sweep_id; everything if not given."),
+        str | None, option("ID", "A sweep_id; everything if not given.", "--sweep")
     ] = None,
     recording: Annotated[
-        Path | None,
-        typer.Option(
-            "--recording", metavar="FILE", help="Check this recording instead of a database."
-        ),
+        Path | None, option("FILE", "Check this recording instead of a database.")
     ] = None,
-    cache: Annotated[
-        Path | None,
-        typer.Option(
-            "--cache", metavar="DIR", help="Also compare every attempt with this cache folder."
-        ),
-    ] = None,
+    cache: Annotated[Path | None, option("DIR", CACHE)] = None,
     study: StudyOption = None,
     trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check that each trial is there and follows from its replies."""
-    from merge_runner.audit.recordings import audit_recording
+    from merge_runner.audit.checks import audit_recording
     from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 
     use_study(study, trust=trust)
@@ -100,8 +109,8 @@ def audit(
         whole = {"ok": ok, "not_replayed": skipped, "audits": [found.as_dict() for found in audits]}
         print_out(json.dumps(whole, ensure_ascii=False))
     else:
-        for line in chain.from_iterable(found.lines() for found in audits):
-            print_out(line)
+        for found in audits:
+            print_out("\n".join(found.lines()))
         if skipped:
             print_out(f"not checked, since no replay tells it: {', '.join(skipped)}")
     sys.exit(0 if ok else 1)
@@ -109,11 +118,10 @@ def audit(
 
 def forget(
     sweeps: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="SWEEP", help="A sweep_id; * stands for anything."),
-    ] = None,
+        list[str], typer.Argument(metavar="SWEEP...", help="A sweep_id; * stands for anything.")
+    ],
     db: DbOption = DEFAULT_DB,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before removing.")] = False,
+    yes: YesOption = False,
 ) -> None:
     """Remove sweeps and their trials from the database.
 
@@ -123,15 +131,97 @@ def forget(
 
     if not sweeps:
         raise UsageError("name a sweep; `merge-runner sql 'from sweeps'` lists them")
-    going = forgetting.to_forget(db, sweeps)
-    agree(
-        f"these go from {db}: {going}",
-        "Remove them?",
-        otherwise="nothing was removed",
-        yes=yes,
-    )
-    gone = forgetting.forget(db, sweeps, going)
+    ids, going = forgetting.to_forget(db, sweeps)
+    agree(f"these go from {db}: {going}", "Remove them?", otherwise="nothing was removed", yes=yes)
+    forgetting.forget(db, ids)
     say(
-        f"removed: {gone}. Their replies stay in the cache: the same `merge-runner sweep` plays "
+        f"removed: {going}. Their replies stay in the cache: the same `merge-runner sweep` plays "
         "the trials again without a call"
     )
+
+
+@recording_app.command("export")
+def recording_export(
+    file: RecordingFile,
+    db: DbOption = DEFAULT_DB,
+    cache: CacheOption = DEFAULT_CACHE,
+    sweeps: Annotated[list[str] | None, option("ID", SWEEP, "--sweep")] = None,
+) -> None:
+    """Write what sweeps asked and were answered into one file."""
+    from merge_runner.llm.cache import ResponseCache
+    from merge_runner.results.recording import export_recording, provenance_of
+    from merge_runner.results.store import recorded_sweeps
+
+    rows, keys = recorded_sweeps(db, sweeps or ())
+    found = " and ".join(row["sweep_id"] for row in rows)
+    if not keys:
+        raise UsageError(f"the sweep {found} made no call: there is nothing to record")
+    calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance_of(rows))
+    say(f"{calls} calls of {found} are in {file}")
+
+
+@recording_app.command("import")
+def recording_import(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A recording (.parquet), or a cache folder.")
+    ],
+    cache: CacheOption = DEFAULT_CACHE,
+) -> None:
+    """Verify a recording or a cache folder, and add it to the cache."""
+    from merge_runner.llm.cache import ResponseCache, import_folder
+    from merge_runner.results.recording import import_recording
+
+    take = import_folder if file.is_dir() else import_recording
+    added, there = take(file, ResponseCache(cache))
+    say(f"{added} calls added to {cache}, {there} were there already")
+
+
+@recording_app.command("verify")
+def recording_verify(file: RecordingFile) -> None:
+    """Check that a file is as it was exported."""
+    from merge_runner.results.recording import summarise
+
+    found = summarise(file)
+    say(f"{file} is whole: {found.calls} calls, as they were exported")
+
+
+@recording_app.command("info")
+def recording_info(
+    file: RecordingFile,
+    as_json: JsonOption = True,
+) -> None:
+    """Verify a recording and print what it holds, as JSON."""
+    from merge_runner.results.recording import summarise
+
+    print_out(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
+
+
+def models(as_json: JsonOption = False) -> None:
+    """List the models and programs that can drive."""
+    from merge_runner.config import Price, key_status
+    from merge_runner.drivers.registry import PROGRAMS
+    from merge_runner.llm.models import load_models, shutdown_notes
+    from merge_runner.llm.prices import cost_usd
+    from merge_runner.records import Usage
+    from merge_runner.results.query_output import write_json, write_table
+
+    entries = load_models()
+    rows: list[tuple[object, ...]] = []
+    for name, entry in entries.items():
+        # A thousand tokens each: more may have a price of their own.
+        usage = (Usage(1000, output_tokens=0), Usage(0, output_tokens=1000))
+        costs = [cost_usd(entry, tokens) for tokens in usage]
+        usd = ["unknown" if cost is None else round(cost * 1000, 6) for cost in costs]
+        source = entry.price.source if isinstance(entry.price, Price) else entry.price
+        closes, key = str(entry.shutdown or ""), key_status(entry)
+        rows.append((name, entry.provider, key, *usd, closes, entry.id, source, entry.note))
+    for name, program in PROGRAMS.items():
+        rows.append((name, "program", "not needed", 0, 0, "", "", "", program.described))
+    if as_json:
+        write_json([*COLUMNS, "note"], rows, sys.stdout)
+    else:
+        shown = [tuple(f"{v:g}" if isinstance(v, float) else v for v in r[:-1]) for r in rows]
+        write_table(list(COLUMNS), shown, sys.stdout)
+        print_out("\n".join(["", *(f"{name}: {note}" for name, *_, note in rows if note)]))
+    for note in shutdown_notes(entries, datetime.now(UTC).date()):
+        say(note)

@@ -1,11 +1,15 @@
-"""The commands that play a study."""
+"""The commands that play a study, or say what that would take."""
 
 from __future__ import annotations
 
+import json
 import shlex
+import signal
 import sys
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
+from datetime import UTC, datetime
 from functools import wraps
+from inspect import signature
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,37 +26,44 @@ from merge_runner.cli.options import (
     RepsOption,
     TrustOption,
     VariantsOption,
+    YesOption,
+    flag,
     levels,
     listed,
+    option,
 )
-from merge_runner.cli.output import print_out, say
-from merge_runner.cli.playing import play
-from merge_runner.cli.stand_in import FaultRateOption, FaultsOption, SeedOption, faults_of
+from merge_runner.cli.output import agree, print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 
 if TYPE_CHECKING:
-    from merge_runner.run.plan import Plan
+    from merge_runner.run.estimate import Estimate
+    from merge_runner.run.plan import Options, Plan
 
 # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
 GOES_ON = (0, 1, 4)
+GRID = (
+    "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
+    "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
+)
+MAX_COST = "Never spend more on this, over all its runs."
+STRICT = "Stop when another model answers."
+KEEP_GOING = "Go on with a model that gives no valid decision."
+DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
+BATCH = "Ask in the provider's batches, a decision of all trials a round, at a lower price."
+REHEARSE = "The emulator answers in the model's place, ten times as fast: no key, no cost."
+RECORDING = "Also replay from this file, without importing it; may be repeated."
 
 
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
 ) -> None:
     """Write a folder with a study that runs, to change into your own."""
-    from merge_runner.study.folder import write_folder
+    from merge_runner.study.file import write_folder
 
     for path in write_folder(folder):
         say(f"wrote {path}")
     print_out(f"go on: cd {shlex.quote(str(folder))} && merge-runner sweep study.toml")
-
-
-def _studies() -> list[str]:
-    from merge_runner.study.file import study_files
-
-    return sorted(study_files())
 
 
 def sweep(
@@ -60,155 +71,66 @@ def sweep(
         list[str],
         typer.Argument(
             metavar="NAME...",
-            autocompletion=_studies,
             help="experiments/NAME.toml, or a path. Several are played one after the other.",
         ),
     ],
-    first: Annotated[
-        bool,
-        typer.Option("--first", help="Only the first decision of both sides, without the trial."),
-    ] = False,
-    grid: Annotated[
-        str | None,
-        typer.Option(
-            metavar="GRID",
-            help="With --first, in the place of the study's conditions: "
-            "h=FROM:TO:STEP,dv=FROM:TO:STEP, projected headways in m and relative velocities in "
-            "m/s; usual: -6:6:2 and -1.6:1.6:0.4.",
-        ),
-    ] = None,
-    model: ModelOption = None,
+    first: Annotated[bool, flag("--first", "Only the first decision of both sides.")] = False,
+    grid: Annotated[str | None, option("GRID", GRID)] = None,
+    models: ModelOption = None,
     only: OnlyOption = None,
-    mirror: Annotated[
-        bool,
-        typer.Option(
-            "--mirror",
-            help="Also play two different drivers with their sides changed, as LEFT+RIGHT.",
-        ),
-    ] = False,
-    reps: RepsOption = None,
+    mirror: Annotated[bool, flag("--mirror", "Also play two drivers both ways.")] = False,
+    repetitions: RepsOption = None,
     conditions: ConditionsOption = None,
     variants: VariantsOption = None,
-    sample_set: Annotated[
-        int, typer.Option(metavar="N", help="Another number draws a fresh set of samples.")
-    ] = 0,
-    order_seed: Annotated[
-        int, typer.Option(metavar="N", help="Another number draws another order.")
-    ] = 0,
+    sample_set: Annotated[int, option("N", "Another number draws a fresh set of samples.")] = 0,
+    order_seed: Annotated[int, option("N", "Another number draws another order.")] = 0,
     db: DbOption = DEFAULT_DB,
     cache: CacheOption = DEFAULT_CACHE,
-    in_flight: Annotated[
-        int, typer.Option(metavar="N", help="Trials at once, over all workers.", min=1)
-    ] = 200,
-    rpm: Annotated[int | None, typer.Option(metavar="N", help="Requests a minute.", min=1)] = None,
-    tpm: Annotated[int | None, typer.Option(metavar="N", help="Tokens a minute.", min=1)] = None,
-    max_cost: Annotated[
-        float | None,
-        typer.Option(metavar="USD", help="Never spend more on this, over all its runs.", min=0),
-    ] = None,
-    dask: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CLUSTER",
-            help="Play on a Dask cluster: local:N, a scheduler's address, or its file.",
-        ),
-    ] = None,
-    batch: Annotated[
-        bool,
-        typer.Option(
-            "--batch",
-            help="Ask in the provider's batches, one decision of all trials a round, at a lower "
-            "price.",
-        ),
-    ] = False,
-    strict_model: Annotated[
-        bool, typer.Option("--strict-model", help="Stop when another model answers.")
-    ] = False,
-    keep_going: Annotated[
-        bool, typer.Option("--keep-going", help="Go on with a model that gives no valid decision.")
-    ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only estimate.")] = False,
-    rehearse: Annotated[
-        bool,
-        typer.Option(
-            "--rehearse",
-            help="The emulator answers in the model's place, ten times as fast: no key, no cost.",
-        ),
-    ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before spending.")] = False,
+    in_flight: Annotated[int, option("N", "Trials at once, over all workers.", min=1)] = 200,
+    rpm: Annotated[int | None, option("N", "Requests a minute.", min=1)] = None,
+    tpm: Annotated[int | None, option("N", "Tokens a minute.", min=1)] = None,
+    max_cost_usd: Annotated[float | None, option("USD", MAX_COST, "--max-cost", min=0)] = None,
+    dask: Annotated[str | None, option("CLUSTER", DASK)] = None,
+    batch: Annotated[bool, flag("--batch", BATCH)] = False,
+    strict_model: Annotated[bool, flag("--strict-model", STRICT)] = False,
+    keep_going: Annotated[bool, flag("--keep-going", KEEP_GOING)] = False,
+    dry_run: Annotated[bool, flag("--dry-run", "Only estimate.")] = False,
+    rehearse: Annotated[bool, flag("--rehearse", REHEARSE)] = False,
+    yes: YesOption = False,
     trust: TrustOption = False,
-    replay: Annotated[bool, typer.Option("--replay", help="From recorded replies alone.")] = False,
-    recording: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also replay from this file, without importing it; may be repeated.",
-        ),
-    ] = None,
-    fault_rate: FaultRateOption = 0.0,
-    faults: FaultsOption = None,
-    seed: SeedOption = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Show no progress.")] = False,
+    replay: Annotated[bool, flag("--replay", "From recorded replies alone.")] = False,
+    recordings: Annotated[list[Path] | None, option("FILE", RECORDING, "--recording")] = None,
+    quiet: Annotated[bool, flag("--quiet", "Show no progress.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Play all trials of one or more sweeps that are not stored yet."""
+    given = {name: value for name, value in locals().items() if value is not None}
     from merge_runner.run.plan import Options, make_plan
-    from merge_runner.run.seat import first_situations, grid_conditions
 
-    for refused, advice in (
-        (not isfinite(max_cost or 0), "--max-cost is a number of USD"),
-        (
-            recording and not replay,
-            "--recording goes with a replay; to keep its replies: recording import",
-        ),
-        (dask is not None and replay, "a replay needs no cluster: leave --dask out"),
-        (grid is not None and not first, "--grid goes with --first"),
-        (
-            None not in (grid, conditions),
-            "--grid takes the place of --conditions: give one of them",
-        ),
-    ):
-        if refused:
-            raise UsageError(advice)
+    if not isfinite(max_cost_usd or 0):
+        raise UsageError("--max-cost is a number of USD")
+    if recordings and not replay:
+        raise UsageError("--recording goes with a replay; to keep its replies: recording import")
+    if replay and dask:
+        raise UsageError("a replay needs no cluster: leave --dask out")
+    known = {each.name for each in fields(Options)} & given.keys() - {"dry_run"}
     options = Options(
-        db=db,
-        cache=cache,
-        in_flight=in_flight,
-        rpm=rpm,
-        tpm=tpm,
-        max_cost_usd=max_cost,
-        replay=replay,
-        recordings=recording or (),
-        faults=faults_of(fault_rate, faults, seed),
-        strict_model=strict_model,
-        keep_going=keep_going,
-        quiet=quiet,
-        dask=dask,
-        batch=batch,
+        **{name: given[name] for name in known},
     )
+    wanted = {name: given[name] for name in signature(make_plan).parameters if name in given}
+    wanted |= {"conditions": listed(conditions), "variants": listed(variants)}
+    wanted["only"] = levels(only or (), "--only")
 
     def planned(name: str) -> Plan:
-        plan = make_plan(
-            name,
-            model or (),
-            reps,
-            listed(conditions) if grid is None else grid_conditions(grid),
-            listed(variants),
-            sample_set=sample_set,
-            order_seed=order_seed,
-            only=levels(only or (), "--only"),
-            mirror=mirror,
-            db=db,
-            trust=trust,
-        )
+        plan = make_plan(name, **wanted)
         if dask is not None and plan.replays_humans:
             raise UsageError("human trials are replayed in this process: leave --dask out")
-        return first_situations(plan) if first else plan
+        return plan
 
     if len(studies) > 1:  # all are looked at before the first one is played
         ledgers = [planned(name).ledger for name in studies]
-        options = replace(options, ledgers=() if max_cost is None else ledgers)
-    whole = any(part is not None for part in (reps, grid, conditions, variants))
+        options = replace(options, ledgers=() if max_cost_usd is None else ledgers)
+    whole = any(part is not None for part in (repetitions, grid, conditions, variants))
     codes = []
     for name in studies:
         if len(studies) > 1:
@@ -218,7 +140,7 @@ def sweep(
             from merge_runner.run.rehearsal import rehearsed
 
             plan, own = rehearsed(plan, options, home_of(name))
-        codes.append(play(plan, own, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
+        codes.append(_play(plan, own, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
         if codes[-1] not in GOES_ON:
             break
     sys.exit(next(filter(None, codes), 0))
@@ -228,3 +150,44 @@ def sweep(
 def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
     """Play a sweep from recorded replies alone: no key, no network."""
     sweep(**{**options, "replay": True})
+
+
+def _play(
+    plan: Plan, options: Options, *, whole: bool, dry_run: bool, yes: bool, as_json: bool
+) -> int:
+    """Play a plan, or print what that would take; return the exit code."""
+    import asyncio
+
+    from merge_runner.llm.models import shutdown_notes
+    from merge_runner.run import summary
+    from merge_runner.run.sweep import INTERRUPTED, unsent
+
+    if plan.is_rehearsal:
+        say(f"REHEARSAL: the emulator answers as {plan.driver}; nobody else is asked, or charges")
+    if not options.replay:
+        asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
+        for note in shutdown_notes(asked, datetime.now(UTC).date()):
+            say(note)
+    if dry_run:
+        expected = asyncio.run(unsent(plan, plan.within_budget(options), say=say))
+        lines = "\n".join(summary.estimate_lines(expected))
+        print_out(json.dumps(asdict(expected)) if as_json else f"{lines}\nNothing was sent.")
+        return 0
+
+    def leave(expected: Estimate) -> None:
+        lines = "\n".join(summary.estimate_lines(expected))
+        by_asyncio = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:  # Ctrl-C is an answer, too
+            agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
+        finally:
+            signal.signal(signal.SIGINT, by_asyncio)
+
+    try:
+        facts, text = asyncio.run(summary.play(plan, options, whole=whole, say=say, agree=leave))
+    except KeyboardInterrupt:  # before the trials began or after they ended
+        say("interrupted: run the same command again to go on")
+        return INTERRUPTED
+    print_out(json.dumps(facts, ensure_ascii=False) if as_json else text)
+    for message in facts["messages"]:
+        say(f"error: {message}")
+    return int(facts["exit_code"])

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from string import Formatter
 from typing import get_args
 
@@ -19,7 +19,7 @@ from merge_runner.records import Road
 from merge_runner.registry import Registry
 
 OUTPUT_FORMAT = "C5"
-SITUATION, TABLE = "C0", "state.table"  # the second stands in place of the first
+LAST = "the end"
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +156,7 @@ Write the list in a Python code block that holds nothing but the list."""
 
 BLOCKS = Registry[Block]("prompt block")
 for _name, _meaning, _merge, _straight in (
-    (SITUATION, "situation", _APPROACHING, _MERGED),
+    ("C0", "situation", _APPROACHING, _MERGED),
     ("C1", "history", _HISTORY, _HISTORY),
     ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
     ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
@@ -187,7 +187,7 @@ for _name, _meaning, _merge, _straight in (
     ("state.relative_speed", "relative speed in words", _FASTER, _FASTER),
     ("state.kmh", "speeds in km/h", _KMH, _KMH),
     ("state.mph", "speeds in mph", _MPH, _MPH),
-    (TABLE, "situation as a table, in place of C0", *_TABLES),
+    ("state.table", "situation as a table, in place of C0", *_TABLES),
 ):
     BLOCKS.register(_name, Block(_meaning, _merge, _straight, before="C1"))
 
@@ -215,30 +215,43 @@ def blocks_of(variant: str) -> dict[str, Block]:
         return dict(chosen.blocks)
     for name in sorted(chosen.removes | chosen.adds):
         BLOCKS.require(name, f"the variant {variant} names it")
-    return {
-        name: block
-        for name, block in _ordered()
-        if name in chosen.adds or (block.in_baseline and name not in chosen.removes)
-    }
+    kept = {n: b for n, b in BLOCKS.items() if b.in_baseline and n not in chosen.removes}
+    blocks = {name: block for name, block in kept.items() if block.before is None}
+    # In the order of names, which is that of no import.
+    for name in sorted({*kept, *chosen.adds} - blocks.keys()):
+        blocks = with_block(blocks, name, BLOCKS[name])
+    return {name: BLOCKS[name] for name in blocks}
+
+
+def with_block(
+    blocks: Mapping[str, Block],
+    name: str,
+    block: Block,
+    anchor: str | None = None,
+    *,
+    after: bool = False,
+) -> dict[str, Block]:
+    """The blocks of a prompt and one more, before or ``after`` its anchor.
+
+    Without an anchor it stands where it says itself, or before the first block of the paper that
+    follows there; else at the end. Raises UsageError for a place that there is not.
+    """
+    if anchor is None and block.before is not None:
+        paper = [each for each, known in BLOCKS.items() if known.before is None]
+        if block.before not in paper:
+            raise UsageError(
+                f"the prompt block {name} stands before {block.before}; valid: {', '.join(paper)}"
+            )
+        later = paper[paper.index(block.before) :]
+        anchor = next((each for each in later if each in blocks), None)
+    names = list(blocks)
+    place = len(names) if anchor is None else names.index(anchor) + after
+    # Where it stands is a part of its hash.
+    added = replace(block, before=[*names, LAST][place])
+    names.insert(place, name)
+    return {each: blocks.get(each, added) for each in names}
 
 
 def block_digests(variant: str) -> dict[str, str]:
     """Block name to digest, for the blocks of a variant."""
     return {name: block.digest for name, block in blocks_of(variant).items()}
-
-
-def _ordered() -> Iterator[tuple[str, Block]]:
-    """All blocks: those of the paper, and before each what stands there, by name.
-
-    So the order of what is registered elsewhere is that of no import; raises UsageError.
-    """
-    paper = {name: block for name, block in BLOCKS.items() if block.before is None}
-    added = {name: block for name, block in sorted(BLOCKS.items()) if block.before is not None}
-    for name, block in added.items():
-        if block.before not in paper:
-            raise UsageError(
-                f"the prompt block {name} stands before {block.before}; valid: {', '.join(paper)}"
-            )
-    for name, block in paper.items():
-        yield from ((n, other) for n, other in added.items() if other.before == name)
-        yield name, block

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from itertools import chain, product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PlainSerializer,
-    computed_field,
-    field_serializer,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, computed_field
 
 from merge_runner.config import (
     MOST_REPETITIONS,
@@ -30,10 +24,10 @@ from merge_runner.config import (
     both_sides,
     endpoint_identity,
     pair_name,
+    validated,
 )
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, HumanTrials, Program
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
@@ -45,14 +39,15 @@ from merge_runner.scenarios.merge.conditions import (
     CONDITIONS,
     HUMAN_CONDITIONS,
     MEAN_SPEED_MPS,
+    NUMBER,
+    Condition,
+    condition_name,
 )
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.crossing import (
     OPPONENT,
-    PERCEPTION,
     PROMPT,
-    SET_BY,
     Arm,
     chosen_models,
     cross,
@@ -69,9 +64,14 @@ from merge_runner.study.file import (
 from merge_runner.study.parts import load_study
 from merge_runner.text_safety import in_a_name
 
+USUAL_GRID = "h=-6:6:2,dv=-1.6:1.6:0.4"
+"""Projected headways in m and relative velocities in m/s, left minus right: FROM:TO:STEP."""
+MOST_VALUES = 100  # of an axis
+_AXIS = re.compile(
+    f"(?P<name>h|dv)=(?P<first>{NUMBER})(:(?P<last>{NUMBER}):(?P<step>{NUMBER}))?", re.ASCII
+)
 # A trial takes about 10 s at 10 m/s over the last 100 m: 10 or 11 prompts a driver.
 _PROMPTS_PER_DRIVER = 10.5
-DRIVERS_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +81,9 @@ class Options:
     ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
     those of other sweeps.
     ``dask`` names the cluster that plays the trials; if None, this process plays them.
-    ``faults`` are those of the emulator. A ``dry_run`` sends nothing, a ``quiet`` run shows no
-    progress, and one that is to ``keep_going`` asks a model on that gives no valid decision. In a
-    ``batch`` run all trials ask together, at a lower price.
+    A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to
+    ``keep_going`` asks a model on that gives no valid decision. In a ``batch`` run all trials ask
+    together, at a lower price.
     """
 
     db: Path
@@ -95,7 +95,6 @@ class Options:
     ledgers: Sequence[str] = ()
     replay: bool = False
     recordings: Sequence[Path] = ()
-    faults: FaultPlan = field(default_factory=FaultPlan)
     strict_model: bool = False
     keep_going: bool = False
     quiet: bool = False
@@ -133,50 +132,30 @@ def _study_of(stored: object) -> object:
 class Plan(BaseModel):
     """A sweep before it runs: the arms of its study, each played in all conditions.
 
-    The column ``sweeps.config`` holds it as JSON, from which it is read again. ``entries`` are the
+    The column ``sweeps.config`` holds it as JSON, from which it is read again. ``model`` says who
+    drives but for opponents, as ids of sweeps do, with a comma between models. ``levels`` are those
+    of each factor of its file, a factor's reference first. ``entries`` are the
     language models of all arms by what an arm's ``asked`` calls them, and ``endpoints`` the
     identities of their endpoints (see ``config.Endpoint``). ``mirror``: its pairs are played both
     ways round whatever its file says. ``seat`` is ``first`` where only the first situations are
-    asked (see ``run.seat``), and empty in a sweep.
+    asked (see ``_first_decision``), and empty in a sweep.
     """
 
-    model_config = ConfigDict(frozen=True, serialize_by_alias=True)
+    model_config = ConfigDict(frozen=True, serialize_by_alias=True, validate_by_name=True)
 
     name: str
     study: Annotated[StudySource, BeforeValidator(_study_of), PlainSerializer(_stored_study)]
-    drivers: tuple[str, ...]
+    model: str
+    levels: dict[str, list[str]]
+    description: str
     arms: tuple[Arm, ...]
-    entries: dict[str, ModelEntry] = Field(serialization_alias="models")
+    entries: dict[str, ModelEntry] = Field(validation_alias="models", serialization_alias="models")
     endpoints: dict[str, str]
     conditions: tuple[str, ...]
     sample_set: int
     order_seed: int
     seat: Literal["", "first"] = ""
     mirror: bool = False
-
-    @model_validator(mode="before")
-    @classmethod
-    def _give_arms_their_entries(cls, stored: Any) -> Any:  # noqa: ANN401 # anything that is stored
-        """Read a stored plan, where an arm names its models and holds none."""
-        if not isinstance(stored, dict) or "models" not in stored:
-            return stored
-        entries = stored["models"]
-        arms = [
-            {**arm, "entries": {n: entries[n] for n in arm["asked"].values() if n in entries}}
-            for arm in stored["arms"]
-        ]
-        return {**stored, "entries": entries, "arms": arms}
-
-    @field_serializer("arms")
-    def _arms_without_entries(self, arms: tuple[Arm, ...]) -> list[dict[str, object]]:
-        return [asdict(replace(arm, entries={})) for arm in arms]
-
-    @computed_field  # type: ignore[prop-decorator] # https://github.com/python/mypy/issues/14461
-    @property
-    def model(self) -> str:
-        """Who drives but for opponents, as ids of sweeps say, with a comma between models."""
-        pairs = (both_sides(name).values() for name in self.drivers)
-        return ",".join("+".join(dict.fromkeys(pair)) for pair in pairs)
 
     @property
     def ledger(self) -> str:
@@ -195,29 +174,11 @@ class Plan(BaseModel):
         """The names in the registry of the models of ``entries``, whatever their parameters."""
         return {arm.asked[side]: arm.sides[side] for arm in self.arms for side in SIDES}
 
-    @property
-    def scenario(self) -> ScenarioConfig:
-        """The first arm's."""
-        return self.arms[0].scenario
-
-    @computed_field  # type: ignore[prop-decorator] # as above
+    @computed_field  # type: ignore[prop-decorator] # https://github.com/python/mypy/issues/14461
     @property
     def repetitions(self) -> dict[str, int]:
         """Prompt variant to repetitions."""
         return {arm.variant: arm.repetitions for arm in self.arms}
-
-    @computed_field  # type: ignore[prop-decorator] # as above
-    @property
-    def levels(self) -> dict[str, list[str]]:
-        """The levels of each factor of its file, a factor's reference first."""
-        models = (arm.model_level for arm in self.arms)
-        return listed_levels(self.study.file, models, self.repetitions)
-
-    @computed_field  # type: ignore[prop-decorator] # as above
-    @property
-    def description(self) -> str:
-        """What the study's file says of it."""
-        return self.study.file.description
 
     @property
     def trials(self) -> int:
@@ -241,6 +202,11 @@ class Plan(BaseModel):
         return any(map(_is_scripted, self.arms))
 
     @property
+    def is_free(self) -> bool:
+        """Whether nobody charges for its calls."""
+        return all(entry.price == "free" for entry in self.entries.values())
+
+    @property
     def is_rehearsal(self) -> bool:
         """Whether the emulator takes the place of the providers."""
         return REHEARSAL in self.endpoints.values()
@@ -254,47 +220,16 @@ class Plan(BaseModel):
     def driver(self) -> str:
         """The drivers with their endpoints; see ``pair_name``."""
         pairs = (pair_name(arm.names, self.endpoints) for arm in self.arms)
-        names = list(dict.fromkeys(pairs))
-        more = f" and {len(names) - DRIVERS_SHOWN} more" if len(names) > DRIVERS_SHOWN else ""
-        return ", ".join(names[:DRIVERS_SHOWN]) + more
+        return ", ".join(dict.fromkeys(pairs))
 
     def within_budget(self, options: Options) -> Options:
         """Return the options with the cap of the study's budget; ``--max-cost`` goes before it."""
-        if options.max_cost_usd is not None:
-            return options
-        return replace(options, max_cost_usd=self.study.file.budget.total_usd)
-
-    def notes(self) -> Iterator[str]:
-        """What a user may have meant otherwise."""
-        if self.is_rehearsal:
-            yield (
-                f"REHEARSAL: the emulator answers as {self.driver}, ten times as fast as the "
-                "model; nothing is sent to the provider, and nobody charges"
-            )
-        prompts = self.study.file.prompts
-        used = {*self.repetitions, *(prompt.based_on for prompt in prompts.values())}
-        if unused := [name for name in prompts if name not in used]:
-            yield f"note: not played, though {self.study.path} has them: {', '.join(unused)}"
-        yield from dict.fromkeys(filter(None, map(self._finer_world, self.arms)))
-        levels = {str(each) for name in SET_BY for each in self.study.file.factors.get(name, ())}
-        if unused := [name for name in self.study.file.perception if name not in levels]:
-            yield (
-                f"note: no level of the factor {PERCEPTION}, though {self.study.path} has them: "
-                + ", ".join(unused)
-            )
-
-    def _finer_world(self, arm: Arm) -> str:
-        """A note where the drivers of an arm need a finer world than the study's own."""
-        step_s = arm.scenario.step_s
-        if step_s == self.study.file.scenario.step_s or "step_s" in arm.factors:
-            return ""
-        return f"note: {arm.model} is driven in steps of {step_s:g} s, as its drivers need"
-
-    @property
-    def capped_by(self) -> str:
-        """Where a user raises what may be spent."""
-        own = self.study.file.budget != BudgetTerms()
-        return f"[budget] of {self.study.path}, or --max-cost," if own else "--max-cost"
+        budget_usd = self.study.file.budget.total_usd
+        return (
+            options
+            if options.max_cost_usd is not None
+            else replace(options, max_cost_usd=budget_usd)
+        )
 
     def by_label(self) -> dict[str, Arm]:
         """The arms by the labels that their trials carry."""
@@ -302,10 +237,8 @@ class Plan(BaseModel):
 
     def with_entries(self, entries: dict[str, ModelEntry]) -> Plan:
         """The same with other entries for the same names, in its arms too."""
-        arms = (
-            replace(arm, entries={name: entries[name] for name in arm.entries}) for arm in self.arms
-        )
-        return self.model_copy(update={"arms": tuple(arms), "entries": entries})
+        arms = tuple(replace(a, entries={n: entries[n] for n in a.entries}) for a in self.arms)
+        return self.model_copy(update={"arms": arms, "entries": entries})
 
     def specs(self) -> dict[str, str]:
         """Spec hash to the canonical JSON that it covers."""
@@ -336,25 +269,10 @@ class Plan(BaseModel):
         Within a repetition the order is random, by the order seed, so that no condition or arm
         always comes first: a service that drifts over hours affects all of them alike.
         """
-        hashes = {
-            (arm.label, name): spec_hash(self.spec(arm, name))
-            for arm in self.arms
-            for name in self.conditions
-        }
-        cells = [
-            (repetition, arm, condition)
-            for repetition in range(1, max(arm.repetitions for arm in self.arms) + 1)
-            for arm in self.arms
-            if repetition <= arm.repetitions
-            for condition in self.conditions
-        ]
-        cells.sort(
-            key=lambda cell: (cell[0], _lot(self.order_seed, cell[0], cell[1].label, cell[2]))
-        )
-        return [
+        specs = [
             TrialSpec(
                 trial_id=self.trial_id_of(arm, condition, repetition),
-                spec_hash=hashes[arm.label, condition],
+                spec_hash=hashed,
                 source="seat" if self.seat else "llm" if arm.entries else "driver",
                 model_left=arm.sides["left"],
                 model_right=arm.sides["right"],
@@ -362,13 +280,22 @@ class Plan(BaseModel):
                 condition=condition,
                 repetition=repetition,
                 sample_set=self.sample_set,
-                order=order,
+                order=0,
                 scripted=_is_scripted(arm),
                 factors=tuple(arm.factors.items()),
                 arm=arm.label,
             )
-            for order, (repetition, arm, condition) in enumerate(cells)
+            for arm, condition in product(self.arms, self.conditions)
+            for hashed in (spec_hash(self.spec(arm, condition)),)
+            for repetition in range(1, arm.repetitions + 1)
         ]
+        specs.sort(key=self._place)
+        return [replace(spec, order=order) for order, spec in enumerate(specs)]
+
+    def _place(self, spec: TrialSpec) -> tuple[int, str]:
+        """What orders trials randomly within a repetition, the same way on every machine."""
+        drawn_for = f"{self.order_seed}/{spec.repetition}/{spec.arm}/{spec.condition}"
+        return spec.repetition, hashlib.sha256(drawn_for.encode()).hexdigest()
 
     def trial_id_of(self, arm: Arm, condition: str, repetition: int) -> str:
         """The id of a trial of an arm."""
@@ -410,11 +337,6 @@ def _is_scripted(arm: Arm) -> bool:
     return any(entry.provider == "emulator" for entry in arm.entries.values())
 
 
-def _lot(*what: object) -> str:
-    """A sort key that orders trials randomly, but the same way on every machine."""
-    return hashlib.sha256("/".join(map(str, what)).encode()).hexdigest()
-
-
 def make_plan(
     sweep: str,
     models: str | Sequence[str] = (),
@@ -427,39 +349,94 @@ def make_plan(
     only: Mapping[str, Sequence[str]] | None = None,
     db: Path | None = None,
     mirror: bool = False,
+    first: bool = False,
+    grid: str | None = None,
     trust: bool = False,
 ) -> Plan:
     """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
+    ``first``: only the first situations, in the conditions or on a ``grid`` (``grid_conditions``).
     Uses the study's catalogue (``study.parts.load_study``, which ``trust`` is for), and the human
     trials of ``db`` where they are to be replayed. Raises UsageError.
     """
+    if grid is not None:
+        if conditions is not None or not first:
+            raise UsageError(
+                "a grid takes the place of the conditions, and goes with --first alone"
+            )
+        conditions = grid_conditions(grid)
     asked = (models,) if isinstance(models, str) else tuple(models)
     study = load_study(sweep, asked, trust=trust)
     registry = load_models(study.path.parent)
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
     drivers = chosen_models(study.file, asked)
+    pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
     wanted = _repetitions(study, variants, repetitions)
     names = _conditions(study.file, conditions)
     arms = cross(
         study.file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
     )
-    if db is not None:
-        _read_humans(arms, db)
-    _check_conditions(names, arms)
+    _check_arms(arms, names, db, first=first)
+    if first:
+        arms = list(map(_first_decision, arms))
     entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
     return Plan(
-        name=study.name,
+        name=f"{study.name}-first" if first else study.name,
         study=study,
-        drivers=drivers,
+        model=",".join(map("+".join, pairs)),
+        levels=listed_levels(study.file, (arm.model_level for arm in arms), wanted),
+        description=study.file.description,
         arms=tuple(arms),
         entries=entries,
         endpoints={name: endpoint_identity(entry) for name, entry in entries.items()},
         conditions=names,
         sample_set=sample_set,
         order_seed=order_seed,
+        seat="first" if first else "",
         mirror=mirror,
+    )
+
+
+def _first_decision(arm: Arm) -> Arm:
+    """The arm in trials whose time is up before their drivers would decide again.
+
+    Such a trial is planned, played, kept and checked as any other; its calls have the texts and the
+    slots, and so the keys, of the first decisions of the study's sweep. Its source is ``seat``,
+    which tables of trials that were driven to their end leave out (``analysis.data.load.TRIALS``).
+    """
+    given = arm.scenario.model_dump(exclude_unset=True)
+    given["timeout_s"] = 1 / arm.scenario.prompt_rate_hz
+    return replace(arm, scenario=validated(ScenarioConfig, given, "scenario"))
+
+
+def grid_conditions(text: str) -> list[str]:
+    """The names of the conditions of a grid such as USUAL_GRID, or ``usual``.
+
+    ``h`` or ``dv`` may be one number, or be left out for that of the usual grid. Raises UsageError.
+    """
+    axes = dict(map(_axis, USUAL_GRID.split(",")))
+    given = list(map(_axis, [] if text == "usual" else text.split(",")))
+    if len({name for name, _ in given}) < len(given):
+        raise UsageError(f"--grid: {text!r} has an axis twice; write it once, as FROM:TO:STEP")
+    names = []
+    for headway_m, velocity_mps in product(*(axes | dict(given)).values()):
+        Condition(headway_m, velocity_mps)  # raises where a vehicle would not drive forwards
+        names.append(condition_name(headway_m, velocity_mps))
+    return names
+
+
+def _axis(text: str) -> tuple[str, list[float]]:
+    """Name and values of a part of a grid, computed in decimals: 3 * 0.4 is 1.2."""
+    if axis := _AXIS.fullmatch(text.strip()):
+        first = Decimal(axis["first"])
+        last, step = Decimal(axis["last"] or first), Decimal(axis["step"] or 1)
+        if step > 0 and 0 <= (last - first) / step < MOST_VALUES:
+            count = int((last - first) / step) + 1
+            return axis["name"], [float(first + i * step) for i in range(count)]
+    raise UsageError(
+        f"--grid: {text!r} is no axis of 1 to {MOST_VALUES} values; write --grid usual, or --grid "
+        f"{USUAL_GRID}: FROM:TO:STEP or one number for each, with at most four decimals"
     )
 
 
@@ -469,35 +446,37 @@ def _replayed(arm: Arm) -> list[tuple[Program, HumanTrials]]:
     return [(program, program.data) for program in programs if program.data is not None]
 
 
-def _read_humans(arms: Iterable[Arm], db: Path) -> None:
-    """Read the human trials of a database where a program replays them."""
-    if replayed := {humans for arm in arms for _, humans in _replayed(arm)}:
+def _check_arms(
+    arms: Sequence[Arm], conditions: Sequence[str], db: Path | None, *, first: bool
+) -> None:
+    """Read the human trials of a database where programs replay them, and check all crossings.
+
+    Raises UsageError for a condition that an arm cannot be played in, or both drivers of which
+    cannot be asked ``first``.
+    """
+    replayed = {humans for arm in arms for _, humans in _replayed(arm)}
+    if replayed and db is not None:
         with read_database(db) if db.is_file() else nullcontext() as connection:
             for humans in replayed:
                 humans.read(connection)
+    for arm, name in product(arms, conditions):
+        world = World(arm.scenario, CONDITIONS.require(name), TRACK)
+        if first and not all(map(world.in_control, SIDES)):
+            raise UsageError(
+                f"{name}: a vehicle is in its tunnel yet when the first driver decides. First "
+                'situations need control_start = "both_exits"'
+            )
+        for program, humans in _replayed(arm):
+            humans.check(program, arm.scenario, name, arm.repetitions)
 
 
 def _conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
     wanted = next(c for c in (chosen, file.conditions, HUMAN_CONDITIONS) if c is not None)
-    conditions = tuple(
-        dict.fromkeys(
-            name
-            for each in wanted
-            for name in (HUMAN_CONDITIONS if each == EVERY_CONDITION else (each,))
-        )
-    )
+    names = (HUMAN_CONDITIONS if each == EVERY_CONDITION else (each,) for each in wanted)
+    conditions = tuple(dict.fromkeys(chain.from_iterable(names)))
     if not conditions:
         raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
     return conditions
-
-
-def _check_conditions(conditions: Sequence[str], arms: Sequence[Arm]) -> None:
-    """Raise UsageError for a condition that an arm cannot be played in."""
-    for name in conditions:
-        for arm in arms:
-            World(arm.scenario, CONDITIONS.require(name), TRACK)
-            for program, humans in _replayed(arm):
-                humans.check(program, arm.scenario, name, arm.repetitions)
 
 
 def _repetitions(
@@ -506,20 +485,11 @@ def _repetitions(
     """The wanted prompts with their repetitions per condition; raises UsageError."""
     if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
-    given = dict(study.file.repetitions)
-    for_all = given.pop(EVERY_PROMPT, None)
-    listed = file_prompts(study.file)
-    for variant in (*given, *listed, *(variants or ())):
-        blocks_of(variant)
-    for name in given:
-        if name not in {*listed, *(variants or ())}:
-            raise UsageError(
-                f"{study.path} has repetitions for {name}, which is never played: name it in the "
-                f"factor {PROMPT}, which has {', '.join(listed)}"
-            )
+    given = study.file.repetitions
     wanted: dict[str, int] = {}
-    for variant in listed if variants is None else variants:
-        repetitions = chosen or given.get(variant, for_all)
+    for variant in file_prompts(study.file) if variants is None else variants:
+        blocks_of(variant)  # raises where there is none
+        repetitions = chosen or given.get(variant, given.get(EVERY_PROMPT))
         if repetitions is None:
             raise UsageError(
                 f"the sweep {study.name} has no variant {variant}; it has {', '.join(given)}. "

@@ -1,37 +1,70 @@
-"""A sweep's outcome as text for a reader and as one JSON object for a program."""
+"""Plays a plan, and sums up what came of it: as one JSON object, and as text for a reader."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
+from io import StringIO
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, get_args
 
-from merge_runner.audit.findings import Audit, Sharing
+from merge_runner.audit.findings import Audit
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.records import Status
+from merge_runner.results.query_output import write_table
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
-from merge_runner.run.sweep import Outcome
-from merge_runner.study.crossing import PROMPT
+from merge_runner.run.recorded_plan import replayed
+from merge_runner.run.sweep import Outcome, open_sweep
 
-Groups = defaultdict[Any, dict[str, int]]
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
-LEDGER = ("model", "variant", "fate", "outcome", "attempts")
-ASKED = ("side", "own dv", "asked", "invalid", "M", "action")
-FAILURES_SHOWN = NOTES_SHOWN = 10
-SHARINGS_SHOWN = 3
-PRICED_ALIKE = "replies of stand-ins are priced as the model's; nobody charges for them"
+SHOWN = 10
+
+
+async def play(
+    plan: Plan,
+    options: Options,
+    *,
+    whole: bool,
+    say: Callable[[str], None],
+    agree: Callable[[Estimate], None],
+) -> tuple[dict[str, Any], str]:
+    """Play what is not stored yet of a plan; return the summary as JSON values and as text.
+
+    A replay that is not ``whole`` plays what its recordings hold. ``agree`` gets an estimate before
+    money is spent, and raises where it is not to be. Raises UsageError.
+    """
+    if options.replay:
+        plan, options, notes = replayed(plan, options, whole=whole)
+        for note in notes:
+            say(note)
+    expected = None
+    options = plan.within_budget(options)
+    async with open_sweep(plan, options, say=say) as sweep:
+        if sweep.trials_to_play and not (options.replay or plan.is_free):
+            expected = await sweep.estimate()
+            agree(expected)
+        outcome = await sweep.run()
+    summary = as_dict(outcome, options, expected)
+    return summary, "\n".join(as_lines(outcome, summary))
 
 
 def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> dict[str, Any]:
-    """The summary as JSON values; ``expected`` is the estimate made before the run, if any."""
+    """The summary as JSON values; ``expected`` is the estimate made before the run, if any.
+
+    The last ones, from ``decisions`` on, are there where anything is stored.
+    """
     plan, facts, meter, spending = outcome.plan, outcome.facts, outcome.meter, outcome.spending
-    return {
+    trials = {
+        "planned": plan.trials,
+        "stored_before": outcome.stored_before,
+        "suspended": outcome.suspended,
+    }
+    summary = {
         "sweep_id": outcome.sweep_id,
         "name": plan.name,
         "model": plan.model,
@@ -40,12 +73,7 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
         "exit_code": outcome.exit_code,
         "messages": outcome.messages,
         "db": str(options.db),
-        "trials": {
-            "planned": plan.trials,
-            "stored_before": outcome.stored_before,
-            "suspended": outcome.suspended,
-            **(_statuses(facts) if facts else {}),
-        },
+        "trials": trials,
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
         "attempts": meter.outcomes,
         "cost_usd": round(meter.cost_usd, 6),
@@ -60,96 +88,125 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
         "open_batches": outcome.batches,
         "playing_s": round(outcome.playing_s, 3),
         "worst_stall_s": round(outcome.worst_stall_s, 3),
-        "decisions": facts.decisions if facts else None,
-        "invalid_decisions": facts.invalid if facts else None,
-        "fallbacks": facts.fallbacks if facts else None,
-        "model_mismatches": _mismatches(facts),
-        "ledger": [dict(zip(LEDGER, row, strict=True)) for row in (facts.ledger if facts else ())],
-        "failed": dict(facts.failed) if facts else {},
         "audit": None if outcome.audit is None else outcome.audit.as_dict(),
-        "outcomes": [
-            {"variant": variant, "condition": condition, **counts}
-            for (variant, condition), counts in (
-                _counts(facts, lambda variant, condition, _: (variant, condition)) if facts else {}
-            ).items()
-        ],
-        "outcomes_by_level": [
-            {"factor": factor, "level": level, **counts}
-            for (factor, level), counts in (_by_level(facts) if facts else {}).items()
-        ],
-        "outcomes_without_fallbacks": _by_fallback(facts)[False] if facts else {},
-        **({"first_looks": facts.first_looks if facts else []} if plan.seat else {}),
+    }
+    if facts is None:
+        return summary
+    statuses: Counter[str] = Counter()
+    for _, _, status, _, _, number in facts.outcomes:
+        statuses[status] += number
+    trials.update({status: statuses[status] for status in get_args(Status)})
+    return {
+        **summary,
+        "decisions": facts.decisions,
+        "invalid_decisions": facts.invalid,
+        "fallbacks": facts.fallbacks,
+        "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts.others},
+        "failed": dict(facts.failed),
+        "outcomes_by_level": [*_tallies(plan, facts)],
+        "first_looks": facts.first_looks,
     }
 
 
-def as_lines(outcome: Outcome, options: Options, expected: Estimate | None) -> Iterator[str]:
-    """The summary for a reader; see ``as_dict``."""
+def _tallies(plan: Plan, facts: SweepFacts) -> Iterator[dict[str, Any]]:
+    """Counts of trials by COLUMNS, for each condition, all, and each level of each factor."""
+    shown = {"condition": [*plan.conditions, "all"], **plan.levels}
+    tallies = {(name, level): Counter[str]() for name in shown for level in shown[name]}
+    rows = [
+        ("condition", level, status, merged_first, trials)
+        for _, condition, status, merged_first, _, trials in facts.outcomes
+        for level in (condition, "all")
+    ]
+    for factor, level, status, merged_first, trials in [*rows, *facts.levels]:
+        outcome = f"{merged_first} first" if status == "finished" else status
+        tally = tallies.setdefault((factor, level), Counter())
+        tally.update({"trials": trials, outcome: trials})
+    for (factor, level), tally in tallies.items():
+        if tally["trials"]:
+            yield {"factor": factor, "level": level, **{name: tally[name] for name in COLUMNS}}
+
+
+def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
+    """The summary for a reader; ``summary`` is the same by ``as_dict``."""
     facts = outcome.facts
     if facts is not None:
-        yield from _asked(facts) if outcome.plan.seat else _table(outcome.plan, facts)
-        yield ""
-        yield from _failures(facts)
-    yield from _costs(outcome, options, expected)
+        if looks := facts.first_looks:
+            as_text = StringIO()
+            write_table([*looks[0]], (tuple(map(_short, look.values())) for look in looks), as_text)
+            yield as_text.getvalue()
+        for factor, group in groupby(summary["outcomes_by_level"], key=itemgetter("factor")):
+            rows = [list(row.values())[1:] for row in group]
+            if len(rows) > 1 and not outcome.plan.seat:
+                yield from _grid([factor, *COLUMNS], rows)
+        share = f" ({facts.invalid / facts.decisions:.1%})" if facts.invalid else ""
+        yield (
+            f"decisions: {facts.decisions}, {facts.invalid} invalid{share}, "
+            f"{facts.fallbacks} fallbacks to an earlier plan"
+        )
+        yield from _without_a_plan(facts)
+    yield from _costs(outcome, summary)
     yield from (f"open batch: {text}" for text in outcome.batches)
     for key in outcome.meter.damaged:
         yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
-    for pair, answers in _mismatches(facts).items():
-        yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
     if facts is not None:
+        for pair, answers in summary["model_mismatches"].items():
+            yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
         yield from _who_answered(outcome, facts)
         if outcome.audit is not None:
             yield from _audited(outcome.audit)
-        yield from _failed(outcome, facts)
+        failed = [f"failed: {trial_id}: {error}" for trial_id, error in facts.failed]
+        yield from _first(failed, "more, in the table trials")
+        if failed and outcome.exit_code != ReplayMiss.exit_code:
+            yield "Run the same command again to play the failed trials anew."
     if outcome.sweep_id:
-        yield f"database: {options.db}"
+        yield f"database: {summary['db']}"
 
 
-def _failures(facts: SweepFacts) -> Iterator[str]:
-    """What went wrong on the way, and whether it may have changed the outcomes."""
-    share = f" ({facts.invalid / facts.decisions:.1%})" if facts.invalid else ""
-    yield (
-        f"decisions: {facts.decisions}, {facts.invalid} invalid{share}, "
-        f"{facts.fallbacks} fallbacks to an earlier plan"
-    )
-    without_plan: defaultdict[tuple[str, str], Counter[str]] = defaultdict(Counter)
+def _grid(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
+    # The widths do not depend on the counts, so that two runs can be compared side by side; rich
+    # would fit them to the content.
+    texts = [[str(cell) for cell in row] for row in (headings, *rows)]
+    width = max(10, *(len(row[0]) + 1 for row in texts))
+    for first, second, *others in texts:
+        yield f"{first:<{width}}{second:>9}" + "".join(f"{text:>12}" for text in others)
+    yield ""
+
+
+def _short(value: object) -> object:
+    return f"{value:.3g}" if isinstance(value, float) else value
+
+
+def _without_a_plan(facts: SweepFacts) -> Iterator[str]:
+    """What became of the attempts that gave no plan, by model and prompt."""
+    causes: defaultdict[tuple[str, str], Counter[str]] = defaultdict(Counter)
     for model, variant, fate, outcome, attempts in facts.ledger:
         if fate != "driven":
-            without_plan[model, variant][f"{fate} after {outcome}"] += attempts
-    for (model, variant), counts in without_plan.items():
+            causes[model, variant][f"{fate} after {outcome}"] += attempts
+    for (model, variant), counts in causes.items():
         named = ", ".join(f"{count} {what}" for what, count in counts.most_common())
         yield f"attempts without a plan, {model}, {variant}: {named}"
-    if facts.fallbacks:
-        outcomes = _counts(facts, lambda *_: "all trials")
-        outcomes["trials without fallbacks"] = _by_fallback(facts)[False]
-        for name, tally in outcomes.items():
-            yield f"outcomes of {name}: " + ", ".join(f"{n} {what}" for what, n in tally.items())
 
 
-def _costs(outcome: Outcome, options: Options, expected: Estimate | None) -> Iterator[str]:
-    meter, spending = outcome.meter, outcome.spending
-    unknown = meter.cost_unknown
+def _costs(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
+    spending, unknown = outcome.spending, outcome.meter.cost_unknown
     yield (
-        f"calls: {meter.calls_live} live, {meter.calls_cached} from recordings; "
-        f"cost {meter.cost_usd:.4f} USD"
+        "calls: {live} live, {cached} from recordings; ".format(**summary["calls"])
+        + f"cost {outcome.meter.cost_usd:.4f} USD"
         + (f" and {unknown} calls of unknown cost" if unknown else "")
     )
-    if expected is not None:
-        cost = (expected.batch or expected).cost_usd
-        yield (
-            f"estimated before: {expected.calls} calls, "
-            + ("an unknown price" if cost is None else f"{cost:.2f} USD")
-        )
+    if (expected := summary["estimate"]) is not None:
+        cost = (expected["batch"] or expected)["cost_usd"]
+        usd = "an unknown price" if cost is None else f"{cost:.2f} USD"
+        yield f"estimated before: {expected['calls']} calls, {usd}"
     if spending.committed_usd:
-        open_ones = spending.open_attempts
+        reserved = (
+            f", and {spending.reserved_usd:.4f} set aside (`merge-runner ledger` says why)"
+            if spending.open_attempts
+            else ""
+        )
         yield (
-            f"this sweep over all its runs: {spending.spent_usd:.4f} USD"
-            + (
-                f", and {spending.reserved_usd:.4f} set aside for {open_ones} attempts of "
-                "unknown cost (`merge-runner ledger` says why)"
-                if open_ones
-                else ""
-            )
-            + f"; all sweeps on {options.cache}: {outcome.cache_cost_usd:.4f} USD"
+            f"this sweep over all its runs: {spending.spent_usd:.4f} USD{reserved}; "
+            f"all sweeps on this cache: {outcome.cache_cost_usd:.4f} USD"
         )
     if spending.overrun_usd:
         yield (
@@ -158,71 +215,15 @@ def _costs(outcome: Outcome, options: Options, expected: Estimate | None) -> Ite
         )
 
 
-def _mismatches(facts: SweepFacts | None) -> dict[str, int]:
-    """Requested and served model where these differ, and how often they did."""
-    others = facts.others if facts else ()
-    return {f"{requested} -> {served}": answers for requested, served, answers in others}
-
-
-def _table(plan: Plan, facts: SweepFacts) -> Iterator[str]:
-    """Counts per condition, and per variant, model and level of a factor where these vary."""
-    conditions = _counts(facts, lambda _, condition, __: condition)
-    variants = _counts(facts, lambda variant, *_: variant)
-    by_level = _by_level(facts)
-    yield from _section("condition", {name: conditions[name] for name in plan.conditions})
-    yield _row("all", _counts(facts, lambda *_: "all")["all"].values())
-    if len(plan.repetitions) > 1:
-        yield ""
-        yield from _section("variant", {name: variants[name] for name in plan.repetitions})
-    levels = {"model": [arm.model_level for arm in plan.arms]}
-    for factor, level in (item for arm in plan.arms for item in arm.factors.items()):
-        levels.setdefault(factor, []).append(level)
-    for factor, each in levels.items():
-        if factor != PROMPT and len({*each}) > 1:
-            yield ""
-            yield from _section(factor, {level: by_level[factor, level] for level in each})
-
-
-def _section(title: str, groups: dict[str, dict[str, int]]) -> Iterator[str]:
-    width = max(map(len, (title, *groups))) + 1
-    yield _row(title, COLUMNS, width)
-    for name, counts in groups.items():
-        yield _row(name, counts.values(), width)
-
-
-def _asked(facts: SweepFacts) -> Iterator[str]:
-    """What was done first, as a table for each driver and prompt, for each of the two that met."""
-    looks = facts.first_looks
-    models = {(look["driver"], look["model"]) for look in looks}
-    met = Counter(driver for driver, _ in models)
-    for (driver, variant, model), rows in groupby(
-        looks, key=itemgetter("driver", "variant", "model")
-    ):
-        who = f"{model} of {driver}" if met[driver] > 1 else driver
-        yield f"{who}/{variant}: share of M, first action in m/s^2, by own relative velocity"
-        yield _row(ASKED[0], ASKED[1:])
-        for row in rows:
-            merging, action_mps2 = row["share_m"], row["first_action_mps2"]
-            cells = [
-                f"{row['relative_velocity_mps']:+g} m/s",
-                row["asked"],
-                row["invalid"],
-                "-" if merging is None else f"{merging:.0%}",
-                "-" if action_mps2 is None else f"{action_mps2:+.3f}",
-            ]
-            yield _row(row["side"], cells)
-
-
 def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
     """Stand-ins, and what the registry notes of models."""
-    for driver, model, provider, scripted, answers in facts.stand_ins:
+    for driver, model, provider, _, _ in facts.stand_ins:
         if provider == EMULATOR:
             yield f"The model `{model}` is a scripted stand-in, no language model."
         else:
-            part = "" if scripted == answers else f" in {scripted} of {answers} answers"
-            yield f"{driver}: a scripted stand-in answered, not {model}{part}"
+            yield f"{driver}: a scripted stand-in answered, not {model}"
     if outcome.meter.cost_usd and facts.stand_ins:
-        yield PRICED_ALIKE
+        yield "replies of stand-ins are priced as the model's; nobody charges for them"
     for name, entry in outcome.plan.entries.items():
         if entry.note and entry.provider != EMULATOR:
             yield f"{name}: {entry.note}"
@@ -231,70 +232,34 @@ def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
 def _audited(audit: Audit) -> Iterator[str]:
     checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
     yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
-    told = [*audit.notes, *_shared(audit.sharings)]
-    yield from (f"note: {text}" for text in told[:NOTES_SHOWN])
-    if len(told) > NOTES_SHOWN:
-        yield f"... and {len(told) - NOTES_SHOWN} more notes: `merge-runner audit`"
+    notes = [f"note: {each}" for each in audit.notes]
+    yield from _first(notes, "more notes: `merge-runner audit`")
 
 
-def _shared(sharings: Sequence[Sharing]) -> Iterator[str]:
-    """What is shared, in one line where many arms ask the same in the same slots."""
-    calls = [each for each in sharings if each.what == "calls"]
-    for each in sharings:
-        if each not in calls or len(calls) <= SHARINGS_SHOWN:
-            yield str(each)
-    if len(calls) > SHARINGS_SHOWN:
-        total = sum(each.count for each in calls)
+def _first(lines: Sequence[str], others: str) -> Iterator[str]:
+    yield from lines[:SHOWN]
+    if len(lines) > SHOWN:
+        yield f"... and {len(lines) - SHOWN} {others}"
+
+
+def estimate_lines(expected: Estimate) -> Iterator[str]:
+    """What a run will take, for a reader."""
+
+    def about(cost_usd: float | None) -> str:
+        return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
+
+    measured = ", as measured before" if expected.measured else ""
+    singly = ", asked singly" if expected.batch is not None else ""
+    tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
+    yield f"driver  {expected.driver}"
+    yield f"trials  {expected.trials} that have not ended yet"
+    yield f"calls   about {expected.calls} that are not recorded yet"
+    yield f"tokens  {tokens}"
+    yield f"cost    {about(expected.cost_usd)}{singly}"
+    yield f"time    about {expected.minutes} minutes{singly}"
+    if (batch := expected.batch) is not None:
         yield (
-            f"{len(calls)} pairs of arms share {total} calls, where they asked the same in the "
-            "same slots: `merge-runner audit` names them"
+            f"batch   {about(batch.cost_usd)} in about {batch.rounds} rounds, at most "
+            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour; "
+            "after two the rest is asked singly"
         )
-
-
-def _failed(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
-    for trial_id, error in facts.failed[:FAILURES_SHOWN]:
-        yield f"failed: {trial_id}: {error}"
-    if len(facts.failed) > FAILURES_SHOWN:
-        yield f"... and {len(facts.failed) - FAILURES_SHOWN} more, in the table trials"
-    if facts.failed and outcome.exit_code != ReplayMiss.exit_code:
-        yield "Run the same command again to play the failed trials anew."
-
-
-def _counts(facts: SweepFacts, group: Callable[[str, str, bool], object]) -> Groups:
-    """Counts of trials by COLUMNS, for each group by variant, condition, and had a fallback."""
-    groups: Groups = defaultdict(lambda: dict.fromkeys(COLUMNS, 0))
-    for variant, condition, status, merged_first, fell_back, trials in facts.outcomes:
-        _count(groups[group(variant, condition, fell_back)], status, merged_first, trials)
-    return groups
-
-
-def _by_level(facts: SweepFacts) -> Groups:
-    """The same for each level of each factor."""
-    groups: Groups = defaultdict(lambda: dict.fromkeys(COLUMNS, 0))
-    for factor, level, status, merged_first, trials in facts.levels:
-        _count(groups[factor, level], status, merged_first, trials)
-    return groups
-
-
-def _by_fallback(facts: SweepFacts) -> Groups:
-    return _counts(facts, lambda _, __, fell_back: fell_back)
-
-
-def _count(counts: dict[str, int], status: str, merged_first: str | None, trials: int) -> None:
-    counts["trials"] += trials
-    if (column := f"{merged_first} first" if status == "finished" else status) in COLUMNS:
-        counts[column] += trials
-
-
-def _statuses(facts: SweepFacts) -> dict[str, int]:
-    counts: Counter[str] = Counter()
-    for _, _, status, _, _, trials in facts.outcomes:
-        counts[status] += trials
-    return {status: counts[status] for status in get_args(Status)}
-
-
-def _row(name: str, values: Iterable[object], width: int = 10) -> str:
-    # The widths do not depend on the counts, so that two runs can be compared side by side; rich
-    # would fit them to the content.
-    first, *others = values
-    return f"{name:<{max(width, 10)}}{first:>9}" + "".join(f"{value:>12}" for value in others)

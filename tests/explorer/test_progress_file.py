@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
@@ -26,7 +25,7 @@ SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm
 def standing(sweep_id="s", **changes):
     plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0"])
     plain = Progress(plan, 2, LocalRunner(plan, {}, 0), LEDGER).standing(sweep_id)
-    return replace(plain, **changes)
+    return plain.model_copy(update=changes)
 
 
 async def begun(db):
@@ -123,14 +122,12 @@ def test_the_name_of_a_sweep_leads_out_of_no_folder(tmp_path):
     assert (tmp_path / "outside.json").exists()
 
 
-def test_a_disk_that_takes_no_file_fails_nothing_and_is_told_of_once(tmp_path, caplog):
+def test_a_disk_that_takes_no_file_fails_nothing(tmp_path):
     (tmp_path / "m.duckdb.progress").write_text("a file where the folder should be")
     file = ProgressFile(tmp_path / "m.duckdb", "s")
-    for _ in range(3):
-        file.write(standing())
+    file.write(standing())
     file.remove()
     clear_dead(tmp_path / "m.duckdb")
-    assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
 @pytest.mark.parametrize("text", ["", "{", '{"sweep_id": "s"}', "\x00" * 9, "[" * 10_000])
@@ -145,4 +142,4 @@ def test_what_was_stored_before_has_ended_and_what_failed_has_not():
     progress = Progress(plan, 3, LocalRunner(plan, {}, 1), LEDGER, stored=1)
     progress.outcome_counts.update(collided=1, failed=1, suspended=1)
     standing = progress.standing("s")
-    assert (standing.ended, standing.failed, progress.ended) == (2, 1, 2)
+    assert (standing.ended, standing.failed) == (2, 1)

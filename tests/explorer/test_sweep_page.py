@@ -86,7 +86,7 @@ def running(db, **changes):
     """Say that the sweep runs, in this process."""
     shown = progress(runner(), planned=3 * len(CONDITIONS))
     shown.outcome_counts = Counter(changes.pop("ended", {"finished": 2}))
-    standing = replace(shown.standing("sweep-1"), left_s=20.0, **changes)
+    standing = shown.standing("sweep-1").model_copy(update={"left_s": 20.0, **changes})
     file = ProgressFile(db, "sweep-1")
     file.write(standing)
     return file

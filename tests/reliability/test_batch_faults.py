@@ -14,10 +14,10 @@ import httpx
 import pytest
 from aiohttp import web
 
-from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import Options, make_plan
 from tests.harness import run_sweep, watched
+from tests.mock_server import BatchPlan, FaultPlan
 
 FORMATS = {"openai": "openai-chat", "anthropic": "anthropic", "gemini": "gemini"}
 REGISTRY = """

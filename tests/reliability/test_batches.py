@@ -14,9 +14,9 @@ from collections import Counter
 import httpx
 import pytest
 
-from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
 from tests.harness import FAST, PROJECT, watched
+from tests.mock_server import BatchPlan, FaultPlan
 
 KILLS = 20
 TWO = ("--conditions", "L_4_0,N_0_0", "--reps", 1)
@@ -227,9 +227,9 @@ async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--batch", "--replay"), "leave --batch out"),
-        (("--batch", "--dask", "local:1"), "leave --dask out"),
-        (("--batch", "--model", "constant"), "no language model is asked: leave --batch out"),
+        (("--batch", "--replay"), "leave it, --replay or --dask out"),
+        (("--batch", "--dask", "local:1"), "leave it, --replay or --dask out"),
+        (("--batch", "--model", "constant"), "leave it, --replay or --dask out"),
         (("--batch", "--model", "local"), "local has no batch mode that is known; valid with"),
     ],
 )

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-import time
+from datetime import UTC, datetime, timedelta
 
-from merge_runner.llm.meter import Meter
+from merge_runner.llm.client import Meter
 from merge_runner.records import Attempt, Usage
+from merge_runner.run.progress import rows_of
 from tests.run.standings import progress, runner
+
+
+def ago(seconds):
+    return datetime.now(UTC) - timedelta(seconds=seconds)
+
+
+def rows(shown):
+    return rows_of(shown.standing(""))
 
 
 def test_every_figure_is_that_of_the_meters():
@@ -14,39 +23,33 @@ def test_every_figure_is_that_of_the_meters():
     meters[0].count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
     meters[1].count_attempt(Attempt(1, "timeout"))
     meters[1].mismatches["o3 -> gpt-4o"] = 2
-    shown = progress(runner(*meters, running=5), cap_usd=20, started=time.monotonic() - 60)
+    shown = progress(runner(*meters, running=5), cap_usd=20, began_at=ago(60))
     shown.planned += 7
     shown.stored += 7
     shown.outcome_counts.update(finished=2, failed=1, suspended=1)
-    fields = dict(shown.fields())
+    fields = dict(rows(shown))
     assert fields["trials"] == "3/10 ended (+7 stored before), 5 running"
     assert fields["failed"] == "1"
     assert fields["WARNING"] == "another model answers: o3 -> gpt-4o"
     assert fields["calls"] == "34 live, 12 from recordings"
-    assert fields["rate"] == "2 requests/min, 150 tokens/min"
     assert fields["cost"] == "1.50 USD, 4.25 of 20 over all runs"
     # 3 of 10 trials have ended but only 46 of 210 calls are made: the larger share tells.
     assert fields["time"] == "60 s, about 140 s left"
 
 
 def test_the_calls_tell_the_time_left_while_no_trial_has_ended():
-    shown = progress(runner(Meter(calls_live=70)), started=time.monotonic() - 10)
-    assert dict(shown.fields())["time"] == "10 s, about 20 s left"
+    shown = progress(runner(Meter(calls_live=70)), began_at=ago(10))
+    assert dict(rows(shown))["time"] == "10 s, about 20 s left"
     shown.runner = runner(Meter())
-    assert dict(shown.fields())["time"] == "10 s"
+    assert dict(rows(shown))["time"] == "10 s"
 
 
-def test_batches_are_shown_with_their_cost_in_the_end_and_that_nobody_need_wait():
+def test_batches_are_shown_and_that_nobody_need_wait():
     texts = [f"round 4 of at most 30: 220 calls of o3 in batch {number}" for number in range(5)]
-    meter = Meter(calls_live=70)
-    meter.count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
-    shown = progress(runner(meter), cap_usd=20, batches=lambda: texts)
-    assert [text for name, text in shown.fields() if name == "batches"] == [
+    shown = progress(runner(Meter(calls_live=70)), batches=lambda: texts)
+    assert [text for name, text in rows(shown) if name == "waiting"] == [
         *texts[:3],
         "2 others",
         "you may close this: the same command goes on",
     ]
-    assert (
-        dict(shown.fields())["cost"] == "1.50 USD, about 4.50 in the end, 4.25 of 20 over all runs"
-    )
-    assert "left" not in dict(shown.fields())["time"]  # nobody knows how long a batch takes
+    assert "left" not in dict(rows(shown))["time"]  # nobody knows how long a batch takes

@@ -8,9 +8,9 @@ import json
 import pytest
 
 from merge_runner import Study
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.results.store import results_digest
 from tests.harness import FAST, watched
+from tests.mock_server import FaultPlan
 
 DEAR = """
 [dear]
@@ -68,7 +68,7 @@ async def test_a_study_in_one_file_runs_within_its_budget_and_is_shown_by_factor
         await process.wait()
         short = await merge_runner(*sweep, cwd=mine, **env)
         assert (short.code, bill.usd <= 1.5) == (3, True), short.err
-        assert "raise [budget] of study.toml" in short.err
+        assert "or the study's budget" in short.err
         with_budget(mine, 20)
         whole = await merge_runner(*sweep, cwd=mine, **env)
         assert (whole.code, whole.summary["trials"]["planned"]) == (0, 48), whole.err

@@ -41,7 +41,7 @@ from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
 from merge_runner.records import ChatRequest
 
 if TYPE_CHECKING:
-    from merge_runner.llm.call import Call
+    from merge_runner.llm.client import Call
 
 # The prefix of names in the cache.
 _BATCH = "batch "
@@ -107,6 +107,7 @@ class Line:
 
     call: Call
     paid: PaidAttempt
+    model: str
     batch: asyncio.Future[Batch]
 
 
@@ -155,9 +156,9 @@ class Rounds:
                 return None
         return batch
 
-    async def ask(self, call: Call, paid: PaidAttempt) -> tuple[AttemptOutcome, Batch]:
+    async def ask(self, call: Call, paid: PaidAttempt, model: str) -> tuple[AttemptOutcome, Batch]:
         """Return what became of a call's next attempt, in the next round or where it waits."""
-        batch = call.open or await self._next_round(call, paid)
+        batch = call.open or await self._next_round(call, paid, model)
         while True:
             await asyncio.shield(batch.work or self._start(batch))
             if call.request.key not in batch.note.lines:
@@ -167,7 +168,7 @@ class Rounds:
                 end = _no_answer("not_created", "the run ended before", charged=False)
             if end is not None:
                 return end, batch
-            batch = await self._next_round(call, paid)
+            batch = await self._next_round(call, paid, model)
 
     async def watch(self, is_idle: Callable[[], bool]) -> None:
         """Close each round when nothing else goes on; ``is_idle`` says whether that is so."""
@@ -214,8 +215,8 @@ class Rounds:
                 return True
         return False
 
-    async def _next_round(self, call: Call, paid: PaidAttempt) -> Batch:
-        line = Line(call, paid, asyncio.get_running_loop().create_future())
+    async def _next_round(self, call: Call, paid: PaidAttempt, model: str) -> Batch:
+        line = Line(call, paid, model, asyncio.get_running_loop().create_future())
         self._forming.append(line)
         return await line.batch
 
@@ -223,7 +224,7 @@ class Rounds:
         groups: defaultdict[tuple[str, str], list[Line]] = defaultdict(list)
         for line in self._forming:
             if not line.batch.done():  # somebody waits for it yet
-                groups[line.call.asked.model, line.paid.ledger.scope].append(line)
+                groups[line.model, line.paid.ledger.scope].append(line)
         self._forming = []
         for (model, ledger), lines in groups.items():
             most = self._most.get(model, MOST_CALLS)

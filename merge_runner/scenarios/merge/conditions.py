@@ -87,22 +87,8 @@ def _human(name: str) -> Condition:
 # A name says who has the projected headway advantage (L, R or N), the projected headway in m and
 # the relative velocity in 0.1 m/s: in ``L_4_-8`` the left vehicle would be 4 m ahead at the merge
 # point and is 0.8 m/s slower.
-HUMAN_CONDITIONS: dict[str, Condition] = {
-    name: _human(name)
-    for name in (
-        "R_-4_-8",
-        "R_-4_0",
-        "R_-4_8",
-        "R_-2_8",
-        "R_0_8",
-        "N_0_0",
-        "L_0_-8",
-        "L_2_-8",
-        "L_4_-8",
-        "L_4_0",
-        "L_4_8",
-    )
-}
+_NAMES = "R_-4_-8 R_-4_0 R_-4_8 R_-2_8 R_0_8 N_0_0 L_0_-8 L_2_-8 L_4_-8 L_4_0 L_4_8"
+HUMAN_CONDITIONS = {name: _human(name) for name in _NAMES.split()}
 """Those of the human experiment (Siebinga et al., 4TU 19550377), which are the paper's, too."""
 
 NUMBER = r"-?\d{1,4}(?:\.\d{1,4})?"

@@ -150,6 +150,7 @@ class Run:
             limiter=Limiter(),
             budget=budget,
             rounds=self.rounds,
+            model="m",
             batch_price=0.5,
         )
 

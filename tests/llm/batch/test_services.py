@@ -8,12 +8,12 @@ from collections import Counter
 import httpx
 import pytest
 
-from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.llm.batch.service import BatchFailed
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import judge
 from tests.llm.batch.conftest import endpoint_at
 from tests.llm.batch.lines import keys, lines
+from tests.mock_server import BatchPlan, FaultPlan
 
 MARK = "round-1"
 
