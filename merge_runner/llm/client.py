@@ -301,10 +301,10 @@ class LlmClient:
         try:
             recorded = self.cache.get(request.key)
         except RecordingError as exc:
-            if self.sealed:
-                raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-            return None
-        return None if recorded is None else self._read(recorded, len(recorded.attempts))
+            if not self.sealed:
+                return None
+            raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
+        return self._read(recorded, len(recorded.attempts)) if recorded else None
 
     def _count(self, reply: ChatReply) -> None:
         """Count an answer that a trial uses, and who gave it where it is another model."""
