@@ -8,16 +8,14 @@ from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
 
 from merge_runner.config import (
-    ModelEntry,
     check_network,
     rehearsal_endpoint,
     resolve_endpoint,
 )
 from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
-from merge_runner.llm.batch.rounds import Batches, Rounds
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
@@ -121,7 +119,7 @@ def live_clients(
     clients: dict[str, LlmClient] = {}
     under_way: dict[str, Call] = {}  # two names of one model may ask the same
     for name, entry in plan.entries.items():
-        model = plan.registered[name]
+        model, terms = plan.registered[name], batch_terms(entry)
         if model not in transports:
             if plan.is_rehearsal:
                 endpoint = rehearsal_endpoint(entry)
@@ -144,7 +142,7 @@ def live_clients(
                 window_s=WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S,
             )
             limiters.setdefault(model, limiter)
-            if rounds is not None and batch_terms(entry) is not None:
+            if rounds is not None and terms is not None:
                 service = SERVICES[entry.format]
                 rounds.services[model] = service(transports[model], endpoint, FORMATS[entry.format])
         clients[name] = LlmClient(
@@ -161,30 +159,21 @@ def live_clients(
                 passed=rounds is not None and rounds.submits,
                 known=name in earlier,
             ),
-            batches=_batches(model, entry, budget, cache, rounds),
+            rounds=rounds if terms else None,
+            model=model,
+            batch_price=terms.price_factor if terms else 1.0,
             under_way=under_way,
         )
     return clients
-
-
-def _batches(
-    model: str, entry: ModelEntry, budget: Budget, cache: ResponseCache, rounds: Rounds | None
-) -> Batches | None:
-    """The batches in which a model is asked; None where it has none."""
-    terms = batch_terms(entry)
-    if rounds is None or terms is None:
-        return None
-    money = Budget(Ledger(cache, "")) if entry.price == "free" else budget
-    return Batches(rounds, model, money, terms.price_factor)
 
 
 def open_rounds(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
 ) -> Rounds | None:
     """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
-    journal = Journal(cache)
     models = set(plan.registered.values())
-    left = [each for each in journal.batches() if each.model in models and journal.waits(each)]
+    rounds = Rounds(cache, models, submits=options.batch, say=say)
+    left = bool(rounds.batches)
     if options.dask is not None:
         if left:
             raise UsageError(
@@ -196,7 +185,7 @@ def open_rounds(
         say("calls that wait in batches of an earlier run are not asked again")
     if not options.batch and not left:
         return None
-    return Rounds(journal, {}, submits=options.batch, say=say)
+    return rounds
 
 
 def check_batches(plan: Plan, options: Options) -> None:

@@ -200,7 +200,7 @@ def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
         if (audit := outcome.audit) is not None:
             checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
             yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
-            notes = [f"note: {each}" for each in (*audit.notes, *audit.sharings)]
+            notes = [f"note: {each}" for each in audit.notes]
             yield from first_of(notes, "more notes: `merge-runner audit`", SHOWN)
         failed = [f"failed: {trial_id}: {error}" for trial_id, error in facts.failed]
         yield from first_of(failed, "more, in the table trials", SHOWN)
