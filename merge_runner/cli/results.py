@@ -8,9 +8,8 @@ import sys
 import tempfile
 from dataclasses import asdict
 from datetime import UTC, datetime
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -23,6 +22,7 @@ CACHE = "Also compare every attempt with this cache folder."
 COLUMNS = ("name", "provider", "key", "usd_per_m_in", "usd_per_m_out", "shutdown", "id", "prices")
 
 SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
+Form = Literal["text", "csv", "json"]
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
 
 recording_app = typer.Typer(
@@ -30,18 +30,10 @@ recording_app = typer.Typer(
 )
 
 
-class Format(StrEnum):
-    """Output formats of a table."""
-
-    TEXT = "text"
-    CSV = "csv"
-    JSON = "json"
-
-
 def sql(
     query: Annotated[str, typer.Argument(metavar="QUERY", help="One SQL query.")],
     db: cli.DbOption = DEFAULT_DB,
-    output: Annotated[Format, typer.Option("--format", help="Form of the result.")] = Format.TEXT,
+    output: Annotated[Form, typer.Option("--format", help="Form of the result.")] = "text",
     as_json: cli.JsonOption = False,
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
@@ -49,11 +41,11 @@ def sql(
     from merge_runner.results.query_output import write_csv, write_json, write_table
     from merge_runner.results.store import answer
 
-    writers = {Format.TEXT: write_table, Format.CSV: write_csv, Format.JSON: write_json}
+    writers = {"text": write_table, "csv": write_csv, "json": write_json}
     # A slow reader of a pipe would otherwise keep every sweep from writing meanwhile.
     with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as spooled:
         with answer(db, query) as result:
-            writers[Format.JSON if as_json else output](names_of(result), fetched(result), spooled)
+            writers["json" if as_json else output](names_of(result), fetched(result), spooled)
         spooled.seek(0)
         shutil.copyfileobj(spooled, sys.stdout)
 

@@ -54,13 +54,7 @@ from merge_runner.study.crossing import (
     file_prompts,
     listed_levels,
 )
-from merge_runner.study.file import (
-    EVERY_CONDITION,
-    EVERY_PROMPT,
-    BudgetTerms,
-    StudyFile,
-    StudySource,
-)
+from merge_runner.study.file import EVERY_CONDITION, EVERY_PROMPT, StudyFile, StudySource
 from merge_runner.study.parts import load_study
 from merge_runner.text_safety import in_a_name
 
@@ -163,7 +157,7 @@ class Plan(BaseModel):
 
         A study with a budget of its own has one ledger over all its models and samples.
         """
-        if self.study.file.budget != BudgetTerms():
+        if self.study.file.budget.total_usd is not None:
             return self.study.name
         models = ",".join(sorted(self.model.split(",")))
         seat = f"/{self.seat}" if self.seat else ""
@@ -196,11 +190,6 @@ class Plan(BaseModel):
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
         return any(map(_is_scripted, self.arms))
-
-    @property
-    def is_free(self) -> bool:
-        """Whether nobody charges for its calls."""
-        return all(entry.price == "free" for entry in self.entries.values())
 
     @property
     def is_rehearsal(self) -> bool:

@@ -63,7 +63,7 @@ class Progress:
         ended = self.outcome_counts.total() - self.outcome_counts["suspended"] - failed
         live, cached = (sum(m.calls_live for m in meters), sum(m.calls_cached for m in meters))
         cost_usd = sum(meter.cost_usd for meter in meters)
-        batches = _first(self.batches(), "others")
+        batches = first_of(self.batches(), "others")
         # How long a batch takes nobody knows.
         left_s = None if batches else self._left_s(elapsed_s, ended + failed, live + cached)
         before = f" (+{self.stored} stored before)" if self.stored else ""
@@ -128,10 +128,10 @@ class Progress:
             ends = [wait.until for wait in waits if wait.until is not None]
             until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
             texts.append(f"{len(waits)} {what}{until}")
-        return _first(texts, "other reasons")
+        return first_of(texts, "other reasons")
 
 
-def _first(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[str]:
+def first_of(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[str]:
     """The first texts, and how many ``others`` there are."""
     left_out = len(texts) - shown
     return [*texts[:shown], f"{left_out} {others}"] if left_out > 0 else texts
@@ -219,7 +219,7 @@ def _notes(progress: Progress) -> list[str]:
     for meter in progress.runner.meters.values():
         while meter.notes:
             notes[meter.notes.popleft()] = None
-    return _first(list(notes), "more like these", NOTES_SHOWN)
+    return first_of(list(notes), "more like these", NOTES_SHOWN)
 
 
 def say(line: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -12,7 +12,6 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, get_args
 
-from merge_runner.audit.findings import Audit
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.llm.cache import ResponseCache
@@ -23,6 +22,7 @@ from merge_runner.results.recorded_study import recorded_part
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
+from merge_runner.run.progress import first_of
 from merge_runner.run.sweep import Outcome, open_sweep
 
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
@@ -56,7 +56,8 @@ async def play(
     expected = None
     options = plan.within_budget(options)
     async with open_sweep(plan, options, say=say) as sweep:
-        if sweep.trials_to_play and not (options.replay or plan.is_free):
+        is_free = all(entry.price == "free" for entry in plan.entries.values())
+        if sweep.trials_to_play and not (options.replay or is_free):
             expected = await sweep.estimate()
             agree(expected)
         outcome = await sweep.run()
@@ -181,19 +182,28 @@ def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
             f"decisions: {facts.decisions}, {facts.invalid} invalid{share}, "
             f"{facts.fallbacks} fallbacks to an earlier plan"
         )
-        yield from _without_a_plan(facts)
+        yield from (
+            f"attempts without a plan, {model}, {variant}: {attempts} {fate} after {cause}"
+            for model, variant, fate, cause, attempts in facts.ledger
+            if fate != "driven"
+        )
     yield from _costs(outcome, summary)
     yield from (f"open batch: {text}" for text in outcome.batches)
     for key in outcome.meter.damaged:
         yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
     if facts is not None:
-        for pair, answers in summary["model_mismatches"].items():
-            yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
+        yield from (
+            f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
+            for pair, answers in summary["model_mismatches"].items()
+        )
         yield from _who_answered(outcome, facts)
-        if outcome.audit is not None:
-            yield from _audited(outcome.audit)
+        if (audit := outcome.audit) is not None:
+            checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
+            yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
+            notes = [f"note: {each}" for each in audit.notes]
+            yield from first_of(notes, "more notes: `merge-runner audit`", SHOWN)
         failed = [f"failed: {trial_id}: {error}" for trial_id, error in facts.failed]
-        yield from _first(failed, "more, in the table trials")
+        yield from first_of(failed, "more, in the table trials", SHOWN)
         if failed and outcome.exit_code != ReplayMiss.exit_code:
             yield "Run the same command again to play the failed trials anew."
     if outcome.sweep_id:
@@ -212,17 +222,6 @@ def _grid(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator
 
 def _short(value: object) -> object:
     return f"{value:.3g}" if isinstance(value, float) else value
-
-
-def _without_a_plan(facts: SweepFacts) -> Iterator[str]:
-    """What became of the attempts that gave no plan, by model and prompt."""
-    causes: defaultdict[tuple[str, str], Counter[str]] = defaultdict(Counter)
-    for model, variant, fate, outcome, attempts in facts.ledger:
-        if fate != "driven":
-            causes[model, variant][f"{fate} after {outcome}"] += attempts
-    for (model, variant), counts in causes.items():
-        named = ", ".join(f"{count} {what}" for what, count in counts.most_common())
-        yield f"attempts without a plan, {model}, {variant}: {named}"
 
 
 def _costs(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
@@ -260,24 +259,9 @@ def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
             yield f"The model `{model}` is a scripted stand-in, no language model."
         else:
             yield f"{driver}: a scripted stand-in answered, not {model}"
-    if outcome.meter.cost_usd and facts.stand_ins:
-        yield "replies of stand-ins are priced as the model's; nobody charges for them"
     for name, entry in outcome.plan.entries.items():
         if entry.note and entry.provider != EMULATOR:
             yield f"{name}: {entry.note}"
-
-
-def _audited(audit: Audit) -> Iterator[str]:
-    checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
-    yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
-    notes = [f"note: {each}" for each in audit.notes]
-    yield from _first(notes, "more notes: `merge-runner audit`")
-
-
-def _first(lines: Sequence[str], others: str) -> Iterator[str]:
-    yield from lines[:SHOWN]
-    if len(lines) > SHOWN:
-        yield f"... and {len(lines) - SHOWN} {others}"
 
 
 def estimate_lines(expected: Estimate) -> Iterator[str]:
