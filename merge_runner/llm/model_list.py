@@ -15,20 +15,20 @@ TIMEOUT_S = 60.0
 POLL_S = 0.5
 
 
-async def listed_models(endpoint: Endpoint, *, patient: bool = False) -> list[str]:
+async def listed_models(endpoint: Endpoint) -> list[str]:
     """Return the ids of the models; raises TransportFailure, ``no_list`` if there is no list.
 
-    A ``patient`` one waits some seconds for a server that is just starting.
+    A server that is just starting is waited for some seconds.
     """
     transport = HttpTransport(endpoint, connections=1)
-    patience_s, began_s = NOBODY_S if patient else 0.0, time.monotonic()
+    began_s = time.monotonic()
     try:
         while True:
             try:
                 raw = await transport.ask("GET", "/models", {}, timeout_s=TIMEOUT_S)
                 break
             except TransportFailure as exc:
-                if exc.outcome != "no_connection" or time.monotonic() - began_s >= patience_s:
+                if exc.outcome != "no_connection" or time.monotonic() - began_s >= NOBODY_S:
                     raise
             await asyncio.sleep(POLL_S)
     finally:

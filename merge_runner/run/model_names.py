@@ -31,7 +31,7 @@ async def served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None
     driver = driver_name(name, endpoint.identity)
     check_network(endpoint.base_url)
     try:
-        listed = await listed_models(endpoint, patient=True)
+        listed = await listed_models(endpoint)
     except TransportFailure as exc:
         if exc.outcome == "no_connection":
             raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
