@@ -27,11 +27,11 @@ from aiohttp import web
 
 from benchmarks.cases import Bench, Figures
 from benchmarks.processes import PROJECT, RUNNER
-from merge_runner.emulator.faults import FaultPlan, transient_faults
-from merge_runner.emulator.server import HOST, application
+from merge_runner.emulator.server import HOST
 from merge_runner.llm.content_hashes import call_key
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot
 from merge_runner.results.store import results_digest
+from tests.mock_server import FaultPlan, application, transient_faults
 
 FAULT_RATE, SEED = 0.2, 15
 LOOK_S = 0.2

@@ -9,6 +9,7 @@ import re
 import tomllib
 from base64 import b64encode
 from collections.abc import Container, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import date
 from functools import cached_property, partial
@@ -57,7 +58,6 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 # What the equations of motion can take: the square of 1e308 is no number.
 Rate = Annotated[Positive, Field(le=1e6)]
 Deviation = Annotated[NotNegative, Field(le=1e6)]
-VehicleSize = Annotated[Positive, Field(le=100)]
 Count = Annotated[int, Field(gt=0, strict=True)]
 Json = Annotated[JsonValue, AfterValidator(_finite)]
 Resistance = Literal["none", "human"]
@@ -83,14 +83,13 @@ def whole_steps(name: str, seconds: float, step_s: float) -> int:
 class Perception(Frozen):
     """How the driver of one side perceives the other vehicle; by default exactly, at once, always.
 
-    ``position_sd_m`` and ``speed_sd_mps`` are the standard deviations of the errors of how far the
-    other is ahead, and of its speed. An error stays for about ``autocorrelation_s``: after t
-    seconds it is correlated by exp(-t / autocorrelation_s) with itself (Uhlenbeck and Ornstein,
-    Phys. Rev. 36, 823, 1930); 0: each instant has an error of its own. What is seen is the other
-    as it was ``delay_s`` ago. A decision receives nothing with the probability ``dropout``, and
-    shows what was received last. The other is seen up to a relative distance of ``range_m``, and
-    once the own car is within ``view_from_m`` of the merge point, or past it. ``own`` gives the own
-    position and speed errors of the same sizes. ``own`` and ``autocorrelation_s`` need an error.
+    ``position_sd_m`` and ``speed_sd_mps`` are the standard deviations of the errors of the relative
+    distance and of the other's speed. An error after t seconds is correlated by
+    exp(-t / autocorrelation_s) with itself (Uhlenbeck and Ornstein, Phys. Rev. 36, 823, 1930); 0:
+    each instant has its own. The other is seen as it was ``delay_s`` ago. A decision receives
+    nothing with the probability ``dropout``, and shows what was received last. The other is seen up
+    to a relative distance of ``range_m``, and once the own car is within ``view_from_m`` of the
+    merge point, or past it. ``own`` gives the own position and speed errors of the same sizes.
     """
 
     position_sd_m: Deviation = 0.0
@@ -114,9 +113,10 @@ class Perception(Frozen):
 
     @model_validator(mode="after")
     def _errors_of_a_size(self) -> Perception:
-        for name, given in (("autocorrelation_s", self.autocorrelation_s), ("own", self.own)):
-            if given and not (self.position_sd_m or self.speed_sd_mps):
-                raise ValueError(f"{name} needs an error: set position_sd_m or speed_sd_mps")
+        if (self.autocorrelation_s or self.own) and not (self.position_sd_m or self.speed_sd_mps):
+            raise ValueError(
+                "autocorrelation_s and own need an error: set position_sd_m or speed_sd_mps"
+            )
         return self
 
 
@@ -150,8 +150,8 @@ class ScenarioConfig(Frozen):
     prompt_rate_hz: Positive = 1.0
     memory_s: Positive = 2.0
     max_acceleration_mps2: Rate = 2.5
-    vehicle_length_m: VehicleSize = 4.5
-    vehicle_width_m: VehicleSize = 1.8
+    vehicle_length_m: Annotated[Positive, Field(le=100)] = 4.5
+    vehicle_width_m: Annotated[Positive, Field(le=100)] = 1.8
     timeout_s: Positive = 30.0
     collision_rule: Literal["euclid2d", "rectangle", "shared_lane"] = "euclid2d"
     control_start: Literal["both_exits", "own_exit"] = "both_exits"
@@ -236,18 +236,16 @@ class BatchTerms(Frozen):
 class ModelEntry(Frozen):
     """One model of ``experiments/models.toml``.
 
-    ``provider`` is one of PROVIDERS, ``format`` one of the wire formats (llm/formats). ``id`` is
-    what is sent (UNNAMED: what a server of one's own serves); a served model that is neither it
-    nor one of ``aliases`` is reported as a mismatch. ``parameters`` go into the request as they
-    are; what is not listed is not sent, so that the provider's default applies;
-    ``applied_defaults`` puts on record which, and ``rejects`` names parameters that the model
-    refuses or does not heed. ``successor`` names the entry to go on with from the
-    ``shutdown`` on. ``efforts`` are the levels of ``reasoning_effort`` as parameters, for a model
-    that has no parameter of this name. ``price`` is ``free``, ``genai-prices`` (the table
-    of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a minute.
-    ``typical_output_tokens`` and ``typical_latency_s`` serve estimates and rehearsals alone. A
-    reply longer than ``max_reply_mb`` (unpacked) is refused. ``batch`` is the batch mode: the
-    ``provider``'s, ``none``, or one on the terms of another server that speaks the format.
+    ``id`` is what is sent (UNNAMED: what a server of one's own serves); a served model that is
+    neither it nor one of ``aliases`` is a mismatch. ``parameters`` go into the request as they are,
+    and nothing else does; ``applied_defaults`` puts on record which defaults of the provider apply,
+    ``rejects`` names parameters that the model refuses or does not heed, ``efforts`` the levels of
+    ``reasoning_effort`` as parameters, for a model that has none of this name. ``successor`` names
+    the entry to go on with from the ``shutdown`` on. ``price`` is ``free``, ``genai-prices`` (the
+    table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
+    minute. ``typical_output_tokens`` and ``typical_latency_s`` serve estimates and rehearsals
+    alone. A reply longer than ``max_reply_mb`` (unpacked) is refused. ``batch`` is the batch mode:
+    the ``provider``'s, ``none``, or one on the terms of another server that speaks the format.
     """
 
     provider: str
@@ -285,9 +283,9 @@ class Provider:
     ``auth`` is ``bearer`` or the header that holds the key. ``error_members`` are the members that
     every error of the provider has, by its documentation: one without them may be a gateway's.
     ``parameters`` are those that its servers take beside those of the wire format. ``batch`` are
-    the terms of its batch mode; None: it has none.
-    ``model_env`` is the variable that names the model of an entry without a name; a provider with
-    one also lists its models at ``/models``. ``if_nobody`` says what to do where nobody answers.
+    the terms of its batch mode. ``model_env`` is the variable that names the model of an entry
+    without a name; a provider with one also lists its models at ``/models``. ``if_nobody`` says
+    what to do where nobody answers.
     """
 
     base_url: str
@@ -303,6 +301,7 @@ class Provider:
 
 
 _half = partial(BatchTerms, price_factor=0.5)
+_ANTHROPIC_GUIDE = "platform.claude.com/docs/en/build-with-claude/batch-processing, 2026-11"
 PROVIDERS: Registry[Provider] = Registry("provider")
 for _name, _provider in {
     "openai": Provider(
@@ -327,9 +326,7 @@ for _name, _provider in {
         ("ANTHROPIC_API_KEY",),
         auth="x-api-key",
         error_members=frozenset({"message", "type"}),
-        batch=_half(
-            source="platform.claude.com/docs/en/build-with-claude/batch-processing, 2026-11"
-        ),
+        batch=_half(source=_ANTHROPIC_GUIDE),
     ),
     "openrouter": Provider(
         "https://openrouter.ai/api/v1",
@@ -382,38 +379,37 @@ class Endpoint:
         return self.provider == "emulator" or self.identity == REHEARSAL
 
 
+def _key_envs(entry: ModelEntry) -> tuple[str, ...]:
+    """Return the variables that may hold the key of a model, the first one first."""
+    return (entry.key_env,) if entry.key_env else PROVIDERS.require(entry.provider).key_envs
+
+
 def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.environ) -> Endpoint:
     """The endpoint of a model, from its entry and the environment.
 
-    Raises UsageError where a key is needed and none is set.
+    Raises UsageError where a key is needed and none is set, or where one cannot be sent.
     """
     provider = PROVIDERS.require(entry.provider)
-    key_envs = (entry.key_env,) if entry.key_env else provider.key_envs
-    key = next(filter(None, map(env.get, key_envs)), None)
-    if key is None and provider.key_needed:
+    variables = " or ".join(_key_envs(entry))
+    key = next(filter(None, map(env.get, _key_envs(entry))), "")
+    if not key and provider.key_needed:
         raise UsageError(
-            f"{name} needs a key: set {' or '.join(key_envs)}. Without one: `merge-runner "
-            "sweep baseline` runs the emulator, and `merge-runner replay baseline --model "
-            f"{name} --recording FILE.parquet` replays a recording."
+            f"{name} needs a key: set {variables}. Without one: `merge-runner sweep baseline` runs "
+            f"the emulator, and `merge-runner replay baseline --model {name} --recording "
+            "FILE.parquet` replays a recording."
         )
-    if key is not None and not (key.isascii() and key.isprintable() and " " not in key):
+    if not (key.isascii() and key.isprintable() and " " not in key):
         raise UsageError(
-            f"{name} needs another key: {' or '.join(key_envs)} holds a space, a line break or "
-            "another character that no key has"
+            f"{name} needs another key: {variables} holds a space, a line break or another "
+            "character that no key has"
         )
     base_url = endpoint_url(entry, env)
-    if key is not None and len(key) >= SHORTEST_SECRET and key.lower() in base_url.lower():
+    if len(key) >= SHORTEST_SECRET and key.lower() in base_url.lower():
         raise UsageError(f"the base URL of {name} holds its key: take it out, since URLs are shown")
-    headers: dict[str, str] = {}
-    if key is not None:
-        auth = entry.auth or provider.auth
-        headers = {"authorization": f"Bearer {key}"} if auth == "bearer" else {auth: key}
-    return Endpoint(
-        provider=entry.provider,
-        identity=endpoint_identity(entry, env),
-        base_url=base_url,
-        auth_headers=headers,
-    )
+    auth = entry.auth or provider.auth
+    headers = {"authorization": f"Bearer {key}"} if auth == "bearer" else {auth: key}
+    identity = endpoint_identity(entry, env)
+    return Endpoint(entry.provider, identity, base_url, headers if key else {})
 
 
 def endpoint_url(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
@@ -490,16 +486,12 @@ def pair_name(pair: Iterable[str], endpoints: Mapping[str, str]) -> str:
 
 
 def key_status(
-    name: str, entry: ModelEntry, env: Mapping[str, str] = os.environ
+    entry: ModelEntry, env: Mapping[str, str] = os.environ
 ) -> Literal["set", "missing", "not needed"]:
     """Whether the environment holds the key that a live run of the model needs."""
     if not PROVIDERS.require(entry.provider).key_needed:
         return "not needed"
-    try:
-        resolve_endpoint(name, entry, env)
-    except UsageError:
-        return "missing"
-    return "set"
+    return "set" if any(map(env.get, _key_envs(entry))) else "missing"
 
 
 def normalised_url(url: str, named: str = "base_url") -> str:
@@ -509,15 +501,11 @@ def normalised_url(url: str, named: str = "base_url") -> str:
     by what it is ``named``.
     """
     parts = _http_url(url.strip())
-    if parts is None:
+    if parts is None or "@" in parts.netloc or parts.query or parts.fragment:
         raise UsageError(
             f"{named} is no base URL: it must begin with http:// or https:// and name a host that "
-            "there can be, without spaces (write other letters than ASCII as xn--...)"
-        )
-    if "@" in parts.netloc or parts.query or parts.fragment:
-        raise UsageError(
-            f"{named} has a user name, a password or a part after ? or #, which are not sent: set "
-            "the provider's key variable"
+            "there can be, without spaces, a user name, a password or a part after ? or # (write "
+            "other letters than ASCII as xn--..., and a key into the provider's variable)"
         )
     name = parts.hostname or ""
     host = f"[{name}]" if ":" in name else name
@@ -537,9 +525,9 @@ def _http_url(url: str) -> SplitResult | None:
             ipaddress.ip_address(name)
         name.encode("idna")  # raises where a label is empty or too long
         is_host = parts.port != 0 and re.fullmatch(r"[\w.:-]+", name)
-        return parts if is_host and parts.scheme in ("http", "https") else None
     except ValueError:
         return None
+    return parts if is_host and parts.scheme in ("http", "https") else None
 
 
 def check_network(base_url: str, env: Mapping[str, str] = os.environ) -> None:
@@ -549,10 +537,8 @@ def check_network(base_url: str, env: Mapping[str, str] = os.environ) -> None:
     values are not shown: they may hold a password.
     """
     by_proxy = urlsplit(base_url).hostname not in LOOPBACK
-    for variable, value in env.items():
-        if not (by_proxy and value and variable.lower() in PROXY_VARIABLES):
-            continue
-        if _http_url(value if "://" in value else f"http://{value}") is None:
+    for variable, value in _proxies(env):
+        if by_proxy and _http_url(value) is None:
             raise UsageError(
                 f"{variable} is no URL of an HTTP proxy: set it to http://HOST:PORT or unset it; a "
                 "SOCKS proxy needs an HTTP proxy before it (privoxy, for one)"
@@ -562,18 +548,20 @@ def check_network(base_url: str, env: Mapping[str, str] = os.environ) -> None:
         raise UsageError("SSL_CERT_DIR names no folder that exists: correct it or unset it")
 
 
+def _proxies(env: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield the variables that name a proxy, and its URL."""
+    for variable, value in env.items():
+        if value and variable.lower() in PROXY_VARIABLES:
+            yield variable, value if "://" in value else f"http://{value}"
+
+
 def proxy_secrets(env: Mapping[str, str] = os.environ) -> Iterator[str]:
     """Yield the user info of the proxies' URLs and its password, as given, decoded and as sent."""
-    for variable, value in env.items():
-        if variable.lower() not in PROXY_VARIABLES:
-            continue
-        try:
-            parts = urlsplit(value if "://" in value else f"http://{value}")
-        except ValueError:  # it is no URL, and nothing goes there
-            continue
-        info = parts.netloc.rpartition("@")[0]
-        for given in {info, unquote(info)}:
-            yield from (given, given.partition(":")[2], b64encode(given.encode()).decode())
+    for _, url in _proxies(env):
+        with suppress(ValueError):  # it is no URL, and nothing goes there
+            info = urlsplit(url).netloc.rpartition("@")[0]
+            for given in {info, unquote(info)}:
+                yield from (given, given.partition(":")[2], b64encode(given.encode()).decode())
 
 
 def state_folder(env: Mapping[str, str] = os.environ) -> Path:
@@ -582,17 +570,17 @@ def state_folder(env: Mapping[str, str] = os.environ) -> Path:
     It lies in XDG_STATE_HOME, or else in HOME, and is never relative, or else a working folder
     could bring its own. Raises UsageError.
     """
-    for named, below in (("XDG_STATE_HOME", ""), ("HOME", ".local/state")):
-        folder = Path(env.get(named, ""))
-        if folder.is_absolute():
-            return folder / below / "merge-runner"
-    raise UsageError("HOME names no folder: set it, or XDG_STATE_HOME")
+    home = Path(env.get("HOME", ""), ".local/state")
+    folder = next(filter(Path.is_absolute, (Path(env.get("XDG_STATE_HOME", "")), home)), None)
+    if folder is None:
+        raise UsageError("HOME names no folder: set it, or XDG_STATE_HOME")
+    return folder / "merge-runner"
 
 
 def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
     """The variables of this environment that say where the entries' providers are reached."""
     variables = {PROVIDERS.require(entry.provider).base_url_env for entry in entries.values()}
-    return {v: os.environ[v] for v in variables if v is not None and os.environ.get(v)}
+    return {v: os.environ[v] for v in variables if v and os.environ.get(v)}
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -617,10 +605,8 @@ def validated(model: type[ModelT], value: object, where: str) -> ModelT:
 
 def experiments() -> list[Path]:
     """The folders of studies: that of the working directory goes before what ships."""
-    here = Path("experiments")
-    if here.is_dir() and not (SHIPPED_EXPERIMENTS.is_dir() and here.samefile(SHIPPED_EXPERIMENTS)):
-        return [here, SHIPPED_EXPERIMENTS]
-    return [here if here.is_dir() else SHIPPED_EXPERIMENTS]
+    folders = {path.resolve(): path for path in (SHIPPED_EXPERIMENTS, Path("experiments"))}
+    return [path for path in reversed(folders.values()) if path.is_dir()]
 
 
 def url_origin(url: str) -> str:
@@ -631,19 +617,17 @@ def url_origin(url: str) -> str:
 
 def _explain(exc: ValidationError, model: type[BaseModel]) -> Iterator[str]:
     for error in exc.errors():
-        place = ".".join(str(part) for part in error["loc"])
-        if error["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-            owner: Any = model
-            for part in error["loc"][:-1]:
-                known = getattr(owner, "model_fields", {}).get(str(part))
-                owner = (known and model_in(known.annotation)) or owner
-            keys = (
-                [each.name for each in fields(owner)] if is_dataclass(owner) else owner.model_fields
-            )
-            yield str(unknown_name("key", place, keys))
-        else:
-            text = error["msg"].removeprefix("Value error, ")
+        place = ".".join(map(str, error["loc"]))
+        text = error["msg"].removeprefix("Value error, ")
+        if error["type"] not in ("extra_forbidden", "unexpected_keyword_argument"):
             yield f"{place}: {text}" if place else text
+            continue
+        owner: Any = model
+        for part in error["loc"][:-1]:
+            known = getattr(owner, "model_fields", {}).get(str(part))
+            owner = (known and model_in(known.annotation)) or owner
+        keys = [f.name for f in fields(owner)] if is_dataclass(owner) else owner.model_fields
+        yield str(unknown_name("key", place, keys))
 
 
 def model_in(annotation: object) -> type | None:

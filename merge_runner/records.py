@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -27,6 +27,13 @@ SCRIPTED_FIELD = "merge_runner_scripted"
 # request's body, and the slot if the request named one.
 ANSWERED_FIELD = "merge_runner_request"
 
+# What an attempt can have: a recorded one with other values is damaged, or made up.
+Number = Annotated[int, Field(ge=1, le=2**31 - 1)]
+Amount = Annotated[float, Field(ge=0, le=2**31 - 1)]
+Tokens = Annotated[int, Field(ge=0, le=2**33)]
+HttpStatus = Annotated[int, Field(ge=0, le=999)]
+Outcome = Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,39}$")]
+
 FAR_BEHIND_M = 1000.0
 """Where the other vehicle is put while it is not seen; see Observation."""
 
@@ -49,15 +56,13 @@ class Slot:
     decision: int
     sample_set: int
 
+    def __str__(self) -> str:
+        """The slot for a reader."""
+        return f"{self.condition} rep {self.repetition} {self.side}, decision {self.decision}"
+
     def as_dict(self) -> dict[str, str | int]:
-        """The slot as plain JSON values."""
-        return {
-            "condition": self.condition,
-            "decision": self.decision,
-            "repetition": self.repetition,
-            "sample_set": self.sample_set,
-            "side": self.side,
-        }
+        """The slot as plain JSON values, by their names' order."""
+        return dict(sorted(asdict(self).items()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +96,10 @@ class Observation:
 class Usage:
     """Tokens of one attempt; ``input`` includes the cached ones, ``output`` the reasoning ones."""
 
-    input_tokens: int | None = None
-    cached_input_tokens: int | None = None
-    output_tokens: int | None = None
-    reasoning_tokens: int | None = None
+    input_tokens: Tokens | None = None
+    cached_input_tokens: Tokens | None = None
+    output_tokens: Tokens | None = None
+    reasoning_tokens: Tokens | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,17 +114,17 @@ class Attempt:
     A line has no latency.
     """
 
-    number: int
-    outcome: str
-    http_status: int | None = None
+    number: Number
+    outcome: Outcome
+    http_status: HttpStatus | None = None
     model_served: str | None = None
     finish_reason: str | None = None
     usage: Usage = field(default_factory=Usage)
-    latency_s: float | None = None
+    latency_s: Amount | None = None
     started_at: str | None = None
     reply: str | None = None
     error: str | None = None
-    cost_usd: float | None = None
+    cost_usd: Amount | None = None
     scripted: bool = False
     # Left out where there is none, so that what is kept of other attempts stays as it was.
     batch_id: Annotated[str | None, Field(exclude_if=lambda value: value is None)] = None

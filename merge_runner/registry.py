@@ -12,6 +12,7 @@ What a study adds is in a ``Catalogue`` of its own, which the tables show while 
 from __future__ import annotations
 
 import re
+from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -65,7 +66,7 @@ class Registry(Mapping[str, T]):
         """Add a thing, and return it; raises UsageError where the name is taken or odd."""
         if not NAME.fullmatch(name):
             raise UsageError(f"the {self.kind} {name!r} needs a name of letters, digits, _ - and .")
-        if name in self._things or name in self._of_study:
+        if name in self._things or name in in_use().parts.get(self.kind, {}):
             raise UsageError(f"there is a {self.kind} {name!r} already")
         things = in_use().parts.setdefault(self.kind, {}) if self.collecting else self._things
         things[name] = thing
@@ -85,24 +86,19 @@ class Registry(Mapping[str, T]):
         return require(self, self.kind, name, hint)
 
     @property
-    def _of_study(self) -> Mapping[str, T]:
-        return in_use().parts.get(self.kind, {})
+    def _all(self) -> ChainMap[str, T]:
+        """Those of the study, and before them those that are installed."""
+        load_plugins()
+        return ChainMap(in_use().parts.get(self.kind, {}), self._things)
 
     def __getitem__(self, name: str) -> T:
-        """The thing of this name; raises KeyError."""
-        load_plugins()
-        study = self._of_study
-        return study[name] if name in study else self._things[name]
+        return self._all[name]
 
     def __iter__(self) -> Iterator[str]:
-        """All names."""
-        load_plugins()
-        return iter({**self._things, **self._of_study})
+        return iter(self._all)
 
     def __len__(self) -> int:
-        """How many there are."""
-        load_plugins()
-        return len({**self._things, **self._of_study})
+        return len(self._all)
 
 
 def in_use() -> Catalogue:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec, resolve_name
 from io import StringIO
@@ -13,8 +14,8 @@ from tokenize import COMMENT, NL, generate_tokens
 from merge_runner.errors import UsageError
 
 SHARED = "merge_runner.drivers"
-# It makes no decision.
-WITHOUT = f"{SHARED}.registry"
+# The registry makes no decision, and what is typed into a notebook is in no file.
+WITHOUT = (f"{SHARED}.registry", "__main__")
 
 
 @cache
@@ -31,11 +32,18 @@ def source_digest(driver: type) -> str:
     waiting = [driver.__module__]
     while waiting:
         name = waiting.pop()
-        if name not in {*sources, WITHOUT} and f"{name}.".startswith(packages):
-            source = _source(name)
-            if source is not None:
-                sources[name] = source
-                waiting += _imported(name, source)
+        module = None
+        if name not in {*sources, *WITHOUT} and f"{name}.".startswith(packages):
+            with suppress(ModuleNotFoundError, ValueError):  # it may be something within a module
+                module = find_spec(name)
+        if module is not None:
+            read = getattr(module.loader, "get_source", None)
+            source = read(name) if read else None
+            if source is None:
+                raise UsageError(f"the source of {name} is not there, and is needed: install it")
+            sources[name] = source
+            is_package = module.submodule_search_locations is not None
+            waiting += _imported(source, name if is_package else name.rpartition(".")[0])
     if driver.__module__ not in sources:
         raise UsageError(
             f"the source of {driver.__qualname__} cannot be found, as that of a class of a "
@@ -62,41 +70,18 @@ def code_of(source: str) -> tuple[str, ...]:
         elif token.type == NL and not lines[row - 1].strip():
             dropped.add(row)
     for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Expr) and _is_text(node.value):
-            first, last = node.lineno, node.end_lineno or node.lineno
-            before = lines[first - 1].encode()[: node.col_offset]
-            after = lines[last - 1].encode()[node.end_col_offset :]
-            if not (before + after).strip():
-                dropped.update(range(first, last + 1))
+        if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
+            continue
+        first, last = node.lineno, node.end_lineno or node.lineno
+        around = lines[first - 1].encode()[: node.col_offset]
+        around += lines[last - 1].encode()[node.end_col_offset :]
+        if isinstance(node.value.value, str) and not around.strip():
+            dropped.update(range(first, last + 1))
     return tuple(line for row, line in enumerate(lines, 1) if row not in dropped)
 
 
-def _is_text(value: ast.expr) -> bool:
-    return isinstance(value, ast.Constant) and isinstance(value.value, str)
-
-
-def _source(name: str) -> str | None:
-    """The source of a module; None where the name is that of something within one."""
-    if name == "__main__":  # what is typed into a notebook is in no file
-        return None
-    try:
-        found = find_spec(name)
-    except (ModuleNotFoundError, ValueError):
-        return None
-    if found is None:
-        return None
-    read = getattr(found.loader, "get_source", None)
-    source: str | None = read(name) if read else None
-    if source is None:
-        raise UsageError(f"the source of {name} is not there, and is needed: install that too")
-    return source
-
-
-def _imported(name: str, source: str) -> Iterator[str]:
-    """What a module may import, also within functions."""
-    found = find_spec(name)
-    assert found is not None
-    package = name if found.submodule_search_locations is not None else name.rpartition(".")[0]
+def _imported(source: str, package: str) -> Iterator[str]:
+    """What a module of a package may import, also within functions."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

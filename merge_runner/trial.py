@@ -22,7 +22,7 @@ from merge_runner.records import (
 )
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.scenarios.merge.world import Starts, World
+from merge_runner.scenarios.merge.world import World
 
 
 async def play_trial(
@@ -34,28 +34,38 @@ async def play_trial(
 ) -> TrialRecord:
     """Play a trial to its end, or until a call fails.
 
-    Drivers are asked at once, or ``in_turn`` where their answers are there already.
+    Drivers are asked at once, or ``in_turn`` where their answers are there already. Raises
+    UsageError for a decision that cannot be driven.
     """
     world = World(scenario, CONDITIONS.require(spec.condition), TRACK)
-    if starts := _starts(drivers):
-        world.start_at(starts)
+    # Each side starts as its own driver says, or else as the other's does.
+    given = {side: d.starts for side, d in drivers.items() if hasattr(d, "starts")}
+    if given:
+        some = next(iter(given.values()))
+        world.start_at({side: given.get(side, some)[side] for side in SIDES})
     seats = {side: _seated(drivers[side], world) for side in SIDES}
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}
     while world.status is None:
-        answers = await _decide(world, seats, in_turn)
-        failures = {s: a for s, a in answers.items() if isinstance(a, CallFailed)}
-        for side, answer in answers.items():
-            if isinstance(answer, Decision):
-                number = seats[side].take(answer, world.step)
-                told = seats[side].told
-                decisions.append(DecisionRow(number, world.time_s, side, answer, told))
+        due = [side for side in SIDES if seats[side].is_due(world) and world.in_control(side)]
+        if in_turn or len(due) < 2:  # both
+            answers = [await _answer(seats[side], world) for side in due]
+        else:
+            answers = await asyncio.gather(*(_answer(seats[side], world) for side in due))
+        for side, answer in zip(due, answers, strict=True):
+            if isinstance(answer, CallFailed):
+                failures[side] = answer
+                continue
+            seat = seats[side]
+            seat.take(answer, world.step)
+            number = seat.number(world.step)
+            decisions.append(DecisionRow(number, world.time_s, side, answer, seat.told))
         if failures:
             break
         world.advance({side: seats[side].action(world.step) for side in SIDES})
-        for side, seated in seats.items():
-            if seated.eyes:
-                seated.eyes.look(world.observe(side))
+        for side, seat in seats.items():
+            if seat.eyes:
+                seat.eyes.look(world.observe(side))
     return TrialRecord(
         spec=spec,
         status=world.status or "failed",
@@ -78,20 +88,6 @@ async def play_trial(
     )
 
 
-def _starts(drivers: Mapping[Side, Driver]) -> Starts | None:
-    """Return where the vehicles start; None where no driver has ``starts`` of both sides.
-
-    Each side starts as its own driver says, or else as the other's does.
-    """
-    known: dict[Side, Starts] = {
-        side: driver.starts for side, driver in drivers.items() if hasattr(driver, "starts")
-    }
-    if not known:
-        return None
-    (some, *_) = known.values()
-    return {side: known.get(side, some)[side] for side in SIDES}
-
-
 @dataclass(slots=True)
 class _Seated:
     """A driver in its trial: what it decided last, and at which step of the world.
@@ -105,23 +101,16 @@ class _Seated:
     decision: Decision | None = None
     decided_at: int = 0
 
-    def is_due(self, step: int) -> bool:
-        """Whether it decides at a step: its instants count from the start of the trial."""
-        return step % self.driver.seat.pace.interval_steps == 0
+    def is_due(self, world: World) -> bool:
+        """Whether it decides now: its instants count from the start of the trial."""
+        return world.step % self.driver.seat.pace.interval_steps == 0
 
     def number(self, step: int) -> int:
         """The number of its decision at a step, or of the last one before."""
         return step // self.driver.seat.pace.interval_steps
 
-    def observe(self, world: World) -> Observation:
-        """What the driver is told of the world as it is now."""
-        if self.eyes is None:
-            return world.observe(self.driver.seat.side)
-        self.told = self.eyes.told()
-        return self.told
-
-    def take(self, decision: Decision, step: int) -> int:
-        """Drive by a decision from now on; returns its number. Raises UsageError for an odd one."""
+    def take(self, decision: Decision, step: int) -> None:
+        """Drive by a decision from now on; raises UsageError for one that cannot be driven."""
         seat = self.driver.seat
         if len(decision.applied) != seat.pace.executed_actions or not all(
             -1 <= action <= 1 for action in decision.applied
@@ -131,7 +120,6 @@ class _Seated:
                 f"{seat.pace.executed_actions} actions from -1 to 1"
             )
         self.decision, self.decided_at = decision, step
-        return self.number(step)
 
     def action(self, step: int) -> float | None:
         """What is driven in a step; None: nothing is decided yet, and the vehicle cruises."""
@@ -150,23 +138,11 @@ def _seated(driver: Driver, world: World) -> _Seated:
     return _Seated(driver, Eyes(perception, seat.seed, seat.scenario.step_s, start))
 
 
-async def _decide(
-    world: World, seats: Mapping[Side, _Seated], in_turn: bool
-) -> dict[Side, Decision | CallFailed]:
-    """Ask all who are due; where one call fails, the other's answer is still awaited."""
-    asked = {
-        side: (seated, seated.observe(world), world.step)
-        for side, seated in seats.items()
-        if seated.is_due(world.step) and world.in_control(side)
-    }
-    if in_turn or not asked:
-        return {side: await _answer(*told) for side, told in asked.items()}
-    answers = await asyncio.gather(*(_answer(*told) for told in asked.values()))
-    return dict(zip(asked, answers, strict=True))
-
-
-async def _answer(seated: _Seated, observation: Observation, step: int) -> Decision | CallFailed:
+async def _answer(seated: _Seated, world: World) -> Decision | CallFailed:
+    """Ask a driver; where its call fails, the other's answer is still awaited."""
+    seated.told = seated.eyes.told() if seated.eyes else None
+    observation = seated.told or world.observe(seated.driver.seat.side)
     try:
-        return await seated.driver.decide(observation, seated.number(step))
+        return await seated.driver.decide(observation, seated.number(world.step))
     except CallFailed as failure:
         return failure

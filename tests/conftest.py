@@ -60,17 +60,17 @@ def emulator_url(zygote, tmp_path_factory):
 def merge_runner(tmp_path, zygote, emulator_url):
     """Runs ``merge-runner`` in an empty folder, beside an emulator.
 
-    With ``EMULATOR_BASE_URL=""``, or with faults, a sweep has an emulator of its own. ``fork``
+    With ``EMULATOR_BASE_URL=""`` a sweep has an emulator of its own. ``fork``
     returns once it has begun, to be signalled; ``start`` does so with a process of its own
     command line and imports.
     """
 
     async def run(*arguments: object, cwd: Path = tmp_path, **changes: str) -> Run:
-        env = beside(emulator_url, arguments, changes)
+        env = beside(emulator_url, changes)
         return Run(*await zygote.run(arguments, cwd=cwd, env=env))
 
     async def fork(*arguments: object, cwd: Path = tmp_path, **changes: str):
-        env = beside(emulator_url, arguments, changes)
+        env = beside(emulator_url, changes)
         return await zygote.start(arguments, cwd=cwd, env=env)
 
     async def start(*arguments: object, cwd: Path = tmp_path, **changes: str):
@@ -94,7 +94,7 @@ def prepare(zygote, emulator_url):
     """Runs ``merge-runner`` in a folder, for what is made once for several tests."""
 
     def run(folder: Path, *arguments: object, **changes: str) -> Run:
-        env = beside(emulator_url, arguments, changes)
+        env = beside(emulator_url, changes)
         return Run(*zygote.run_blocking(arguments, cwd=folder, env=env))
 
     return run
@@ -114,7 +114,6 @@ def played(prepare, tmp_path_factory):
     return play(tmp_path_factory.mktemp("mine"), prepare)
 
 
-def beside(emulator_url, arguments, changes):
-    """The environment of a run beside the emulator, unless it needs one of its own."""
-    own = any(str(argument).startswith("--fault") for argument in arguments)
-    return environment(**{**({} if own else {"EMULATOR_BASE_URL": emulator_url}), **changes})
+def beside(emulator_url, changes):
+    """The environment of a run beside the emulator."""
+    return environment(**{"EMULATOR_BASE_URL": emulator_url, **changes})

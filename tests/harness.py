@@ -14,12 +14,12 @@ from pathlib import Path
 
 from aiohttp import web
 
-from merge_runner.emulator.server import HOST, application
-from merge_runner.llm.trial_costs import TrialCalls, TrialCosts
+from merge_runner.emulator.server import HOST
 from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 from merge_runner.registry import GROUP
 from merge_runner.run.plan import Options, Plan
 from merge_runner.run.sweep import Outcome, open_sweep
+from tests.mock_server import application
 
 PROJECT = Path(__file__).parent.parent
 PROGRAM = Path(sys.executable).with_name("merge-runner")
@@ -77,9 +77,9 @@ async def run_sweep(plan: Plan, options: Options, *, say: Callable[[str], None])
         return await sweep.run()
 
 
-def each(usd: float, model: str = "m") -> TrialCosts:
-    """Trials of which each is expected to cost so much, whatever is measured."""
-    return TrialCosts(lambda _: {model: TrialCalls(10**9, 1, usd)})
+def each(usd: float) -> Callable[[int], float]:
+    """Trials of which each is expected to cost so much."""
+    return lambda _: usd
 
 
 @dataclass

@@ -182,7 +182,7 @@ def test_the_laws_of_normalisation(scheme, host, port, path, slash):
 def test_the_header_that_carries_the_key(model, env, headers):
     assert resolve_endpoint("m", model, env).auth_headers == headers
     needed = model.provider not in ("local", "emulator")
-    assert key_status("m", model, env) == ("set" if needed else "not needed")
+    assert key_status(model, env) == ("set" if needed else "not needed")
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_a_missing_key_is_an_error_that_names_its_variable(model, env, named):
         resolve_endpoint("my-model", model, env)
     assert all(name in str(caught.value) for name in [*named, "my-model"])
     assert "\n" not in str(caught.value)
-    assert key_status("my-model", model, env) == "missing"
+    assert key_status(model, env) == "missing"
 
 
 def test_the_identity_needs_no_key():

@@ -18,7 +18,7 @@ from analysis.tables.attempts import attempts
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.results.database import in_memory
 from merge_runner.results.store import sweep_facts
-from merge_runner.served_model import is_other_model, others_among, sql_of
+from merge_runner.served_model import others_among, sql_of
 from tests.analysis.studies import Drive, Said, write_study
 
 SERVED = ("another", "o3", "o3-2025", "o3-2026", "it's")
@@ -92,8 +92,6 @@ def memory():
 @given(st.lists(st.tuples(names, names)), st.lists(st.tuples(names, names)))
 def test_the_condition_in_sql_is_the_rule(memory, pairs, aliases):
     others = others_among(pairs, aliases)
-    declared = {asked: {a for model, a in aliases if model == asked} for asked, _ in pairs}
-    assert others == [p for p in pairs if is_other_model(*p, declared[p[0]])]
     for pair in pairs:
         (other,) = memory.execute(
             f"SELECT {sql_of(others)} FROM (SELECT ? AS model_requested, ? AS model_served)", pair
@@ -101,7 +99,6 @@ def test_the_condition_in_sql_is_the_rule(memory, pairs, aliases):
         assert other is (pair in others)
 
 
-def test_an_unnamed_answer_is_nobody_elses():
-    assert not is_other_model("o3", None)
-    assert is_other_model("o3", "gpt-4o", ["o3-2025"])
-    assert not is_other_model("o3", "o3-2025", ["o3-2025"])
+def test_neither_the_id_nor_an_alias_is_another_model():
+    pairs = [("o3", "gpt-4o"), ("o3", "o3"), ("o3", "o3-2025")]
+    assert others_among(pairs, [("o3", "o3-2025")]) == [("o3", "gpt-4o")]

@@ -1,7 +1,7 @@
-"""Tables and figures that the database keeps beside the results, until these change.
+"""Tables and figures that a file beside the database keeps until the results change.
 
-Where the file cannot be written, as on a read-only disk or while another program holds it, nothing
-is kept, and the next run computes them again.
+A table is kept as JSON, a figure as SVG in Base64. Where the file cannot be written, as on a
+read-only disk, nothing is kept, and the next run computes them again.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -18,19 +20,13 @@ import duckdb
 
 import analysis
 import merge_runner
-from merge_runner.errors import StoreError
 from merge_runner.registry import in_use, plugin_sources, plugins
-from merge_runner.results.database import open_database, read_database
-from merge_runner.text_safety import first_line
+from merge_runner.results.database import read_database
 
 KEPT = """
--- A table as JSON, or a figure as SVG in Base64, of the results in one state.
 CREATE TABLE IF NOT EXISTS finished (
-    state VARCHAR NOT NULL,
-    options VARCHAR NOT NULL,
-    name VARCHAR NOT NULL,
-    content VARCHAR NOT NULL
-);
+    state TEXT NOT NULL, options TEXT NOT NULL, name TEXT NOT NULL, content TEXT NOT NULL
+)
 """
 # What tables are made of: all but prompts, texts, requests and replies.
 ROWS = {
@@ -91,15 +87,6 @@ def state(connection: duckdb.DuckDBPyConnection) -> str:
     return hashlib.sha256(f"{program()} {study}{sorted(sums)}".encode()).hexdigest()
 
 
-def has(connection: duckdb.DuckDBPyConnection, table: str) -> bool:
-    """Whether anything was ever kept in this table."""
-    found = connection.execute(
-        "SELECT 1 FROM duckdb_tables() WHERE table_name = ? AND database_name = current_database()",
-        [table],
-    )
-    return found.fetchone() is not None
-
-
 def options_text(
     db: Path,
     models: Sequence[str] | None = None,
@@ -120,32 +107,41 @@ def present_state(db: Path) -> str:
 
 def finished(db: Path, made_of: str, options: str, names: Sequence[str]) -> dict[str, str]:
     """The tables or figures that are kept of this state, by name."""
-    with read_database(db) as connection:
-        if not has(connection, "finished"):
-            return {}
-        rows = connection.execute(
-            "SELECT name, content FROM finished WHERE state = ? AND options = ? "
-            "AND list_contains(?, name)",
-            [made_of, options, list(names)],
-        ).fetchall()
-    return dict(rows)
-
-
-def keep_finished(db: Path, made_of: str, options: str, contents: dict[str, str]) -> None:
-    """Keep tables or figures, unless the results have left the state that these are ``made_of``."""
+    if not _beside(db).exists():
+        return {}
+    query = "SELECT name, content FROM finished WHERE state = ? AND options = ?"
     try:
-        with open_database(db, read_only=False, patience_s=PATIENCE_S) as connection:
-            connection.begin()
-            connection.execute(KEPT)
-            if state(connection) == made_of:
-                connection.execute("DELETE FROM finished WHERE state <> ?", [made_of])
-                connection.executemany(
-                    "INSERT INTO finished VALUES (?, ?, ?, ?)",
-                    [[made_of, options, name, content] for name, content in contents.items()],
-                )
-            connection.commit()
-    except (StoreError, duckdb.Error) as exc:
-        _say_once(first_line(exc))
+        with _opened(db) as kept:
+            rows = kept.execute(query, [made_of, options])
+            return {name: content for name, content in rows if name in names}
+    except sqlite3.Error as exc:
+        _say_once(str(exc))
+        return {}
+
+
+def keep_finished(db: Path, made_of: str, options: str, contents: Mapping[str, str]) -> None:
+    """Keep tables or figures, unless the results have left the state that these are ``made_of``."""
+    if present_state(db) != made_of:
+        return
+    rows = [(made_of, options, name, content) for name, content in contents.items()]
+    try:
+        with _opened(db) as kept:
+            kept.execute("DELETE FROM finished WHERE state <> ?", [made_of])
+            kept.executemany("INSERT INTO finished VALUES (?, ?, ?, ?)", rows)
+    except sqlite3.Error as exc:
+        _say_once(str(exc))
+
+
+def _beside(db: Path) -> Path:
+    return db.with_name(f"{db.name}.derived")
+
+
+@contextmanager
+def _opened(db: Path) -> Iterator[sqlite3.Connection]:
+    """Open the file for one transaction; raises sqlite3.Error."""
+    with closing(sqlite3.connect(_beside(db), timeout=PATIENCE_S)) as kept, kept:
+        kept.execute(KEPT)
+        yield kept
 
 
 @cache

@@ -16,6 +16,7 @@ import pandas as pd
 
 from analysis.data.collision_rules import judged
 from analysis.data.derived_cache import options_text, present_state
+from analysis.data.driver_words import has_chance, language_models, stand_in, unresponsive
 from analysis.data.imported_humans import RECORDINGS, Imported, imported, of_published_pairs
 from analysis.data.intermittency import measure_profiles
 from analysis.data.load import (
@@ -35,7 +36,6 @@ from analysis.data.load import (
 from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
 from analysis.data.studies import Order, Studies, read_studies, study_name
 from analysis.names import BASELINE, HUMAN
-from merge_runner.drivers.registry import has_chance, language_models, stand_in, unresponsive
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.content_hashes import canonical_json, spec_hash
 from merge_runner.paths import DEFAULT_DB

@@ -5,7 +5,6 @@ pandas and the fits hold a Python process for seconds, and no page may wait for 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
-from analysis.explorer.child import serve, use_given
 from analysis.metrics import GAP, LEFT_FIRST, Metric
 from analysis.names import HUMAN
 from analysis.tables import make_tables
@@ -93,8 +91,7 @@ class Numbers:
         if missing := [name for name in wanted if name not in kept]:
             study = self.study
             made = dict(zip(missing, make_tables(study, missing), strict=True))
-            # If the state in which the study was read is past, or another program holds the
-            # database, they are not kept there.
+            # If the state in which the study was read is past, they are not kept.
             texts = {name: to_text(made[name]) for name in missing}
             keep_finished(self.db, study.state, options, texts)
             self._made |= made
@@ -259,9 +256,3 @@ def _published_gaps() -> dict[str, float]:
     velocity = np.array([one.relative_velocity_mps for one in HUMAN_CONDITIONS.values()])
     gaps = gap_design(headway, velocity) @ terms
     return dict(zip(HUMAN_CONDITIONS, map(float, gaps), strict=True))
-
-
-if __name__ == "__main__":
-    use_given()
-    numbers = Numbers(Path(sys.argv[1]))
-    serve(lambda request: (numbers.answer(request), b""))

@@ -238,7 +238,7 @@ def _sql_routes(site: Site) -> list[Route]:
             return RedirectResponse(site.at.to("sql", q=sql.query_in(request.query_params)))
         try:
             content = sql.sql_csv(site, request.query_params)
-        except sql.UNANSWERED as exc:
+        except MergeRunnerError as exc:
             return HTMLResponse(sql.sql_page(site, request.query_params, problem=str(exc)), 400)
         return _download(content, KINDS["csv"], "query.csv")
 

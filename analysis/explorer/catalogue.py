@@ -16,11 +16,11 @@ from pydantic import ValidationError
 
 from analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
 from analysis.accounts.course import Course
+from analysis.data.driver_words import language_models, stand_in, unresponsive
 from analysis.explorer.details import scenario_of
-from analysis.explorer.query_worker import csv_cell
+from analysis.explorer.display_text import csv_cell
 from analysis.explorer.reading import PATIENCE_S, Row, reading, records
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.registry import language_models, stand_in, unresponsive
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, schema_sql
@@ -471,17 +471,6 @@ class Catalogue:
         """Another connection to what is in memory: its queries keep no page waiting."""
         with self._lock:
             return self._memory.cursor()
-
-    def copy(self, sql: str) -> None:
-        """Run statements of ours that copy texts of the database; raises UsageError, StoreError."""
-        try:
-            with reading(self.db, self._instance) as connection:
-                connection.execute(sql)
-        except StoreLocked:
-            raise
-        except MergeRunnerError:
-            self._file = self._stamp = None  # as in refresh
-            raise
 
     def tag(self, tags: tuple[tuple[str, str, str], ...]) -> None:
         """Know the tags that readers gave: (trial, spec, tag), each once."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from analysis.data.driver_words import unresponsive
 from analysis.explorer.prompts import Part, parts_of
 from analysis.explorer.reading import Row, reading, records
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
-from merge_runner.drivers.registry import unresponsive
 from merge_runner.records import SIDES, Side
 
 ONE = "WHERE trial_id = $trial AND spec_hash = $spec"

@@ -1,11 +1,18 @@
-"""What a model wrote, made visible: nothing in it may hide, or turn the page around."""
+"""Values as texts, and texts made visible: nothing in them may hide, or turn the page around."""
 
 from __future__ import annotations
 
+import json
 import unicodedata
+from datetime import datetime
+from decimal import Decimal
+
+from merge_runner.text_safety import in_spreadsheet
 
 SHOWN = 20_000
 BEGINNING = 800
+# What Python gets for infinite timestamps.
+INFINITE = {"9999-12-31 23:59:59.999999": "infinity", "0001-01-01 00:00:00": "-infinity"}
 # Formats that show nothing, among them those that turn the direction of writing.
 _HIDDEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 # Letters and marks that show nothing either: fillers, joiners, and selectors of variants.
@@ -35,3 +42,40 @@ def clamped(text: str) -> tuple[str, str, int]:
     """What a text begins with, as much more as is shown, and how many characters are left out."""
     shown, more = shortened(text[BEGINNING:])
     return visible(text[:BEGINNING]), shown, more
+
+
+def csv_cell(value: object) -> object:
+    """A value of any type for a cell of CSV."""
+    text = text_of(value)
+    return text if isinstance(value, int | float | Decimal) else in_spreadsheet(text)
+
+
+def text_of(value: object) -> str | None:
+    """A value of any type as a text; None for NULL."""
+    match value:
+        case None | str():
+            return value
+        case bool():
+            return "true" if value else "false"
+        case bytes():
+            return f"0x{value.hex()}"
+        case datetime():
+            text = value.isoformat(" ")
+            return INFINITE.get(text, text)
+        case list() | tuple() | dict():
+            return json.dumps(_plain(value), ensure_ascii=False)
+        case _:
+            return str(value)
+
+
+def _plain(value: object) -> object:
+    """A nested value as JSON can say it."""
+    match value:
+        case list() | tuple():
+            return [_plain(item) for item in value]
+        case dict():
+            return {str(text_of(key)): _plain(item) for key, item in value.items()}
+        case bool() | int() | float():
+            return value
+        case _:
+            return text_of(value)

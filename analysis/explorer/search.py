@@ -1,87 +1,55 @@
-"""Search in what drivers said: a copy of their words in a file of our own.
-
-The database is open only while words are copied; searching reads the copy, beside the list of
-trials, and keeps no page waiting.
-"""
+"""Search in what drivers said, planned and drove, beside the list of trials."""
 
 from __future__ import annotations
 
-import tempfile
 import threading
-import time
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import duckdb
 
 from analysis.explorer.catalogue import SEVERAL, Catalogue, Filter
+from analysis.explorer.database_copy import Copies
 from analysis.explorer.reading import Row, records
 from analysis.explorer.snippets import Snippet, snippet
-from merge_runner.errors import StoreLocked
-from merge_runner.text_safety import quoted
 
 PAGE = 50
 LONGEST = 65_536  # characters of a text that are searched
-AT_ONCE = 500  # trials whose words are copied while the file is held
-READING_S = 1.0  # a page waits so long for words that are not copied yet
-# What is searched: a column of a table, and the row of a decision that holds it, which of a call is
-# that of the last reply.
+# Within this part of the greatest acceleration a driver holds its speed, beyond it goes or brakes.
+HOLDS = 0.08
+# What is searched: a column of a table, and which of the table's rows is that of a decision.
 KINDS = {
-    "rationales": (
-        "decisions",
-        "rationale",
-        "SELECT trial_id, spec_hash, side, decision, rowid AS place FROM decisions "
-        "SEMI JOIN wanted USING (trial_id, spec_hash)",
-    ),
-    "replies": (
-        "calls",
-        "reply",
-        "SELECT trial_id, spec_hash, side, decision, arg_max(rowid, attempt) AS place FROM calls "
-        "SEMI JOIN wanted USING (trial_id, spec_hash) WHERE reply IS NOT NULL GROUP BY ALL",
-    ),
+    "rationales": ("decisions", "rationale", "any_value(rowid)"),
+    "replies": ("calls", "reply", "arg_max(rowid, attempt) FILTER (reply IS NOT NULL)"),
 }
-TABLES = """
-CREATE TABLE IF NOT EXISTS words.taken_{kind} (number INTEGER);
-CREATE TABLE IF NOT EXISTS words.{kind} (number INTEGER, side VARCHAR, decision INTEGER,
-    time_s DOUBLE, tactical VARCHAR, switch VARCHAR, failure VARCHAR, text VARCHAR, folded VARCHAR);
-DELETE FROM words.taken_{kind} WHERE number NOT IN (SELECT number FROM memory.listed);
-DELETE FROM words.{kind} WHERE number NOT IN (SELECT number FROM words.taken_{kind});
-"""
-WAITING = """
-FROM memory.listed WHERE decisions > 0 AND number NOT IN (SELECT number FROM words.taken_{kind})
-"""
-# Texts are read by the numbers of their rows: else all are read, to find a few. A change of mind is
-# between what a driver said and what it had said before. A line break is a space to whoever looks
-# for a phrase.
-TAKE = f"""
-BEGIN;
-INSERT INTO words.{{kind}} BY NAME
-WITH wanted AS MATERIALIZED (SELECT number, trial_id, spec_hash {{waiting}}),
-places AS MATERIALIZED ({{places}}),
-texts AS (SELECT rowid AS place, left({{column}}, {LONGEST}) AS text
-    FROM {{table}} WHERE rowid IN (SELECT place FROM places)),
-decided AS (
-    SELECT number, trial_id, spec_hash, side, decision, time_s,
-        coalesce(tactical, 'none') AS tactical,
+OWN_FACETS = ("tactical", "planned", "driven", "switch", "failure")
+TRIAL_FACETS = ("model", "variant", "condition", "outcome", "account", "tag")
+ACTION = (
+    f"CASE WHEN list_avg({{0}}) < -{HOLDS} THEN 'brake' WHEN list_avg({{0}}) > {HOLDS} THEN 'go' "
+    "WHEN list_avg({0}) IS NOT NULL THEN 'hold' END"
+)
+# A line break is a space to whoever looks for a phrase.
+FOLDED = f"lower(translate(left({{column}}, {LONGEST}), chr(10) || chr(13) || chr(9), '   '))"
+# A change of mind is between what a driver said and what it had said before. ``place`` is the row
+# of the text: all texts are read to find some of them, and those of a page to show them.
+HITS = f"""
+CREATE TEMP TABLE hits AS
+WITH decided AS (
+    SELECT trial_id, spec_hash, side, decision, time_s, coalesce(tactical, 'none') AS tactical,
         CASE WHEN tactical <> lag(tactical IGNORE NULLS) OVER said
             THEN lag(tactical IGNORE NULLS) OVER said || ' to ' || tactical END AS switch,
-        failure
-    FROM decisions JOIN wanted USING (trial_id, spec_hash) WHERE call_key IS NOT NULL
-    WINDOW said AS (PARTITION BY number, side ORDER BY decision)
+        failure, {ACTION.format("plan")} AS planned, {ACTION.format("applied")} AS driven
+    FROM copied.decisions WHERE call_key IS NOT NULL
+    WINDOW said AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
+), places AS (
+    SELECT trial_id, spec_hash, side, decision, {{place}} AS place
+    FROM copied.{{table}} GROUP BY ALL
 )
-SELECT decided.* EXCLUDE (trial_id, spec_hash), text,
-    lower(translate(text, chr(10) || chr(13) || chr(9), '   ')) AS folded
-FROM decided LEFT JOIN places USING (trial_id, spec_hash, side, decision)
-    LEFT JOIN texts USING (place);
-INSERT INTO words.taken_{{kind}} SELECT number {{waiting}};
-COMMIT;
+SELECT number, side, decision, time_s, {", ".join(OWN_FACETS)}, place
+FROM decided JOIN listed USING (trial_id, spec_hash)
+    LEFT JOIN places USING (trial_id, spec_hash, side, decision)
 """  # noqa: S608 # constants
-WITHOUT_A_LOG = "RECOVERY_MODE no_wal_writes, ROW_GROUP_SIZE 16384"
-OWN_FACETS = ("tactical", "switch", "failure")
-TRIAL_FACETS = ("model", "variant", "condition", "outcome", "account", "tag")
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,17 +82,13 @@ class Hit:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A page of hits, and how many there are in how many trials.
-
-    ``unread`` trials are still to be searched.
-    """
+    """A page of hits, and how many there are in how many trials."""
 
     hits: list[Hit]
     decisions: int
     trials: int
     page: int
     facets: dict[str, list[tuple[str, int]]]
-    unread: int
 
     @property
     def last_page(self) -> int:
@@ -134,87 +98,37 @@ class Found:
 
 @dataclass(slots=True)
 class Words:
-    """What the drivers of a database said. One search or copy goes on at a time."""
+    """What the drivers of a database said. One search goes on at a time."""
 
     catalogue: Catalogue
+    copies: Copies
     _lock: threading.Lock = field(default_factory=threading.Lock)
-    _folder: tempfile.TemporaryDirectory[str] | None = None
 
     def search(self, wanted: Wanted, page: int) -> Found:
-        """What is found in the words that are copied by now, and a page of it, from 1."""
+        """What is found, and a page of it, from 1; raises UsageError and StoreLocked."""
+        copy = self.copies.current()
         with self._lock, self.catalogue.cursor() as connection:
-            self._prepare(connection, wanted.kind)
-            with suppress(StoreLocked):  # what is read is searched
-                self._take(connection, wanted.kind)
-            return _searched(connection, wanted, page)
-
-    def every(self, kind: str) -> list[Row]:
-        """What all drivers said, in the order of the trials; raises StoreError."""
-        with self._lock, self.catalogue.cursor() as connection:
-            self._prepare(connection, kind)
-            while _unread(connection, kind):
-                self._take(connection, kind)
-            return records(
-                connection,
-                "SELECT number, side, decision, time_s, tactical, switch, failure, text "  # noqa: S608 # constants
-                f"FROM words.{kind} JOIN listed USING (number) "
-                "ORDER BY trial_id, spec_hash, decision, side",
-                (),
-            )
-
-    @property
-    def folder(self) -> Path | None:
-        """Where the copy is, once there is one."""
-        return None if self._folder is None else Path(self._folder.name)
-
-    def close(self) -> None:
-        """Delete the copy."""
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
-
-    def _prepare(self, connection: duckdb.DuckDBPyConnection, kind: str) -> None:
-        """Have a place for words, where those of trials that are gone go, too."""
-        names = connection.execute("SELECT database_name FROM duckdb_databases()").fetchall()
-        if ("words",) not in names:  # the catalogue has begun anew, or we begin
-            self.close()
-            self._folder = tempfile.TemporaryDirectory()
-            file = quoted(f"{self._folder.name}/words.duckdb")
-            connection.execute(f"ATTACH {file} AS words ({WITHOUT_A_LOG})")
-        connection.execute(TABLES.format(kind=kind))
-
-    def _take(self, connection: duckdb.DuckDBPyConnection, kind: str) -> None:
-        """Copy words, for a moment; raises UsageError and StoreError."""
-        until = time.monotonic() + READING_S
-        table, column, places = KINDS[kind]
-        some = f"{WAITING.format(kind=kind)} ORDER BY number LIMIT {AT_ONCE}"
-        take = TAKE.format(kind=kind, table=table, column=column, places=places, waiting=some)
-        while time.monotonic() < until and _unread(connection, kind):
-            self.catalogue.copy(take)
-
-
-def _unread(connection: duckdb.DuckDBPyConnection, kind: str) -> int:
-    """How many trials' words are not copied yet."""
-    ((trials,),) = connection.execute(f"SELECT count(*) {WAITING.format(kind=kind)}").fetchall()
-    return int(trials)
-
-
-def _look(connection: duckdb.DuckDBPyConnection, wanted: Wanted) -> None:
-    """Find the decisions with all the words, of whatever trials."""
-    holds = "".join(" AND contains(folded, lower(?))" for _ in wanted.terms)
-    connection.execute(
-        "CREATE TEMP TABLE hits AS SELECT rowid AS place, number, side, decision, tactical, "  # noqa: S608 # constants
-        f"switch, failure FROM words.{wanted.kind} WHERE true{holds}",
-        wanted.terms,
-    )
-    connection.execute(
-        "CREATE TEMP TABLE counted AS SELECT number, tactical, switch, failure, count(*) AS times "
-        "FROM hits GROUP BY ALL"
-    )
+            connection.execute(f"ATTACH {copy.file} AS copied (READ_ONLY)")
+            try:
+                return _searched(connection, wanted, page)
+            finally:
+                connection.execute("DETACH copied")
 
 
 def _searched(connection: duckdb.DuckDBPyConnection, wanted: Wanted, page: int) -> Found:
-    _look(connection, wanted)
+    table, column, place = KINDS[wanted.kind]
+    folded = FOLDED.format(column=column)
+    hits, values = HITS.format(table=table, place=place), list[Any]()
+    if wanted.terms:
+        holds = " AND ".join([f"contains({folded}, lower(?))"] * len(wanted.terms))
+        hits += f"WHERE place IN (SELECT rowid FROM copied.{table} WHERE {holds})"  # noqa: S608 # constants
+        values += wanted.terms
+    connection.execute(hits, values)
+    connection.execute(
+        "CREATE TEMP TABLE counted AS "  # noqa: S608 # constants
+        f"SELECT number, {', '.join(OWN_FACETS)}, count(*) AS times "
+        "FROM hits GROUP BY ALL"
+    )
     where, values = wanted.where()
     (totals,) = records(
         connection,
@@ -223,30 +137,30 @@ def _searched(connection: duckdb.DuckDBPyConnection, wanted: Wanted, page: int) 
         values,
     )
     number = min(page, max(1, -(-totals["decisions"] // PAGE)))
-    hits, facets = _page(connection, wanted, number), _facets(connection, wanted)
-    return Found(
-        hits, **totals, page=number, facets=facets, unread=_unread(connection, wanted.kind)
-    )
-
-
-def _page(connection: duckdb.DuckDBPyConnection, wanted: Wanted, number: int) -> list[Hit]:
-    where, values = wanted.where()
     rows = records(
         connection,
-        "SELECT chosen.*, time_s, text, folded FROM ("  # noqa: S608 # constants
-        "SELECT place, trial_id, spec_hash, model, variant, condition, outcome, hits.side, "
-        "hits.decision, tactical, switch, failure FROM hits JOIN listed USING (number) "
-        f"WHERE {where} ORDER BY trial_id, spec_hash, hits.decision, hits.side "
-        f"LIMIT {PAGE} OFFSET ?) AS chosen JOIN words.{wanted.kind} AS said "
-        "ON said.rowid = place ORDER BY trial_id, spec_hash, chosen.decision, chosen.side",
+        "SELECT trial_id, spec_hash, model, variant, condition, outcome, hits.* "  # noqa: S608 # constants
+        f"FROM hits JOIN listed USING (number) WHERE {where} "
+        f"ORDER BY trial_id, spec_hash, hits.decision, hits.side LIMIT {PAGE} OFFSET ?",
         [*values, PAGE * (number - 1)],
     )
-    folded = connection.execute("SELECT lower(unnest(?::VARCHAR[]))", [wanted.terms]).fetchall()
-    terms = [term for (term,) in folded]
-    return [
-        Hit(row, None if row["text"] is None else snippet(row["text"], row["folded"], terms))
-        for row in rows
-    ]
+    texts = connection.execute(
+        f"SELECT rowid, left({column}, {LONGEST}), {folded} FROM copied.{table} "  # noqa: S608 # constants
+        f"WHERE {column} IS NOT NULL AND rowid IN (SELECT unnest(?::BIGINT[]))",
+        [[row["place"] for row in rows]],
+    ).fetchall()
+    said = {place: (text, folded) for place, text, folded in texts}
+    lowered = connection.execute("SELECT lower(unnest(?::VARCHAR[]))", [wanted.terms]).fetchall()
+    terms = [term for (term,) in lowered]
+    return Found(
+        [
+            Hit(row, snippet(*said[row["place"]], terms) if row["place"] in said else None)
+            for row in rows
+        ],
+        **totals,
+        page=number,
+        facets=_facets(connection, wanted),
+    )
 
 
 def _facets(

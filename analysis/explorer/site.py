@@ -15,10 +15,11 @@ from analysis.explorer.analysis_process import Computing
 from analysis.explorer.assets import STYLES
 from analysis.explorer.catalogue import Catalogue
 from analysis.explorer.conditions import condition_texts
+from analysis.explorer.database_copy import Copies
 from analysis.explorer.display_text import visible
 from analysis.explorer.glossary import sections
 from analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
-from analysis.explorer.query_process import Sandbox
+from analysis.explorer.queries import Queries
 from analysis.explorer.search import Words
 from analysis.explorer.urls import HOME, Links
 from analysis.explorer.views import clock, condition_text
@@ -70,9 +71,10 @@ class Site:
         self._first_reading: threading.Thread | None = None
         self._conditions: dict[str, str] = {}
         self.catalogue = Catalogue(self.db)
-        self.sandbox = Sandbox(self.db)
+        copies = Copies(self.db)
+        self.queries = Queries(copies)
         self.computing = Computing(self.db)
-        self.words = Words(self.catalogue)
+        self.words = Words(self.catalogue, copies)
         self.notes = Notes(self.db, self.reader)
         self._environment = jinja2.Environment(
             loader=jinja2.FileSystemLoader(TEMPLATES),
@@ -141,6 +143,4 @@ class Site:
 
     def close(self) -> None:
         """Leave nothing behind."""
-        self.words.close()
-        self.sandbox.close()
         self.computing.close()

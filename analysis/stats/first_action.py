@@ -16,12 +16,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from analysis.data.driver_words import has_chance
 from analysis.data.reference_data import human_outcomes
 from analysis.data.study import Group, Study, of_group
 from analysis.metrics import Bounded
 from analysis.stats.intervals import interval
 from analysis.stats.regressions import Array, unfit_for_logit
-from merge_runner.drivers.registry import has_chance
 from merge_runner.records import SIDES
 
 # A human pedal seldom holds a speed exactly: within this a driver holds, beyond it goes or brakes.

@@ -1,21 +1,36 @@
-"""Audits by SQL alone (checks.sql): of one sweep, and of what belongs to none."""
+"""Audits by SQL alone (checks.sql): of one sweep, of what belongs to none, and of a recording."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from datetime import datetime
 from importlib.resources import files
+from itertools import islice
 from pathlib import Path
 
 import duckdb
 
-from merge_runner.audit.findings import Audit, Finding, Sharing
-from merge_runner.errors import StoreError
+from merge_runner.audit.findings import Audit, Finding
+from merge_runner.errors import RecordingError, StoreError
+from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.content_hashes import canonical_json, spec_hash, without_prompt
 from merge_runner.records import ANSWERED_FIELD
 from merge_runner.results.comparison import TrialKey
-from merge_runner.results.database import append, by_name, fetched, read_database
+from merge_runner.results.database import (
+    SETTINGS,
+    append,
+    by_name,
+    fetched,
+    in_memory,
+    read_database,
+    schema_sql,
+)
+from merge_runner.results.recorded_study import described_sweeps
+from merge_runner.results.recording import read_provenance, read_recording
+from merge_runner.results.rows import Row, call_row
 from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
@@ -35,7 +50,9 @@ FROM ({ASKED_DECISIONS}) JOIN (SELECT trial_id, spec_hash, variant FROM trials)
 JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
-MANY_REPEATED = 5
+BATCH = 100
+SHOWN = 3
+NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 
 @contextmanager
@@ -87,7 +104,15 @@ def audit_sweep(path: Path, sweep_id: str, planned: Sequence[TrialKey], *, finis
     """Audit a sweep that has just been played; see ``check_sweep``."""
     with audited_database(path) as connection:
         audit = check_sweep(connection, sweep_id, planned, finished=finished)
-        audit.sharings += calls_in_common(connection)
+        shared = connection.execute("SELECT count(*), sum(calls) FROM calls_in_common").fetchall()
+        ((pairs, calls),) = shared
+        if pairs > SHOWN:
+            audit.notes.append(
+                f"{pairs} pairs of arms share {calls} calls, where they asked the same in the "
+                "same slots: `merge-runner audit` names them"
+            )
+        else:
+            audit.notes += _in_common(connection)
         return audit
 
 
@@ -109,9 +134,7 @@ def check_sweep(
     connection.execute(AUDITED)
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
     audit = Audit(sweep_id, counts, [*_findings(connection, "findings", sweep_id)])
-    audit.notes += _notes(connection, counts, finished=finished)
-    for earlier, trials in connection.execute("FROM taken_over").fetchall():
-        audit.sharings.append(Sharing("trials", sweep_id, earlier, trials))
+    audit.notes += _notes(connection)
     connection.execute("INSERT INTO done FROM audited")
     return audit
 
@@ -131,15 +154,14 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
         str(path),
         counts,
         list(_findings(connection, orphans)),
-        calls_in_common(connection),
-        [] if counts["sweeps"] else ["there is no sweep in this database"],
+        _in_common(connection) if counts["sweeps"] else ["there is no sweep in this database"],
     )
 
 
-def calls_in_common(connection: duckdb.DuckDBPyConnection) -> list[Sharing]:
-    """Return the calls that several specs share, since their requests were identical."""
+def _in_common(connection: duckdb.DuckDBPyConnection) -> list[str]:
+    """Return notes on calls that several specs share, since their requests were identical."""
     rows = connection.execute("FROM calls_in_common").fetchall()
-    return [Sharing("calls", *row) for row in rows]
+    return [f"{first} and {second} share {calls} calls" for first, second, calls in rows]
 
 
 def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:
@@ -147,17 +169,8 @@ def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:
 
     0 where some differ, or where only a few prompts were asked again.
     """
-    ((repeated, alike),) = connection.execute("FROM alike").fetchall()
-    return int(alike) if alike == repeated >= MANY_REPEATED else 0
-
-
-def unclear_ids(connection: duckdb.DuckDBPyConnection) -> list[str]:
-    """Return notes on servers whose repeated ids prove nothing."""
-    return [
-        f"{count} replies of {model} at {endpoint or 'its endpoint'} have an id that the server "
-        "gave more than once: its ids do not tell whether an answer was given twice"
-        for model, endpoint, count in connection.execute("FROM unclear_ids").fetchall()
-    ]
+    ((answers,),) = connection.execute("FROM alike").fetchall()
+    return int(answers)
 
 
 def _findings(
@@ -168,30 +181,61 @@ def _findings(
         yield Finding(kind, text, sweep_id, trial, side, decision)
 
 
-def _notes(
-    connection: duckdb.DuckDBPyConnection, counts: dict[str, int], *, finished: bool
-) -> Iterable[str]:
-    missing, failed = counts["missing"], counts["failed"]
-    if not finished and (missing or failed):
-        yield (
-            f"unfinished: {missing} of {counts['trials']} trials are missing, {failed} failed; "
-            "the same command again plays them"
-        )
-    ((elsewhere, later),) = connection.execute(
-        "SELECT (SELECT count(*) FROM unplayed WHERE elsewhere), "
-        "(SELECT count(*) FROM linked SEMI JOIN done USING (trial_id, spec_hash))"
-    ).fetchall()
-    if elsewhere:
-        yield f"{elsewhere} of its trials were played by another sweep"
-    if later:
-        yield f"{later} of its trials are checked with a later sweep that has them too"
-    yield from unclear_ids(connection)
-    scripted = counts["attempts answered by a scripted stand-in"]
-    if (alike := answers_alike(connection)) and not scripted:  # the emulator has a few phrases
-        yield (
-            f"all {alike} answers to prompts that were asked before are word for word as "
-            "before: are they samples?"
-        )
+def _notes(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
+    yield from (text for (text,) in connection.execute("FROM notes").fetchall())
     for group, model, invalid, asked in connection.execute(DECIDED).fetchall():
         if why := not_judged(model, invalid, asked):
             yield f"{group}: {why}"
+
+
+def audit_recording(file: Path) -> Audit:
+    """Audit a recording; one that is damaged is a finding. Raises UsageError without a file.
+
+    Its calls become those of a database in memory, and the checks of a database read them.
+    """
+    with in_memory(SETTINGS) as connection:
+        connection.execute(schema_sql())
+        try:
+            _fill(connection, read_recording(file))
+            sweeps = described_sweeps(read_provenance(file))
+        except RecordingError as exc:
+            return Audit(str(file), findings=[Finding("recording", str(exc))])
+        configs = (canonical_json({"models": sweep.models}) for sweep in sweeps)
+        rows = ((n, "", NEVER, None, None, c, None, None, "{}") for n, c in enumerate(configs))
+        append(connection, "sweeps", rows)  # of which the aliases of models are read
+        prepare(connection)
+        connection.execute("INSERT INTO audited SELECT trial_id, spec_hash FROM trials")
+        columns = 'calls, attempts, "reply ids"'
+        counts = next(by_name(connection.execute(f"SELECT {columns} FROM counts")))  # noqa: S608 # constants
+        of_calls = "(FROM call_findings UNION ALL FROM shared_findings)"
+        findings = [*_findings(connection, of_calls)]
+        return Audit(str(file), counts, findings, notes=[*_notes(connection)])
+
+
+def _fill(connection: duckdb.DuckDBPyConnection, entries: Iterator[CachedCall]) -> None:
+    """Fill the tables with the calls of a recording.
+
+    A spec stands for all requests that differ in the prompt alone, and a trial for a repetition
+    of a condition: a recording does not say which prompt variant a call was made for.
+    """
+    specs: dict[str, str] = {}
+    trials: dict[TrialKey, Row] = {}
+    while batch := list(islice(entries, BATCH)):
+        rows: list[Row] = []
+        for entry in batch:
+            request, slot = entry.request, entry.request.slot
+            asked = (request.endpoint, request.model, request.path, request.headers)
+            spec = spec_hash(canonical_json([*asked, without_prompt(request.body)]))
+            driver = {"endpoint": request.endpoint}
+            specs[spec] = canonical_json({"left": driver, "right": driver})
+            set_ = f"/set{slot.sample_set}" if slot.sample_set else ""
+            trial = f"{slot.condition}/rep{slot.repetition:02d}{set_}"
+            trials[trial, spec] = (
+                *(trial, spec, None, "llm", None, None, None, slot.condition, 0.0, 0.0),
+                *(slot.repetition, slot.sample_set, "finished", None, 0.0, None, False),
+            )
+            place = (trial, spec, slot.side, slot.decision, request)
+            rows += [call_row(*place, attempt, cached=True) for attempt in entry.attempts]
+        append(connection, "calls", rows)
+    append(connection, "specs", specs.items())
+    append(connection, "trials", trials.values())

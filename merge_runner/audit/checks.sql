@@ -250,18 +250,12 @@ UNION ALL FROM shared_findings;
 
 -- What is no fault.
 
-CREATE OR REPLACE TEMP VIEW unclear_ids AS
-SELECT model_requested, endpoint, count(DISTINCT call_key) AS replies
-FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash)
-JOIN repeated_ids USING (endpoint, model_requested, reply_id)
-WHERE NOT telling GROUP BY ALL ORDER BY ALL;
-
--- Of the answers to prompts that were asked before, how many are word for word like another. A model
--- that samples never gives only answers that it has given before. A proxy that caches and gives each
+-- How many answers to prompts that were asked before are word for word as before, if all are, and
+-- there are a few. A model that samples never gives only answers that it has given before. A proxy that caches and gives each
 -- reply a new id does, and so does a model at temperature 0: in both cases they are no samples.
 CREATE OR REPLACE TEMP VIEW alike AS
-SELECT coalesce(sum(times - 1), 0)::BIGINT AS repeated,
-    coalesce(sum(times - different), 0)::BIGINT AS alike
+SELECT if(count(*) FILTER (different > 1) = 0 AND sum(times - 1) >= 5, sum(times - 1), 0)::BIGINT
+    AS answers
 FROM (
     SELECT count(*) AS times, count(DISTINCT answer) AS different
     FROM (
@@ -273,14 +267,7 @@ FROM (
     ) GROUP BY model_left, model_right, side, prompt_hash
 );
 
--- Trials that a sweep did not play, since earlier ones had, and identical requests of the same slot.
-CREATE OR REPLACE TEMP VIEW taken_over AS
-SELECT earlier.sweep_id, count(*) AS trials
-FROM linked JOIN (SELECT DISTINCT * FROM sweep_trials) AS links USING (trial_id, spec_hash)
-JOIN sweeps AS earlier USING (sweep_id)
-WHERE started_at < (SELECT started_at FROM sweeps SEMI JOIN subject USING (sweep_id))
-GROUP BY ALL ORDER BY ALL;
-
+-- Identical requests of the same slot.
 CREATE OR REPLACE TEMP VIEW calls_in_common AS
 WITH used AS (
     SELECT DISTINCT call_key, spec_hash, driver || '/' || variant AS name
@@ -289,7 +276,7 @@ WITH used AS (
 )
 SELECT if(a.name = b.name, format('{} ({})', a.name, a.spec_hash), a.name),
     if(a.name = b.name, format('{} ({})', b.name, b.spec_hash), b.name),
-    count(DISTINCT call_key)
+    count(DISTINCT call_key) AS calls
 FROM used AS a JOIN used AS b USING (call_key)
 WHERE (a.name, a.spec_hash) < (b.name, b.spec_hash)
     AND (a.spec_hash IN (SELECT spec_hash FROM audited)
@@ -308,3 +295,30 @@ FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, sp
     FROM calls SEMI JOIN audited USING (trial_id, spec_hash)),
     (SELECT count(DISTINCT reply_id) AS "reply ids"
     FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash));
+
+CREATE OR REPLACE TEMP VIEW notes AS
+SELECT format('unfinished: {} of {} trials are missing, {} failed; the same command again plays them',
+    missing, (SELECT count(*) FROM planned), failed) AS text
+FROM counts, subject WHERE NOT finished AND missing + failed > 0
+UNION ALL FROM (
+    -- Trials that it did not play, since earlier ones had.
+    SELECT format('{} and {} share {} trials', subject.sweep_id, earlier.sweep_id, count(*))
+    FROM linked JOIN (SELECT DISTINCT * FROM sweep_trials) AS links USING (trial_id, spec_hash)
+    JOIN sweeps AS earlier USING (sweep_id), subject JOIN sweeps AS own ON own.sweep_id = subject.sweep_id
+    WHERE earlier.started_at < own.started_at
+    GROUP BY subject.sweep_id, earlier.sweep_id ORDER BY ALL
+)
+UNION ALL SELECT format('{} of its trials were played by another sweep', count(*))
+FROM unplayed WHERE elsewhere HAVING count(*) > 0
+UNION ALL SELECT format('{} of its trials are checked with a later sweep that has them too', count(*))
+FROM linked SEMI JOIN done USING (trial_id, spec_hash) HAVING count(*) > 0
+UNION ALL SELECT format('{} replies of {} at {} have an id that the server gave more than once: its ids '
+    'do not tell whether an answer was given twice', count(DISTINCT call_key), model_requested,
+    coalesce(nullif(endpoint, ''), 'its endpoint'))
+FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash)
+JOIN repeated_ids USING (endpoint, model_requested, reply_id)
+WHERE NOT telling GROUP BY model_requested, endpoint
+-- The emulator has a few phrases.
+UNION ALL SELECT format('all {} answers to prompts that were asked before are word for word as before: '
+    'are they samples?', answers)
+FROM alike, counts WHERE answers > 0 AND "attempts answered by a scripted stand-in" = 0;

@@ -1,4 +1,4 @@
-"""What an audit says: findings, what is shared on purpose, and how much was checked."""
+"""What an audit says: findings, notes on what is no fault, and how much was checked."""
 
 from __future__ import annotations
 
@@ -27,22 +27,6 @@ class Finding:
         return f"{self.kind}: {where}: {self.text}" if where else f"{self.kind}: {self.text}"
 
 
-@dataclass(frozen=True, slots=True)
-class Sharing:
-    """What two sweeps or two prompt variants have in common, which is no fault.
-
-    ``what`` is ``trials`` (of two sweeps) or ``calls`` (identical requests of the same slot).
-    """
-
-    what: str
-    first: str
-    second: str
-    count: int
-
-    def __str__(self) -> str:
-        return f"{self.first} and {self.second} share {self.count} {self.what}"
-
-
 @dataclass(slots=True)
 class Audit:
     """What was checked of ``subject``: a sweep, a database, a recording or a cache.
@@ -54,7 +38,6 @@ class Audit:
     subject: str
     counts: dict[str, int] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
-    sharings: list[Sharing] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -71,7 +54,7 @@ class Audit:
         number = len(self.findings)
         yield f"{self.subject}: " + (f"{number} findings" if number else "all holds")
         yield "  checked: " + ", ".join(f"{n} {name}" for name, n in self.counts.items())
-        for text in (*self.notes, *map(str, self.sharings)):
+        for text in self.notes:
             yield f"  note: {text}"
         shown: Counter[str] = Counter()
         for finding in self.findings:

@@ -73,7 +73,7 @@ def audit(
     as_json: cli.JsonOption = False,
 ) -> None:
     """Check that each trial is there and follows from its replies."""
-    from merge_runner.audit.recordings import audit_recording
+    from merge_runner.audit.checks import audit_recording
     from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 
     cli.use_study(study, trust=trust)
@@ -112,11 +112,13 @@ def forget(
     """
     from merge_runner.results import forgetting
 
-    going = forgetting.to_forget(db, sweeps)
+    if not sweeps:
+        raise UsageError("name a sweep; `merge-runner sql 'from sweeps'` lists them")
+    ids, going = forgetting.to_forget(db, sweeps)
     agree(f"these go from {db}: {going}", "Remove them?", otherwise="nothing was removed", yes=yes)
-    gone = forgetting.forget(db, sweeps, going)
+    forgetting.forget(db, ids)
     say(
-        f"removed: {gone}. Their replies stay in the cache: the same `merge-runner sweep` plays "
+        f"removed: {going}. Their replies stay in the cache: the same `merge-runner sweep` plays "
         "the trials again without a call"
     )
 
@@ -194,7 +196,7 @@ def models(as_json: cli.JsonOption = False) -> None:
         costs = [cost_usd(entry, tokens) for tokens in usage]
         usd = ["unknown" if cost is None else round(cost * 1000, 6) for cost in costs]
         source = entry.price.source if isinstance(entry.price, Price) else entry.price
-        closes, key = str(entry.shutdown or ""), key_status(name, entry)
+        closes, key = str(entry.shutdown or ""), key_status(entry)
         rows.append((name, entry.provider, key, *usd, closes, entry.id, source, entry.note))
     for name, program in PROGRAMS.items():
         rows.append((name, "program", "not needed", 0, 0, "", "", "", program.described))

@@ -18,7 +18,6 @@ import typer
 
 from merge_runner.cli import options as cli
 from merge_runner.cli.output import agree, print_out, say
-from merge_runner.cli.stand_in import FaultRateOption, FaultsOption, SeedOption, faults_of
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 
@@ -45,7 +44,7 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A new folder, or an empty one.")],
 ) -> None:
     """Write a folder with a study that runs, to change into your own."""
-    from merge_runner.study.folder import write_folder
+    from merge_runner.study.file import write_folder
 
     for path in write_folder(folder):
         say(f"wrote {path}")
@@ -86,9 +85,6 @@ def sweep(
     trust: cli.TrustOption = False,
     replay: Annotated[bool, cli.flag("--replay", "From recorded replies alone.")] = False,
     recordings: Annotated[list[Path] | None, cli.option("FILE", RECORDING, "--recording")] = None,
-    fault_rate: FaultRateOption = 0.0,
-    faults: FaultsOption = None,
-    seed: SeedOption = 0,
     quiet: Annotated[bool, cli.flag("--quiet", "Show no progress.")] = False,
     as_json: cli.JsonOption = False,
 ) -> None:
@@ -102,11 +98,8 @@ def sweep(
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
     if replay and dask:
         raise UsageError("a replay needs no cluster: leave --dask out")
-    known = {each.name for each in fields(Options)} & given.keys() - {"faults", "dry_run"}
-    options = Options(
-        **{name: given[name] for name in known},
-        faults=faults_of(fault_rate, faults, seed),
-    )
+    known = {each.name for each in fields(Options)} & given.keys() - {"dry_run"}
+    options = Options(**{name: given[name] for name in known})
     wanted = {name: given[name] for name in signature(make_plan).parameters if name in given}
     wanted |= {"conditions": cli.listed(conditions), "variants": cli.listed(variants)}
     wanted["only"] = cli.levels(only or (), "--only")

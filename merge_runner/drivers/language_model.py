@@ -18,16 +18,12 @@ Decided = Callable[[Decision], None]
 """Gets each decision before it is driven; raises SweepStopped."""
 
 
-def _ignore(_: Decision) -> None:
-    pass
-
-
 @dataclass(frozen=True, slots=True)
 class LanguageModel:
     """Makes drivers that ask one model."""
 
     ask: Ask
-    decided: Decided = _ignore
+    decided: Decided | None = None
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> LlmDriver:
         """See MakeDriver."""
@@ -42,17 +38,19 @@ class LlmDriver:
     ask: Ask
     spec: TrialSpec
     seat: Seat
-    decided: Decided = _ignore
+    decided: Decided | None = None
     _plan: tuple[float, ...] | None = None
     _executed: int = 0
 
     async def decide(self, observation: Observation, number: int) -> Decision:
-        """Ask the model and drive its plan, or go on with the last valid one."""
+        """Ask the model and drive its plan, or go on with the last valid one.
+
+        Where the plan is exhausted, or there is none, the vehicle cruises.
+        """
         scenario, spec = self.seat.scenario, self.spec
         assert spec.variant is not None, "only human trials have no prompt variant"
-        prompt = render_prompt(
-            observation, self._remaining(), variant=spec.variant, scenario=scenario
-        )
+        rest = None if self._plan is None else self._plan[self._executed :]
+        prompt = render_prompt(observation, rest, variant=spec.variant, scenario=scenario)
         slot = Slot(spec.condition, spec.repetition, self.seat.side, number, spec.sample_set)
         reply = await self.ask(prompt, slot, spec)
         # A refusal or a truncated answer is an outcome of its own; it is not searched for a plan.
@@ -61,30 +59,23 @@ class LlmDriver:
             if reply.outcome == "ok"
             else ParsedReply(None, None, reply.text, reply.outcome)
         )
-        fallback = parsed.plan is None
         if parsed.plan is not None:
             self._plan, self._executed = parsed.plan, 0
         elif scenario.fallback == "restart":
             self._executed = 0
+        wanted = self.seat.pace.executed_actions
+        actions = (self._plan or ())[self._executed :][:wanted]
+        self._executed += wanted
         decision = Decision(
             plan=parsed.plan,
-            applied=self._take(),
+            applied=actions + (0.0,) * (wanted - len(actions)),
             tactical=parsed.tactical,
             rationale=parsed.rationale,
             failure=parsed.failure,
-            fallback=fallback,
+            fallback=parsed.plan is None,
             prompt=prompt,
             reply=reply,
         )
-        self.decided(decision)
+        if self.decided is not None:
+            self.decided(decision)
         return decision
-
-    def _remaining(self) -> tuple[float, ...] | None:
-        return None if self._plan is None else self._plan[self._executed :]
-
-    def _take(self) -> tuple[float, ...]:
-        """The next actions of the plan, and 0 where it is exhausted or there is none."""
-        wanted = self.seat.pace.executed_actions
-        actions = (self._remaining() or ())[:wanted]
-        self._executed += wanted
-        return actions + (0.0,) * (wanted - len(actions))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from math import inf, isfinite
 from pkgutil import iter_modules
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeGuard
 
 from merge_runner import drivers
 from merge_runner.config import ScenarioConfig
@@ -26,7 +26,6 @@ EMULATOR = "emulator"
 MOCKS = frozenset({EMULATOR, "random"})
 """The models of our own, under whose names no other is expected to answer."""
 SET = "set"  # the parameter that names a set of others
-RESERVED = ("program", "clock")  # what a study says of a driver beside its parameters
 
 
 class HumanTrials(Protocol):
@@ -81,10 +80,11 @@ class Program:
             raise UsageError(f"the driver {name} needs a rate_hz above 0")
         if self.sets:
             require(self.sets, f"{SET} of the driver {name}", str(self.parameters.get(SET)))
-        if not all(map(_can_be, self.values.values())):
-            raise UsageError(f"the parameters of the driver {name} must be finite numbers or texts")
-        if taken := {*RESERVED} & {*self.values}:
-            raise UsageError(f"the driver {name} needs another name for its parameter {min(taken)}")
+        for value in self.values.values():
+            if not isinstance(value, str) and not _is_number(value):
+                raise UsageError(
+                    f"the parameters of the driver {name} must be finite numbers or texts"
+                )
         if self.check is not None:
             self.check(self.values)
         if self.check_clock is not None and self.rate_hz is not None:
@@ -99,8 +99,7 @@ class Program:
     @property
     def described(self) -> str:
         """What it does, how often it decides, and its parameters, the chosen set first."""
-        often = "once" if self.rate_hz == 1 else f"{self.rate_hz or 0:g} times"
-        rate = "" if self.rate_hz is None else f" ({often} a second)"
+        rate = "" if self.rate_hz is None else f" ({self.rate_hz:g} Hz)"
         shown = dict(self.values)
         if self.sets:
             shown[SET] = " | ".join(dict.fromkeys([str(shown[SET]), *self.sets]))
@@ -122,19 +121,23 @@ class Program:
                 f"clock = {clock_s:g} is too fast: {name} decides every {1 / self.rate_hz:g} s, "
                 "and a clock can only slow it down"
             )
-        # Which other parameters there are depends on the set.
-        chosen = {SET: _like(self.values, name, SET, changes[SET])} if SET in changes else {}
-        values = replace(self, parameters={**self.parameters, **chosen}).values
-        for each in changes.keys() - values.keys():
-            if having := [f'"{one}"' for one, numbers in self.sets.items() if each in numbers]:
-                raise UsageError(
-                    f"{each} of {name} is a number of its sets: name one beside it, "
-                    f"{SET} = {' or '.join(having)}"
-                )
-        given = {each: _like(values, name, each, value) for each, value in changes.items()}
+        values, given = self.values, dict(self.parameters)
+        # Which other parameters there are depends on the set, so that it comes first.
+        for each in sorted(changes, key=lambda each: each != SET):
+            hint = f"each {SET} has parameters of its own" if self.sets else ""
+            value, default = changes[each], require(values, f"parameter of {name}", each, hint)
+            if isinstance(default, str) and isinstance(value, str):
+                given[each] = value
+            elif not isinstance(default, str) and _is_number(value):
+                given[each] = float(value)
+            else:
+                wanted = "a text" if isinstance(default, str) else "a finite number"
+                raise UsageError(f"{each} of {name} is {wanted}, as {default!r}, not {value!r}")
+            if each == SET:
+                values = replace(self, parameters=given).values
         return replace(
             self,
-            parameters={**self.parameters, **given},
+            parameters=given,
             rate_hz=self.rate_hz if clock_s is None else 1 / clock_s,
             based_on=self.based_on or name,
         )
@@ -166,77 +169,26 @@ class Program:
 
     def in_spec(self, name: str) -> dict[str, object]:
         """What the spec of its trials says of it; its version covers what all drivers share."""
+        # What there is not is left out, so that specs from before it keep their hashes.
+        optional = {
+            "chance": self.chance or None,
+            "rate_hz": self.rate_hz,
+            "data": None if self.data is None else self.data.digest,
+            "based_on": self.based_on or None,
+        }
         return {
             "program": name,
             "parameters": self.values,
             "source": self.source,
-            # Left out where there is none, so that specs from before it keep their hashes.
-            **({"chance": True} if self.chance else {}),
-            **({} if self.rate_hz is None else {"rate_hz": self.rate_hz}),
-            **({} if self.data is None else {"data": self.data.digest}),
-            **({"based_on": self.based_on} if self.based_on else {}),
+            **{key: value for key, value in optional.items() if value is not None},
         }
 
 
-def _can_be(value: object) -> bool:
-    return isinstance(value, str) or (isinstance(value, int | float) and isfinite(value))
-
-
-def _like(values: Mapping[str, Parameter], program: str, name: str, value: object) -> Parameter:
-    """A parameter as it is set; raises UsageError where it is unknown or of another type."""
-    default = require(values, f"parameter of {program}", name)
-    if isinstance(default, str) and isinstance(value, str):
-        return value
-    number = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
-    if isinstance(default, str) or not number:
-        wanted = "a text" if isinstance(default, str) else "a finite number"
-        raise UsageError(f"{name} of {program} is {wanted}, as {default!r}, not {value!r}")
-    assert isinstance(value, int | float)
-    return float(value)
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
 
 
 PROGRAMS = Registry[Program]("driver")
-
-
-def language_models(names: Mapping[Side, str], spec: Mapping[str, Any]) -> dict[Side, str]:
-    """Of the drivers' names those of language models, as the spec of their trials tells them.
-
-    It knows the programs of a study, too, which may not be registered here.
-    """
-    return {side: name for side, name in names.items() if "program" not in (spec.get(side) or {})}
-
-
-def has_chance(spec: Mapping[str, Any], sides: Collection[Side] = SIDES) -> bool:
-    """Return whether drivers of a spec, or what they perceive, are drawn by chance.
-
-    A language model samples; a program declares it.
-    """
-    scenario = ScenarioConfig.model_validate(spec.get("scenario", {}))
-    drivers = [spec.get(side) or {} for side in sides]
-    return any("program" not in driver or driver.get("chance") for driver in drivers) or any(
-        scenario.perception(side).is_random for side in sides
-    )
-
-
-def unresponsive(spec: Mapping[str, Any]) -> str:
-    """Return what to say wherever trials of a spec are shown; empty where no human is replayed."""
-    sides = [side for side in SIDES if "data" in (spec.get(side) or {})]
-    if len(sides) == len(SIDES):
-        return "both humans are replayed and do not react"
-    return f"the human on the {sides[0]} is replayed and does not react" if sides else ""
-
-
-def stand_in(models: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:
-    """What is said of trials of these language models in which a stand-in answered on these sides.
-
-    A side that a program drives has no model.
-    """
-    named = {side: name for side, name in models.items() if name not in MOCKS}
-    posing = "+".join(dict.fromkeys(name for side, name in named.items() if side in sides))
-    real = [side for side in named if side not in sides]
-    where = f" on the {'left' if real == ['right'] else 'right'}" if real else ""
-    return f"scripted stand-in{where}, {f'not {posing}' if posing else 'no language model'}"
-
 
 # Each program registers itself, in a module of this package that nobody else needs to name.
 for _module in iter_modules(drivers.__path__, f"{drivers.__name__}."):

@@ -4,6 +4,9 @@ Who goes first is drawn from the human logistic odds, or from those that a reque
 (``planted_effect``), once for a trial and shared by both sides. Both hold piecewise constant
 accelerations that open a gap. In every third repetition, in one condition, the driver
 that should yield misjudges: it keeps level with the other, and they collide.
+
+Beside it a driver that understands nothing draws its answers to any prompt at random: it rehearses
+a study whose prompts the scripted driver cannot read.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from merge_runner.scenarios.merge.geometry import TRACK
 
 VEHICLE_LENGTH_M = 4.5
 MAX_ACCELERATION_MPS2 = 2.5
+HARDEST_BRAKING_MPS2, HARDEST_PUSH_MPS2 = -2.2, 1.4
 SHORTEST_S = 1.0
 HUMAN = PlantedEffect()
 # What every prompt must say.
@@ -30,7 +34,13 @@ NEEDED = (
     "Relative distance (of the other car, ahead of you): N m",
     "exactly N numbers",
 )
-HARDEST_BRAKING_MPS2, HARDEST_PUSH_MPS2 = -2.2, 1.4
+OPENINGS = (
+    "Neither of us has the right of way.",
+    "We approach the merge point at nearly the same time.",
+    "I compare when each of us arrives at the merge point.",
+)
+# The most actions of a plan, and the lengths that it usually has, for the random driver.
+MOST_ACTIONS, USUAL_LENGTHS = 200, range(1, 31)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,42 +65,64 @@ class Seen:
         """The other vehicle's distance to the merge point, negative once it has passed."""
         return (self.distance_to_merge or 0.0) - self.relative_distance
 
+    @property
+    def projected_lead_m(self) -> float:
+        """How far ahead the ego would be when the first one reaches the merge point."""
+        own = (self.distance_to_merge or 0.0) / max(self.own_speed, 0.1)
+        other = max(self.other_distance_to_merge, 0.0) / max(self.other_speed, 0.1)
+        return (self.own_speed - self.other_speed) * min(own, other) - self.relative_distance
+
 
 @dataclass(frozen=True, slots=True)
-class Temper:
-    """What is drawn for a trial: who goes first, the gap aimed at, and who does how much.
+class Draws:
+    """The draws of a trial: who goes first, the gap aimed at, and the leader's share in it.
 
-    ``misjudges`` says that this driver goes first although the other does.
+    ``misjudges`` says that this driver goes first although the other does. The ``wobble`` of its
+    hand, in m/s^2, and its ``opening`` words are drawn for each decision.
     """
 
     goes_first: bool
     misjudges: bool
     target_gap_m: float
     leader_share: float
+    wobble: float
+    opening: str
 
 
 def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) -> str:
-    """The reply's text for a prompt; without a slot it depends on the prompt alone."""
+    """Return the reply's text for a prompt; without a slot it depends on the prompt alone."""
     seen = read_prompt(prompt)
     if isinstance(seen, str):
         return seen
-    temper = temper_for(seen, slot, None if effect is None else effect.before(prompt))
+    draws = _draws(seen, prompt, slot, None if effect is None else effect.before(prompt))
     if not seen.other_seen:
         action, why = 0.0, "I do not see the other car, and keep my speed."
     elif seen.distance_to_merge is None:
         action, why = _on_straight(seen)
-    elif temper.goes_first:
-        action, why = _go_first(seen, temper, slot)
     else:
-        action, why = _yield(seen, temper, slot)
+        action, why = _approach(seen, draws)
     normalised = round(min(1.0, max(-1.0, action / MAX_ACCELERATION_MPS2)), 2) + 0.0
     plan = ", ".join([f"{normalised:.2f}"] * seen.plan_actions)
-    token = ("M\n\n" if temper.goes_first else "Y\n\n") if seen.asks_tactical else ""
+    token = ("M\n\n" if draws.goes_first else "Y\n\n") if seen.asks_tactical else ""
     return f"{token}{why}\n\n```python\n[{plan}]\n```"
 
 
+def random_answer(prompt: str, slot: Slot | None) -> str:
+    """Return M or Y and a plan, both drawn at random; without a slot by the prompt alone."""
+    drawn_for = (prompt, *(() if slot is None else slot.as_dict().values()))
+    word = "M" if draw("word", *drawn_for) < 0.5 else "Y"
+    action = f"{round(draw_between(-1, 1, 'action', *drawn_for), 2) + 0.0:.2f}"
+    lengths = {int(number) for number in re.findall(r"exactly (\d+) numbers", prompt)}
+    if not lengths:
+        # The parser takes the list of the right length, whatever others stand beside it.
+        mentioned = map(int, re.findall(r"(?<![\d.])\d{1,3}(?!\.?\d)", prompt))
+        lengths = {*USUAL_LENGTHS, *(n for n in mentioned if 0 < n <= MOST_ACTIONS)}
+    plans = "\n".join(f"[{', '.join([action] * length)}]" for length in sorted(lengths))
+    return f"{word}\n\nI draw lots and hold what I draw.\n\n```python\n{plans}\n```"
+
+
 def read_prompt(prompt: str) -> Seen | str:
-    """The situation that a prompt describes, or an answer that says which words it lacks."""
+    """Return the situation that a prompt describes, or an answer that says what it lacks."""
     own = _quantity("Your speed", "m/s", prompt)
     other = _quantity("Speed of the other car", "m/s", prompt)
     relative = _quantity("Relative distance .*?", "m", prompt)
@@ -106,6 +138,8 @@ def read_prompt(prompt: str) -> Seen | str:
             f"prompt: it does not say {lacking}, with a number for N. The model `random` answers "
             "any prompt."
         )
+    before = _number(r"Observed speeds of the other car .*[\[ ]([^, \]]+)\]$", prompt)
+    step_s = _number(r"one value every (\S+) s", prompt)
     return Seen(
         own_speed=own,
         other_speed=other,
@@ -114,30 +148,37 @@ def read_prompt(prompt: str) -> Seen | str:
         asks_tactical="merge first (M) or yield" in prompt,
         plan_actions=int(actions),
         vehicle_length=_quantity("Length of each car", "m", prompt) or VEHICLE_LENGTH_M,
-        other_acceleration=_other_acceleration(prompt, other),
+        other_acceleration=(other - before) / step_s if before is not None and step_s else 0.0,
         previous=_number(r"not been executed yet\): \[([^,\]]+)", prompt),
         other_seen=other_seen,
     )
 
 
-def temper_for(seen: Seen, slot: Slot | None, effect: PlantedEffect | None) -> Temper:
-    """The trial's draws; without a slot the projected order decides who goes first."""
-    added_gap_m = 0.0 if effect is None else effect.x_gap_m
-    if slot is None:
-        return Temper(_projected_lead_m(seen) > 0, False, 3.85 + added_gap_m, 0.5)
-    trial: tuple[object, ...] = (slot.condition, slot.repetition, slot.sample_set)
-    if effect is not None:  # trials with another effect are drawn independently
-        trial += (effect.model_dump_json(),)
-    noise = draw_normal("noise", *trial)
-    chance = _chance_left_first(effect or HUMAN, slot.condition, noise)
-    left_first = draw("who first", *trial) < chance
-    goes_first = (slot.side == "left") == left_first
-    misjudges = not goes_first and _somebody_misjudges(slot)
-    return Temper(
+def _draws(seen: Seen, prompt: str, slot: Slot | None, effect: PlantedEffect | None) -> Draws:
+    """Return the draws; without a slot the projected order decides who goes first."""
+    goes_first, misjudges = seen.projected_lead_m > 0, False
+    trial: tuple[object, ...] = ()
+    decision: tuple[object, ...] = (prompt,)
+    if slot is not None:
+        trial = (slot.condition, slot.repetition, slot.sample_set)
+        decision = tuple(slot.as_dict().values())
+        if effect is not None:  # trials with another effect are drawn independently
+            trial += (effect.model_dump_json(),)
+        chance = _chance_left_first(effect or HUMAN, slot.condition, draw_normal("noise", *trial))
+        goes_first = (slot.side == "left") == (draw("who first", *trial) < chance)
+        # In one human condition of every third repetition.
+        turn = draw_index(3, "misjudge turn", slot.sample_set)
+        names = list(HUMAN_CONDITIONS)
+        chosen = draw_index(len(names), "misjudged condition", slot.repetition, slot.sample_set)
+        here = slot.repetition % 3 == turn and names[chosen] == slot.condition
+        misjudges = not goes_first and here
+    return Draws(
         goes_first=goes_first or misjudges,
         misjudges=misjudges,
-        target_gap_m=draw_between(1.8, 6.5, "gap", *trial) + added_gap_m,
+        target_gap_m=draw_between(1.8, 6.5, "gap", *trial) + (effect or HUMAN).x_gap_m,
         leader_share=draw_between(0.1, 0.7, "share", *trial),
+        wobble=draw_between(-0.05, 0.05, "wobble", *decision),
+        opening=OPENINGS[draw_index(len(OPENINGS), "words", *decision)],
     )
 
 
@@ -155,50 +196,43 @@ def _chance_left_first(effect: PlantedEffect, condition: str, noise: float) -> f
     return 1 / (1 + math.exp(-max(logit, -700.0)))  # exp of more than 709 overflows
 
 
-def _somebody_misjudges(slot: Slot) -> bool:
-    """Whether a driver misjudges here: in one human condition of every third repetition."""
-    turn = draw_index(3, "misjudge turn", slot.sample_set)
-    names = list(HUMAN_CONDITIONS)
-    chosen = draw_index(len(names), "misjudged condition", slot.repetition, slot.sample_set)
-    return slot.repetition % 3 == turn and names[chosen] == slot.condition
-
-
-def _go_first(seen: Seen, temper: Temper, slot: Slot | None) -> tuple[float, str]:
-    if seen.other_distance_to_merge <= 0:
-        return 0.0, "The other car is through already, so I keep my speed and stay behind it."
-    leading = _projected_lead_m(seen)
-    if temper.misjudges:
-        catch_up = _even_acceleration(-leading, seen.distance_to_merge, seen.own_speed)
-        action = min(MAX_ACCELERATION_MPS2, max(0.0, seen.other_acceleration + catch_up))
-        return action, _phrase(
-            slot,
-            "I take the gap: with enough speed I reach the merge point before the other car, "
-            "which should let me in. I keep an eye on it.",
-        )
-    lacking = _lacking_m(leading, seen, temper)
-    push = _even_acceleration(temper.leader_share * lacking, seen.distance_to_merge, seen.own_speed)
-    action = min(HARDEST_PUSH_MPS2, max(0.0, push))
-    return _settled(action, seen, slot), _phrase(
-        slot,
-        f"At present speeds I would be {leading:.1f} m ahead at the merge point. I go first and "
-        "make the gap clear by my speed, and hold this acceleration.",
-    )
-
-
-def _yield(seen: Seen, temper: Temper, slot: Slot | None) -> tuple[float, str]:
+def _approach(seen: Seen, draws: Draws) -> tuple[float, str]:
+    """Return the acceleration before the merge point, and the reason for it."""
     other_distance = seen.other_distance_to_merge
+    if other_distance <= 0 and draws.goes_first:
+        return 0.0, "The other car is through already, so I keep my speed and stay behind it."
     if other_distance <= 0:
         return _on_straight(seen)
-    behind = -_projected_lead_m(seen)
-    lacking = _lacking_m(behind, seen, temper)
-    share = 1 - temper.leader_share
-    brake = -_even_acceleration(share * lacking, other_distance, seen.other_speed)
-    action = min(0.0, max(HARDEST_BRAKING_MPS2, brake))
-    return _settled(action, seen, slot), _phrase(
-        slot,
-        f"The other car will be about {behind:.1f} m ahead at the merge point if nobody acts. I "
-        "let it go first and slow down evenly to leave a safe gap.",
-    )
+    lead = seen.projected_lead_m if draws.goes_first else -seen.projected_lead_m
+    if draws.misjudges:
+        catch_up = _even_acceleration(-lead, seen.distance_to_merge, seen.own_speed)
+        return min(MAX_ACCELERATION_MPS2, max(0.0, seen.other_acceleration + catch_up)), (
+            f"{draws.opening} I take the gap: with enough speed I reach the merge point before the "
+            "other car, which should let me in. I keep an eye on it."
+        )
+    # What the leader's projected lead lacks; a leader from behind acts at once.
+    lacking = draws.target_gap_m + seen.vehicle_length - lead + max(0.0, 1.0 - lead)
+    if draws.goes_first:
+        metres = draws.leader_share * lacking
+        push = _even_acceleration(metres, seen.distance_to_merge, seen.own_speed)
+        action = min(HARDEST_PUSH_MPS2, max(0.0, push))
+        why = (
+            f"At present speeds I would be {lead:.1f} m ahead at the merge point. I go first and "
+            "make the gap clear by my speed, and hold this acceleration."
+        )
+    else:
+        metres = (1 - draws.leader_share) * lacking
+        brake = -_even_acceleration(metres, other_distance, seen.other_speed)
+        action = min(0.0, max(HARDEST_BRAKING_MPS2, brake))
+        why = (
+            f"The other car will be about {lead:.1f} m ahead at the merge point if nobody acts. I "
+            "let it go first and slow down evenly to leave a safe gap."
+        )
+    # The level of the previous plan is held unless the need has moved away from it.
+    held = None if seen.previous is None else seen.previous * MAX_ACCELERATION_MPS2
+    if held is None or abs(action - held) >= 0.25:
+        held = action + draws.wobble
+    return held, f"{draws.opening} {why}"
 
 
 def _on_straight(seen: Seen) -> tuple[float, str]:
@@ -215,54 +249,15 @@ def _on_straight(seen: Seen) -> tuple[float, str]:
     return 0.0, "The other car is ahead at a sufficient distance. I keep my speed and follow it."
 
 
-def _settled(action: float, seen: Seen, slot: Slot | None) -> float:
-    """Hold the level of the previous plan unless the need has moved away from it."""
-    held = None if seen.previous is None else seen.previous * MAX_ACCELERATION_MPS2
-    if held is not None and abs(action - held) < 0.25:
-        return held
-    wobble = 0.0 if slot is None else draw_between(-0.05, 0.05, "wobble", *slot.as_dict().values())
-    return action + wobble
-
-
-def _lacking_m(lead: float, seen: Seen, temper: Temper) -> float:
-    """How far the leader's projected lead falls short; a leader from behind acts at once."""
-    return temper.target_gap_m + seen.vehicle_length - lead + max(0.0, 1.0 - lead)
-
-
-def _projected_lead_m(seen: Seen) -> float:
-    """How far ahead of the other the ego would be when the first one reaches the merge point."""
-    own = (seen.distance_to_merge or 0.0) / max(seen.own_speed, 0.1)
-    other = max(seen.other_distance_to_merge, 0.0) / max(seen.other_speed, 0.1)
-    seconds = min(own, other)
-    return (seen.own_speed - seen.other_speed) * seconds - seen.relative_distance
-
-
 def _even_acceleration(metres: float, distance: float | None, speed: float) -> float:
-    """The constant acceleration that gains a distance before the leader reaches the merge point."""
+    """Return the acceleration that gains a distance before the leader is at the merge point."""
     # From s = a t^2 / 2; near the merge point t is bounded, for a to stay within reason.
     seconds = max(SHORTEST_S, (distance or TRACK.merge_point_m) / max(speed, 0.1))
     return 2 * metres / seconds**2
 
 
-def _phrase(slot: Slot | None, reason: str) -> str:
-    if slot is None:
-        return reason
-    openings = (
-        "Neither of us has the right of way.",
-        "We approach the merge point at nearly the same time.",
-        "I compare when each of us arrives at the merge point.",
-    )
-    return f"{openings[draw_index(len(openings), 'words', *slot.as_dict().values())]} {reason}"
-
-
-def _other_acceleration(prompt: str, speed_now: float) -> float:
-    before = _number(r"Observed speeds of the other car .*[\[ ]([^, \]]+)\]$", prompt)
-    step = _number(r"one value every (\S+) s", prompt)
-    return (speed_now - before) / step if before is not None and step else 0.0
-
-
 def _quantity(name: str, unit: str, prompt: str) -> float | None:
-    """A quantity in the list of the situation, or in its table."""
+    """Return a quantity in the list of the situation, or in its table."""
     return _number(rf"{name}(?:: | \| )(\S+) (?:\| )?{unit}(?![\w/])", prompt)
 
 

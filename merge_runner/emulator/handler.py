@@ -1,125 +1,174 @@
-"""The emulator: answers HTTP requests in this process, and as a transport of httpx."""
+"""The emulator answers HTTP requests: within this process, as a transport of httpx, or as a server.
+
+Requests and responses are those of httpx in both cases.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import json
 import re
-from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import replace
-from functools import partial
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import httpx
 
-from merge_runner.emulator.batches import AnthropicMode, Batches, GeminiMode, OpenAIMode
-from merge_runner.emulator.exchange import BrokenOff, Request, Response, as_error, as_json
-from merge_runner.emulator.faults import STATUS_FAULTS, FaultPlan
-from merge_runner.emulator.formats import SERVED, ServedFormat
-from merge_runner.emulator.replies import MODELS, Asked, Replies, dumps
+from merge_runner.chance import draw_index
+from merge_runner.config import validated
+from merge_runner.emulator import Behaviour, driver
+from merge_runner.emulator.formats import SERVED, Completion, ServedFormat
 from merge_runner.errors import UsageError
-from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_HEADER, SLOT_HEADER
+from merge_runner.planted_effect import PlantedEffect, planted_fields
+from merge_runner.records import (
+    ANSWERED_FIELD,
+    ATTEMPT_HEADER,
+    SCRIPTED_FIELD,
+    SCRIPTED_HEADER,
+    SLOT_HEADER,
+    Slot,
+)
 
-ID_HEADER = "x-request-id"
-Handler = Callable[[Request], Response | Awaitable[Response]]
+MODEL, RANDOM_MODEL = "scripted-driver", "random-driver"
+# What anything but a chat request can raise: refused with 400.
+UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
+# The faults that are errors of the provider, beside a rate limit.
+ERRORS = {"server_error": 500, "overloaded": 503}
+PROSE = "M\n\nI would rather describe my plan in words than write a list of numbers."
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A chat request as it came; ``slot`` and ``attempt`` as the client sent them.
+
+    ``model`` is the one in the path, where it stands there.
+    """
+
+    wire: ServedFormat
+    path: str
+    raw: bytes
+    model: str | None = None
+    slot: str | None = None
+    attempt: str = ""
+
+    @property
+    def body_sha256(self) -> str:
+        """The hash of its body."""
+        return hashlib.sha256(self.raw).hexdigest()
+
+    @property
+    def where(self) -> str:
+        """The name of the request among all that may be asked."""
+        return self.slot or self.body_sha256
 
 
 class Emulator:
-    """Answers chat requests of every format in SERVED; ``faults`` decides what goes wrong."""
+    """Answers chat requests of every format in SERVED."""
 
-    def __init__(self, faults: FaultPlan | None = None) -> None:
-        self._faults = faults or FaultPlan()
-        self._replies = Replies(self._faults)
-        self._batches = Batches(self._replies)
-        routes: list[tuple[str, str, Handler]] = [
-            *(("POST", wire.path, partial(self._serve, wire)) for wire in SERVED),
-            ("GET", "/v1/models", self._models),
-            *OpenAIMode(self._batches).routes(),
-            *AnthropicMode(self._batches).routes(),
-            *GeminiMode(self._batches).routes(),
-            ("GET", "/emulator/answered", self._answered),
-        ]
-        self._routes = [(method, re.compile(path), handler) for method, path, handler in routes]
+    def __init__(self, behaviour: Behaviour | None = None) -> None:
+        self.behaviour = behaviour or Behaviour()
+        self._asked: Counter[str] = Counter()
 
-    async def respond(self, request: Request) -> Response:
-        """Answer a request; raises BrokenOff."""
-        for method, pattern, handler in self._routes:
-            if method == request.method and (named := pattern.fullmatch(request.path)):
-                response = handler(replace(request, named=named.groupdict()))
-                return response if isinstance(response, Response) else await response
-        return Response(b"404: Not Found", 404, {"content-type": "text/plain"})
+    def transport(self) -> httpx.MockTransport:
+        """Return a transport that carries requests here: no server, no socket."""
+        return httpx.MockTransport(self.respond)
 
-    def _models(self, request: Request) -> Response:
-        listed = [{"id": model, "object": "model", "owned_by": "emulator"} for model in MODELS]
-        return as_json({"object": "list", "data": listed})
+    async def respond(self, request: httpx.Request) -> httpx.Response:
+        """Answer a request of any kind."""
+        path = request.url.path
+        if (request.method, path) == ("GET", "/v1/models"):
+            model = {"id": MODEL, "object": "model", "owned_by": "emulator"}
+            return as_json({"object": "list", "data": [model]})
+        for wire in SERVED:
+            if request.method == "POST" and (match := re.fullmatch(wire.path, path)):
+                asked = Asked(
+                    wire,
+                    path,
+                    request.content,
+                    match.groupdict().get("model"),
+                    request.headers.get(SLOT_HEADER),
+                    request.headers.get(ATTEMPT_HEADER, ""),
+                )
+                return await self._chat(asked)
+        return as_response(b"404: Not Found", 404, {"content-type": "text/plain"})
 
-    def _answered(self, request: Request) -> Response:
-        """How often each request was answered, also in batches that nobody has fetched yet."""
-        self._batches.settle()
-        return Response(dumps(self._replies.count()))
-
-    async def _serve(self, wire: ServedFormat, request: Request) -> Response:
-        asked = Asked(
-            wire=wire,
-            path=request.path,
-            raw=request.body,
-            model=request.named.get("model"),
-            slot=request.headers.get(SLOT_HEADER),
-            attempt=request.headers.get(ATTEMPT_HEADER, ""),
-        )
+    async def _chat(self, asked: Asked) -> httpx.Response:
+        attempt = self.attempt(asked)
+        fault = self.behaviour.fault(asked.where, attempt)
         try:
-            question = self._replies.question(asked)
+            answer = self.answer(asked, attempt, fault)
         except UsageError as exc:
-            return as_error(wire, 400, str(exc))
-        attempt = self._replies.attempt(asked)
-        fault = self._faults.fault(asked.where, attempt)
-        await asyncio.sleep(self._faults.latency_s)
-        if fault == "hang":
-            await asyncio.sleep(self._faults.hang_s)
-        if fault in ("hang", "reset", "truncated_body"):
-            raise BrokenOff(fault)
-        if fault == "bad_gateway":
-            return Response(b"<html>502 Bad Gateway</html>", 502, {"content-type": "text/plain"})
-        if fault == "rate_limit":
-            delay_s = self._faults.wait_s(asked.where, attempt)
-            return as_error(wire, 429, "Rate limit reached.", delay_s)
-        if fault in STATUS_FAULTS:
-            return as_error(wire, STATUS_FAULTS[fault], "An emulated fault.")
-        reply = self._replies.answer(question, attempt, fault)
-        return Response(dumps(reply)[: -20 if fault == "truncated_json" else None])
+            return as_error(asked.wire, 400, str(exc))
+        await asyncio.sleep(self.behaviour.latency_s)
+        return await self.deliver(asked, fault, answer)
 
+    def attempt(self, asked: Asked) -> int:
+        """Return the attempt's number: the client's own count, or how often this was asked."""
+        self._asked[asked.where] += 1
+        is_number = re.fullmatch("[0-9]{1,6}", asked.attempt)
+        return int(asked.attempt) if is_number else self._asked[asked.where]
 
-def headers_of(asked: Mapping[str, str]) -> dict[str, str]:
-    """Return the headers of each response to a request with the headers ``asked``.
-
-    They say that a mock model made it, even an error or what is no JSON, and repeat the request's
-    id, as many gateways do.
-    """
-    told = {SCRIPTED_HEADER: "true"}
-    if ID_HEADER in asked:
-        told[ID_HEADER] = asked[ID_HEADER]
-    return told
-
-
-class InProcess(httpx.AsyncBaseTransport):
-    """Carries requests to an emulator in this process: no server, no socket."""
-
-    def __init__(self, emulator: Emulator) -> None:
-        self._emulator = emulator
-
-    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
-        """Answer a request; raises httpx.ReadError where the emulator breaks off."""
-        asked = Request(
-            method=request.method,
-            path=request.url.path,
-            host=request.url.netloc.decode(),
-            headers=request.headers,
-            query=request.url.params,
-            body=await request.aread(),
-        )
+    def answer(self, asked: Asked, attempt: int, fault: str | None) -> dict[str, Any]:
+        """Return the body of an answer; raises UsageError where the request is none."""
         try:
-            response = await self._emulator.respond(asked)
-        except BrokenOff as exc:
-            raise httpx.ReadError(str(exc)) from exc
-        headers = {**response.headers, **headers_of(request.headers)}
-        # A stream, which the client reads as it reads any other.
-        body = httpx.ByteStream(response.body)
-        return httpx.Response(response.status, headers=headers, stream=body)
+            body = json.loads(asked.raw)
+            slot = None if asked.slot is None else Slot(**json.loads(asked.slot))
+            prompt = asked.wire.prompt(body)
+            model = asked.model or str(body.get("model", MODEL))
+            (prompt + model).encode()
+            planted = planted_fields(asked.wire.parameters(body))
+        except UNREADABLE as exc:
+            raise UsageError("The body is not valid.") from exc
+        effect = validated(PlantedEffect, planted, "the emulator") if planted else None
+        if fault == "malformed":
+            text = PROSE
+        elif model == RANDOM_MODEL:
+            text = driver.random_answer(prompt, slot)
+        else:
+            text = driver.answer(prompt, slot, effect)
+        # A token is about four bytes.
+        tokens_in, visible = len(prompt.encode()) // 4, len(text.encode()) // 4
+        reasoning = 200 + draw_index(600, "reasoning", prompt)
+        if typical := self.behaviour.output_tokens:
+            drawn = typical // 2 + draw_index(typical, "reasoning", prompt)
+            reasoning = max(0, drawn - visible)
+        # Only the same attempt at the same request gets the same id: the audit takes one that
+        # comes back for an answer that was given twice.
+        which = f"{asked.path} {asked.where} {attempt}".encode()
+        reply = hashlib.sha256(asked.raw + which).hexdigest()[:24]
+        said = Completion(reply, model, text, tokens_in, visible, reasoning)
+        request = {"body_sha256": asked.body_sha256, "slot": slot and slot.as_dict()}
+        return {**asked.wire.answer(said), ANSWERED_FIELD: request, SCRIPTED_FIELD: True}
+
+    async def deliver(
+        self, asked: Asked, fault: str | None, answer: dict[str, Any]
+    ) -> httpx.Response:
+        """Return the response with an answer, or the error that takes its place."""
+        if fault == "rate_limit":
+            return as_error(asked.wire, 429, "Rate limit reached.", self.behaviour.delay_s)
+        if fault in ERRORS:
+            return as_error(asked.wire, ERRORS[fault], "An emulated fault.")
+        return as_json(answer)
+
+
+def as_response(body: bytes, status: int, headers: Mapping[str, str]) -> httpx.Response:
+    """Return a response that says that a mock model made it, even an error or what is no JSON."""
+    # The client reads a stream as it reads any other response.
+    stream = httpx.ByteStream(body)
+    return httpx.Response(status, headers={**headers, SCRIPTED_HEADER: "true"}, stream=stream)
+
+
+def as_json(
+    body: dict[str, Any], status: int = 200, headers: Mapping[str, str] | None = None
+) -> httpx.Response:
+    """Return a response of JSON."""
+    sent = json.dumps(body, ensure_ascii=False).encode()
+    return as_response(sent, status, {"content-type": "application/json", **(headers or {})})
+
+
+def as_error(wire: ServedFormat, status: int, message: str, delay_s: float = 0.0) -> httpx.Response:
+    """Return an error in a provider's form."""
+    body, headers = wire.error(status, message, delay_s)
+    return as_json({**body, SCRIPTED_FIELD: True}, status, headers)

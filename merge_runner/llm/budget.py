@@ -1,14 +1,12 @@
 """A cap on what a sweep spends, over all its runs, that holds whatever happens.
 
 The worst case of an attempt is reserved when it queues for its turn, and durably, in the ledger,
-right before it is sent. PaidAttempt says where the money goes when the attempt ends, however it
-ends.
+right before it is sent; see PaidAttempt.
 
 So that money finishes trials instead of beginning ever more of them, a trial begins only where what
-it is expected to cost (trial_costs.py) fits beside what the trials that have begun are still
-expected to cost. Expectations err, so the oldest trial goes first: an attempt leaves room for what
-older trials need, and for no younger one's. So the oldest trial has all the money that is left, and
-is suspended only where that does not pay for a single attempt.
+it is expected to cost fits beside what the trials that have begun are still expected to cost.
+Expectations err, so an attempt leaves room for what older trials need, and for no younger one's:
+the oldest trial is suspended only where all the money left does not pay for a single attempt.
 
 A server may ignore the output cap. What a reply cost beyond its worst case is taken from what is
 left, and from then on the worst case is multiplied by as much as that driver's most expensive reply
@@ -28,8 +26,7 @@ from operator import itemgetter
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.cache import CachedCall
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger, Spending
-from merge_runner.llm.trial_costs import TrialCosts
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.records import Attempt
 
 # An older trial that has money kept for it may wait for a call of a younger one, which waits for
@@ -41,15 +38,11 @@ PATIENCE_S = 90.0
 class PaidAttempt:
     """The money of one attempt, from its reservation to ``close``, the end of the attempt.
 
-    ``aside_usd`` is reserved in this process, and from ``begin`` on in the ledger. An attempt that
-    ends
-
-    - before ``begin`` (cancelled while waiting, refused by the cap) gives all of it back;
-    - after it (it may have been charged) leaves it in the ledger, until a user releases it;
-    - after ``settle`` or ``keep`` has what is not spent of it given back by the ledger, where the
-      cost is known.
-
-    What it gives back its trial may spend again.
+    ``aside_usd`` is reserved in this process while it is ``queued``, and from ``begin`` on in the
+    ledger. An attempt that ends before ``begin`` (cancelled while waiting, refused by the cap)
+    gives all of it back to its trial. After ``settle`` or ``keep`` it gives back what was not
+    spent, where the cost is known. Otherwise it may have been charged: all of it stays in the
+    ledger until a user releases it.
     """
 
     budget: Budget
@@ -60,6 +53,11 @@ class PaidAttempt:
     aside_usd: float
     queued: bool = True
     cost_usd: float | None = None
+
+    def __post_init__(self) -> None:
+        self.budget.in_flight += 1
+        self.budget.queued_usd += self.aside_usd if self.queued else 0.0
+        self.budget.charge(self.trial, self.aside_usd)
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
         """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
@@ -87,8 +85,6 @@ class PaidAttempt:
         """Keep the answer that the attempt brought, then settle what it cost."""
         kept = await self.ledger.cache.put(entry)
         await self._pay(entry.attempts[-1])
-        if self.cost_usd is not None:
-            self.budget.costs.answers[self.asked.model].add(self.cost_usd)
         return kept
 
     async def _pay(self, attempt: Attempt) -> None:
@@ -100,8 +96,8 @@ class PaidAttempt:
         self.budget.in_flight -= 1
         if self.queued:
             self.budget.queued_usd -= self.aside_usd
-            self.budget.charge(self.trial, -self.aside_usd)
-        elif self.cost_usd is not None:
+            self.cost_usd = 0.0
+        if self.cost_usd is not None:
             self.budget.charge(self.trial, self.cost_usd - self.aside_usd)
         self.budget.wake()
 
@@ -109,21 +105,24 @@ class PaidAttempt:
 class Budget:
     """Spending under a cap in USD; without one nothing is refused, and all of it recorded.
 
-    A trial is named by its order in the sweep. ``in_flight`` counts the attempts that have money,
-    ``queued_usd`` is reserved in this process alone.
+    A trial is named by its order in the sweep; ``trial_usd`` returns the USD that one is expected
+    to cost. ``in_flight`` counts the attempts that have money, ``queued_usd`` is reserved in this
+    process alone.
     """
 
     def __init__(
-        self, ledger: Ledger, cap_usd: float | None = None, costs: TrialCosts | None = None
+        self,
+        ledger: Ledger,
+        cap_usd: float | None = None,
+        trial_usd: Callable[[int], float] = lambda _: 0.0,
     ) -> None:
         self.ledger = ledger
         self.cap_usd = cap_usd
-        self.costs = costs or TrialCosts(lambda _: {})
+        self.trial_usd = trial_usd
         self.in_flight = 0
         self.queued_usd = 0.0
         self._largest_usd = 0.0
         self._spent_before = ledger.spending.committed_usd > 0
-        self._asked: set[str] = set()
         self._charged_usd: dict[int, float] = {}  # by trial that has begun, with reservations
         self._left: set[int] = set()
         # The lowest place first: attempts come before trials that wait to begin, and older trials,
@@ -155,23 +154,14 @@ class Budget:
         if self.cap_usd is not None:
             await self._in_turn((False, trial), partial(self._pays, trial, asked))
         usd = self._worst_usd(asked)
-        self.in_flight += 1
-        self.queued_usd += usd
         self._largest_usd = max(self._largest_usd, usd)
-        self._asked.add(asked.model)
-        self.charge(trial, usd)
         return PaidAttempt(self, self.ledger, trial, key, asked, usd)
 
     def going_on(self, trial: int, key: str, asked: Asked, scope: str) -> PaidAttempt:
-        """Return the money of an attempt that an earlier run has begun under a ledger's name.
-
-        The caller closes it.
-        """
+        """Return the money of an attempt that an earlier run has begun under a ledger's name."""
         ledger = Ledger(self.ledger.cache, scope) if self.ledger.scope else self.ledger
-        paid = PaidAttempt(self, ledger, trial, key, asked, ledger.aside_usd(key), queued=False)
-        self.in_flight += 1
-        self.charge(trial, paid.aside_usd)
-        return paid
+        usd = ledger.aside_usd(key)
+        return PaidAttempt(self, ledger, trial, key, asked, usd, queued=False)
 
     def charge(self, trial: int, usd: float) -> None:
         """Count what a trial that has begun spends or sets aside, or gives back."""
@@ -180,8 +170,8 @@ class Budget:
 
     def wake(self) -> None:
         """Let the first in the queue see whether it may go on by now."""
-        for _, changed in self._queue[:1]:
-            changed.set()
+        if self._queue:
+            self._queue[0][1].set()
 
     def _begins(self, trial: int) -> bool:
         """Begin a trial if there is money for it beside all that have begun."""
@@ -189,42 +179,42 @@ class Budget:
             raise TrialSuspended("its trial is suspended")
         if trial in self._charged_usd:  # its other driver stood in the queue, too
             return True
-        needed_usd, spending = self.costs.usd(trial), self.ledger.read()
-        left_usd = self._left_usd(spending) - needed_usd + TOLERANCE_USD
-        if left_usd < 0 and not self._charged_usd and not self.in_flight:
-            if self._spent_before or not self._asked.isdisjoint(self.costs.calls(trial)):
-                raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD", spending)
-            # The first one of a model shows what a trial costs; each attempt must still fit.
-        elif left_usd < self._needed_usd(self._charged_usd):
+        needed_usd, left_usd = self.trial_usd(trial), self._left_usd()
+        if left_usd < needed_usd and not self._charged_usd and not self.in_flight:
+            # The first one begins all the same: it may cost less, and each attempt must still fit.
+            if self._spent_before or self._left:
+                raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD")
+        elif left_usd < needed_usd + self._needed_usd(self._charged_usd):
             return False
         self._charged_usd[trial] = 0.0
         return True
 
     def _pays(self, trial: int, asked: Asked, waited_s: float) -> bool:
         """Return whether there is money for an attempt."""
-        spending = self.ledger.read()
+        left_usd = self._left_usd()  # reads what the worst case is by now
         worst_usd = self._worst_usd(asked)
-        left_usd = self._left_usd(spending) - worst_usd + TOLERANCE_USD
-        if left_usd < 0 and not self.in_flight:
-            raise self._suspended(f"the next call may cost {worst_usd:.4f} USD", spending)
+        if left_usd < worst_usd and not self.in_flight:
+            raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
         counted_on = self.in_flight or waited_s < PATIENCE_S
         older = (each for each in self._charged_usd if each < trial and counted_on)
         # A server that ignores the output cap is known only by its first expensive reply, when the
         # others are sent already: all in flight may cost twice as much.
         twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
-        return left_usd >= max(self._needed_usd(older), twice_usd if self.in_flight else 0.0)
+        return left_usd - worst_usd >= max(
+            self._needed_usd(older), twice_usd if self.in_flight else 0.0
+        )
 
     def _worst_usd(self, asked: Asked) -> float:
         """Return the worst case, scaled by this driver's largest observed cost overrun."""
-        return asked.honest_usd * self.ledger.spending.times(asked.driver)
+        return asked.honest_usd * self.ledger.spending.overruns.get(asked.driver, 1.0)
 
-    def _left_usd(self, spending: Spending) -> float:
+    def _left_usd(self) -> float:
         assert self.cap_usd is not None
-        return self.cap_usd - spending.committed_usd - self.queued_usd
+        return self.cap_usd - self.ledger.read().committed_usd - self.queued_usd + TOLERANCE_USD
 
     def _needed_usd(self, trials: Iterable[int]) -> float:
         """Return what these begun trials are still expected to cost."""
-        return sum(max(0.0, self.costs.usd(each) - self._charged_usd[each]) for each in trials)
+        return sum(max(0.0, self.trial_usd(each) - self._charged_usd[each]) for each in trials)
 
     async def _in_turn(self, place: tuple[bool, int], may_go: Callable[[float], bool]) -> None:
         """Wait in the queue until ``may_go``, which is told for how many s this waits, is True."""
@@ -243,16 +233,13 @@ class Budget:
             self._queue.remove(own)
             self.wake()
 
-    def _suspended(self, what: str, spending: Spending) -> TrialSuspended:
+    def _suspended(self, what: str) -> TrialSuspended:
+        """Return the error of a trial that cannot be paid."""
+        spending, kept_usd = self.ledger.spending, self._needed_usd(self._charged_usd)
         reserved_usd = spending.reserved_usd + self.queued_usd
-        kept_usd = self._needed_usd(self._charged_usd)
-        set_aside = (
-            f", {reserved_usd:.4f} set aside for {spending.open_attempts} attempts whose cost is "
-            "not known: `merge-runner ledger`"
-        )
-        kept = f"; {kept_usd:.4f} more are kept for the trials that have begun"
         return TrialSuspended(
             f"{what}, and {spending.spent_usd + reserved_usd:.4f} of {self.cap_usd:g} USD are "
-            f"spent or set aside ({spending.spent_usd:.4f} spent"
-            f"{set_aside if reserved_usd > TOLERANCE_USD else ''}){kept if kept_usd else ''}"
+            f"spent or set aside ({spending.spent_usd:.4f} spent, {reserved_usd:.4f} set aside for "
+            f"{spending.open_attempts} attempts whose cost is not known: `merge-runner ledger`); "
+            f"{kept_usd:.4f} more are kept for the trials that have begun"
         )

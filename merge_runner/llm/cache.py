@@ -1,9 +1,9 @@
 """Recorded replies on disk: one text entry per call key, never evicted, never pickled.
 
-An entry is the JSON of a request, its slot and every attempt, the answering one last, behind a
-checksum. It is durable before anyone sees it: each batch of writes is one synchronous SQLite
-transaction. Beside the entries lie the attempts of calls that have no answer yet, the notes of
-batches, and damaged entries in quarantine. What was spent lies in the ledger's file (ledger.py).
+An entry is the JSON of a request and every attempt, the answering one last, behind a checksum.
+It is durable before anyone sees it: each batch of writes is one synchronous SQLite transaction.
+Beside the entries lie the attempts of calls that have no answer yet, the notes of batches, and
+damaged entries in quarantine.
 """
 
 from __future__ import annotations
@@ -15,42 +15,38 @@ import os
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import diskcache
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
+from merge_runner.llm.content_hashes import DAMAGED, check_body, check_call
 from merge_runner.llm.ledger import LedgerFile
 from merge_runner.llm.model_lock import ModelLocks
+from merge_runner.llm.sqlite_files import connect, making
 from merge_runner.llm.text_disk import (
     FILE,
     FORMAT,
     FORMAT_KEY,
+    NEW_CACHE,
     TextDisk,
-    connect,
-    damage_told,
     open_texts,
     refuse_others,
 )
-from merge_runner.llm.verify import DAMAGED, check_body, check_call
 from merge_runner.llm.write_batcher import BatchWriter, Operation, ResultT
 from merge_runner.records import Attempt, ChatRequest
 
 CHECKSUM_LENGTH = 32
 BATCH = 1_000
-ATTEMPTS = TypeAdapter(tuple[Attempt, ...])
+Attempts = tuple[Attempt, ...]
+ATTEMPTS = TypeAdapter(Attempts)
 FAILURES = (OSError, sqlite3.Error, UnicodeDecodeError)
-ADVICE = {
-    "read": "Put a copy of it back, or name another with --cache; the database and any exported "
-    "recording are not affected",
-    "written": "Every reply up to now is kept, those in flight are lost; when that is fixed, run "
-    "the same command again",
-}
 # Prefixes of keys that are no call keys.
 _UNANSWERED, _DAMAGED = "attempts ", "damaged "
 _GET = "SELECT mode, filename, value FROM Cache WHERE key = ? AND raw = 1"
@@ -62,6 +58,7 @@ _CALLS = """
 SELECT rowid FROM Cache NOT INDEXED WHERE typeof(key) != 'text' OR raw IS NOT 1
 OR length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ')
 """
+_CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +66,7 @@ class CachedCall:
     """A recorded call: its request, and all attempts, the answering one last."""
 
     request: ChatRequest
-    attempts: tuple[Attempt, ...]
+    attempts: Annotated[Attempts, Field(min_length=1)]
 
     def to_json(self) -> str:
         """Return the entry as one JSON text."""
@@ -79,14 +76,10 @@ class CachedCall:
     def from_json(cls, text: str) -> CachedCall:
         """Read an entry; raises RecordingError."""
         try:
-            stored = _STORED.validate_json(text, strict=True)
+            return _STORED.validate_json(text, strict=True).entry
         except ValidationError as exc:
-            raise RecordingError(
-                f"the recorded reply is damaged: {exc.errors()[0]['msg']}"
-            ) from exc
-        if not stored.entry.attempts:
-            raise RecordingError("the recorded reply is damaged: it holds no attempt")
-        return stored.entry
+            why = exc.errors()[0]["msg"]
+            raise RecordingError(f"the recorded reply is damaged: {why}") from exc
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,36 +116,18 @@ class ResponseCache:
         self.money = LedgerFile(folder)
         self._read_overlay = overlay
         self._disk = TextDisk(str(folder))
-        self._texts: diskcache.Cache | None = None
-        if read_only and not (folder / FILE).exists():
-            raise UsageError(f"there is no cache in {folder}")
-        try:
-            self._open(read_only)
-        except FAILURES as exc:
-            raise UsageError(
-                f"the cache {folder} cannot be used: {exc}. Put a copy of it back, or name another "
-                "folder with --cache, into which `merge-runner recording import FILE` takes the "
-                "replies of a recording"
-            ) from exc
         self._writer = BatchWriter(self.run_now)
-
-    def _open(self, read_only: bool) -> None:
-        if not read_only:
-            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self.folder.chmod(0o700)
-            if not (self.folder / FILE).exists():
-                _make(self.folder)
-        self._reading = connect(self.folder)
+        if read_only and not (folder / FILE).exists():
+            raise UsageError(f"there is no cache in {folder}: name one with --cache")
         try:
-            refuse_others(self.folder, self._reading)
-        except (UsageError, *FAILURES):
-            self._reading.close()
-            raise
-        self._own = self._identity()  # that of the file which was opened to be written
-        if not read_only:
-            self._texts = open_texts(self.folder)
-            with self._texts.transact():  # raises where nothing can be written
-                self._texts.set("opened", "")
+            if not read_only:
+                _make(folder)
+            refuse_others(folder)
+            self._opened = self._file
+            self._reading = connect(folder / FILE)
+            self._texts: Any = None if read_only else open_texts(folder)
+        except FAILURES as exc:
+            raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
 
     @cached_property
     def _overlay(self) -> Mapping[str, CachedCall]:
@@ -163,20 +138,24 @@ class ResponseCache:
         return self._overlay.get(key) or self._kept(key)
 
     async def put(self, entry: CachedCall) -> CachedCall:
-        """Keep an entry; returns the one that is kept when it is durable.
-
-        That is another one where an import was first: a kept reply is never replaced.
-        """
+        """Keep an entry durably; returns what is kept, another one where an import was first."""
         while (kept := await self.write(partial(self._keep, entry))) is None:
             self.set_damage_aside(entry.request.key)
         return kept
 
-    def put_now(self, entries: Iterable[CachedCall]) -> list[CachedCall]:
-        """Keep entries in one transaction, in this thread; returns those that are kept."""
+    def put_now(
+        self, entries: Iterable[CachedCall], tried: Iterable[tuple[str, Attempts]] = ()
+    ) -> list[CachedCall]:
+        """Keep entries, and attempts at calls without an answer, in one transaction in this thread.
+
+        Returns the entries that are kept.
+        """
         entries = list(entries)
         for entry in entries:
             self.set_damage_aside(entry.request.key)
-        return self.run_now([partial(self._keep, entry) for entry in entries])
+        kept = [partial(self._keep, entry) for entry in entries]
+        others = [partial(self._keep_tried, *each) for each in tried]
+        return self.run_now([*kept, *others])[: len(kept)]
 
     def add_missing(self, entries: Iterable[CachedCall]) -> tuple[int, int]:
         """Keep the entries that the cache lacks; returns (added, already there)."""
@@ -188,46 +167,30 @@ class ResponseCache:
         return added, seen - added
 
     def set_damage_aside(self, key: str) -> list[str]:
-        """Move a damaged entry, or list of attempts, to quarantine, byte for byte.
-
-        Returns the names of what was moved.
-        """
+        """Move a damaged entry or list of attempts to quarantine as it is; returns their names."""
         damaged = []
         for name, check in ((key, self._kept), (_UNANSWERED + key, self._tried)):
             try:
                 check(key)
-                continue
             except RecordingError:
                 damaged.append(name)
-            taken, free, number = set(self.names(_DAMAGED + name)), _DAMAGED + name, 2
-            while free in taken:
-                free, number = f"{_DAMAGED}{name} {number}", number + 1
-            with self._told("written"), contextlib.closing(connect(self.folder, "rw")) as own:
-                own.execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [free, name])
+        for name in damaged:
+            aside = _DAMAGED + name
+            aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
+            with self._told("written"), closing(connect(self.folder / FILE, "rw")) as own:
+                own.execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
         return damaged
 
-    def unanswered(self, key: str) -> tuple[Attempt, ...]:
-        """Return the attempts at a call that earlier runs made without an answer.
-
-        Those that a run began before it died are among them, with an unknown outcome.
-        """
+    def unanswered(self, key: str) -> Attempts:
+        """Return the attempts of earlier runs at a call without an answer, also unknown ones."""
         tried = self._tried(key)
         return (*tried, *self.money.begun(key, len(tried)))
 
-    async def put_unanswered(self, key: str, attempts: tuple[Attempt, ...]) -> None:
+    async def put_unanswered(self, key: str, attempts: Attempts) -> None:
         """Keep the attempts at a call that has no answer yet, durably."""
-        await self.write(partial(self.keep_all, (), {key: attempts}))
+        await self.write(partial(self._keep_tried, key, attempts))
 
-    def keep_all(
-        self, entries: Iterable[CachedCall], unanswered: Mapping[str, tuple[Attempt, ...]]
-    ) -> None:
-        """Keep entries, and the attempts at calls that have no answer yet; an operation."""
-        for entry in entries:
-            self._keep(entry)
-        for key, attempts in unanswered.items():
-            self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())
-
-    def all_unanswered(self) -> dict[str, tuple[Attempt, ...]]:
+    def all_unanswered(self) -> dict[str, Attempts]:
         """Return the attempts at all calls without an answer, by call key."""
         keys = (name.removeprefix(_UNANSWERED) for name in self.names(_UNANSWERED))
         return {key: self._tried(key) for key in keys}
@@ -238,48 +201,54 @@ class ResponseCache:
 
     def run_now(self, operations: list[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread."""
-        with self._told("written"), self._written.transact():
+        with self._told("written"), self._texts.transact():
             results = [operation() for operation in operations]
-            if not self._in_place:
+            if self._file != self._opened:
                 raise FileNotFoundError("it is no longer there")
         return results
 
     def read(self, name: str) -> str | None:
-        """Return the text that was kept under a name that is no call key, or None.
-
-        Raises RecordingError where it is damaged, CacheFailed where the folder cannot be read.
-        """
-        text = self._text(name)
-        return None if text is None else _checked(text)
+        """Return the text under a name, or None; raises RecordingError where it is damaged."""
+        with self._told("read"):
+            rows = self._reading.rows(_GET, name)
+        return _checked(self._disk.fetch(*rows[0])) if rows else None
 
     def replace(self, name: str, text: str) -> None:
         """Keep a text under a name that is no call key, behind a checksum; an operation."""
-        self._written.set(name, _behind_checksum(text))
+        self._texts.set(name, _behind_checksum(text))
 
     def remove(self, name: str) -> None:
         """Forget the text under a name that is no call key; an operation."""
-        self._written.delete(name)
+        self._texts.delete(name)
 
     def names(self, prefix: str) -> list[str]:
-        """Return the names, none of a call, that begin with a prefix; damaged ones do not."""
-        found = []
+        """Return the names, none of a call, that begin with a prefix."""
         with self._told("read"):
-            for (name,) in self._reading.execute(_KEYS, [prefix, prefix + chr(0x10FFFF)]):
-                with contextlib.suppress(UnicodeDecodeError):
-                    found.append(name.decode())
-        return found
+            rows = self._reading.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
+        return [name.decode(errors="replace") for (name,) in rows]
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
         """Yield all entries, of the folder and of the overlay, each verified.
 
         What is damaged, or none of ours, is left out, and the reason added to ``left_out``.
         """
-        yield from self._own_entries([] if left_out is None else left_out)
+        with self._told("read"):
+            for row in self._reading.execute(_CALLS):
+                try:
+                    with self._told("read"):
+                        ((key, raw, *value),) = self._reading.rows(_CALL, *row)
+                    key, text = self._disk.get(key, raw), self._disk.fetch(*value)
+                    entry = _verified(key, _checked(text))
+                    check_body(entry.request.body)
+                    yield entry
+                except (RecordingError, *DAMAGED) as exc:
+                    if left_out is not None:
+                        left_out.append(str(exc))
         yield from self._overlay.values()
 
     def recorded(self, fits: Callable[[ChatRequest], bool]) -> Iterator[ChatRequest]:
         """Yield the requests that fit and have a reply: the recording's, else the folder's."""
-        for entries in (self._overlay.values(), self._own_entries([])):
+        for entries in (self._overlay.values(), self.entries()):
             found = False
             for request in filter(fits, (each.request for each in entries)):
                 found = True
@@ -291,97 +260,65 @@ class ResponseCache:
         """Close the folder, and free its locks."""
         self.locks.close()
         self.money.close()
-        self._reading.close()
+        self._reading.close()  # first, since the last one to write ends the journal
         if self._texts is not None:
             self._texts.close()
-
-    @property
-    def _written(self) -> diskcache.Cache:
-        if self._texts is None:
-            raise sqlite3.OperationalError("it was opened to be read alone")
-        return self._texts
 
     def _keep(self, entry: CachedCall) -> CachedCall | None:
         """Keep an entry unless there is one; None where that is damaged; an operation."""
         key = entry.request.key
-        if self._written.add(key, _behind_checksum(entry.to_json())):
-            self._written.delete(_UNANSWERED + key)
+        if self._texts.add(key, _behind_checksum(entry.to_json())):
+            self._texts.delete(_UNANSWERED + key)
             return entry
         with contextlib.suppress(RecordingError):
             return self._kept(key)
         return None
 
+    def _keep_tried(self, key: str, attempts: Attempts) -> None:
+        self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())
+
     def _kept(self, key: str) -> CachedCall | None:
-        text = self._text(key)
+        text = self.read(key)
         return None if text is None else _verified(key, text)
 
-    def _tried(self, key: str) -> tuple[Attempt, ...]:
+    def _tried(self, key: str) -> Attempts:
         try:
             return ATTEMPTS.validate_json(self.read(_UNANSWERED + key) or "[]")
         except ValidationError as exc:
             raise RecordingError("the list of earlier attempts is damaged") from exc
 
-    def _text(self, name: str) -> str | None:
-        with self._told("read"), damage_told():
-            if self._texts is not None:
-                text: str | None = self._texts.get(name)
-                return text
-            row = self._reading.execute(_GET, [name]).fetchone()
-            return None if row is None else self._disk.fetch(*row)
-
-    def _own_entries(self, left_out: list[str]) -> Iterator[CachedCall]:
-        sql = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
-        with self._told("read"):
-            for row in self._reading.execute(_CALLS):
-                try:
-                    with damage_told():
-                        key, raw, *value = self._reading.execute(sql, row).fetchone()
-                    entry = _verified(self._disk.get(key, raw), self._disk.fetch(*value))
-                    check_body(entry.request.body)
-                    yield entry
-                except (RecordingError, *DAMAGED) as exc:
-                    left_out.append(str(exc))
-
     @contextlib.contextmanager
     def _told(self, done: str) -> Iterator[None]:
-        """Raise CacheFailed where the folder cannot be read or written."""
+        """Raise CacheFailed where the folder cannot be used, RecordingError for what is no text."""
         try:
             yield
         except (diskcache.Timeout, *FAILURES) as exc:
-            if not self._in_place:
-                raise CacheFailed(
-                    f"the cache {self.folder} was removed, moved or replaced while it was in use, "
-                    "and what it kept with it. Put it back if you can, and run the same command "
-                    "again: what is in no cache is asked again. The database is not affected"
-                ) from exc
-            why = str(exc) or "it cannot be locked to be written"
+            if "utf-8" in str(exc).lower():  # SQLite says no more of it
+                raise RecordingError("the recorded reply is damaged: it is no text") from exc
+            why = f"cannot be {done}: {str(exc) or 'another program writes'}"
+            if self._file != self._opened:
+                why = "was removed, moved or replaced while it was in use"
             raise CacheFailed(
-                f"the cache {self.folder} cannot be {done}: {why}. {ADVICE[done]}"
+                f"the cache {self.folder} {why}. When that is mended, or a copy of it put back, "
+                "run the same command again: what is in no cache is asked again"
             ) from exc
 
     @property
-    def _in_place(self) -> bool:
-        """True while the file is the one that was opened: SQLite writes on where it is gone."""
-        try:
-            return self._identity() == self._own
-        except OSError:
-            return False
-
-    def _identity(self) -> tuple[int, int]:
-        status = os.stat(self.folder / FILE)
-        return status.st_dev, status.st_ino
+    def _file(self) -> tuple[int, int] | None:
+        """The identity of the file in the folder: SQLite goes on with one that is gone."""
+        with contextlib.suppress(OSError):
+            status = os.stat(self.folder / FILE)
+            return status.st_dev, status.st_ino
+        return None
 
 
 def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
     """Add what the cache lacks of another folder's replies; returns (added, already there).
 
-    Each is verified, and the folder is only read. Raises RecordingError, when all others are added,
-    if any was damaged or none of ours.
+    The folder is only read. Raises RecordingError, when all others are added, if any was damaged.
     """
-    if folder.resolve() == cache.folder.resolve():
-        raise UsageError(f"{folder} is the cache itself: name another one with --cache")
     left_out: list[str] = []
-    with contextlib.closing(ResponseCache(folder, read_only=True)) as source:
+    with closing(ResponseCache(folder, read_only=True)) as source:
         added, there = cache.add_missing(source.entries(left_out))
     if left_out:
         raise RecordingError(
@@ -392,35 +329,21 @@ def import_folder(folder: Path, cache: ResponseCache) -> tuple[int, int]:
 
 
 def _make(folder: Path) -> None:
-    """Make the file whole or not at all, so that an empty one is never one that is being made."""
-    with tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:
-        _lay_out(Path(new))
-        try:
-            os.link(Path(new) / FILE, folder / FILE)
-        except FileExistsError:
-            pass  # another process was quicker
-        except OSError:  # a file system without links
-            _lay_out(folder)
-    # The name of a new file is durable only when its folder is.
-    descriptor = os.open(folder, os.O_RDONLY)
-    os.fsync(descriptor)
-    os.close(descriptor)
-
-
-def _lay_out(folder: Path) -> None:
-    """Make what is missing of a file; one that another process has made stays as it is."""
-    made = open_texts(folder)
-    made.add(FORMAT_KEY, FORMAT)
-    made.close()
+    """Make a folder and its file, whole or not at all: an empty one is never taken for new."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    folder.chmod(0o700)
+    if (folder / FILE).exists():
+        return
+    with making(folder), tempfile.TemporaryDirectory(prefix="new-", dir=folder) as new:
+        if not (folder / FILE).exists():
+            with closing(open_texts(Path(new))) as made:
+                made.set(FORMAT_KEY, FORMAT)
+            os.replace(Path(new) / FILE, folder / FILE)
 
 
 def _verified(key: str, text: str) -> CachedCall:
-    """Return the entry that a row holds.
-
-    Raises RecordingError unless it is whole and belongs to its key: a reply to one request must
-    never answer another.
-    """
-    entry = CachedCall.from_json(_checked(text))
+    """Return the entry that a row holds; raises RecordingError unless it belongs to its key."""
+    entry = CachedCall.from_json(text)
     try:
         check_call(key, entry.request, entry.attempts)
     except DAMAGED as exc:

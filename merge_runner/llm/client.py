@@ -1,14 +1,16 @@
 """The client of one model: what is known, what is sealed, and what is asked.
 
-What an attempt means for its call is decided in http_outcome.py.
+A Call is one that is asked, with all its attempts; a Meter counts them for display and summary.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
-from contextlib import closing
-from dataclasses import dataclass, field, replace
+from collections import Counter, deque
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TYPE_CHECKING
@@ -16,39 +18,40 @@ from typing import TYPE_CHECKING
 from merge_runner.config import ModelEntry, driver_name, is_own_host
 from merge_runner.errors import (
     CallFailed,
+    EndpointRefused,
     MergeRunnerError,
     ModelSwapped,
     ProviderDown,
+    QuotaExhausted,
     RecordingError,
     ReplayMiss,
     SweepStopped,
 )
-from merge_runner.llm.batch.lines import Batches
+from merge_runner.llm.batch.journal import OpenBatch
+from merge_runner.llm.batch.rounds import Batches
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call import Call, Wait, slot_text
-from merge_runner.llm.content_hashes import make_request
+from merge_runner.llm.content_hashes import make_request, reply_object
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import WireFormat
 from merge_runner.llm.http_outcome import (
+    NOBODY_S,
     AttemptOutcome,
-    Consequences,
     Deadline,
     FirstCall,
     OutOfTime,
     RawReply,
-    RequestFailed,
     TransportFailure,
     TryAgain,
-    is_web_page,
+    backoff_s,
+    if_nobody,
     judge,
     may_be_charged,
+    why_refused,
 )
 from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.meter import Meter
 from merge_runner.llm.prices import cost_usd
-from merge_runner.llm.verify import reply_object
 from merge_runner.records import (
     SCRIPTED_HEADER,
     Attempt,
@@ -59,13 +62,119 @@ from merge_runner.records import (
     is_scripted,
     says_scripted,
 )
-from merge_runner.served_model import own_names
 
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
 
 # A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
+# How often a format that knows empty answers as a fault is asked again after one; and how many
+# refusals by an endpoint that has answered before mean the configuration.
+EMPTY_RETRIES, SEVERAL = 2, 3
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """Who waits for what, and until when (UTC); None: until it happens.
+
+    It is ``idle`` where what it waits for does not happen by itself: an answer that makes room, or
+    that is somebody else's.
+    """
+
+    who: str
+    what: str
+    until: datetime | None = None
+    idle: bool = False
+
+
+@dataclass(slots=True, eq=False)
+class Call:
+    """A call that somebody waits for.
+
+    ``asked`` names it for a reader and bounds the cost of an attempt, ``worst`` bounds its tokens.
+    ``attempts`` are all that were made, the first ``earlier`` of them by earlier runs. ``began_s``
+    is when the first attempt was due, on the event loop's clock. While the call waits, ``wait``
+    says for what; otherwise it is in flight, or being saved. A call that is ``stopping`` waits for
+    nothing any more. ``task`` makes it. ``asking`` counts those who wait for its answer. It goes
+    ``singly`` where a batch brought no answer, and ``open`` says in which batch it waits already.
+    """
+
+    request: ChatRequest
+    order: int
+    asked: Asked
+    worst: Usage
+    stopping: bool
+    attempts: list[Attempt] = field(default_factory=list)
+    earlier: int = 0
+    began_s: float = 0.0
+    wait: Wait | None = None
+    asking: int = 0
+    singly: bool = False
+    open: OpenBatch | None = None
+    task: asyncio.Task[ChatReply] = field(init=False)
+
+    @property
+    def own_attempts(self) -> list[Attempt]:
+        """The attempts of this run."""
+        return self.attempts[self.earlier :]
+
+    @property
+    def last_failure(self) -> str:
+        """The reason why the last attempt brought no answer."""
+        last = self.attempts[-1]
+        return last.error or last.outcome
+
+    @contextmanager
+    def waiting(
+        self, what: str, until: datetime | None = None, *, idle: bool = False
+    ) -> Iterator[Wait]:
+        """Mark the call as waiting, so that it can be given up: nothing of it is in flight."""
+        if self.stopping:
+            raise CallFailed("the sweep was stopped", self.request)
+        self.wait = wait = Wait(f"{self.asked.driver}: {self.asked.slot}", what, until, idle)
+        try:
+            yield wait
+        finally:
+            self.wait = None
+
+    def stop(self) -> None:
+        """Give the call up: at once if it waits, otherwise as soon as it would wait again."""
+        self.stopping = True
+        # What is in flight may be charged whether or not anybody takes the answer: it goes on.
+        if self.wait is not None:
+            self.task.cancel()
+
+
+@dataclass(slots=True)
+class Meter:
+    """Counts of calls, attempts, tokens and cost.
+
+    ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name; ``damaged``
+    are the keys of recorded replies that could not be read.
+    """
+
+    calls_live: int = 0
+    calls_cached: int = 0
+    tokens: int = 0
+    cost_usd: float = 0.0
+    cost_unknown: int = 0
+    outcomes: Counter[str] = field(default_factory=Counter)
+    mismatches: Counter[str] = field(default_factory=Counter)
+    stand_ins: int = 0
+    notes: deque[str] = field(default_factory=deque)
+    damaged: list[str] = field(default_factory=list)
+
+    def count_attempt(self, attempt: Attempt) -> None:
+        """Count one live attempt."""
+        self.outcomes[attempt.outcome] += 1
+        self.cost_usd += attempt.cost_usd or 0.0
+        self.cost_unknown += attempt.cost_usd is None
+        self.tokens += (attempt.usage.input_tokens or 0) + (attempt.usage.output_tokens or 0)
+
+    def add(self, other: Meter) -> None:
+        """Add what another meter has counted."""
+        for each in fields(self):
+            setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
 
 
 @dataclass(slots=True)
@@ -75,9 +184,9 @@ class LlmClient:
     ``endpoint`` is the identity that enters the keys. ``budget`` is None for a model that costs
     nothing. ``first`` is the run's first call to the endpoint, which goes alone. ``sealed`` says
     that nothing may be asked anew, so that there is no ``transport``; ``strict`` that an answer of
-    another model stops the sweep. ``model`` is its name in the registry where ``name`` also tells
-    its parameters. ``batches`` are those in which it may be asked, or where its calls may wait
-    already. ``driver`` is its name, with the endpoint where that is not the provider's own.
+    another model stops the sweep. ``batches`` are those in which it may be asked, or where its
+    calls may wait already. ``driver`` is its name, with the endpoint where that is not the
+    provider's own.
 
     ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
     its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
@@ -93,8 +202,7 @@ class LlmClient:
     budget: Budget | None = None
     sealed: bool = False
     strict: bool = False
-    model: str = ""
-    first: FirstCall = field(default_factory=partial(FirstCall, passed=True))
+    first: FirstCall = field(default_factory=lambda: FirstCall(passed=True))
     batches: Batches | None = None
     under_way: dict[str, Call] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter)
@@ -102,24 +210,17 @@ class LlmClient:
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
     _money: Budget = field(init=False)
-    _consequences: Consequences = field(init=False)
+    _own_host: str | None = field(init=False)  # the provider whose own host is asked
     _stopping: bool = False
 
     def __post_init__(self) -> None:
         """Derive what every call needs."""
+        provider = self.entry.provider
         self.driver = driver_name(self.name, self.endpoint)
         self._wire = FORMATS[self.entry.format]
-        self._own_names = own_names(self.entry.id, self.entry.aliases)
+        self._own_names = frozenset({None, self.entry.id, *self.entry.aliases})
         self._money = self.budget or Budget(Ledger(self.cache, ""))  # a ledger that keeps nothing
-        provider = self.entry.provider
-        self._consequences = Consequences(
-            self.name,
-            self.entry,
-            self.driver,
-            # The provider whose own host is asked; None: another server in its format.
-            provider if is_own_host(provider, self.endpoint) else None,
-            self.first,
-        )
+        self._own_host = provider if is_own_host(provider, self.endpoint) else None
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """Return the model's reply for a slot; lower ``order`` is served first.
@@ -155,10 +256,9 @@ class LlmClient:
         served = reply.attempts[-1].model_served
         if self.strict and served not in self._own_names:
             raise ModelSwapped(
-                f"{self.driver}: {served} answered where {self.entry.id} was asked for, at "
-                f"{slot_text(slot)}; --strict-model stops the sweep. The reply is kept. To go on "
-                "with it, leave --strict-model out, or name it in `aliases` in "
-                "experiments/models.toml"
+                f"{self.driver}: {served} answered where {self.entry.id} was asked for, at {slot}; "
+                "the reply is kept. To go on with it, leave --strict-model out, or name it in "
+                "`aliases` in experiments/models.toml"
             )
         return reply
 
@@ -228,7 +328,7 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
         worst_usd = cost_usd(self.entry, worst) or 0.0
-        asked = Asked(self.driver, slot_text(request.slot), worst_usd, self.model or self.name)
+        asked = Asked(self.driver, str(request.slot), worst_usd)
         call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call
@@ -246,10 +346,14 @@ class LlmClient:
         opened = self.batches is not None and self.batches.takes_up(call)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
-        alone = False
-        if not self.first.passed and not opened:  # nobody waits for an answer that may take hours
+        first = self.first
+        alone = not first.passed and not opened  # nobody waits for an answer that may take hours
+        if alone:
             with call.waiting(f"for the first answer of {self.driver}"):
-                alone = await self.first.turn()
+                await first.alone.acquire()
+            if first.passed:  # answered meanwhile: nobody goes alone any more
+                first.alone.release()
+                alone = False
         try:
             self._resume(call)
             return await self._attempts(call)
@@ -258,7 +362,7 @@ class LlmClient:
             raise
         finally:
             if alone:
-                self.first.give_turn()
+                first.alone.release()
 
     def _resume(self, call: Call) -> None:
         """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
@@ -271,9 +375,9 @@ class LlmClient:
             )
         earlier = self.cache.unanswered(key)
         if self.batches is not None:
-            call.open = self.batches.rounds.open_line(key, earlier)
+            call.open = self.batches.rounds.open_batch(key, earlier)
         opened = call.open  # the attempt that has begun there is the one that goes on
-        call.attempts = [each for each in earlier if not opened or each.number < opened.attempt]
+        call.attempts = [each for each in earlier if not opened or each.number < opened.lines[key]]
         call.earlier = len(call.attempts)
 
     async def _attempts(self, call: Call) -> ChatReply:
@@ -291,15 +395,17 @@ class LlmClient:
 
         try:
             return await deadline.keep(partial(self._attempt, call, deadline), sleep=sleep)
-        except (OutOfTime, RequestFailed) as exc:
-            why, made = f"{exc} ({call.last_failure})", len(call.own_attempts)
-            if isinstance(exc, OutOfTime) and not self.first.passed:
-                raise ProviderDown(
-                    f"{self.driver}: {exc} to the first call of this run ({call.last_failure}), "
-                    f"{made} attempts: nothing else is asked. When the service answers again, run "
-                    "the same command"
-                ) from exc
-            raise call.failed(f"{self.name}: {why}, {made} attempts") from exc
+        except OutOfTime as exc:
+            if self.first.passed:
+                raise self._failed(call, str(exc)) from exc
+            raise ProviderDown(
+                f"{self.driver}: the first call of this run: {exc} ({call.last_failure}): nothing "
+                "else is asked. When the service answers again, run the same command"
+            ) from exc
+
+    def _failed(self, call: Call, why: str) -> CallFailed:
+        why = f"{self.name}: {why} ({call.last_failure}), {len(call.own_attempts)} attempts"
+        return CallFailed(why, call.request, tuple(call.attempts), call.earlier)
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; return its answer, which is kept, or raise what follows from it."""
@@ -350,22 +456,64 @@ class LlmClient:
         call.attempts.append(record)
         self.meter.count_attempt(record)
         self._tell_overrun(call, paid.aside_usd)
-        error = error or self._consequences.error(call, outcome)
+        error = error or self._error(call, outcome)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
             if kept.attempts[-1] != record:  # an import was first
                 return self._read(kept, call.earlier)
             text = outcome.reading.text
             return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
-        if isinstance(error, TryAgain) and error.pause_s is not None:
-            self.limiter.pause(error.pause_s)
-            until = datetime.now(UTC) + timedelta(seconds=error.pause_s)
-            self.meter.notes.append(
-                f"{self.driver}: all its calls wait {error.pause_s:.1f} s, until "
-                f"{until:%H:%M:%S} UTC: {error}"
-            )
+        if outcome.pause:
+            self.limiter.pause(outcome.delay_s or backoff_s(len(call.own_attempts)))
         await paid.settle(call.attempts)  # before the error, which may end the whole run
         raise error
+
+    def _error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
+        """Return the error that follows from a call's last attempt, None if it is an answer."""
+        if stop := self._end_of_run(call, outcome):
+            return stop
+        message = outcome.message or outcome.name
+        match outcome.action:
+            case "retry":
+                return TryAgain(message, outcome.delay_s)
+            case "fail":
+                return self._failed(call, "nothing that is asked again would help")
+        self.first.passed = self.first.known = True
+        empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
+        if outcome.name == "empty" and self._wire.retries_empty and empty <= EMPTY_RETRIES:
+            return TryAgain("empty answer")
+        return None
+
+    def _end_of_run(self, call: Call, outcome: AttemptOutcome) -> SweepStopped | None:
+        """Return the error that ends a run whose other calls would fare no better."""
+        first, delay_s, why = self.first, outcome.delay_s or 0.0, None
+        if outcome.action == "refused" or not first.passed:
+            why = why_refused(self.name, self.entry, outcome)
+        if why is not None:
+            first.refused += outcome.action == "fail"
+            # An endpoint that has answered before may mean this prompt alone.
+            known = first.known and outcome.action != "refused"
+            return (
+                None
+                if known and first.refused < SEVERAL
+                else EndpointRefused(f"{self.driver}: {why}")
+            )
+        if outcome.name == "no_connection" and not first.passed:
+            # A server that is just starting is waited for, but only for seconds.
+            if asyncio.get_running_loop().time() - call.began_s < NOBODY_S:
+                return None
+            what = if_nobody(self.name, self.entry)
+            return ProviderDown(f"{self.driver}: {outcome.message}: {what}")
+        if outcome.action == "quota":
+            why = "the account's quota is exhausted"
+        elif outcome.pause and delay_s > self.entry.deadline_s:
+            why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
+        if why is None:
+            return None
+        return QuotaExhausted(
+            f"{self.driver}: {why} ({outcome.message}). Every reply so far is saved; run the same "
+            "command later to go on."
+        )
 
     def _tell_overrun(self, call: Call, aside_usd: float) -> None:
         spent_usd = call.attempts[-1].cost_usd or 0.0
@@ -408,16 +556,16 @@ class LlmClient:
             return cost_usd(self.entry, usage)
         if (usage.output_tokens or 0) > self.entry.max_output_tokens:
             return cost_usd(self.entry, replace(worst, output_tokens=usage.output_tokens))
-        stray = raw.status == 200 and is_web_page(raw) and not self.first.known
-        charged = may_be_charged(raw, self._consequences.own_host) and not stray
-        return None if charged else 0.0
+        stray = raw.status == 200 and raw.is_web_page and not self.first.known
+        return None if may_be_charged(raw, self._own_host) and not stray else 0.0
 
     async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""
-        opened, call.open = call.open, None
-        async with batches.attempt(call, opened) as (paid, line):
+        line = await batches.line(call)
+        with closing(line.paid):
             with call.waiting(f"for batches of {batches.model}", idle=True):
-                end = await batches.rounds.ask(line)
+                end, batch = await batches.rounds.ask(line)
+            call.open, call.singly = None, True
             outcome = AttemptOutcome("retry", end.outcome, end.message, charged=end.unclear)
             if end.raw is not None:  # no limit of single calls is meant, and no call waits for one
                 outcome = replace(judge(end.raw, self._wire), pause=False, delay_s=None)
@@ -427,9 +575,8 @@ class LlmClient:
                 usd = 0.0  # no line that failed is charged
             record = replace(
                 record,
-                started_at=line.submitted_at,
+                started_at=batch.submitted_at.isoformat(timespec="milliseconds"),
                 cost_usd=None if usd is None else usd * batches.price_factor,
-                batch_id=end.batch_id,
+                batch_id=batch.batch_id or None,
             )
-            call.singly = True
-            return await self._concluded(call, paid, outcome, record, end.error)
+            return await self._concluded(call, line.paid, outcome, record, end.error)

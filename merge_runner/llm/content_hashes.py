@@ -3,20 +3,32 @@
 The key of a reply covers the key version, the endpoint's identity, the path, the headers that
 change the meaning of a request, its exact body and the slot. All stand in one canonical JSON
 object, so no two of them can run into each other.
+
+A recorded call may be damaged, or made up: it is used only if its content belongs to its key. The
+numbers of its attempts are checked as they are read, by the bounds in records.py.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+import re
+from datetime import datetime
+from functools import lru_cache
+from typing import Any
 
 from pydantic import JsonValue
 
-from merge_runner.records import ChatRequest, Slot
+from merge_runner.config import MOST_REPETITIONS, MOST_STEPS
+from merge_runner.records import ANSWERS, Attempt, ChatRequest, Slot
+from merge_runner.registry import NAME
 
 KEY_VERSION = 1
 SPEC_VERSION = 2  # since then one valid array in a reply is enough
+# What reading content of others can raise; RecursionError where JSON is nested deeply.
+DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
+LARGEST_STATUS = 999
+_TEXT = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"')
 _CANONICAL = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
 )
@@ -44,16 +56,8 @@ def make_request(
 ) -> ChatRequest:
     """Return a request with its key."""
     text = canonical_json(body)
-    return ChatRequest(
-        key=call_key(endpoint=endpoint, path=path, headers=headers, body=text, slot=slot),
-        provider=provider,
-        endpoint=endpoint,
-        model=model,
-        path=path,
-        headers=headers,
-        body=text,
-        slot=slot,
-    )
+    key = call_key(endpoint=endpoint, path=path, headers=headers, body=text, slot=slot)
+    return ChatRequest(key, provider, endpoint, model, path, headers, text, slot)
 
 
 def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, slot: Slot) -> str:
@@ -67,20 +71,55 @@ def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, sl
 
 def without_prompt(body: str) -> str:
     """Return a canonical body without its longest text, which is the prompt."""
-    prompt = max(_texts(json.loads(body)), key=len, default="")
-    return body.replace(canonical_json(prompt), '""')
+    return body.replace(max(_TEXT.findall(body), key=len, default='""'), '""')
 
 
-def manner(path: str, empty_body: str) -> str:
-    """Return the short hash of all that is sent but the prompt."""
-    return hashlib.sha256(f"{path} {empty_body}".encode()).hexdigest()[:16]
+def check_call(key: str, request: ChatRequest, attempts: tuple[Attempt, ...]) -> None:
+    """Raise one of DAMAGED unless a call belongs to its key and its attempts are possible.
+
+    The last attempt is the one that was answered.
+    """
+    slot = request.slot
+    content = call_key(
+        endpoint=request.endpoint,
+        path=request.path,
+        headers=request.headers,
+        body=request.body,
+        slot=slot,
+    )
+    if not key == request.key == content:
+        raise ValueError("its content does not belong to its key")
+    if not (
+        NAME.fullmatch(slot.condition)
+        and 1 <= slot.repetition <= MOST_REPETITIONS
+        and 0 <= slot.decision <= MOST_STEPS
+        and slot.sample_set >= 0
+    ):
+        raise ValueError("its slot is none of a study")
+    numbers = [attempt.number for attempt in attempts]
+    if numbers != sorted({*numbers}):
+        raise ValueError("its attempts are not numbered one after the other")
+    last = attempts[-1]
+    if last.outcome not in ANSWERS or (last.http_status != 200 and last.outcome != "refusal"):
+        raise ValueError("its last attempt is no answer")
+    for attempt in attempts:
+        if attempt.started_at is not None:
+            datetime.fromisoformat(attempt.started_at)
+        if attempt.http_status == 200 and (attempt.outcome != "bad_body" or attempt is last):
+            reply_object(attempt.reply or "{}")
 
 
-def _texts(value: JsonValue) -> Iterator[str]:
-    waiting = [value]
-    while waiting:
-        part = waiting.pop()
-        if isinstance(part, str):
-            yield part
-        elif isinstance(part, dict | list):
-            waiting += part.values() if isinstance(part, dict) else part
+def check_body(body: str) -> None:
+    """Raise one of DAMAGED for the body of a request that we would not send."""
+    value = json.loads(body)
+    if not isinstance(value, dict) or canonical_json(value) != body:
+        raise ValueError("its request is not a canonical JSON object")
+
+
+@lru_cache(maxsize=1)  # who checks a reply reads it next
+def reply_object(text: str) -> dict[str, Any]:
+    """Return the JSON object of a reply, not to be changed; raises one of DAMAGED."""
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise ValueError("a reply is not a JSON object")
+    return value

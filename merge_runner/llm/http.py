@@ -8,10 +8,8 @@ import re
 import select
 import ssl
 import zlib
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 from urllib.request import getproxies, proxy_bypass
 from uuid import uuid4
 from weakref import WeakSet
@@ -32,9 +30,11 @@ if TYPE_CHECKING:
 
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
-MOST_BYTES = 16_000_000
+# Of a reply, and of the results of a whole batch.
+MOST_BYTES, MOST_LINES_BYTES = 16_000_000, 1_000_000_000
 KEPT_S = 5.0
 MOST_UNPACKED = 2**18  # bytes at a time
+ENCODINGS = ("", "identity", "gzip", "x-gzip", "deflate")
 HEADERS = {
     "accept": "*/*",
     "accept-encoding": "gzip",
@@ -46,51 +46,6 @@ MASK = "[key]"
 # one of its pieces, each half as long.
 RUN = 12
 PIECE = RUN // 2
-T = TypeVar("T")
-
-
-@dataclass(slots=True)
-class Trust:
-    """Whether an endpoint has kept to one answer for each request.
-
-    ``doubted`` is True once an answer was late or cut, or something came unasked; ``answers_named``
-    while its answers name their requests.
-    """
-
-    doubted: bool = False
-    answers_named: bool = False
-
-    @property
-    def one_each(self) -> bool:
-        """True if a connection serves one request alone, so that nothing late is taken."""
-        return self.doubted and not self.answers_named
-
-
-class Connections(aiohttp.TCPConnector):
-    """Serves a further request on a connection only while it is silent."""
-
-    def __init__(self, trust: Trust, **options: Any) -> None:  # noqa: ANN401 # aiohttp's own
-        super().__init__(**options)
-        self._trust = trust
-        self._used: WeakSet[ResponseHandler] = WeakSet()
-
-    async def connect(self, *args: Any, **options: Any) -> Connection:  # noqa: ANN401
-        """Return a new connection, or one on which nothing has come since its last answer."""
-        while True:
-            connection = await super().connect(*args, **options)
-            handler, channel = connection.protocol, connection.transport
-            assert handler is not None
-            assert channel is not None
-            if handler not in self._used:
-                self._used.add(handler)
-                return connection
-            # The event loop may have had no time to read what has arrived: so ask the system.
-            arrived = select.poll()
-            arrived.register(channel.get_extra_info("socket").fileno(), select.POLLIN)
-            self._trust.doubted |= handler.should_close
-            if not (handler.should_close or arrived.poll(0) or self._trust.one_each):
-                return connection
-            connection.close()
 
 
 class Mask:
@@ -127,9 +82,9 @@ class HttpTransport:
 
     A reply of more than ``most_bytes`` is refused. Proxies are those of the environment; loopback
     never goes through one. Only our own emulator is told the slot. Each attempt has a random id; an
-    answer that names another one is not taken. Once an answer was late, cut or came unasked, each
-    connection serves one request, unless the answers name their requests. A ``carrier`` takes the
-    requests in the place of connections.
+    answer that names another one is not taken. Once the endpoint is ``doubted``, since an answer
+    was late or cut, or came unasked, each connection serves one request, unless the answers name
+    their requests. A ``carrier`` takes the requests in the place of connections.
     """
 
     def __init__(
@@ -142,18 +97,24 @@ class HttpTransport:
     ) -> None:
         self._endpoint = endpoint
         self._base = httpx.URL(endpoint.base_url)
+        self._urls: dict[str, httpx.URL] = {}
         self._most_bytes = most_bytes
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}
         self._mask = Mask(secret for secret in secrets if len(secret) >= SHORTEST_SECRET)
         self._tells_slot = endpoint.is_emulator
-        self._trust = Trust()
+        self.doubted = False
+        self._answers_named = False
         # Each id is a UUID, as some servers demand (llama-cpp-python): a random part, this
         # transport's own, and the number of the request.
         self._own = str(uuid4())[:24]
         self._ids = map("{:012x}".format, itertools.count(1))
         self._carrier = carrier or self._network(connections)
-        self._urls: dict[str, httpx.URL] = {}
+
+    @property
+    def one_each(self) -> bool:
+        """True if a connection serves one request alone, so that nothing late is taken."""
+        return self.doubted and not self._answers_named
 
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Post the hashed bytes; raises TransportFailure."""
@@ -174,59 +135,53 @@ class HttpTransport:
         timeout_s: float,
         most_bytes: int | None = None,
     ) -> RawReply:
-        """Ask for anything; raises TransportFailure."""
-        with self._failures(timeout_s):
+        """Ask for anything; turns every error of the libraries into a TransportFailure."""
+        own_id = self._own + next(self._ids)
+        sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
+        sent |= dict.fromkeys(ID_HEADERS, own_id)
+        sent["connection"] = "close" if self.one_each else "keep-alive"
+        request = httpx.Request(method, self._url(path), headers=sent, content=body)
+        try:
             async with asyncio.timeout(timeout_s):
-                reply = await self._reply(method, path, headers, body)
+                reply = await self._carrier.handle_async_request(request)
                 try:
+                    self._refuse_others(reply, own_id)
                     return await self._read(reply, most_bytes or self._most_bytes)
                 finally:
                     await reply.aclose()
+        except TransportFailure:
+            self.doubted = True
+            raise
+        except TimeoutError as exc:
+            self.doubted = True
+            raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
+        except (httpx.RequestError, aiohttp.ClientError, zlib.error) as exc:
+            raise self._failure(exc) from exc
 
     async def lines(
         self, path: str, headers: Mapping[str, str], *, timeout_s: float
     ) -> AsyncGenerator[str | TransportFailure]:
         """Get a body of lines, each up to ``most_bytes`` long, or why it is refused.
 
-        Nothing may be late by more than ``timeout_s``. Raises ErrorReply where the status is not
-        200, and TransportFailure.
+        Raises ErrorReply where the status is not 200, and TransportFailure.
         """
-        with self._failures(timeout_s):
-            reply = await _within(timeout_s, self._reply("GET", path, headers, b""))
-            try:
-                if reply.status_code != 200:
-                    raise ErrorReply(await _within(timeout_s, self._read(reply, self._most_bytes)))
-                chunks = _in_time(_unpacked(reply), timeout_s)
-                async for line in split_lines(chunks, self._most_bytes):
-                    if line is None:
-                        yield _too_long(self._most_bytes)
-                    else:
-                        yield self._mask(_decoded(line))
-            finally:
-                await reply.aclose()
+        raw = await self.ask("GET", path, headers, timeout_s=timeout_s, most_bytes=MOST_LINES_BYTES)
+        if raw.status != 200:
+            raise ErrorReply(raw)
+        for line in raw.body.split("\n"):
+            yield line.strip() if len(line) <= self._most_bytes else _too_long(self._most_bytes)
 
     async def close(self) -> None:
         """Close all connections."""
         await self._carrier.aclose()
 
-    async def _reply(
-        self, method: str, path: str, headers: Mapping[str, str], body: bytes
-    ) -> httpx.Response:
-        """Send a request; return the reply with its body unread."""
-        own_id = self._own + next(self._ids)
-        sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
-        sent |= dict.fromkeys(ID_HEADERS, own_id)
-        sent["connection"] = "close" if self._trust.one_each else "keep-alive"
-        reply = await self._carrier.handle_async_request(
-            httpx.Request(method, self._url(path), headers=sent, content=body)
-        )
+    def _refuse_others(self, reply: httpx.Response, own_id: str) -> None:
+        """Raise TransportFailure where an answer names another request of this transport."""
         named = [part.strip() for h in ID_HEADERS for part in reply.headers.get(h, "").split(",")]
         ours = {part for part in named if part.startswith(self._own)}
-        self._trust.answers_named = bool(ours)
+        self._answers_named = bool(ours)
         if ours - {own_id}:
-            await reply.aclose()
             raise TransportFailure("wrong_answer", "the server sent the answer to another request")
-        return reply
 
     async def _read(self, reply: httpx.Response, most_bytes: int) -> RawReply:
         pieces, size = [], 0
@@ -235,24 +190,11 @@ class HttpTransport:
             if size > most_bytes:
                 raise _too_long(most_bytes)
             pieces.append(piece)
-        # A provider may echo the key in an error; it must not get into a log or a database.
-        body = self._mask(_decoded(b"".join(pieces)))
+        # UTF-8 is the encoding of JSON, whatever a header says. A provider may echo the key in an
+        # error; it must not get into a log or a database.
+        body = self._mask(b"".join(pieces).decode("utf-8-sig", errors="replace"))
         headers = {name.lower(): value for name, value in reply.headers.items()}
         return RawReply(reply.status_code, headers, body)
-
-    @contextmanager
-    def _failures(self, timeout_s: float) -> Iterator[None]:
-        """Turn every error of the libraries into a TransportFailure."""
-        try:
-            yield
-        except TransportFailure:
-            self._trust.doubted = True
-            raise
-        except TimeoutError as exc:
-            self._trust.doubted = True
-            raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
-        except (httpx.RequestError, aiohttp.ClientError) as exc:
-            raise self._failure(exc) from exc
 
     def _failure(self, error: Exception) -> TransportFailure:
         """Return the TransportFailure for an error of the libraries."""
@@ -267,20 +209,21 @@ class HttpTransport:
             if isinstance(cause.os_error, ConnectionRefusedError) and not by_proxy:
                 message = f"nothing listens at {self._endpoint.base_url}"
             return TransportFailure("no_connection", message, sent=False)
-        self._trust.doubted = True
+        self.doubted = True
         return TransportFailure("connection_lost", reason)
 
     def _url(self, path: str) -> httpx.URL:
         """Return the URL of a path at the configured host, which alone may get the key."""
         if path not in self._urls:
-            with suppress(httpx.InvalidURL):
+            try:
                 url = httpx.URL(self._endpoint.base_url + path)
-                if url.netloc == self._base.netloc:
-                    self._urls[path] = url
-        if path not in self._urls:
-            raise UsageError(
-                f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml"
-            )
+            except httpx.InvalidURL:
+                url = httpx.URL()
+            if url.netloc != self._base.netloc:
+                raise UsageError(
+                    f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml"
+                )
+            self._urls[path] = url
         return self._urls[path]
 
     def _network(self, connections: int) -> AiohttpTransport:
@@ -296,25 +239,47 @@ class HttpTransport:
                 "the certificates that SSL_CERT_FILE names cannot be read "
                 f"({exc.strerror or exc}): correct it or unset it"
             ) from exc
-
         kept = {"limit": connections, "keepalive_timeout": KEPT_S, "ssl": trusted}
 
         def session() -> aiohttp.ClientSession:
             return aiohttp.ClientSession(
-                connector=Connections(self._trust, **kept),
+                connector=Connections(self, **kept),
                 cookie_jar=aiohttp.DummyCookieJar(),  # one would tie independent samples together
             )
 
-        return AiohttpTransport(verify=trusted, client=session, proxy=_proxy(url))
+        proxies = getproxies()
+        named = proxies.get(url.scheme) or proxies.get("all")
+        proxy = None
+        if named and url.host not in LOOPBACK and not proxy_bypass(url.netloc.decode()):
+            proxy = httpx.Proxy(named if "://" in named else f"http://{named}")
+        return AiohttpTransport(verify=trusted, client=session, proxy=proxy)
 
 
-def _proxy(url: httpx.URL) -> httpx.Proxy | None:
-    """Return the proxy that the environment names for an endpoint."""
-    proxies = getproxies()
-    named = proxies.get(url.scheme) or proxies.get("all")
-    if named is None or url.host in LOOPBACK or proxy_bypass(url.netloc.decode()):
-        return None
-    return httpx.Proxy(named if "://" in named else f"http://{named}")
+class Connections(aiohttp.TCPConnector):
+    """Serves a further request on a connection only while it is silent."""
+
+    def __init__(self, transport: HttpTransport, **options: Any) -> None:  # noqa: ANN401
+        super().__init__(**options)
+        self._transport = transport
+        self._used: WeakSet[ResponseHandler] = WeakSet()
+
+    async def connect(self, *args: Any, **options: Any) -> Connection:  # noqa: ANN401
+        """Return a new connection, or one on which nothing has come since its last answer."""
+        while True:
+            connection = await super().connect(*args, **options)
+            handler, channel = connection.protocol, connection.transport
+            assert handler is not None
+            assert channel is not None
+            if handler not in self._used:
+                self._used.add(handler)
+                return connection
+            # The event loop may have had no time to read what has arrived: so ask the system.
+            arrived = select.poll()
+            arrived.register(channel.get_extra_info("socket").fileno(), select.POLLIN)
+            self._transport.doubted |= handler.should_close
+            if not (handler.should_close or arrived.poll(0) or self._transport.one_each):
+                return connection
+            connection.close()
 
 
 def _too_long(most_bytes: int) -> TransportFailure:
@@ -326,64 +291,24 @@ def _refused(why: str) -> TransportFailure:
     return TransportFailure("reply_refused", f"the reply is refused: {why}", action="fail")
 
 
-def _decoded(body: bytes) -> str:
-    """Decode a body as UTF-8, the encoding of JSON, whatever a header says."""
-    return body.decode("utf-8-sig", errors="replace")
-
-
-async def _within(seconds: float, awaited: Awaitable[T]) -> T:
-    async with asyncio.timeout(seconds):
-        return await awaited
-
-
-async def _in_time(chunks: AsyncIterator[bytes], timeout_s: float) -> AsyncIterator[bytes]:
-    """Yield the chunks; raises TimeoutError where one is late."""
-    while (chunk := await _within(timeout_s, anext(chunks, None))) is not None:
-        yield chunk
-
-
 async def _unpacked(reply: httpx.Response) -> AsyncIterator[bytes]:
     """Yield the decompressed pieces of a body, which may be a thousand times as long."""
     encoding = reply.headers.get("content-encoding", "").strip().lower()
+    if encoding not in ENCODINGS:
+        raise _refused(f"it is encoded as {encoding[:40]!r}, which was not asked for")
     if encoding in ("", "identity"):
         async for chunk in reply.aiter_raw():
             yield chunk
         return
-    if encoding not in ("gzip", "x-gzip", "deflate"):
-        raise _refused(f"it is encoded as {encoding[:40]!r}, which was not asked for")
     unpacking = zlib.decompressobj(wbits=32 + zlib.MAX_WBITS)  # tells gzip from deflate
-    cut = False
-    async for chunk in reply.aiter_raw():
-        packed = chunk
-        while packed:
-            try:
-                yield unpacking.decompress(packed, MOST_UNPACKED)
-            except zlib.error as exc:
-                raise TransportFailure("connection_lost", f"the reply is no {encoding}") from exc
-            packed = unpacking.unconsumed_tail
+    packed = b""
+    async for packed in reply.aiter_raw():
+        waiting = packed
+        while waiting:
+            yield unpacking.decompress(waiting, MOST_UNPACKED)
+            waiting = unpacking.unconsumed_tail
             if unpacking.unused_data:
                 raise _refused(f"it goes on after the end of its {encoding}")
             await asyncio.sleep(0)  # other calls go on while a large body is unpacked
-        cut = not unpacking.eof
-    if cut:
+    if packed and not unpacking.eof:
         raise TransportFailure("connection_lost", f"the reply is cut within its {encoding}")
-
-
-async def split_lines(chunks: AsyncIterator[bytes], most_bytes: int) -> AsyncIterator[bytes | None]:
-    """Yield the lines of a body, or None for one of more than ``most_bytes``.
-
-    Their ends, which may be CRLF, are left out.
-    """
-    pieces: list[bytes] = []
-    size = 0
-    async for chunk in chunks:
-        for number, part in enumerate(chunk.split(b"\n")):
-            if number:
-                yield b"".join(pieces).removesuffix(b"\r") if size <= most_bytes else None
-                pieces, size = [], 0
-            size += len(part)
-            if size <= most_bytes:
-                pieces.append(part)
-            else:  # of a line that is too long nothing is kept
-                pieces.clear()
-    yield b"".join(pieces).removesuffix(b"\r") if size <= most_bytes else None

@@ -1,7 +1,7 @@
 """What a raw HTTP reply means: an answer, something to try again, or a reason to stop.
 
-``judge`` says what a reply is by itself, ``Consequences.error`` what follows for its call and its
-run. The loop of attempts is tenacity's. Ours are the wait, which no server can shorten, and the
+``judge`` says what a reply is by itself; what follows for its call and its run, the client decides.
+The loop of attempts is tenacity's. Ours are the wait, which no server can shorten, and the
 deadline.
 """
 
@@ -13,49 +13,33 @@ import random
 import re
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Literal, TypeVar
 from urllib.parse import urlsplit
 
 from merge_runner.config import PROVIDERS, ModelEntry
-from merge_runner.errors import (
-    EndpointRefused,
-    MergeRunnerError,
-    ProviderDown,
-    QuotaExhausted,
-    SweepStopped,
-)
-from merge_runner.llm.formats import FORMATS, PASSED_ON
-from merge_runner.llm.formats.base import (
-    Reading,
-    ServerError,
-    WireFormat,
-    as_dict,
-    read_error,
-)
+from merge_runner.errors import MergeRunnerError
+from merge_runner.llm.formats import PASSED_ON
+from merge_runner.llm.formats.base import Reading, ServerError, WireFormat, as_dict, read_error
 from merge_runner.llm.formats.delays import server_delay_s
 
 if TYPE_CHECKING:
     from tenacity import RetryCallState
-
-    from merge_runner.llm.call import Call
 
 T = TypeVar("T")
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
 NOTHING_READ = Reading("error")
 REGISTRY = "experiments/models.toml"
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
-EMPTY_RETRIES = 2
-# At the first call of a run: for how long connections may be refused, and how many refusals mean
-# the configuration; the statuses of a refusal that names the request.
+# For how long connections may be refused at the first call of a run.
 NOBODY_S = 5.0
-SEVERAL = 3
-REQUEST_ITSELF = (400, 413, 422, 429)
-
+# The statuses of a refusal that names the request.
+REQUEST_ITSELF = (200, 400, 413, 422, 429)
 # Azure charges for a prompt that it has looked at, also where it then refuses it.
 CHARGED_ERRORS = frozenset({"content_filter", "context_length_exceeded"})
 TOO_LATE = frozenset({408, 499, 504, 524})
+
 # What a status means unless a format knows better; any other one means a bad request.
 STATUSES = {
     401: "not_allowed",
@@ -77,17 +61,12 @@ ACTIONS: dict[str, Action] = {
     "quota_exhausted": "quota",
     "not_allowed": "refused",
     "unknown_model": "refused",
-    **dict.fromkeys(
-        (
-            "rate_limited",
-            "request_timeout",
-            "conflict",
-            "server_error",
-            "overloaded",
-            "server_timeout",
-        ),
-        "retry",
-    ),
+    "rate_limited": "retry",
+    "request_timeout": "retry",
+    "conflict": "retry",
+    "server_error": "retry",
+    "overloaded": "retry",
+    "server_timeout": "retry",
 }
 
 
@@ -119,6 +98,11 @@ class RawReply:
         if isinstance(self.payload, list):
             return self.payload[0] if self.payload else None
         return self.payload
+
+    @property
+    def is_web_page(self) -> bool:
+        """Whether a web site answers: no service of any format sends this as an answer."""
+        return self.body.lstrip("\ufeff \t\r\n")[:9].lower().startswith(("<!doctype", "<html"))
 
 
 class TransportFailure(MergeRunnerError):
@@ -170,49 +154,37 @@ class AttemptOutcome:
 def may_be_charged(raw: RawReply, provider: str | None) -> bool:
     """Return whether a reply without usage may have been billed.
 
-    A refusal before any work is not, nor an error in the documented form of the ``provider`` whose
-    own host answered (None: another server). That of a gateway, or one for want of time, may
-    follow an answer that was made.
+    A refusal before any work is not, nor an error with the members that the ``provider`` documents
+    for its own, from its own host (None: another server). That of a gateway, or one for want of
+    time, may follow an answer that was made.
     """
     if raw.status < 300 or raw.status in TOO_LATE or '"usage' in raw.body:
         return True
-    if raw.status >= 500:
-        return provider is None or not _in_its_form(provider, raw)
-    return provider is None and bool(raw.error.names & CHARGED_ERRORS)
-
-
-def is_web_page(raw: RawReply) -> bool:
-    """Return whether a web site answers: no service of any format sends this as an answer."""
-    return raw.body.lstrip("\ufeff \t\r\n")[:9].lower().startswith(("<!doctype", "<html"))
-
-
-def _in_its_form(provider: str, raw: RawReply) -> bool:
-    """Return whether an error has the members that the provider documents for its own."""
-    members = PROVIDERS[provider].error_members
-    return bool(members) and members <= as_dict(as_dict(raw.first).get("error")).keys()
+    if raw.status < 500:
+        return provider is None and bool(raw.error.names & CHARGED_ERRORS)
+    members = PROVIDERS[provider].error_members if provider else frozenset()
+    return not members or not members <= as_dict(as_dict(raw.first).get("error")).keys()
 
 
 def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     """Classify a reply by the rules of docs/reference/providers.md."""
-    if raw.status == 200:
-        return replace(_judge_success(raw, wire), raw=raw)
-    outcome = judge_error(raw.error, wire)
-    # The usage that an error states is billed.
-    usage = wire.read(as_dict(raw.first)).usage
-    return replace(outcome, reading=replace(outcome.reading, usage=usage), raw=raw)
-
-
-def _judge_success(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
+    if raw.status != 200:
+        outcome = judge_error(raw.error, wire)
+        # The usage that an error states is billed.
+        usage = wire.read(as_dict(raw.first)).usage
+        return replace(outcome, reading=replace(outcome.reading, usage=usage), raw=raw)
     if not isinstance(raw.payload, dict):
-        return AttemptOutcome("retry", "bad_body", "the body is not a JSON object")
+        return AttemptOutcome("retry", "bad_body", "the body is not a JSON object", raw=raw)
     reading = wire.read(raw.payload)
-    parts = [raw.payload.get(name) for name in wire.members]
-    if reading.outcome == "empty" and all(part in (None, [], {}) for part in parts):
-        return AttemptOutcome("retry", "bad_body", "the body has nothing of an answer", reading)
-    if reading.outcome != "error":
-        return AttemptOutcome("accept", reading.outcome, reading=reading)
-    error = replace(raw.error, status=status_within(raw.error))
-    return replace(judge_error(error, wire), reading=reading)
+    if reading.outcome == "error":
+        error = replace(raw.error, status=status_within(raw.error))
+        return replace(judge_error(error, wire), reading=reading, raw=raw)
+    if reading.outcome == "empty":
+        parts = [raw.payload.get(name) for name in wire.members]
+        if all(part in (None, [], {}) for part in parts):
+            why = "the body has nothing of an answer"
+            return AttemptOutcome("retry", "bad_body", why, reading, raw=raw)
+    return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)
 
 
 def status_within(error: ServerError) -> int:
@@ -249,21 +221,11 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
 
 
 class TryAgain(MergeRunnerError):
-    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for.
+    """An attempt failed in a way that passes; ``delay_s`` is what the server asked for."""
 
-    All calls to the endpoint wait for ``pause_s``, where there is one.
-    """
-
-    def __init__(
-        self, message: str, delay_s: float | None = None, pause_s: float | None = None
-    ) -> None:
+    def __init__(self, message: str, delay_s: float | None = None) -> None:
         super().__init__(message)
         self.delay_s = delay_s
-        self.pause_s = pause_s
-
-
-class RequestFailed(MergeRunnerError):
-    """The provider rejects this one request; asking again would not help."""
 
 
 class OutOfTime(MergeRunnerError):
@@ -319,22 +281,13 @@ class Deadline:
                 raise failed.pop()
             return await attempt()
 
-        def wait_s(state: RetryCallState) -> float:
-            error = state.outcome.exception() if state.outcome else None
-            assert isinstance(error, TryAgain)
-            # The jitter lets calls that failed together, as when a server restarts, not return
-            # together.
-            jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
-            backoff = min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
-            return max(error.delay_s or 0.0, backoff)
-
         async def wait(seconds: float) -> None:
             self._used_s += seconds
             await sleep(seconds)
 
         again = AsyncRetrying(
             retry=retry_if_exception_type(TryAgain),
-            wait=wait_s,
+            wait=_wait_s,
             stop=lambda state: self._used_s + state.upcoming_sleep >= self._seconds,
             sleep=wait,
             reraise=True,
@@ -352,141 +305,67 @@ class Deadline:
             raise OutOfTime(why) from exc
 
 
+def _wait_s(state: RetryCallState) -> float:
+    """Return the wait in s after a failed attempt: the backoff, or the server's longer one."""
+    error = state.outcome.exception() if state.outcome else None
+    assert isinstance(error, TryAgain)
+    # The jitter lets calls that failed together, as when a server restarts, not return together.
+    jitter_s = random.uniform(0, FIRST_BACKOFF_S)  # noqa: S311 # no secret
+    return max(
+        error.delay_s or 0, min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
+    )
+
+
+@dataclass(slots=True)
 class FirstCall:
-    """The first live call of a run goes alone: a wrong key, URL or parameter costs one call.
+    """The first live call of a run goes ``alone``: a wrong key, URL or parameter costs one call.
 
     ``passed`` says that the endpoint has answered in this run, in its format, ``known`` that it
-    ever has.
+    ever has; ``refused`` counts the requests that it has refused before.
     """
 
-    def __init__(self, *, passed: bool = False, known: bool = False) -> None:
-        self.passed = passed
-        self.known = known
-        self.refused = 0
-        self._alone = asyncio.Lock()
-
-    async def turn(self) -> bool:
-        """Wait until a call may go; True if it goes alone, until ``give_turn``."""
-        await self._alone.acquire()
-        if self.passed:  # it was answered while this call waited: nobody goes alone any more
-            self._alone.release()
-        return not self.passed
-
-    def give_turn(self) -> None:
-        """Let another call go, after the one that went alone."""
-        self._alone.release()
+    passed: bool = False
+    known: bool = False
+    refused: int = 0
+    alone: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
-@dataclass(frozen=True, slots=True)
-class Consequences:
-    """What follows from attempts at one model; see LlmClient for the fields."""
-
-    name: str
-    entry: ModelEntry
-    driver: str
-    own_host: str | None
-    first: FirstCall
-
-    def error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
-        """Return the error that follows from a call's last attempt, None if it is an answer."""
-        if not self.first.passed and (stop := self._end_of_run(call, outcome)):
-            return stop
-        message = outcome.message or outcome.name
-        delay_s = outcome.delay_s or 0.0
-        if outcome.pause and delay_s > self.entry.deadline_s:
-            return QuotaExhausted(
-                f"{self.driver}: the provider asks to wait {delay_s:.0f} s, longer than a "
-                f"call's deadline of {self.entry.deadline_s:.0f} s ({message}). Every reply so far "
-                "is saved; run the same command again later to go on."
-            )
-        match outcome.action:
-            case "retry":
-                pause_s = (delay_s or backoff_s(len(call.own_attempts))) if outcome.pause else None
-                return TryAgain(message, outcome.delay_s, pause_s)
-            case "fail":
-                which = "reply" if outcome.name == "reply_refused" else "request"
-                return RequestFailed(f"the {which} was rejected")
-            case "quota":
-                return QuotaExhausted(
-                    f"{self.driver}: the account's quota is exhausted ({message}). Every reply so "
-                    "far is saved; when there is credit again, run the same command to go on."
-                )
-            case "refused":
-                return EndpointRefused(f"{self.driver}: {self._advice(outcome)} ({message})")
-        self.first.passed = self.first.known = True
-        # Servers of some formats give an empty answer now and then.
-        if outcome.name != "empty" or not FORMATS[self.entry.format].retries_empty:
-            return None
-        empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
-        return TryAgain("empty answer") if empty <= EMPTY_RETRIES else None
-
-    def _end_of_run(self, call: Call, outcome: AttemptOutcome) -> SweepStopped | None:
-        """Return the error that ends a run whose other calls would fare no better."""
-        if outcome.raw is None:
-            # A server that is just starting is waited for, but only for seconds.
-            waited_s = asyncio.get_running_loop().time() - call.began_s
-            if outcome.name != "no_connection" or waited_s < NOBODY_S:
-                return None
-            advice = if_nobody(self.name, self.entry)
-            return ProviderDown(f"{self.driver}: {call.last_failure}: {advice}")
-        why = self._refusal(outcome.raw, outcome)
-        if why is None:
-            return None
-        # An endpoint that has answered before may mean this prompt alone; several refusals mean the
-        # configuration.
-        self.first.refused += outcome.action == "fail"
-        if self.first.known and self.first.refused < SEVERAL and outcome.action != "accept":
-            return None
-        return EndpointRefused(f"{self.driver}: {why}")
-
-    def _refusal(self, raw: RawReply, outcome: AttemptOutcome) -> str | None:
-        """Return why all calls of a run would fail, and what to set; None: they might not."""
-        base_url = set_base_url(self.name, self.entry)
-        if is_web_page(raw) and raw.status == 200:
-            return f"a web page answers there, and no language model: {base_url}"
-        if outcome.name == "bad_body" and isinstance(raw.payload, dict):
-            return f"what answers there does not speak {self.entry.format}: {base_url}"
-        if outcome.action != "fail" or outcome.of_prompt:
-            return None
-        if raw.status not in (200, *REQUEST_ITSELF):
-            return f"no language model answers there: {base_url} ({outcome.message})"
-        named = self._named_parameter(raw)
-        where = f"{f'`{named}` of ' if named else ''}[{self.name}] in {REGISTRY}"
-        return f"the request is refused: look at {where} ({outcome.message})"
-
-    def _named_parameter(self, raw: RawReply) -> str | None:
-        """Return the parameter that an error names."""
-        error = as_dict(as_dict(raw.first).get("error"))
-        said = f"{error.get('param')} {raw.error.message}"
-        named = (f"parameters.{each}" for each in self.entry.parameters if each in said)
-        is_cap = any(words in said for words in ("max_", "tokens", "Request too large"))
-        return next(named, "max_output_tokens" if is_cap else None)
-
-    def _advice(self, outcome: AttemptOutcome) -> str:
-        """Return what a user can do if the endpoint refuses all calls."""
-        entry = self.entry
-        if outcome.name == "not_allowed":
-            key_envs = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
-            key = " or ".join(key_envs) or f"`key_env` of [{self.name}] in {REGISTRY}"
-            return f"the endpoint does not accept the key; set {key} to a valid one"
-        if outcome.name == "bad_certificate":
-            return (
-                "the endpoint's certificate cannot be trusted, and nothing was sent; check the "
-                "base URL, or set SSL_CERT_FILE to the certificates of whoever signed it"
-            )
-        retired = (
-            f", which was announced to shut down on {entry.shutdown}" if entry.shutdown else ""
+def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | None:
+    """Return why all calls of a run would fail, and what to set; None: they might not."""
+    raw, base_url, place = outcome.raw, set_base_url(name, entry), f"[{name}] in {REGISTRY}"
+    why = None
+    if outcome.name == "bad_certificate":
+        why = (
+            "the endpoint's certificate cannot be trusted, and nothing was sent; check the base "
+            "URL, or set SSL_CERT_FILE to the certificates of whoever signed it"
         )
-        other = "" if self.own_host else f", or {set_base_url(self.name, entry)}"
-        return f"the endpoint has no model {entry.id!r}{retired}; see `merge-runner models`{other}"
+    elif raw is None or outcome.of_prompt:
+        return None
+    elif raw.is_web_page and raw.status == 200:
+        return f"a web page answers there, and no language model: {base_url}"
+    elif outcome.name == "bad_body" and isinstance(raw.payload, dict):
+        return f"what answers there does not speak {entry.format}: {base_url}"
+    elif outcome.action == "refused" and outcome.name == "not_allowed":
+        key_envs = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
+        key = " or ".join(key_envs) or f"`key_env` of {place}"
+        why = f"the endpoint does not accept the key; set {key} to a valid one"
+    elif outcome.action == "refused":
+        until = f", which was announced to shut down on {entry.shutdown}" if entry.shutdown else ""
+        model = f"the endpoint has no model {entry.id!r}{until}"
+        why = f"{model}; see `merge-runner models`, or {base_url}"
+    elif outcome.action == "fail" and raw.status not in REQUEST_ITSELF:
+        why = f"no language model answers there: {base_url}"
+    elif outcome.action == "fail":
+        said = f"{as_dict(as_dict(raw.first).get('error')).get('param')} {outcome.message}"
+        named = next((f"`parameters.{each}` of " for each in entry.parameters if each in said), "")
+        why = f"the request is refused: look at {named}{place}"
+    return why and f"{why} ({outcome.message})"
 
 
 def if_nobody(name: str, entry: ModelEntry) -> str:
     """Return what a user can do if no server answers."""
-    return (
-        f"{PROVIDERS[entry.provider].if_nobody}, or {set_base_url(name, entry)}; then run the same "
-        "command again"
-    )
+    what = PROVIDERS[entry.provider].if_nobody
+    return f"{what}, or {set_base_url(name, entry)}; then run the same command again"
 
 
 def set_base_url(name: str, entry: ModelEntry) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -17,7 +17,8 @@ from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
-from merge_runner.errors import CacheFailed, RecordingError, UsageError
+from merge_runner.errors import UsageError
+from merge_runner.llm.sqlite_files import Connection, connect, making
 from merge_runner.llm.write_batcher import BatchWriter, Operation
 from merge_runner.records import Attempt
 
@@ -25,11 +26,11 @@ if TYPE_CHECKING:
     from merge_runner.llm.cache import ResponseCache
 
 FILE = "ledger.db"
-BUSY_S = 600.0
 TOLERANCE_USD = 1e-9  # sums of floats
 Rows = list[tuple[Any, ...]]
-Query = Callable[..., Rows]
+# Sums of what is spent, since a sum over all attempts at each reservation would take ever longer.
 TABLES = """
+BEGIN IMMEDIATE;
 CREATE TABLE IF NOT EXISTS spent (
   scope TEXT, driver TEXT, usd REAL NOT NULL, overrun_usd REAL NOT NULL,
   most_overrun REAL NOT NULL, PRIMARY KEY (scope, driver)
@@ -39,15 +40,13 @@ CREATE TABLE IF NOT EXISTS open (
   worst_usd REAL, since TEXT, outcome TEXT
 ) STRICT;
 CREATE INDEX IF NOT EXISTS open_call ON open (call);
+COMMIT;
+PRAGMA journal_mode = wal;
+PRAGMA synchronous = full; -- it survives a power cut
 """
-_SPENDING = """
-SELECT spent.usd, open.usd, open.attempts, spent.overrun_usd FROM
-(SELECT total(usd) AS usd, total(overrun_usd) AS overrun_usd FROM spent WHERE scope = ?1) AS spent,
-(SELECT total(usd) AS usd, count(*) AS attempts FROM open WHERE scope = ?1) AS open
-"""
-_OVERRUNS = "SELECT driver, most_overrun FROM spent WHERE scope = ? AND most_overrun > 0"
-_RESERVE = "INSERT INTO open VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
-_MADE = "SELECT 1 FROM sqlite_master WHERE name = 'open_call'"
+_SPENT = "SELECT driver, usd, overrun_usd, most_overrun FROM spent WHERE scope = ?"
+_RESERVED = "SELECT total(usd), count(*) FROM open WHERE scope = ?"
+_OPEN = "INSERT INTO open VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _BEGUN = """
 SELECT since FROM open WHERE call = ? AND attempt > ? AND outcome = 'in flight' ORDER BY attempt
 """
@@ -56,19 +55,10 @@ INSERT INTO spent VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET usd = usd + e
 overrun_usd = overrun_usd + excluded.overrun_usd,
 most_overrun = max(most_overrun, excluded.most_overrun)
 """
-_IN_FLIGHT = "SELECT call, attempt, driver FROM open WHERE scope = ? AND outcome = 'in flight'"
-_NOTE = """
-UPDATE open SET outcome = ?
-WHERE rowid = (SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
-"""
 _CLOSE = """
-DELETE FROM open
-WHERE rowid = (SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
-RETURNING usd, worst_usd
-"""
-_ROWS_SPENT = "SELECT driver, usd, overrun_usd, most_overrun FROM spent WHERE scope = ?"
-_ROWS_OPEN = """
-SELECT call, attempt, usd, driver, slot, worst_usd, since, outcome FROM open WHERE scope = ?
+DELETE FROM open WHERE rowid =
+(SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
+RETURNING usd, driver, slot, worst_usd, since
 """
 _REASONS = """
 SELECT driver, outcome, count(*), sum(usd), min(since), max(since), min(slot) FROM open
@@ -78,15 +68,11 @@ WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Who is asked, for which slot, and the most that costs if the output cap is respected.
-
-    ``model`` is its name in the registry; ``driver`` names its endpoint, too.
-    """
+    """Which driver at which endpoint is asked, for which slot, and the most that honestly costs."""
 
     driver: str = ""
     slot: str = ""
     honest_usd: float = 0.0
-    model: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,10 +94,6 @@ class Spending:
         """The most that may have been spent."""
         return self.spent_usd + self.reserved_usd
 
-    def times(self, driver: str) -> float:
-        """Return how many worst cases are reserved: more than 1 where a server ignores the cap."""
-        return self.overruns.get(driver, 1.0)
-
     @property
     def dearest(self) -> str:
         """The largest overruns by driver, in words."""
@@ -124,38 +106,33 @@ class LedgerFile:
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / FILE
-        self._connections: dict[str, sqlite3.Connection] = {}
+        self._connections: dict[str, Connection] = {}
         self._one_at_a_time = RLock()
-        self._made = False
         self.writer = BatchWriter(self.run_now)
 
     def read(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises UsageError where the file is damaged."""
         with self._told():
-            if not self._made:
-                if not self._file.exists():
-                    return []
-                # Another process may be making it.
-                self._made = bool(self._connection("ro").execute(_MADE).fetchall())
-            return self._connection("ro").execute(sql, values).fetchall() if self._made else []
+            # Its first transaction makes all tables: until then it is empty.
+            if not self._connections and not (self._file.exists() and self._file.stat().st_size):
+                return []
+            return self._connection("ro").rows(sql, *values)
 
-    def begun(self, call: str, tried: int) -> Iterator[Attempt]:
-        """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
-        rows: Rows = []
-        with contextlib.suppress(UsageError):  # which is told before anything is paid
-            rows = self.read(_BEGUN, call, tried)
-        for number, (since,) in enumerate(rows, tried + 1):
-            yield Attempt(
-                number=number,
-                outcome="unknown",
-                started_at=since,
-                error="the run ended before a reply was seen; it may have been charged",
-            )
+    def spending(self, scope: str, ask: Callable[..., Rows]) -> Spending:
+        """Return the sums of a sweep, by ``read`` or ``write``; raises UsageError for odd ones."""
+        with self._told():
+            # What is reserved first: what is settled meanwhile counts twice rather than never.
+            ((reserved_usd, attempts),) = ask(_RESERVED, scope) or [(0.0, 0)]
+            spent = ask(_SPENT, scope)
+            spent_usd, overrun_usd = (sum((r[column] for r in spent), 0.0) for column in (1, 2))
+            if not (spent_usd >= 0 and reserved_usd >= 0):
+                raise sqlite3.IntegrityError("no sweep can have spent that")
+        overruns = {driver: most for driver, _, _, most in spent if most > 0}
+        return Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
 
-    def run_now(self, operations: list[Operation]) -> list[Any]:
-        """Run operations in one durable transaction, in this thread; raises UsageError."""
-        with self.transaction():
-            return [operation() for operation in operations]
+    def write(self, sql: str, *values: object) -> Rows:
+        """Execute a statement within a transaction, and return its rows."""
+        return self._connection("rwc").rows(sql, *values)
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
@@ -169,51 +146,42 @@ class LedgerFile:
                 connection.execute("BEGIN IMMEDIATE")
                 yield
 
-    def spending(self, scope: str, query: Query | None = None) -> Spending:
-        """Return the sums of a sweep; raises UsageError where they cannot be."""
-        ask = query or self.read
-        with self._told():
-            rows = ask(_SPENDING, scope)
-            overruns: dict[str, float] = dict(ask(_OVERRUNS, scope))
-            spent_usd, reserved_usd, attempts, overrun_usd = rows[0] if rows else (0.0, 0.0, 0, 0.0)
-            if not (spent_usd >= 0 and reserved_usd >= 0):
-                raise sqlite3.IntegrityError("no sweep can have spent that")
-        return Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
+    def run_now(self, operations: list[Operation]) -> list[Any]:
+        """Run operations in one durable transaction, in this thread; raises UsageError."""
+        with self.transaction():
+            return [operation() for operation in operations]
 
-    def write(self, sql: str, *values: object) -> Rows:
-        """Execute a statement within the transaction of ``run_now``, and return its rows."""
-        return self._connection("rwc").execute(sql, values).fetchall()
+    def begun(self, call: str, tried: int) -> Iterator[Attempt]:
+        """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
+        rows: Rows = []
+        with contextlib.suppress(UsageError):  # which is told before anything is paid
+            rows = self.read(_BEGUN, call, tried)
+        for number, (since,) in enumerate(rows, tried + 1):
+            why = "the run ended before a reply was seen; it may have been charged"
+            yield Attempt(number, "unknown", started_at=since, error=why)
 
     def close(self) -> None:
         """Close the file."""
         while self._connections:
             self._connections.popitem()[1].close()
 
-    def _connection(self, mode: str) -> sqlite3.Connection:
+    def _connection(self, mode: str) -> Connection:
+        """Return a connection of its own to read or write: the event loop reads while one syncs."""
         if mode not in self._connections:
-            self._connections[mode] = connection = sqlite3.connect(
-                f"{self._file.absolute().as_uri()}?mode={mode}",
-                uri=True,
-                timeout=BUSY_S,
-                isolation_level=None,
-                check_same_thread=False,  # one batch at a time, each in a thread
-            )
+            self._connections[mode] = connection = connect(self._file, mode)
             if mode == "rwc":
-                connection.execute("PRAGMA journal_mode = wal")
-                connection.execute("PRAGMA synchronous = full")  # it survives a power cut
-                connection.executescript(TABLES)
+                with making(self._file.parent):
+                    connection.executescript(TABLES)
         return self._connections[mode]
 
     @contextlib.contextmanager
     def _told(self) -> Iterator[None]:
         try:
             yield
-        except sqlite3.OperationalError as exc:
-            raise CacheFailed(f"the ledger {self._file} cannot be used: {exc}") from exc
         except sqlite3.Error as exc:
             raise UsageError(
-                f"the record of what sweeps have spent ({self._file}) is damaged, so that no cap "
-                f"could hold ({exc}): put a copy of it back, or take the replies with "
+                f"the record of what sweeps have spent ({self._file}) cannot be used, so that no "
+                f"cap could hold ({exc}): put a copy of it back, or take the replies with "
                 f"`merge-runner recording import {self._file.parent} --cache NEW`, and go on with "
                 "--cache NEW, which counts from 0"
             ) from exc
@@ -236,14 +204,14 @@ class Ledger:
         self.spending = Spending()
         self.scope = scope
         self.cache = cache
+        self._money = cache.money
         # A damaged record is an error only where money is to be spent: a replay needs none.
         with contextlib.suppress(UsageError):
             self.read()
 
     def read(self) -> Spending:
         """Return the current state; raises UsageError where its record is damaged."""
-        if self.scope:
-            self.spending = self.cache.money.spending(self.scope)
+        self.spending = self._money.spending(self.scope, self._money.read)
         return self.spending
 
     def reserve(
@@ -252,82 +220,58 @@ class Ledger:
         """Reserve the worst case of an attempt at a call; False if that exceeds the cap."""
         if not self.scope:
             return True
-        money = self.cache.money
-        with money.transaction():
-            committed_usd = money.spending(self.scope, money.write).committed_usd
+        with self._money.transaction():
+            committed_usd = self._money.spending(self.scope, self._money.write).committed_usd
             if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
                 return False
-            worst_usd, since = asked.honest_usd or usd, datetime.now(UTC)
-            place = (asked.driver, asked.slot, worst_usd, since.isoformat(timespec="milliseconds"))
-            money.write(_RESERVE, self.scope, key, number, usd, *place, "in flight")
+            since = datetime.now(UTC).isoformat(timespec="milliseconds")
+            place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
+            self._money.write(_OPEN, self.scope, key, number, usd, *place)
         return True
 
     def aside_usd(self, key: str) -> float:
         """Return the USD reserved for the last attempt at a call; 0 where nothing is."""
         sql = "SELECT usd FROM open WHERE scope = ? AND call = ? ORDER BY attempt DESC LIMIT 1"
-        rows = self.cache.money.read(sql, self.scope, key) if self.scope else []
+        rows = self._money.read(sql, self.scope, key)
         return float(rows[0][0]) if rows else 0.0
 
     async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
-        """Settle an attempt at a call, whose cost may be unknown; see also ``settle_kept``."""
+        """Settle an attempt at a call; its reservation stays where the cost is unknown."""
         if self.scope:
-            await self.cache.money.writer.write(partial(self._settled, key, attempt, driver))
+            await self._money.writer.write(partial(self._settled, key, attempt, driver))
             self.read()
 
     def _settled(self, key: str, attempt: Attempt, driver: str) -> None:
-        money, place = self.cache.money, (self.scope, key, attempt.number)
-        if attempt.cost_usd is None:  # it stays reserved: it may have been charged
-            money.write(_NOTE, attempt.outcome, *place)
-            return
-        rows = money.write(_CLOSE, *place)
-        # A batch may end after its money was released: then nothing is known to compare with.
-        usd, worst_usd = rows[0] if rows else (attempt.cost_usd, attempt.cost_usd)
-        overrun_usd = attempt.cost_usd - usd
-        overran = overrun_usd > TOLERANCE_USD
-        ratio = attempt.cost_usd / max(worst_usd, TOLERANCE_USD) if overran else 0.0
-        over = (overrun_usd if overran else 0.0, ratio)
-        money.write(_PAY, self.scope, driver, attempt.cost_usd, *over)
-
-    def settle_kept(self, drivers: Collection[str]) -> None:
-        """Settle attempts that were kept right before their run was killed.
-
-        No other run may ask these drivers meanwhile.
-        """
-        money = self.cache.money
-        rows = money.read(_IN_FLIGHT, self.scope)
-        for key, number, driver in (row for row in rows if row[2] in drivers):
-            with contextlib.suppress(RecordingError):
-                entry = self.cache.get(key)
-                for attempt in entry.attempts if entry else self.cache.unanswered(key):
-                    if attempt.number == number and attempt.outcome != "unknown":
-                        money.run_now([partial(self._settled, key, attempt, driver)])
+        place, cost_usd, over = (self.scope, key, attempt.number), attempt.cost_usd, (0.0, 0.0)
+        # It may be gone: a batch may end after its money was released.
+        for row in self._money.write(_CLOSE, *place):
+            if cost_usd is None:  # it may have been charged
+                self._money.write(_OPEN, *place, *row, attempt.outcome)
+            elif cost_usd > row[0] + TOLERANCE_USD:
+                over = (cost_usd - row[0], cost_usd / max(row[3], TOLERANCE_USD))
+        if cost_usd is not None:
+            self._money.write(_PAY, self.scope, driver, cost_usd, *over)
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""
-        read = self.cache.money.read
-        return read(_ROWS_SPENT, self.scope), read(_ROWS_OPEN, self.scope)
+        opened = self._money.read("SELECT * FROM open WHERE scope = ?", self.scope)
+        return self._money.read(_SPENT, self.scope), [row[1:] for row in opened]
 
     def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
         """Put what a task has spent, and has open, in the place of the share reserved for it."""
-        money = self.cache.money
-        with money.transaction():
-            money.write("DELETE FROM open WHERE scope = ? AND call = ?", self.scope, name)
-            for row in spent:
-                money.write(_PAY, self.scope, *row)
-            for row in opened:
-                money.write(_RESERVE, self.scope, *row)
+        with self._money.transaction():
+            self._money.write("DELETE FROM open WHERE scope = ? AND call = ?", self.scope, name)
+            for sql, rows in ((_PAY, spent), (_OPEN, opened)):
+                for row in rows:
+                    self._money.write(sql, self.scope, *row)
 
     def reasons(self) -> list[dict[str, Any]]:
-        """Return the reservations by driver and outcome, the largest sum in USD first.
-
-        ``first`` and ``last`` are UTC in ISO 8601; ``slot`` is one of those that they are for.
-        """
+        """Return the reservations by driver and outcome, with times in UTC and one of the slots."""
         names = ("driver", "outcome", "attempts", "usd", "first", "last", "slot")
-        rows = self.cache.money.read(_REASONS, self.scope)
-        return [dict(zip(names, row, strict=True)) for row in rows]
+        return [dict(zip(names, r, strict=True)) for r in self._money.read(_REASONS, self.scope)]
 
     def release(self) -> None:
         """Count no longer what is reserved; nobody may be asking meanwhile."""
-        money = self.cache.money
-        money.run_now([lambda: money.write("DELETE FROM open WHERE scope = ?", self.scope)])
+        with self._money.transaction():
+            self._money.write("DELETE FROM open WHERE scope = ?", self.scope)
         self.read()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import heapq
+import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -28,21 +29,16 @@ BURST_S = 0.5
 CLOCK_STEP_S, POLL_S = 1e-6, 1e-3
 
 
-@dataclass(slots=True, eq=False)
-class _Turn:
-    """A dispatched request's tokens; they count while the window holds it."""
-
-    dispatched_at: float
-    tokens: int
-    counts: bool
-
-
 @dataclass(order=True, slots=True)
-class _Waiter:
+class _Turn:
+    """A request that waits for its turn; then its tokens count while the window holds it."""
+
     order: int
     arrival: int
     tokens: int = field(compare=False)
-    turn: asyncio.Future[_Turn] = field(compare=False)
+    given: asyncio.Future[None] = field(compare=False)
+    dispatched_at: float = field(default=0.0, compare=False)
+    counts: bool = field(default=False, compare=False)
 
 
 @dataclass(slots=True)
@@ -68,12 +64,11 @@ class Limiter:
         pause: Pause | None = None,
         window_s: float = WINDOW_S,
     ) -> None:
-        self._limited = rpm is not None or tpm is not None
         self._tpm = tpm
         self._window_s = window_s
         self._throttles = [] if rpm is None else _throttles(rpm, window_s)
-        self._waiters: list[_Waiter] = []
-        self._arrivals = 0
+        self._waiting: list[_Turn] = []
+        self._arrivals = itertools.count()
         self._window: deque[_Turn] = deque()
         self._tokens_in_window = 0
         self._pause = pause or Pause()
@@ -89,17 +84,17 @@ class Limiter:
                 "experiments/models.toml"
             )
         loop = asyncio.get_running_loop()
+        turn = _Turn(order, next(self._arrivals), tokens, loop.create_future())
         # Without a limit, and with nobody before it, it needs no dispatcher, which is a task more.
-        if not self._limited and not self._waiters and loop.time() >= self._pause.until:
-            return partial(self._settle, _Turn(loop.time(), tokens, counts=False))
-        waiter = _Waiter(order, self._arrivals, tokens, loop.create_future())
-        self._arrivals += 1
-        waiter.turn.add_done_callback(lambda _: self._changed.set())
-        heapq.heappush(self._waiters, waiter)
-        self._changed.set()
-        if self._dispatcher is None or self._dispatcher.done():
-            self._dispatcher = asyncio.create_task(self._dispatch())
-        return partial(self._settle, await waiter.turn)
+        limited = self._throttles or self._tpm is not None
+        if limited or self._waiting or loop.time() < self._pause.until:
+            turn.given.add_done_callback(lambda _: self._changed.set())
+            heapq.heappush(self._waiting, turn)
+            self._changed.set()
+            if self._dispatcher is None or self._dispatcher.done():
+                self._dispatcher = asyncio.create_task(self._dispatch())
+            await turn.given
+        return partial(self._settle, turn)
 
     def pause(self, seconds: float) -> None:
         """Dispatch nothing for a while: the server asked everybody on this key to wait."""
@@ -116,44 +111,41 @@ class Limiter:
     async def _dispatch(self) -> None:
         """Serve the queue until it is empty."""
         loop = asyncio.get_running_loop()
-        while waiter := self._head():
-            wait = self._blocked_for(waiter, loop.time())
+        while turn := self._head():
+            wait = self._blocked_for(turn, loop.time())
             if wait > 0:
-                await self._wait(wait)
+                # A new turn, or a settlement, may change what can be done.
+                self._changed.clear()
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(wait):
+                        await self._changed.wait()
                 continue
             for throttle in self._throttles:
                 await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
-            heapq.heappop(self._waiters)
-            turn = _Turn(loop.time(), waiter.tokens, counts=self._tpm is not None)
-            if turn.counts:
+            heapq.heappop(self._waiting)
+            if self._tpm is not None:
+                turn.counts, turn.dispatched_at = True, loop.time()
                 self._window.append(turn)
                 self._tokens_in_window += turn.tokens
-            waiter.turn.set_result(turn)
+            turn.given.set_result(None)
 
-    def _head(self) -> _Waiter | None:
-        # A waiter that was cancelled has a turn that is done and that nobody will use.
-        while self._waiters and self._waiters[0].turn.done():
-            heapq.heappop(self._waiters)
-        return self._waiters[0] if self._waiters else None
+    def _head(self) -> _Turn | None:
+        # One that was cancelled is done before its turn, and nobody will use it.
+        while self._waiting and self._waiting[0].given.done():
+            heapq.heappop(self._waiting)
+        return self._waiting[0] if self._waiting else None
 
-    def _blocked_for(self, waiter: _Waiter, now: float) -> float:
+    def _blocked_for(self, turn: _Turn, now: float) -> float:
         """Return the least wait in s of the head of the queue."""
         while self._window and now - self._window[0].dispatched_at >= self._window_s:
             expired = self._window.popleft()
             expired.counts = False
             self._tokens_in_window -= expired.tokens
         free_at = max(self._pause.until, *(throttle.free_at for throttle in self._throttles), 0.0)
-        if self._tpm is not None and self._tokens_in_window + waiter.tokens > self._tpm:
+        if self._tpm is not None and self._tokens_in_window + turn.tokens > self._tpm:
             # At least until the oldest leaves the window; if that frees too little, once more.
             free_at = max(free_at, self._window[0].dispatched_at + self._window_s)
         return free_at - now
-
-    async def _wait(self, seconds: float) -> None:
-        """Wait for a time, or until a new waiter or a settlement changes what can be done."""
-        self._changed.clear()
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                await self._changed.wait()
 
 
 class _Throttle(Throttler):

@@ -12,37 +12,21 @@ GENAI_PRICES_PROVIDER = {"gemini": "google"}
 PER_MILLION = Decimal(1_000_000)
 
 
-def is_known(entry: ModelEntry) -> bool:
-    """Return whether anybody knows the price of a model."""
-    return cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is not None
-
-
 def cost_usd(entry: ModelEntry, usage: Usage) -> float | None:
     """Return the cost of an attempt in USD, None where the price or the tokens are unknown."""
-    if entry.price == "free":
+    price, read, written = entry.price, usage.input_tokens, usage.output_tokens
+    if price == "free":
         return 0.0
-    if usage.input_tokens is None or usage.output_tokens is None:
+    if read is None or written is None:
         return None
     cached = usage.cached_input_tokens or 0
-    if cached > usage.input_tokens:
+    if cached > read:
         cached = 0  # the server counts wrongly: none is taken for cheap
-    if isinstance(entry.price, Price):
-        return _by_figures(entry.price, usage.input_tokens, cached, usage.output_tokens)
-    return _by_table(entry, usage.input_tokens, cached, usage.output_tokens)
-
-
-def _by_figures(price: Price, read: int, cached: int, written: int) -> float:
-    cached_price = price.input if price.cached_input is None else price.cached_input
-    # Decimals of the written figures, so that sums of costs have no digits that nobody wrote.
-    cost = (
-        (read - cached) * Decimal(str(price.input))
-        + cached * Decimal(str(cached_price))
-        + written * Decimal(str(price.output))
-    )
-    return float(cost / PER_MILLION)
-
-
-def _by_table(entry: ModelEntry, read: int, cached: int, written: int) -> float | None:
+    if isinstance(price, Price):
+        cached_price = price.input if price.cached_input is None else price.cached_input
+        parts = ((read - cached, price.input), (cached, cached_price), (written, price.output))
+        # Decimals of the written figures, so that sums of costs have no digits that nobody wrote.
+        return float(sum(n * Decimal(str(usd)) for n, usd in parts) / PER_MILLION)
     from genai_prices import Usage as PricedUsage  # here, since it takes long to load
     from genai_prices import calc_price
 

@@ -8,19 +8,18 @@ other settings than ours is refused before diskcache opens it.
 from __future__ import annotations
 
 import contextlib
-import sqlite3
-from collections.abc import Iterator
 from pathlib import Path
 
 import diskcache
 from diskcache.core import METADATA, MODE_RAW, UNKNOWN
 
 from merge_runner.errors import RecordingError, UsageError
+from merge_runner.llm.sqlite_files import BUSY_S, connect
 from merge_runner.text_safety import one_line
 
 FILE = "cache.db"
 FORMAT_KEY, FORMAT = "format", "5"
-BUSY_S = 600.0  # another process may be writing long replies to a slow disk
+NEW_CACHE = "`merge-runner recording import FILE --cache NEW` makes one from a recording"
 SETTINGS = diskcache.DEFAULT_SETTINGS | {
     "eviction_policy": "none",
     "cull_limit": 0,
@@ -43,9 +42,7 @@ class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
     def get(self, key: object, raw: object) -> str:
         """Return a stored key; raises RecordingError unless it is a text."""
         if not (raw and isinstance(key, str)):
-            raise RecordingError(
-                "the cache holds a key that is no text, which is not ours: refused"
-            )
+            raise RecordingError("the cache holds a key that is no text: it is not ours")
         return key
 
     def store(self, value: object, read: bool, key: object = UNKNOWN) -> tuple[int, int, None, str]:
@@ -57,9 +54,7 @@ class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
     def fetch(self, mode: object, filename: object, value: object, read: bool = False) -> str:
         """Return the text of a row; raises RecordingError unless it holds one."""
         if filename is not None or mode != MODE_RAW:
-            raise RecordingError(
-                "the cache holds a pickle or names a file, which is not ours: refused"
-            )
+            raise RecordingError("the cache holds a pickle or names a file: it is not ours")
         if not isinstance(value, str):
             raise RecordingError("the recorded reply is damaged: it is no text")
         return value
@@ -73,43 +68,22 @@ def open_texts(folder: Path) -> diskcache.Cache:
     return diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
 
 
-def connect(folder: Path, mode: str = "ro") -> sqlite3.Connection:
-    """Return a connection of our own to a folder's file; ``mode`` is SQLite's."""
-    uri = f"{(folder / FILE).absolute().as_uri()}?mode={mode}"
-    return sqlite3.connect(
-        uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
-    )
-
-
-def refuse_others(folder: Path, connection: sqlite3.Connection) -> None:
+def refuse_others(folder: Path) -> None:
     """Raise UsageError for settings that we do not write, and for the file of another version.
 
     diskcache would obey such settings; the first version left no mark.
     """
-    for key, value in connection.execute("SELECT key, value FROM Settings").fetchall():
-        if key not in METADATA and (key not in SETTINGS or value != SETTINGS[key]):
-            raise UsageError(
-                f"{folder / FILE} has the setting {one_line(repr(key))[:40]} of another program: "
-                "name another folder with --cache"
-            )
     sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
-    (mark,) = connection.execute(sql, [FORMAT_KEY]).fetchone() or (b"1",)
-    if (
-        mark is not None and mark.isascii() and mark != FORMAT.encode()
-    ):  # of a damaged one each entry is checked
+    with contextlib.closing(connect(folder / FILE)) as connection:
+        settings = connection.rows("SELECT key, value FROM Settings")
+        ((mark,),) = connection.rows(sql, FORMAT_KEY) or [(b"1",)]
+    for key, value in settings:
+        if key not in METADATA and (key not in SETTINGS or value != SETTINGS[key]):
+            name = one_line(repr(key))[:40]
+            raise UsageError(f"{folder / FILE} has the setting {name} of another program")
+    # Where the mark is damaged, each entry is checked all the same.
+    if mark is not None and mark.isascii() and mark != FORMAT.encode():
         raise UsageError(
             f"the cache {folder} has format {one_line(mark.decode()[:9])}, and this merge-runner "
-            f"has format {FORMAT}: name another folder with --cache; `merge-runner recording "
-            "import FILE --cache NEW` makes one from a recording of its replies"
+            f"has format {FORMAT}: {NEW_CACHE}"
         )
-
-
-@contextlib.contextmanager
-def damage_told() -> Iterator[None]:
-    """Raise RecordingError for a text that is no UTF-8, of which SQLite says no more."""
-    try:
-        yield
-    except (sqlite3.OperationalError, UnicodeDecodeError) as exc:
-        if isinstance(exc, sqlite3.OperationalError) and "UTF-8" not in str(exc):
-            raise
-        raise RecordingError("the recorded reply is damaged: it is no text") from exc

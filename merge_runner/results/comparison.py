@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any
 
 import duckdb
@@ -17,6 +18,7 @@ TrialKey = tuple[str, str]
 
 Span = tuple[int, int]
 """The first and the last row number."""
+NOWHERE: Span = (2**62, -1)
 AT_ONCE = 16
 """Trials whose rows are in memory together, without their long texts."""
 
@@ -61,11 +63,10 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """Rows of one table by trial, with its columns; those in ``hashed`` hold hashes of texts."""
+    """Rows of one table by trial, with its columns; hashes are in place of long texts."""
 
     table: str
-    names: tuple[str, ...]
-    hashed: tuple[str, ...] = ()
+    names: list[str]
     rows: dict[TrialKey, list[Row]] = field(default_factory=dict)
 
     def named(self, key: TrialKey) -> Iterator[dict[str, Any]]:
@@ -79,37 +80,32 @@ class Stored:
         *,
         ignored: Collection[str] = (),
         tolerance: float = 0.0,
+        part: bool = False,
     ) -> Iterator[Difference]:
-        """The differences of a trial's stored rows from the wanted ones."""
-        stored, made = self.rows.get(key, []), [self._as_stored(row) for row in wanted]
+        """The differences of a trial's stored rows from the wanted ones.
+
+        ``part`` says that those are a part of the trial's rows, so that others may be stored.
+        """
         at = [self.names.index(name) for name in PLACES[self.table]]
+        stored = self.rows.get(key, [])
         old = {tuple(row[i] for i in at): row for row in stored}
-        new = {tuple(row[i] for i in at): row for row in made}
-        if odd := len(stored) - len(old) + len(old.keys() ^ new.keys()):
-            first = min(old.keys() ^ new.keys() or old.keys())
-            yield Difference(
-                self.table, None, dict(zip(PLACES[self.table], first, strict=True)), odd
-            )
+        new = {tuple(row[i] for i in at): self._as_stored(row) for row in wanted}
+        odd = new.keys() - old.keys() if part else old.keys() ^ new.keys()
+        twice = 0 if part else len(stored) - len(old)
+        if odd or twice:
+            place = dict(zip(PLACES[self.table], min(odd or old), strict=True))
+            yield Difference(self.table, None, place, twice + len(odd))
         common = [place for place in new if place in old and old[place] != new[place]]
         for index, name in enumerate(self.names):
-            if name in ignored:
-                continue
             places = [p for p in common if not same_value(old[p][index], new[p][index], tolerance)]
-            if places:
-                first = places[0]
-                yield Difference(
-                    self.table,
-                    name,
-                    dict(zip(PLACES[self.table], first, strict=True)),
-                    len(places),
-                    old[first][index],
-                    new[first][index],
-                )
+            if places and name not in ignored:
+                place, first = dict(zip(PLACES[self.table], places[0], strict=True)), places[0]
+                values = old[first][index], new[first][index]
+                yield Difference(self.table, name, place, len(places), *values)
 
     def _as_stored(self, row: Row) -> Row:
         values = list(row)
-        for name in self.hashed:
-            index = self.names.index(name)
+        for index in map(self.names.index, LONG.get(self.table, ())):
             if values[index] is not None:
                 values[index] = hashlib.sha256(values[index].encode()).hexdigest()
         return tuple(values)
@@ -122,15 +118,13 @@ def stored_rows(
     span: Span | None = None,
 ) -> Stored:
     """The rows of these trials, with hashes in place of long texts."""
-    hashed = LONG.get(table, ())
-    hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in hashed)
+    hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in LONG.get(table, ()))
     columns = f"* REPLACE ({hashes})" if hashes else "*"
     result = rows_of_trials(connection, columns, table, keys, span)
-    names = tuple(names_of(result))
-    trial_id, spec_hash = names.index("trial_id"), names.index("spec_hash")
-    stored = Stored(table, names, hashed)
+    stored = Stored(table, names_of(result))
+    key = itemgetter(*map(stored.names.index, ("trial_id", "spec_hash")))
     for row in result.fetchall():
-        stored.rows.setdefault((row[trial_id], row[spec_hash]), []).append(row)
+        stored.rows.setdefault(key(row), []).append(row)
     return stored
 
 
@@ -147,39 +141,34 @@ def rows_of_trials(
     that no other rows are read.
     """
     names = [[key[0] for key in keys], [key[1] for key in keys]]
-    first, last = (
-        span
-        or connection.execute(
-            f"SELECT min(rowid), max(rowid) FROM {table} {_OF_THESE}",  # noqa: S608 # constants
-            names,
-        ).fetchall()[0]
-    )
+    if span is None:
+        sql = f"SELECT min(rowid), max(rowid) FROM {table} {_OF_THESE}"  # noqa: S608 # constants
+        (span,) = connection.execute(sql, names).fetchall()
     return connection.execute(
         f"SELECT {columns} FROM {table} {_OF_THESE} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # constants
-        [*names, first, last],
+        [*names, *span],
     )
 
 
 def in_order(
     connection: duckdb.DuckDBPyConnection, keys: Iterable[TrialKey]
-) -> Iterator[tuple[list[TrialKey], dict[str, Span]]]:
-    """Yield trials, a few at once, and the span of their rows in each table.
+) -> Iterator[tuple[TrialKey, dict[str, Stored]]]:
+    """Yield trials with their rows of each table, in the order in which they are stored.
 
-    They come in the order in which they are stored, so that they are one stretch of each table.
+    The rows of a few are read at once, which are one stretch of each table.
     """
-    where = {table: _spans(connection, table) for table in PLACES}
-    nowhere = (0, -1)
-    ordered = sorted(keys, key=lambda key: [spans.get(key, nowhere) for spans in where.values()])
+    where = {table: spans(connection, table) for table in PLACES}
+    ordered = sorted(keys, key=where["trials"].__getitem__)
     for first in range(0, len(ordered), AT_ONCE):
-        some = ordered[first : first + AT_ONCE]
-        stretches = {}
-        for table, spans in where.items():
-            there = [spans[key] for key in some if key in spans] or [nowhere]
-            stretches[table] = (min(a for a, _ in there), max(b for _, b in there))
-        yield some, stretches
+        some, tables = ordered[first : first + AT_ONCE], {}
+        for table, spans_of in where.items():
+            begin, end = zip(*(spans_of.get(key, NOWHERE) for key in some), strict=True)
+            tables[table] = stored_rows(connection, table, some, (min(begin), max(end)))
+        yield from ((key, tables) for key in some)
 
 
-def _spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, Span]:
+def spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, Span]:
+    """The first and the last row number of each trial in a table."""
     rows = connection.execute(
         f"SELECT trial_id, spec_hash, min(rowid), max(rowid) FROM {table} GROUP BY ALL"  # noqa: S608 # constants
     ).fetchall()

@@ -54,13 +54,8 @@ def schema_sql() -> str:
     return f"{SCHEMA.read_text(encoding='utf-8')}\n{measures_sql()}"
 
 
-def update_measures(connection: duckdb.DuckDBPyConnection) -> None:
-    """Define the measures anew if another version of the program defined them."""
-    if not _has_these_measures(connection):
-        connection.execute(measures_sql())
-
-
-def _has_these_measures(connection: duckdb.DuckDBPyConnection) -> bool:
+def has_these_measures(connection: duckdb.DuckDBPyConnection) -> bool:
+    """Whether this version of the program defined the measures of the open database."""
     return connection.execute("SELECT measures_version()").fetchone() == (measures_version(),)
 
 
@@ -117,46 +112,44 @@ def open_database(
     connection = instance.cursor()
     name = f"results_{id(connection)}"  # of no other file that is open
     mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
+    # A name such as md:x or :memory: names a file, too.
+    _attach(connection, f"{quoted(path.absolute())} AS {name} ({mode})", path, patience_s, instance)
     try:
-        # A name such as md:x or :memory: names a file, too.
-        attach = f"ATTACH {quoted(path.absolute())} AS {name} ({mode}); USE {name}"
-        _attach(connection, attach, path, patience_s)
-    except duckdb.Error as exc:
-        instance.drop()
-        raise StoreError(f"{path} cannot be opened as a database: {first_line(exc)}") from exc
-    try:
+        connection.execute(f"USE {name}")
         yield connection
     except BaseException:
         instance.drop()
         raise
     else:
-        _detach(connection, name, instance)
+        try:
+            connection.execute(f"USE memory; DETACH {name}")
+        except duckdb.Error as exc:
+            # As on a full disk: what was committed stays in the log beside the file.
+            LOG.warning("the database was not closed in order: %s", first_line(exc))
+            instance.drop()
     finally:
         connection.close()
 
 
-def _detach(connection: duckdb.DuckDBPyConnection, name: str, instance: Instance) -> None:
-    try:
-        connection.execute(f"USE memory; DETACH {name}")
-    except duckdb.Error as exc:
-        # As on a full disk: what was committed stays in the log beside the file, and is not lost.
-        LOG.warning("the database was not closed in order: %s", first_line(exc))
-        instance.drop()
-
-
 def _attach(
-    connection: duckdb.DuckDBPyConnection, statement: str, path: Path, patience_s: float
+    connection: duckdb.DuckDBPyConnection,
+    file: str,
+    path: Path,
+    patience_s: float,
+    instance: Instance,
 ) -> None:
-    """Run the statement, again and again while another one holds the file."""
-    began = time.monotonic()
-    told = False
+    """Attach a file, again and again while another one holds it."""
+    began, told = time.monotonic(), False
     while True:
         try:
-            connection.execute(statement)
+            connection.execute(f"ATTACH {file}")
         except duckdb.Error as exc:
-            if not any(words in str(exc) for words in _BUSY):
-                raise
-            waited_s = time.monotonic() - began
+            busy, waited_s = any(words in str(exc) for words in _BUSY), time.monotonic() - began
+            if not busy:
+                instance.drop()
+                raise StoreError(
+                    f"{path} cannot be opened as a database: {first_line(exc)}"
+                ) from exc
             if waited_s >= patience_s:
                 raise StoreLocked(f"{path} is held by {_holder(exc)}: close it there") from exc
             if waited_s > 1 and not told:
@@ -243,7 +236,7 @@ def read_database(
         open_database(path, read_only=True, patience_s=patience_s, instance=instance) as connection,
     ):
         check_schema(connection, path)
-        if not _has_these_measures(connection):
+        if not has_these_measures(connection):
             _warn_of_other_measures(path)
         yield connection
 

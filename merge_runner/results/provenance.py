@@ -20,12 +20,12 @@ def git_state() -> tuple[str, bool | None]:
     """The commit of the program's own checkout, and whether there are uncommitted changes.
 
     Files that git does not track, such as a study of the user's, are no change of the program.
-    Without a checkout: the installed version and None.
+    Without a checkout that tracks the package: the installed version and None.
     """
-    commit = _commit()
-    if commit is None:
-        return f"merge-runner {version('merge-runner')}", None
-    return commit, bool(_git("status", "--porcelain", "--untracked-files=no"))
+    tracked = _git("ls-files", "--error-unmatch", "merge_runner/__init__.py")
+    if tracked and (commit := _git("rev-parse", "HEAD")):
+        return commit, bool(_git("status", "--porcelain", "--untracked-files=no"))
+    return f"merge-runner {version('merge-runner')}", None
 
 
 def program() -> str:
@@ -37,22 +37,16 @@ def program() -> str:
     return f"merge-runner at commit {made_by}{also}"
 
 
-def _commit() -> str | None:
-    """The commit of the repository in the project's folder, if it tracks the package."""
-    package = _git("ls-files", "--error-unmatch", "merge_runner/__init__.py")
-    return _git("rev-parse", "HEAD") if package else None
-
-
-def _git(*arguments: str) -> str | None:
-    """What git says about the repository at PROJECT, and about no other around it."""
+def _git(*arguments: str) -> str:
+    """What git says about the repository at PROJECT, and about no other around it; or nothing."""
     own = ["-C", str(PROJECT), f"--git-dir={PROJECT / '.git'}", f"--work-tree={PROJECT}"]
     try:
         done = subprocess.run(  # noqa: S603 # constant arguments
             ["git", *own, *arguments],  # noqa: S607 # the user's own git
             capture_output=True,
             text=True,
-            check=False,
+            check=True,
         )
-    except FileNotFoundError:
-        return None
-    return done.stdout.strip() if done.returncode == 0 else None
+    except (FileNotFoundError, subprocess.CalledProcessError):
+        return ""
+    return done.stdout.strip()

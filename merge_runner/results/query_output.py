@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from itertools import chain
 from tempfile import TemporaryFile
 from typing import Any, TextIO
@@ -12,7 +12,6 @@ from merge_runner.errors import UsageError
 from merge_runner.text_safety import csv_writer, in_spreadsheet, printable
 
 Rows = Iterable[tuple[Any, ...]]
-Writer = Callable[[list[str], Rows, TextIO], None]
 
 
 def write_csv(names: list[str], rows: Rows, out: TextIO) -> None:
@@ -44,9 +43,5 @@ def write_table(names: list[str], rows: Rows, out: TextIO) -> None:
             kept.write(json.dumps(cells) + "\n")
         kept.seek(0)
         for line in kept:
-            out.write(_line(json.loads(line), widths))
-
-
-def _line(cells: Sequence[str], widths: list[int]) -> str:
-    padded = (cell.ljust(width) for cell, width in zip(cells, widths, strict=True))
-    return printable("  ".join(padded).rstrip()) + "\n"
+            padded = map(str.ljust, json.loads(line), widths)
+            out.write(printable("  ".join(padded).rstrip()) + "\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from itertools import chain
@@ -12,7 +13,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
 from merge_runner.llm.cache import CachedCall
-from merge_runner.results.recording import opened, read_provenance, sweeps_of
+from merge_runner.results.recording import opened, sweeps_of
 from merge_runner.text_safety import one_line
 
 
@@ -22,8 +23,7 @@ class RecordedSweep(BaseModel):
     It is read from the configuration of any version that wrote a recording. ``arms`` has the
     labels of the arms of a study; recordings of plain sweeps may have none. ``mirror`` says that
     two different drivers were played both ways round. ``seat`` is ``first`` where only the first
-    situations were asked. It has ``ended`` where all its trials did, and ``begins_late`` where a
-    driver may take control after the other.
+    situations were asked.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -37,8 +37,6 @@ class RecordedSweep(BaseModel):
     seat: str = ""
     mirror: bool = False
     models: dict[str, JsonValue] = {}
-    ended: bool = False
-    begins_late: bool = False
 
     @field_validator("arms", mode="before")
     @classmethod
@@ -68,23 +66,14 @@ class RecordedSweep(BaseModel):
         words += [word for file in files for word in ("--recording", str(file))]
         return one_line(shlex.join(words))
 
-    def arms_of(self, repetition: int) -> int:
-        """Return how many prompts may ask for a decision of a repetition."""
-        variants = sum(repetition <= most for most in self.repetitions.values())
-        return max(variants, len(self.arms))
-
 
 def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
     """Return the sweeps as a recording says itself, without those whose configuration is odd."""
     sweeps = []
     for row in sweeps_of(provenance):
         with suppress(KeyError, TypeError, ValueError, RecursionError):
-            told = {
-                "name": row.get("name", ""),
-                "ended": "ended_at" in row and row.get("exit_code", "0") == "0",
-                "begins_late": '"own_exit"' in row["config"],
-            }
-            sweeps.append(RecordedSweep(**{**json.loads(row["config"]), **told}))
+            told = {**json.loads(row["config"]), "name": row.get("name", "")}
+            sweeps.append(RecordedSweep(**told))
     return sweeps
 
 
@@ -93,16 +82,18 @@ def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
 
     A recording that does not say of what sweep it is has none. Raises RecordingError.
     """
-    found = []
+    sweeps = []
     for file in files:
-        there = _conditions_and_repetitions(file)
-        for sweep in described_sweeps(read_provenance(file)):
-            conditions = tuple(name for name in sweep.conditions if name in there)
-            most = max((there[name] for name in conditions), default=0)
-            repetitions = {v: min(n, most) for v, n in sweep.repetitions.items()}
+        with opened(file) as (connection, provenance):
+            counts = "SELECT condition, max(repetition) FROM recording GROUP BY ALL"
+            recorded = dict(connection.execute(counts).fetchall())
+        for sweep in described_sweeps(provenance):
+            conditions = tuple(name for name in sweep.conditions if name in recorded)
+            most = max((recorded[name] for name in conditions), default=0)
+            repetitions = {name: min(n, most) for name, n in sweep.repetitions.items()}
             changes = {"conditions": conditions, "repetitions": repetitions}
-            found.append(sweep.model_copy(update=changes))
-    return found
+            sweeps.append(sweep.model_copy(update=changes))
+    return sweeps
 
 
 def recorded_part(
@@ -119,47 +110,24 @@ def recorded_part(
     ]
     if not parts:
         return None
-    repetitions: dict[str, int] = {}
-    for variant, most in chain.from_iterable(part.repetitions.items() for part in parts):
-        repetitions[variant] = max(most, repetitions.get(variant, 0))
-    conditions = dict.fromkeys(chain.from_iterable(part.conditions for part in parts))
+    repetitions: Counter[str] = Counter()
+    for part in parts:
+        repetitions |= Counter(part.repetitions)  # the larger number of each
+    conditions = tuple(dict.fromkeys(chain.from_iterable(part.conditions for part in parts)))
     arms = frozenset(chain.from_iterable(part.arms for part in parts))
-    changes = {"repetitions": repetitions, "conditions": tuple(conditions), "arms": arms}
+    changes = {"repetitions": dict(repetitions), "conditions": conditions, "arms": arms}
     return parts[0].model_copy(update=changes)
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
     """What recordings hold, and what to type to replay it; without files, what a cache holds.
 
-    ``entries`` are all their calls, from which it is told what no recording says.
+    ``entries`` are all their calls, which are counted where no recording says its sweep.
     """
-    named = ", ".join(map(str, files))
+    named = ", ".join(map(str, files)) or "the cache"
     if sweeps := recorded_sweeps(files):
         said = "; ".join(map(str, sweeps))
         return f"{named} holds {said}. To replay it: {sweeps[0].command(files)}"
-    models: dict[str, list[CachedCall]] = {}
-    for entry in entries:
-        models.setdefault(entry.request.model, []).append(entry)
-    held = "; ".join(_counted(model, calls) for model, calls in sorted(models.items()))
-    return f"{named or 'the cache'} holds {held or 'no call at all'}"
-
-
-def _counted(model: str, calls: Sequence[CachedCall]) -> str:
-    slots = [call.request.slot for call in calls]
-    sets = sorted({slot.sample_set for slot in slots})
-    conditions = list(dict.fromkeys(slot.condition for slot in slots))
-    return one_line(
-        f"{len(calls)} calls of {model}: up to {max(slot.repetition for slot in slots)} "
-        f"repetitions in {len(conditions)} conditions ({', '.join(conditions)}), "
-        f"sample set {', '.join(map(str, sets))}"
-    )
-
-
-def _conditions_and_repetitions(file: Path) -> dict[str, int]:
-    """Each condition of which a call is recorded, and its highest repetition."""
-    with opened(file) as (connection, _):
-        return dict(
-            connection.execute(
-                "SELECT condition, max(repetition) FROM recording GROUP BY ALL"
-            ).fetchall()
-        )
+    models = Counter(entry.request.model for entry in entries)
+    counts = ", ".join(f"{calls} calls of {model}" for model, calls in sorted(models.items()))
+    return one_line(f"{named} holds {counts or 'no call at all'}")

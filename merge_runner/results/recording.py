@@ -26,12 +26,18 @@ from pydantic import TypeAdapter, ValidationError
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import KEY_VERSION, canonical_json
-from merge_runner.llm.verify import DAMAGED, check_body, check_call
+from merge_runner.llm.content_hashes import (
+    DAMAGED,
+    KEY_VERSION,
+    canonical_json,
+    check_body,
+    check_call,
+)
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
 from merge_runner.results.database import Settings, fetched, in_memory
-from merge_runner.text_safety import first_line, one_line, quoted
+from merge_runner.results.rows import Row
+from merge_runner.text_safety import first_line, quoted
 
 FORMAT = "merge-runner recording 2"
 """Read for ever: a model that is shut down cannot be asked again."""
@@ -92,13 +98,15 @@ class Summary:
 def export_recording(
     file: Path, cache: ResponseCache, keys: list[str], provenance: dict[str, str]
 ) -> int:
-    """Write the entries under these keys; returns their number. Raises RecordingError.
+    """Write the entries under these keys, in their order; returns their number.
 
-    Damaged entries are left out; once the others are written, the error names them.
+    Raises RecordingError. Damaged entries are left out; once the others are written, the error
+    names them.
     """
     if file.is_dir():
         raise UsageError(f"{file} is a folder: name a file")
     refuse_another_kind(file, b"PAR1", "recording")
+    damaged: list[str] = []
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with (
@@ -106,70 +114,62 @@ def export_recording(
             in_memory(SETTINGS) as connection,
         ):
             connection.execute(f"ATTACH {quoted(f'{folder}/calls.duckdb')} AS file; USE file")
-            damaged = _collect(connection, cache, keys)
-            _copy(connection, Path(folder) / "calls.parquet", provenance)
+            columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
+            connection.execute(f"CREATE TABLE calls ({columns})")
+            appender = connection.appender("calls")
+            content, calls, size = hashlib.sha256(), 0, 0
+            for row in _exported_rows(cache, keys, damaged):
+                appender.append_rows([row])
+                content.update(_fingerprint(row[0], row[-1]))
+                calls, size = calls + 1, size + len(row[-1]) + len(row[-2])
+                if size > PART_BYTES:
+                    appender.flush()
+                    size = 0
+            appender.flush()
+            metadata = {
+                **provenance,
+                "format": FORMAT,
+                "key_version": str(KEY_VERSION),
+                "calls": str(calls),
+                "content_sha256": content.hexdigest(),
+            }
+            metadata[PROVENANCE_HASH] = _provenance_hash(metadata)
+            pairs = ", ".join(f"{quoted(name)}: {quoted(text)}" for name, text in metadata.items())
+            options = f"COMPRESSION zstd, ROW_GROUP_SIZE {BLOCK}, KV_METADATA {{{pairs}}}"
+            connection.execute(
+                f"COPY calls TO {quoted(f'{folder}/calls.parquet')} (FORMAT parquet, {options})"
+            )
             os.replace(f"{folder}/calls.parquet", file)  # so that no reader sees half a file
     except (OSError, duckdb.Error) as exc:
         raise RecordingError(f"{file} cannot be written: {exc}") from exc
     if damaged:
-        key, reason = next(iter(damaged.items()))
         raise RecordingError(
             f"{len(damaged)} of {len(keys)} replies are damaged and left out of {file}, the first "
-            f"is {key}: {reason}. The other {len(keys) - len(damaged)} are in it; a sweep into "
+            f"is {damaged[0]}. The other {len(keys) - len(damaged)} are in it; a sweep into "
             "another database, named with --db, asks for the damaged ones again"
         )
     return len(keys)
 
 
-def _collect(
-    connection: duckdb.DuckDBPyConnection, cache: ResponseCache, keys: list[str]
-) -> dict[str, str]:
-    """Make a table of the entries under these keys; returns what is wrong with damaged ones."""
-    columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
-    connection.execute(f"CREATE TABLE unordered ({columns})")
-    appender, size = connection.appender("unordered"), 0
-    damaged: dict[str, str] = {}
+def _exported_rows(cache: ResponseCache, keys: list[str], damaged: list[str]) -> Iterator[Row]:
+    """Yield the rows of the entries under these keys; what is wrong with others is noted."""
     for key in keys:
         try:
             entry = cache.get(key)
         except RecordingError as exc:
-            damaged[key] = str(exc)
+            damaged.append(f"{key}: {exc}")
             continue
         if entry is None:
             raise RecordingError(
                 f"the reply {key} is not in the cache {cache.folder}: run the sweep again with it"
             )
-        row = _row(entry)
-        appender.append_rows([row])
-        size += len(row[-1]) + len(row[-2])
-        if size > PART_BYTES:
-            appender.flush()
-            size = 0
-    appender.flush()
-    order = ", ".join((*SLOT, "call_key"))
-    connection.execute(f"CREATE TABLE calls AS FROM unordered ORDER BY {order}")
-    return damaged
-
-
-def _copy(connection: duckdb.DuckDBPyConnection, file: Path, provenance: dict[str, str]) -> None:
-    """Write the table ``calls`` as a recording."""
-    content, calls = hashlib.sha256(), 0
-    for key, attempts in fetched(connection.execute("SELECT call_key, attempts FROM calls")):
-        content.update(_fingerprint(key, attempts))
-        calls += 1
-    metadata = {
-        **provenance,
-        "format": FORMAT,
-        "key_version": str(KEY_VERSION),
-        "calls": str(calls),
-        "content_sha256": content.hexdigest(),
-    }
-    metadata[PROVENANCE_HASH] = _provenance_hash(metadata)
-    pairs = ", ".join(f"{quoted(name)}: {quoted(text)}" for name, text in metadata.items())
-    connection.execute(
-        f"COPY calls TO {quoted(str(file))} "
-        f"(FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE {BLOCK}, KV_METADATA {{{pairs}}})"
-    )
+        columns = asdict(entry.request)
+        columns |= columns.pop("slot") | {
+            "call_key": key,
+            "headers": json.dumps(entry.request.headers, sort_keys=True),
+            "attempts": ATTEMPTS.dump_json(entry.attempts).decode(),
+        }
+        yield tuple(columns[name] for name in COLUMNS)
 
 
 def read_recording(file: Path) -> Iterator[CachedCall]:
@@ -243,23 +243,22 @@ def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
 
 def summarise(file: Path) -> Summary:
     """Verify a recording and count what it holds."""
-    found = Summary()
+    summary = Summary(provenance=read_provenance(file))
     for entry in read_recording(file):
         request, last = entry.request, entry.attempts[-1]
-        found.calls += 1
-        found.scripted += is_scripted(request, last)
-        found.attempts += len(entry.attempts)
-        found.cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
+        summary.calls += 1
+        summary.scripted += is_scripted(request, last)
+        summary.attempts += len(entry.attempts)
+        summary.cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
         for counts, name in (
-            (found.models_requested, request.model),
-            (found.models_served, last.model_served or "unknown"),
-            (found.endpoints, request.endpoint),
-            (found.outcomes, last.outcome),
+            (summary.models_requested, request.model),
+            (summary.models_served, last.model_served or "unknown"),
+            (summary.endpoints, request.endpoint),
+            (summary.outcomes, last.outcome),
         ):
             counts[name] = counts.get(name, 0) + 1
-    found.cost_usd = round(found.cost_usd, 6)
-    found.provenance = read_provenance(file)
-    return found
+    summary.cost_usd = round(summary.cost_usd, 6)
+    return summary
 
 
 def _fingerprint(key: str, attempts: str) -> bytes:
@@ -271,17 +270,6 @@ def _provenance_hash(metadata: dict[str, str]) -> str:
     """Return a hash of everything that a file says about itself."""
     told = {name: text for name, text in metadata.items() if name != PROVENANCE_HASH}
     return hashlib.sha256(canonical_json(told).encode()).hexdigest()
-
-
-def _row(entry: CachedCall) -> tuple[Any, ...]:
-    row = asdict(entry.request)
-    row |= row.pop("slot")
-    row |= {
-        "call_key": row.pop("key"),
-        "headers": json.dumps(row["headers"], sort_keys=True),
-        "attempts": ATTEMPTS.dump_json(entry.attempts).decode(),
-    }
-    return tuple(row[name] for name in COLUMNS)
 
 
 def _entry(row: dict[str, Any]) -> CachedCall:
@@ -335,23 +323,16 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
                 f"SELECT key, value FROM parquet_kv_metadata({pattern})"  # noqa: S608 # quoted
             ).fetchall()
             metadata = {key.decode(): value.decode() for key, value in pairs}
-            _check_versions(file, metadata)
+            versions = metadata.get("format"), metadata.get("key_version")
+            if versions != (FORMAT, str(KEY_VERSION)):
+                raise RecordingError(
+                    f"{file} has the format {versions[0]!r} with keys of version {versions[1]!r}, "
+                    f"this program reads {FORMAT!r} with keys of version {KEY_VERSION}"
+                )
             _refuse_bombs(file, connection)
             yield connection, metadata
         except (duckdb.Error, UnicodeDecodeError) as exc:
             raise RecordingError(f"{file} is damaged: {first_line(exc)}") from exc
-
-
-def _check_versions(file: Path, metadata: dict[str, str]) -> None:
-    for name, what, ours in (
-        ("format", "the format", FORMAT),
-        ("key_version", "keys of version", str(KEY_VERSION)),
-    ):
-        if metadata.get(name) != ours:
-            raise RecordingError(
-                f"{file} has {what} {one_line(repr(metadata.get(name)))}, this program reads "
-                f"{ours!r}"
-            )
 
 
 def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
@@ -362,10 +343,9 @@ def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
         f"SELECT sum({bytes_of_row}) FROM recording GROUP BY file_row_number // {BLOCK} "  # noqa: S608 # constants
         "ORDER BY 1 DESC"
     )
-    (calls,) = connection.execute("SELECT count(*) FROM recording").fetchone() or (0,)
+    ((calls,),) = connection.execute("SELECT count(*) FROM recording").fetchall()
     # What a footer claims is not there to be read.
-    row = connection.execute(blocks).fetchone() if calls <= MOST_CALLS else None
-    longest = row[0] if row else 0
+    (longest,) = (connection.execute(blocks).fetchone() if calls <= MOST_CALLS else None) or (0,)
     if calls > MOST_CALLS or longest > MOST_BLOCK_BYTES:
         raise RecordingError(
             f"{file} is not one of our recordings: it claims {calls} calls, {longest} bytes in "

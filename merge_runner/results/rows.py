@@ -29,13 +29,6 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 Row = tuple[Any, ...]
 # Fields that are columns side by side; dataclasses.astuple would copy each value.
 _state = attrgetter(*(field.name for field in fields(StateRow)))
-_spec = attrgetter(
-    "trial_id", "spec_hash", "pair", "source", "model_left", "model_right", "variant", "condition"
-)
-_end = attrgetter("status", "merged_first", "end_time_s", "error", "scripted")
-_decision = attrgetter("valid", "failure", "tactical", "rationale")
-_told_of_itself = attrgetter("other_seen", "own_position_m", "own_speed_mps")
-_told_of_the_other = attrgetter("relative_distance_m", "other_speed_mps", "other_acceleration_mps2")
 _usage = attrgetter(*(field.name for field in fields(Usage)))
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
@@ -46,16 +39,21 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
         "trials": [trial_row(record)],
         "trial_factors": list(factor_rows(record.spec)),
         "states": list(state_rows(record)),
-        "decisions": list(decision_rows(record)),
-        "calls": list(call_rows(record)),
+        "decisions": list(_decision_rows(record)),
+        "calls": list(_call_rows(record)),
     }
 
 
 def trial_row(record: TrialRecord) -> Row:
     """The row of ``trials``."""
     spec, condition = record.spec, CONDITIONS[record.spec.condition]
-    numbers = (condition.projected_headway_m, condition.relative_velocity_mps)
-    return (*_spec(spec), *numbers, spec.repetition, spec.sample_set, *_end(record))
+    return (
+        *(spec.trial_id, spec.spec_hash, spec.pair, spec.source),
+        *(spec.model_left, spec.model_right, spec.variant, spec.condition),
+        *(condition.projected_headway_m, condition.relative_velocity_mps),
+        *(spec.repetition, spec.sample_set, record.status, record.merged_first),
+        *(record.end_time_s, record.error, record.scripted),
+    )
 
 
 def factor_rows(spec: TrialSpec) -> Iterator[Row]:
@@ -69,18 +67,12 @@ def state_rows(record: TrialRecord) -> Iterator[Row]:
     return ((*key, *_state(row)) for row in record.states)
 
 
-def decision_rows(record: TrialRecord) -> Iterator[Row]:
-    """Rows of ``decisions``."""
-    key = (record.spec.trial_id, record.spec.spec_hash)
+def _decision_rows(record: TrialRecord) -> Iterator[Row]:
     for row in record.decisions:
-        decision = row.decision
-        prompt = decision.prompt
+        decision, prompt = row.decision, row.decision.prompt
         yield (
-            *key,
-            row.number,
-            row.time_s,
-            row.side,
-            *_decision(decision),
+            *(record.spec.trial_id, record.spec.spec_hash, row.number, row.time_s, row.side),
+            *(decision.valid, decision.failure, decision.tactical, decision.rationale),
             None if decision.plan is None else list(decision.plan),
             list(decision.applied),
             decision.fallback,
@@ -95,18 +87,20 @@ def _told(told: Observation | None) -> Row:
     """What a driver was told, of the other vehicle only where it was seen; NULLs: the truth."""
     if told is None:
         return (None,) * 7
+    of_itself = (told.other_seen, told.own_position_m, told.own_speed_mps)
     if not told.other_seen:
-        return (*_told_of_itself(told), None, None, None, None)
-    return (*_told_of_itself(told), *_told_of_the_other(told), list(told.other_speeds_mps))
+        return (*of_itself, None, None, None, None)
+    of_the_other = (told.relative_distance_m, told.other_speed_mps, told.other_acceleration_mps2)
+    return (*of_itself, *of_the_other, list(told.other_speeds_mps))
 
 
-def call_rows(record: TrialRecord) -> Iterator[Row]:
+def _call_rows(record: TrialRecord) -> Iterator[Row]:
     """Rows of ``calls``: every attempt of every call, including failed calls."""
     key = (record.spec.trial_id, record.spec.spec_hash)
     calls: list[tuple[Side, int, ChatReply | FailedCall]] = [
         (row.side, row.number, row.decision.reply) for row in record.decisions if row.decision.reply
     ]
-    calls += [(failed.side, failed.number, failed) for failed in record.failed_calls]
+    calls += [(call.side, call.number, call) for call in record.failed_calls]
     for side, number, call in calls:
         for attempt in call.attempts:
             cached = attempt.number <= call.earlier
@@ -116,7 +110,7 @@ def call_rows(record: TrialRecord) -> Iterator[Row]:
 def call_row(
     trial_id: str,
     spec_hash: str,
-    side: str,
+    side: Side,
     decision: int,
     request: ChatRequest,
     attempt: Attempt,
@@ -125,28 +119,14 @@ def call_row(
 ) -> Row:
     """The row of an attempt at a decision's call."""
     return (
-        request.key,
-        trial_id,
-        spec_hash,
-        side,
-        decision,
-        attempt.number,
-        request.provider,
-        request.model,
-        attempt.model_served,
-        attempt.http_status,
-        attempt.outcome,
-        cached,
+        *(request.key, trial_id, spec_hash, side, decision, attempt.number),
+        *(request.provider, request.model, attempt.model_served, attempt.http_status),
+        *(attempt.outcome, cached),
         attempt.started_at and datetime.fromisoformat(attempt.started_at).replace(tzinfo=None),
         attempt.latency_s,
         *_usage(attempt.usage),
-        attempt.cost_usd,
-        attempt.finish_reason,
-        request.body,
-        _as_json(attempt),
-        attempt.error,
-        is_scripted(request, attempt),
-        attempt.batch_id,
+        *(attempt.cost_usd, attempt.finish_reason, request.body, _as_json(attempt)),
+        *(attempt.error, is_scripted(request, attempt), attempt.batch_id),
     )
 
 
@@ -157,15 +137,12 @@ def _as_json(attempt: Attempt) -> str | None:
     any honest reply. An answer was read as JSON already.
     """
     text = attempt.reply
-    if text is None or (attempt.answered and not _has_half_a_pair(text)):
+    # Most texts have nothing that needs a search for half a pair.
+    plain = text is None or (text.isascii() and "\\u" not in text)
+    if text is None or (attempt.answered and (plain or not _SURROGATE.search(text))):
         return text
     try:
         json.dumps(json.loads(text), ensure_ascii=False).encode()
     except (ValueError, RecursionError):
         return json.dumps(text.encode(errors="replace").decode())
     return text
-
-
-def _has_half_a_pair(text: str) -> bool:
-    """Whether half of a surrogate pair may be in a text; most have nothing that needs a search."""
-    return not (text.isascii() and "\\u" not in text) and bool(_SURROGATE.search(text))

@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from itertools import chain, groupby
 from operator import itemgetter
@@ -16,8 +15,9 @@ from typing import Any
 
 import duckdb
 
-from merge_runner.errors import UsageError, unknown_name
-from merge_runner.records import TrialRecord
+from merge_runner.errors import UsageError
+from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.registry import require
 from merge_runner.results.comparison import FACTORS, PLACES, TrialKey, rows_of_trials, stored_rows
 from merge_runner.results.database import (
     SCHEMA_VERSION,
@@ -27,22 +27,38 @@ from merge_runner.results.database import (
     by_name,
     check_schema,
     fetched,
+    has_these_measures,
     merge_small_groups,
     names_of,
     read_database,
     schema_sql,
     unreadable_is_usage,
-    update_measures,
     write_database,
 )
-from merge_runner.results.rows import Row, rows_of
+from merge_runner.results.rows import Row, factor_rows, rows_of
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.served_model import other_models, sql_of
+from merge_runner.scenarios.merge.measures import measures_sql
+from merge_runner.served_model import other_models
 
 # Columns that differ from run to run: whether the run made an attempt itself, and when.
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
+FACTS = Path(__file__).with_name("facts.sql")
 SWEEPS = "FROM sweeps ORDER BY started_at"
-AGAIN_S = 0.1  # after which a query that has not ended is told so again
+# By their slots.
+CALLS_OF = """
+SELECT DISTINCT condition, rep, side, decision, sample_set, call_key
+FROM decisions JOIN trials USING (trial_id, spec_hash)
+SEMI JOIN (FROM sweep_trials WHERE list_contains(?, sweep_id)) USING (trial_id, spec_hash)
+WHERE call_key IS NOT NULL ORDER BY ALL
+"""
+# The first and the third of these columns order the rows of a trial.
+OF_THE_DIGEST = {
+    "trials": "pair, source, model_left, model_right, variant, condition, rep, sample_set, "
+    "status, merged_first, end_time_s, error",
+    "states": "step, time_s, side, position_m, velocity_mps, acceleration_mps2",
+    "decisions": "decision, time_s, side, valid, failure, tactical, rationale, plan, applied, "
+    "fallback, prompt",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,31 +89,25 @@ class Store:
         with unreadable_is_usage(), write_database(self.path) as connection:
             if connection.execute("SHOW TABLES").fetchall():
                 check_schema(connection, path)
-                update_measures(connection)
+                if not has_these_measures(connection):
+                    connection.execute(measures_sql())
             else:
                 connection.execute(schema_sql())
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
 
     def begin_sweep(
-        self,
-        sweep: SweepRow,
-        specs: dict[str, str],
-        stored: Sequence[TrialKey],
-        factors: Sequence[Row] = (),
+        self, sweep: SweepRow, specs: dict[str, str], stored: Sequence[TrialSpec]
     ) -> None:
         """Add a sweep, what its spec hashes stand for, and those of its trials already stored.
 
-        ``factors`` are the levels of these trials, which another study may have stored without.
+        Their levels are added, too, which another study may have stored without.
         """
         with write_database(self.path) as connection:
-            columns = ", ".join(field.name for field in fields(sweep))
-            connection.execute(
-                f"INSERT INTO sweeps ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?)",  # noqa: S608 # our fields
-                astuple(sweep),
-            )
+            connection.execute("INSERT INTO sweeps BY NAME SELECT unnest(?)", [asdict(sweep)])
             _add_specs(connection, specs)
-            append(connection, "sweep_trials", ((sweep.sweep_id, *key) for key in stored))
-            _add_factors(connection, factors)
+            links = ((sweep.sweep_id, spec.trial_id, spec.spec_hash) for spec in stored)
+            append(connection, "sweep_trials", links)
+            _add_factors(connection, [*chain.from_iterable(map(factor_rows, stored))])
 
     def end_sweep(self, sweep_id: str, ended_at: datetime, exit_code: int) -> None:
         """Note when and how a sweep ended."""
@@ -145,9 +155,9 @@ class Store:
         with write_database(self.path, patience_s) as connection:
             merge_small_groups(connection)
             _, differing = _add_trials(connection, played)
-            keys = (_key(record) for record in records)
+            keys = map(_key, records)
             append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
-            return dict(differing)
+            return differing
 
     def add_recorded(
         self, records: Sequence[TrialRecord], specs: dict[str, str]
@@ -161,8 +171,7 @@ class Store:
         with write_database(self.path) as connection:
             _add_specs(connection, specs)
             added, differing = _add_trials(connection, played)
-            there = len(records) - added - len(differing)
-            return added, there, [trial_id for trial_id, _ in differing]
+            return added, len(records) - added - len(differing), list(differing)
 
 
 def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
@@ -178,11 +187,16 @@ def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
 def answer(path: Path, sql: str) -> Iterator[duckdb.DuckDBPyConnection]:
     """The result of a query, to be fetched; the database is locked until the block ends."""
     # The settings hold for a whole instance, and cannot be taken back.
-    with (
-        read_database(path, Instance()) as connection,
-        answering(connection, sql) as result,
-    ):
-        yield result
+    with read_database(path, Instance()) as connection:
+        # DuckDB looks at no signal while several of its threads work on a query.
+        connection.execute("SET threads = 1")
+        try:
+            with answering(connection, sql) as result:
+                yield result
+        except RuntimeError as exc:
+            if "interrupted" not in str(exc):
+                raise
+            raise KeyboardInterrupt from exc
 
 
 @contextmanager
@@ -205,7 +219,7 @@ def answering(
                 "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
                 "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
             )
-        _execute(connection, statements[0])
+        connection.execute(statements[0])
         yield connection
     except duckdb.IOException:
         raise  # a query reaches no file but the database, so it is the database that is damaged
@@ -215,25 +229,8 @@ def answering(
             "ask for fewer rows or columns at once; requests and replies are long"
         ) from exc
     except duckdb.Error as exc:
-        if "pytz" in str(exc):
-            raise UsageError("cast times with a zone, as in now()::TIMESTAMP") from exc
-        raise UsageError(f"the query failed: {exc}") from exc
-
-
-def _execute(connection: duckdb.DuckDBPyConnection, statement: duckdb.Statement) -> None:
-    """Run a statement in a thread, so that Ctrl-C ends it.
-
-    DuckDB looks at no signal while several of its threads work on a query.
-    """
-    with ThreadPoolExecutor(1) as pool:
-        running = pool.submit(connection.execute, statement)
-        try:
-            running.result()
-        except KeyboardInterrupt:
-            while not running.done():  # a query that is about to begin forgets that it was to end
-                connection.interrupt()
-                wait([running], AGAIN_S)
-            raise
+        hint = "; cast times with a zone, as in now()::TIMESTAMP" if "pytz" in str(exc) else ""
+        raise UsageError(f"the query failed: {exc}{hint}") from exc
 
 
 def _reads(statement: duckdb.Statement) -> bool:
@@ -253,20 +250,7 @@ def results_digest(path: Path) -> tuple[str, int]:
     """
     digests: dict[TrialKey, Any] = {}
     with read_database(path) as connection:
-        # The first and the third of these columns order the rows of a trial.
-        for columns, table in (
-            (
-                "pair, source, model_left, model_right, variant, condition, rep, sample_set, "
-                "status, merged_first, end_time_s, error",
-                "trials",
-            ),
-            ("step, time_s, side, position_m, velocity_mps, acceleration_mps2", "states"),
-            (
-                "decision, time_s, side, valid, failure, tactical, rationale, plan, applied, "
-                "fallback, prompt",
-                "decisions",
-            ),
-        ):
+        for table, columns in OF_THE_DIGEST.items():
             # A trial's rows lie together in the table, which is too large to be sorted.
             sql = f"SELECT trial_id, spec_hash, {columns} FROM {table}"  # noqa: S608 # constants
             for key, rows in groupby(fetched(connection.execute(sql)), key=itemgetter(0, 1)):
@@ -285,31 +269,14 @@ def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str
     with read_database(path) as connection:
         sweeps = {row["sweep_id"]: row for row in by_name(connection.execute(SWEEPS))}
         wanted = list(dict.fromkeys(sweep_ids)) or [*sweeps][-1:] or [""]
-        if unknown := [sweep_id for sweep_id in wanted if sweep_id not in sweeps]:
-            raise unknown_name("sweep", unknown[0], sorted(sweeps), f"in {path}")
-        keys = connection.execute(
-            "SELECT DISTINCT call_key FROM decisions SEMI JOIN "
-            "(SELECT trial_id, spec_hash FROM sweep_trials SEMI JOIN (SELECT unnest(?) AS sweep_id)"
-            " USING (sweep_id)) "
-            "USING (trial_id, spec_hash) WHERE call_key IS NOT NULL ORDER BY call_key",
-            [wanted],
-        ).fetchall()
-    return [sweeps[sweep_id] for sweep_id in wanted], [key for (key,) in keys]
+        rows = [require(sweeps, "sweep", sweep_id, f"in {path}") for sweep_id in wanted]
+        keys = connection.execute(CALLS_OF, [wanted]).fetchall()
+    return rows, [key for *_, key in keys]
 
 
 @dataclass(frozen=True, slots=True)
 class SweepFacts:
-    """What the database says of one sweep.
-
-    ``outcomes`` holds (variant, condition, status, merged_first, had a fallback, trials),
-    ``levels`` (factor, level, status, merged_first, trials),
-    ``ledger`` (driver, variant, fate, outcome, attempts) as the view ``attempts`` names them,
-    ``failed`` (trial_id, error), ``others`` (model requested, model served, answers) where another
-    model answered, and ``stand_ins`` (driver, model, provider, scripted answers, answers) where a
-    scripted stand-in answered. Where drivers were only asked, ``first_looks`` says what was done
-    first by driver, variant, model that was asked, or program, side and own relative velocity; the
-    share of M is that among answers with a tactical word.
-    """
+    """What the database says of one sweep: each list is the view of its name in facts.sql."""
 
     outcomes: list[tuple[str, str, str, str | None, bool, int]]
     levels: list[tuple[str, str, str, str | None, int]]
@@ -323,78 +290,17 @@ class SweepFacts:
     fallbacks: int
 
 
-PLAYED = """
-CREATE TEMP TABLE played AS
-FROM trials SEMI JOIN (FROM sweep_trials WHERE sweep_id = ?) USING (trial_id, spec_hash)
-"""
-# Their attempts, with the name of the driver that was asked.
-TRIED = """
-CREATE TEMP VIEW tried AS
-SELECT *, driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver
-FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash)
-"""
-FACTS = {
-    "outcomes": """
-        SELECT variant, condition, status, merged_first, coalesce(fallen_back, false), count(*)
-        FROM played LEFT JOIN (
-            SELECT trial_id, spec_hash, bool_or(fallback) AS fallen_back
-            FROM decisions GROUP BY ALL
-        ) USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL""",
-    "levels": """
-        SELECT factor, value, status, merged_first, count(*)
-        FROM played JOIN trial_levels USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL""",
-    "ledger": """
-        SELECT driver, variant, fate, if(outcome = 'ok', coalesce(failure, outcome), outcome),
-            count(*)
-        FROM tried GROUP BY ALL ORDER BY ALL""",
-    "failed": "SELECT trial_id, error FROM played WHERE status = 'failed' ORDER BY ALL",
-    "stand_ins": """
-        SELECT driver, model, provider, count(*) FILTER (scripted), count(*)
-        FROM tried WHERE fate IN ('driven', 'fallback')
-        GROUP BY ALL HAVING bool_or(scripted) ORDER BY ALL""",
-}
-OTHERS = """
-SELECT model_requested, model_served, count(*) FROM calls SEMI JOIN played
-USING (trial_id, spec_hash) WHERE http_status = 200 AND {is_other} GROUP BY ALL ORDER BY ALL
-"""
-DECIDED = """
-SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
-    count(*) FILTER (fallback) AS fallbacks
-FROM decisions SEMI JOIN played USING (trial_id, spec_hash)
-"""
-# The velocity is the driver's own, minus the other's; the action is the net acceleration over the
-# first step, of the fallback where the reply was invalid.
-FIRST_LOOKS = """
-WITH asked AS (FROM played WHERE source = 'seat' AND status <> 'failed')
-SELECT driver, variant, if(side = 'left', model_left, model_right) AS model, side,
-    if(side = 'left', 1, -1) * relative_velocity_mps + 0 AS relative_velocity_mps,
-    count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,
-    count(tactical) AS with_a_word,
-    count(*) FILTER (tactical = 'M') / nullif(count(tactical), 0) AS share_m,
-    avg(action_mps2) FILTER (valid) AS first_action_mps2
-FROM asked
-JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash)
-JOIN (
-    SELECT trial_id, spec_hash, side, min_by(acceleration_mps2, step) AS action_mps2
-    FROM states SEMI JOIN asked USING (trial_id, spec_hash) WHERE time_s > 0 GROUP BY ALL
-) USING (trial_id, spec_hash, side)
-JOIN trial_drivers USING (trial_id, spec_hash)
-GROUP BY ALL ORDER BY ALL
-"""
-
-
 def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
     """Count a sweep's trials, decisions and answers."""
     with read_database(path) as connection:
-        connection.execute(PLAYED, [sweep_id])
-        connection.execute(TRIED)
-        facts = next(by_name(connection.execute(DECIDED)))
-        facts |= {name: connection.execute(sql).fetchall() for name, sql in FACTS.items()}
-        others = OTHERS.format(is_other=sql_of(other_models(connection)))
+        connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
+        connection.execute(FACTS.read_text(encoding="utf-8"))
+        append(connection, "other_models", other_models(connection))
+        facts = next(by_name(connection.execute("FROM decided")))
+        for name in ("outcomes", "levels", "ledger", "failed", "others", "stand_ins"):
+            facts[name] = connection.execute(f"FROM {name}").fetchall()
         return SweepFacts(
-            **facts,
-            others=connection.execute(others).fetchall(),
-            first_looks=list(by_name(connection.execute(FIRST_LOOKS))),
+            **facts, first_looks=list(by_name(connection.execute("FROM first_looks")))
         )
 
 
@@ -407,8 +313,8 @@ def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> 
 
 
 def _add_specs(connection: duckdb.DuckDBPyConnection, specs: dict[str, str]) -> None:
-    for item in specs.items():
-        connection.execute("INSERT OR IGNORE INTO specs VALUES (?, ?)", list(item))
+    sql = "INSERT OR IGNORE INTO specs SELECT unnest(?), unnest(?)"
+    connection.execute(sql, [list(specs), list(specs.values())])
 
 
 def _refuse_other_conditions(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:
@@ -426,58 +332,42 @@ def _key(record: TrialRecord) -> TrialKey:
     return record.spec.trial_id, record.spec.spec_hash
 
 
-def _ended(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> dict[TrialKey, bool]:
+def _ended(connection: duckdb.DuckDBPyConnection, keys: Sequence[TrialKey]) -> dict[TrialKey, bool]:
     """Which of these trials are stored, and whether each ended: a failed one is played again."""
-    columns = "trial_id, spec_hash, status <> 'failed'"
-    rows = rows_of_trials(connection, columns, "trials", keys).fetchall()
-    return {(trial_id, spec_hash): ended for trial_id, spec_hash, ended in rows}
+    columns = "(trial_id, spec_hash), status <> 'failed'"
+    return dict(rows_of_trials(connection, columns, "trials", keys).fetchall())
 
 
 def _add_trials(
     connection: duckdb.DuckDBPyConnection, played: list[tuple[TrialRecord, dict[str, list[Row]]]]
-) -> tuple[int, list[tuple[str, list[str]]]]:
+) -> tuple[int, dict[str, list[str]]]:
     """Store whole trials, replacing failed ones; compare those that had ended before.
 
     Returns how many were stored, and the ids of those that had been stored with other values, each
     with the columns that differ.
     """
     stored = _ended(connection, [_key(record) for record, _ in played])
-    _delete(connection, [key for key, ended in stored.items() if not ended])
     new: dict[TrialKey, dict[str, list[Row]]] = {}
-    again: list[tuple[TrialKey, dict[str, list[Row]]]] = []
+    again: dict[TrialKey, dict[str, list[Row]]] = {}
     for record, rows in played:
         key = _key(record)
         if not stored.get(key) and key not in new:
             new[key] = rows
         elif record.status != "failed":
-            again.append((key, rows))
+            again[key] = rows
     for table in PLACES:
+        for key in new.keys() & stored.keys():
+            connection.execute(
+                f"DELETE FROM {table} WHERE trial_id = ? AND spec_hash = ?",  # noqa: S608 # constants
+                key,
+            )
         append(connection, table, chain.from_iterable(rows[table] for rows in new.values()))
-    _add_factors(connection, [row for _, rows in again for row in rows[FACTORS]])
-    return len(new), list(_differing(connection, again))
-
-
-def _differing(
-    connection: duckdb.DuckDBPyConnection, played: list[tuple[TrialKey, dict[str, list[Row]]]]
-) -> Iterator[tuple[str, list[str]]]:
-    """Trials whose stored values differ from those just played: their ids, with the columns."""
-    keys = [key for key, _ in played]
+    _add_factors(connection, [row for rows in again.values() for row in rows[FACTORS]])
+    differing: dict[str, list[str]] = {}
     # The levels of a study are no results: another one may name others for the same trial.
-    compared = [table for table in PLACES if table != FACTORS] if played else []
-    tables = [stored_rows(connection, table, keys) for table in compared]
-    for key, rows in played:
-        columns = [
-            difference.name
-            for stored in tables
-            for difference in stored.differences(key, rows[stored.table], ignored=OF_A_RUN)
-        ]
-        if columns:
-            yield key[0], columns
-
-
-def _delete(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:
-    for table in PLACES if keys else ():
-        connection.executemany(
-            f"DELETE FROM {table} WHERE trial_id = ? AND spec_hash = ?",  # noqa: S608 # constants
-            keys,
-        )
+    for table in [table for table in PLACES if table != FACTORS] if again else []:
+        there = stored_rows(connection, table, list(again))
+        for key, rows in again.items():
+            for difference in there.differences(key, rows[table], ignored=OF_A_RUN):
+                differing.setdefault(key[0], []).append(difference.name)
+    return len(new), differing

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 
 from merge_runner.results.data_dictionary import SchemaColumn, tables
 from merge_runner.text_safety import quoted
@@ -22,7 +22,7 @@ GROUP BY factor ORDER BY factor
 """
 WIDE = """
 SELECT trials.*, trial_drivers.* EXCLUDE (trial_id, spec_hash),
-    trial_metrics.* EXCLUDE (trial_id, spec_hash){columns}
+    trial_metrics.* EXCLUDE (trial_id, spec_hash), levels.* EXCLUDE (trial_id, spec_hash)
 FROM trials {only}
 LEFT JOIN trial_drivers USING (trial_id, spec_hash)
 LEFT JOIN trial_metrics USING (trial_id, spec_hash)
@@ -47,12 +47,12 @@ def wide_trials(factors: Iterable[tuple[str, str]], sweep_id: str | None = None)
 
     A factor that is called like a column of the trials has ``factor_`` before its name.
     """
-    taken = {column.name for column in fixed_columns()}
-    levels = columns = ""
-    for number, (factor, kind) in enumerate(factors):
-        levels += f", max(value) FILTER (factor = {quoted(factor)})::{kind} AS level_{number}"
-        columns += f", level_{number} AS {_identifier(factor, taken)}"
-    return WIDE.format(columns=columns, levels=levels, only=only(sweep_id))
+    taken, levels = {column.name for column in fixed_columns()}, ""
+    for factor, kind in factors:
+        name = f"factor_{factor}" if factor.lower() in taken else factor
+        column = '"' + name.replace('"', '""') + '"'
+        levels += f", max(value) FILTER (factor = {quoted(factor)})::{kind} AS {column}"
+    return WIDE.format(levels=levels, only=only(sweep_id))
 
 
 def fixed_columns() -> list[SchemaColumn]:
@@ -60,8 +60,3 @@ def fixed_columns() -> list[SchemaColumn]:
     names = ("trials", "trial_drivers", "trial_metrics")
     every = {c.name: c for table in tables() if table.name in names for c in table.columns}
     return list(every.values())
-
-
-def _identifier(factor: str, taken: Collection[str]) -> str:
-    name = f"factor_{factor}" if factor.lower() in taken else factor
-    return '"' + name.replace('"', '""') + '"'

@@ -6,55 +6,35 @@ import os
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
 
 from merge_runner.config import (
-    Endpoint,
     ModelEntry,
-    base_urls,
     check_network,
-    driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
 )
-from merge_runner.emulator.faults import FaultPlan
+from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.journal import Journal
-from merge_runner.llm.batch.lines import Batches
-from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.rounds import Batches, Rounds
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.call import Call
-from merge_runner.llm.call_totals import CallTotals
-from merge_runner.llm.client import LlmClient
+from merge_runner.llm.client import Call, LlmClient
+from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
-from merge_runner.llm.prices import is_known
-from merge_runner.run.estimate import trial_costs
-from merge_runner.run.plan import Options, Plan, most_prompts
+from merge_runner.llm.prices import cost_usd
+from merge_runner.records import Usage
+from merge_runner.run.estimate import CallTotals, call_totals, trial_costs
+from merge_runner.run.plan import Options, Plan
 from merge_runner.run.rehearsal import SPEED, behaviour
 
 # For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
-
-
-@dataclass(frozen=True, slots=True)
-class EndpointPlan:
-    """How the endpoints of a sweep are asked; ``urls`` maps variables to base URLs.
-
-    ``emulator`` says how the emulator of this process behaves, None where none is needed. ``known``
-    names the models whose endpoint has ever given an answer in its format, and ``measured`` is what
-    the cache knows about each model's answers to similar requests.
-    """
-
-    urls: Mapping[str, str]
-    emulator: FaultPlan | None
-    known: frozenset[str]
-    measured: Mapping[str, CallTotals]
 
 
 def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
@@ -73,80 +53,76 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     }
 
 
-def _limiters(plan: Plan, options: Options, share: float) -> dict[str, Limiter]:
-    """The rate limiter of each entry, with a share of its model's limits."""
-    # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
-    pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
-    # An account's limits are those of a model, with whatever parameters it is asked.
-    by_model: dict[str, Limiter] = {}
+def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, CallTotals]:
+    """Return what the cache knows of each model's answers to requests like those of a plan.
+
+    A model whose endpoint has never given an answer is not among them.
+    """
+    totals = call_totals(cache.entries())
+    answered = {(model, endpoint) for model, endpoint, *_ in totals}
+    earlier = {}
     for name, entry in plan.entries.items():
-        if plan.registered[name] not in by_model:
-            rpm, tpm = (limit and max(1, int(limit * share)) for limit in options.rates(entry))
-            by_model[plan.registered[name]] = Limiter(
-                rpm=rpm,
-                tpm=tpm,
-                pause=pauses[plan.endpoints[name]],
-                window_s=WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S,
-            )
-    return {name: by_model[plan.registered[name]] for name in plan.entries}
-
-
-def endpoint_plan(
-    plan: Plan, options: Options, known: frozenset[str], measured: Mapping[str, CallTotals]
-) -> EndpointPlan:
-    """Return how the endpoints of a plan's models are asked; see EndpointPlan for the last two."""
-    emulated = any(entry.provider == "emulator" for entry in plan.entries.values())
-    if plan.is_rehearsal:
-        emulator: FaultPlan | None = behaviour(plan)
-    else:
-        runs = bool(os.environ.get("EMULATOR_BASE_URL"))  # and is the one to ask
-        emulator = options.faults if emulated and not runs else None
-    return EndpointPlan(base_urls(plan.entries), emulator, known, measured)
+        place = entry.id, plan.endpoints[name]
+        if place in answered:
+            sent = FORMATS[entry.format].request(entry, "")
+            asked = *place, sent.path, canonical_json(sent.body)
+            earlier[name] = totals.get(asked, CallTotals())
+    return earlier
 
 
 def live_clients(
     plan: Plan,
     options: Options,
-    endpoint_plan: EndpointPlan,
+    earlier: Mapping[str, CallTotals],
     cache: ResponseCache,
     ledger: Ledger,
     *,
     stack: AsyncExitStack,
     rounds: Rounds | None = None,
+    urls: Mapping[str, str] | None = None,
     share: float = 1.0,
+    limiters: dict[str, Limiter] | None = None,
 ) -> dict[str, LlmClient]:
     """Clients with connections, closed with ``stack``, and a share of the rate limits.
 
-    ``rounds`` are those of this run, which get the batch modes of its models. Raises UsageError
+    ``earlier`` is as ``earlier_answers`` says. ``rounds`` are those of this run, which get the
+    batch modes of its models. Variables in ``urls`` go before the environment. ``limiters`` by
+    registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
     """
     from merge_runner.llm.http import HttpTransport
 
     for name, entry in plan.entries.items():
-        if options.max_cost_usd is not None and not is_known(entry):
+        unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
+        if options.max_cost_usd is not None and unknown:
             raise UsageError(
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
-        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
-    costs = trial_costs(plan, endpoint_plan.measured, batch=options.batch)
+    costs = trial_costs(plan, earlier, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
-    limiters = _limiters(plan, options, share)
     _allow_open_files(options.connections + SPARE_FILES)
+    env = {**os.environ, **(urls or {})}
     in_process = None
-    if endpoint_plan.emulator is not None:
-        from merge_runner.emulator.handler import Emulator, InProcess
+    if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
+        from merge_runner.emulator.handler import Emulator
 
-        in_process = InProcess(Emulator(endpoint_plan.emulator))
+        in_process = Emulator(behaviour(plan) if plan.is_rehearsal else Behaviour()).transport()
+    limiters = {} if limiters is None else limiters
+    # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
+    pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
     transports: dict[str, HttpTransport] = {}
     clients: dict[str, LlmClient] = {}
     under_way: dict[str, Call] = {}  # two names of one model may ask the same
     for name, entry in plan.entries.items():
         model = plan.registered[name]
         if model not in transports:
-            endpoint = _endpoint(plan, name, endpoint_plan.urls)
+            if plan.is_rehearsal:
+                endpoint = rehearsal_endpoint(entry)
+            else:
+                endpoint = resolve_endpoint(name, entry, env)
             check_network(endpoint.base_url)
             transports[model] = HttpTransport(
                 endpoint,
@@ -155,6 +131,15 @@ def live_clients(
                 carrier=in_process if endpoint.is_emulator else None,
             )
             stack.push_async_callback(transports[model].close)
+            # An account's limits are those of a model, with whatever parameters it is asked.
+            rpm, tpm = (limit and max(1, int(limit * share)) for limit in options.rates(entry))
+            limiter = Limiter(
+                rpm=rpm,
+                tpm=tpm,
+                pause=pauses[plan.endpoints[name]],
+                window_s=WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S,
+            )
+            limiters.setdefault(model, limiter)
             if rounds is not None and batch_terms(entry) is not None:
                 service = SERVICES[entry.format]
                 rounds.services[model] = service(transports[model], endpoint, FORMATS[entry.format])
@@ -164,25 +149,18 @@ def live_clients(
             endpoint=plan.endpoints[name],
             cache=cache,
             transport=transports[model],
-            limiter=limiters[name],
+            limiter=limiters[model],
             budget=None if entry.price == "free" else budget,
             strict=options.strict_model,
-            model=model,
             first=FirstCall(
                 # A round is asked at once: no call of it waits for another one's answer.
                 passed=rounds is not None and rounds.submits,
-                known=name in endpoint_plan.known,
+                known=name in earlier,
             ),
             batches=_batches(model, entry, budget, cache, rounds),
             under_way=under_way,
         )
     return clients
-
-
-def _endpoint(plan: Plan, name: str, urls: Mapping[str, str]) -> Endpoint:
-    if plan.is_rehearsal:
-        return rehearsal_endpoint(plan.entries[name])
-    return resolve_endpoint(name, plan.entries[name], {**os.environ, **urls})
 
 
 def _batches(
@@ -193,7 +171,7 @@ def _batches(
     if rounds is None or terms is None:
         return None
     money = Budget(Ledger(cache, "")) if entry.price == "free" else budget
-    return Batches(rounds, model, budget.ledger.scope, money, terms.price_factor)
+    return Batches(rounds, model, money, terms.price_factor)
 
 
 def open_rounds(
@@ -203,39 +181,29 @@ def open_rounds(
     journal = Journal(cache)
     models = set(plan.registered.values())
     left = [each for each in journal.batches() if each.model in models and journal.waits(each)]
-    own = [each for each in left if each.ledger == plan.ledger]
     if options.dask is not None:
-        if own:
+        if left:
             raise UsageError(
                 "calls wait in batches of an earlier run: run the same command without --dask "
                 "until they have ended"
             )
         return None
-    if own and not options.batch:
+    if left and not options.batch:
         say("calls that wait in batches of an earlier run are not asked again")
-    if others := sorted({each.ledger for each in left} - {plan.ledger}):
-        say(f"calls that wait in batches of {', '.join(others)} are not asked again")
     if not options.batch and not left:
         return None
-    most = max((most_prompts(arm) for arm in plan.arms), default=1)
-    free = {
-        plan.registered[name]
-        for name, entry in plan.entries.items()
-        if plan.is_rehearsal or entry.price == "free"
-    }
-    return Rounds(journal, {}, submits=options.batch, most_rounds=most, free=free, say=say)
+    return Rounds(journal, {}, submits=options.batch, say=say)
 
 
 def check_batches(plan: Plan, options: Options) -> None:
     """Raise UsageError where a run cannot use batches as it is told to."""
     if not options.batch:
         return
-    if options.replay:
-        raise UsageError("a replay asks nothing: leave --batch out")
-    if options.dask is not None:
-        raise UsageError("--batch plays in this process: leave --dask out")
-    if not plan.entries:
-        raise UsageError("no language model is asked: leave --batch out")
+    if options.replay or options.dask is not None or not plan.entries:
+        raise UsageError("--batch asks models from this process: leave it, --replay or --dask out")
+    runs = os.environ.get("EMULATOR_BASE_URL")
+    if not runs and any(entry.provider == "emulator" for entry in plan.entries.values()):
+        raise UsageError("the emulator has no batch mode: leave --batch out")
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         require_batch(plan.registered[name], entry, registry)
@@ -245,11 +213,11 @@ def _allow_open_files(wanted: int) -> None:
     """Raise this process's limit on open files to what the connections need."""
     # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft >= wanted or soft == resource.RLIM_INFINITY:
-        return
-    if hard != resource.RLIM_INFINITY and hard < wanted:
+    try:
+        if wanted > soft != resource.RLIM_INFINITY:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    except ValueError as exc:
         raise UsageError(
             f"{wanted} connections exceed this system's limit of {hard} open files: choose a lower "
             "--in-flight or raise `ulimit -n`"
-        )
-    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        ) from exc

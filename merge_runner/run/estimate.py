@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from merge_runner.config import ModelEntry, driver_name
-from merge_runner.llm.batch.terms import batch_terms
-from merge_runner.llm.call_totals import CallTotals
-from merge_runner.llm.ledger import Spending
+from merge_runner.llm.batch.providers import batch_terms
+from merge_runner.llm.cache import CachedCall
+from merge_runner.llm.content_hashes import without_prompt
 from merge_runner.llm.prices import cost_usd
-from merge_runner.llm.trial_costs import Answers, TrialCalls, TrialCosts
 from merge_runner.prompts.render import render_prompt
-from merge_runner.records import Usage
+from merge_runner.records import Usage, is_scripted
 from merge_runner.run.plan import Options, Plan, most_prompts, usual_prompts
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -23,6 +22,46 @@ from merge_runner.study.crossing import Arm
 
 # A reply's JSON around the prompt, and later prompts with longer histories and numbers.
 PROMPT_MARGIN = 1.25
+# Trials that turn out longer, and attempts that are charged but bring no answer.
+TRIAL_MARGIN = 1.5
+
+
+@dataclass(slots=True)
+class CallTotals:
+    """Sums over the answers that state their tokens and are the model's own, no mock model's.
+
+    ``measured`` is their number; ``timed`` of them have a latency: a batch tells none.
+    """
+
+    measured: int = 0
+    input_tokens: int = 0
+    output_tokens: int = 0
+    timed: int = 0
+    latency_s: float = 0.0
+
+    @property
+    def mean(self) -> Usage | None:
+        """The tokens of an answer on average; None before any is measured."""
+        sums = (self.input_tokens, self.output_tokens)
+        read, written = (round(tokens / max(1, self.measured)) for tokens in sums)
+        return Usage(input_tokens=read, output_tokens=written) if self.measured else None
+
+
+def call_totals(entries: Iterable[CachedCall]) -> dict[tuple[str, str, str, str], CallTotals]:
+    """Return the totals by model, endpoint, path and the body without its prompt."""
+    totals: defaultdict[tuple[str, str, str, str], CallTotals] = defaultdict(CallTotals)
+    for entry in entries:
+        sent, last = entry.request, entry.attempts[-1]
+        each = totals[sent.model, sent.endpoint, sent.path, without_prompt(sent.body)]
+        read, written = last.usage.input_tokens, last.usage.output_tokens
+        own = sent.provider == "emulator" or not is_scripted(sent, last)
+        if own and read is not None and written is not None:
+            each.measured += 1
+            each.input_tokens += read
+            each.output_tokens += written
+            each.timed += last.latency_s is not None
+            each.latency_s += last.latency_s or 0.0
+    return totals
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +81,7 @@ class Estimate:
     """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
 
     ``measured`` lists the drivers whose tokens and latency are taken from their earlier answers.
-    ``trials_within_cap`` is None without a cap, or where a price is unknown. ``batch`` is what the
-    same takes in batches, where the run is to use them.
+    ``batch`` is what the same takes in batches, where the run is to use them.
     """
 
     driver: str
@@ -55,199 +93,134 @@ class Estimate:
     minutes: float
     free: bool
     measured: tuple[str, ...]
-    trials_within_cap: int | None
     batch: BatchEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Calls:
-    """How many calls a model of the registry has yet to answer in one arm, and what one takes.
+    """The calls of a model that one arm lacks, each with its tokens and its latency in s."""
 
-    A run pays a ``part`` of their price: less than all of it in batches.
-    """
-
-    arm: str
     model: str
     entry: ModelEntry
     number: int
     usage: Usage
     latency_s: float
-    part: float
 
-    @property
-    def cost_usd(self) -> float | None:
-        """What they cost together, asked singly."""
-        price = cost_usd(self.entry, self.usage)
-        return None if price is None else self.number * price
+    def limited_s(self, options: Options) -> float:
+        """Return how long the limits stretch the calls, in s.
 
-    @property
-    def paid_usd(self) -> float | None:
-        """What the run pays for them."""
-        return None if self.cost_usd is None else self.cost_usd * self.part
+        Within a minute's window a call counts with its output cap until its reply is in, and with
+        its actual tokens from then on.
+        """
+        rpm, tpm = options.rates(self.entry)
+        waiting = min(self.latency_s / 60, 1.0)
+        written = waiting * self.entry.max_output_tokens
+        written += (1 - waiting) * (self.usage.output_tokens or 0)
+        tokens = (self.usage.input_tokens or 0) + written
+        return max(
+            60 * self.number / (rpm or math.inf), 60 * self.number * tokens / (tpm or math.inf)
+        )
 
 
 def estimate(
     plan: Plan,
     options: Options,
     *,
-    trials: Mapping[str, int],
+    trials: int,
     calls: Mapping[str, Mapping[str, float]],
     facts: Mapping[str, CallTotals],
-    spending: Spending,
 ) -> Estimate:
-    """The estimate for the ``trials`` that a live run of a plan has yet to play, by arm.
+    """Return the estimate for the ``trials`` that a live run of a plan has yet to play.
 
-    ``calls`` is roughly how many each model has yet to answer in an arm. ``facts`` is what the
-    cache knows about each model's earlier answers to similar requests at its endpoint,
-    ``spending`` what counts against the caps already.
+    ``calls`` is roughly how many each model has yet to answer, by arm. ``facts`` is what the cache
+    knows about each model's earlier answers to similar requests at its endpoint.
     """
     todo = [
-        _Calls(
-            label,
-            plan.registered[name],
-            entry,
-            round(calls[label][name]),
-            *_per_call(plan, arm, entry, facts[name]),
-            price_factor(entry) if options.batch else 1.0,
-        )
+        _calls(plan, arm, name, round(calls[label][name]), facts[name])
         for label, arm in plan.by_label().items()
-        for name, entry in arm.entries.items()
+        for name in arm.entries
     ]
     batch = None
     if options.batch:
         batch = BatchEstimate(
-            cost_usd=_rounded_sum(each.paid_usd for each in todo),
+            _cost_usd(todo, batch=True),
             rounds=max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0),
             most_rounds=max(map(most_prompts, plan.arms), default=0),
         )
+    at_once, minutes = min(options.connections, 2 * max(trials, 1)), 0.0
+    for model in {each.model for each in todo}:
+        own = [each for each in todo if each.model == model]
+        in_turn_s = math.ceil(sum(each.number for each in own) / at_once) * own[0].latency_s
+        limited_s = sum(each.limited_s(options) for each in own)
+        minutes = max(minutes, round(max(in_turn_s, limited_s) / 60, 1))
     return Estimate(
         plan.driver,
-        sum(trials.values()),
+        trials,
         calls=sum(each.number for each in todo),
         input_tokens=sum(each.number * (each.usage.input_tokens or 0) for each in todo),
         output_tokens=sum(each.number * (each.usage.output_tokens or 0) for each in todo),
-        cost_usd=_rounded_sum(each.cost_usd for each in todo),
-        minutes=_minutes(options, sum(trials.values()), todo),
+        cost_usd=_cost_usd(todo),
+        minutes=minutes,
         free=all(entry.price == "free" for entry in plan.entries.values()),
         measured=tuple(
             driver_name(name, plan.endpoints[name]) for name in plan.entries if facts[name].measured
         ),
-        trials_within_cap=_within(options.max_cost_usd, spending, trials, todo),
         batch=batch,
     )
 
 
-def price_factor(entry: ModelEntry) -> float:
-    """What part of its price a model costs in batches."""
-    terms = batch_terms(entry)
+def _calls(plan: Plan, arm: Arm, name: str, number: int, facts: CallTotals) -> _Calls:
+    """Return the calls of a model in an arm, as measured or as listed in the registry."""
+    entry = arm.entries[name]
+    usage = facts.mean or Usage(
+        # English has about 4 bytes a token.
+        input_tokens=len(typical_prompt(plan, arm).encode()) // 4,
+        output_tokens=entry.typical_output_tokens,
+    )
+    latency_s = facts.latency_s / facts.timed if facts.timed else entry.typical_latency_s
+    return _Calls(plan.registered[name], entry, number, usage, latency_s)
+
+
+def _cost_usd(calls: Iterable[_Calls], *, batch: bool = False) -> float | None:
+    """Return what calls cost together, to a cent; None where a price is unknown."""
+    sum_usd = 0.0
+    for each in calls:
+        usd = cost_usd(each.entry, each.usage)
+        if usd is None:
+            return None
+        sum_usd += each.number * usd * _part(each.entry, batch=batch)
+    return round(sum_usd, 2)
+
+
+def _part(entry: ModelEntry, *, batch: bool) -> float:
+    """Return the part of its price that a model costs, which is less than 1 in batches."""
+    terms = batch_terms(entry) if batch else None
     return 1.0 if terms is None else terms.price_factor
 
 
-def _rounded_sum(costs: Iterable[float | None]) -> float | None:
-    """The sum to a cent; None where a price is unknown."""
-    known = list(costs)
-    return None if None in known else round(sum(cost or 0.0 for cost in known), 2)
+def trial_costs(
+    plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = False
+) -> Callable[[int], float]:
+    """Return what tells by a trial's order the USD that it is expected to cost, perhaps in batches.
 
-
-def _within(
-    cap_usd: float | None, spending: Spending, trials: Mapping[str, int], calls: Sequence[_Calls]
-) -> int | None:
-    """How many trials the money left buys, spread evenly; None without a cap or a price."""
-    if cap_usd is None or any(each.cost_usd is None for each in calls):
-        return None
-    usd = sum(each.paid_usd or 0.0 for each in calls)
-    paid = {each.arm for each in calls if each.paid_usd}
-    share = max(0.0, min(1.0, (cap_usd - spending.committed_usd) / usd)) if usd else 1.0
-    return int(sum(n * (share if label in paid else 1.0) for label, n in trials.items()))
-
-
-def _minutes(options: Options, trials: int, calls: Sequence[_Calls]) -> float:
-    """How long the slowest model takes, by its latency or by its limits."""
-    at_once = min(options.connections, 2 * max(trials, 1))
-    slowest_s = 0.0
-    for model in {each.model for each in calls}:
-        own = [each for each in calls if each.model == model]
-        in_turn_s = math.ceil(sum(each.number for each in own) / at_once) * own[0].latency_s
-        slowest_s = max(slowest_s, in_turn_s, sum(_limited_s(options, each) for each in own))
-    return round(slowest_s / 60, 1)
-
-
-def trial_costs(plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = False) -> TrialCosts:
-    """What the trials of a plan are expected to cost, in a ``batch`` run or not; a cell is an arm.
-
-    ``facts`` is as for ``estimate``.
+    They are its usual calls, with a margin, and one worst case, which the last call must be able to
+    reserve. ``facts`` is as for ``estimate``.
     """
-    labels = {spec.order: spec.arm for spec in plan.trial_specs()}
-    parts = {name: price_factor(e) if batch else 1.0 for name, e in plan.entries.items()}
-    calls = {arm.label: _trial_calls(plan, arm, parts) for arm in plan.arms}
-    earlier: defaultdict[str, Answers] = defaultdict(Answers)
-    for name, totals in facts.items():
-        if totals.measured:
-            one_usd = cost_usd(plan.entries[name], _measured_usage(totals)) or 0.0
-            usd = totals.measured * one_usd * parts[name]
-            earlier[plan.registered[name]].add(usd, totals.measured)
-    return TrialCosts(lambda order: calls[labels[order]], earlier)
-
-
-def _trial_calls(plan: Plan, arm: Arm, parts: Mapping[str, float]) -> dict[str, TrialCalls]:
-    """The calls of each model in a trial: at most up to the timeout, every answer at its cap.
-
-    A model that drives on both sides with different parameters counts with the dearer ones. Each
-    costs so many ``parts`` of its price.
-    """
-    sides = Counter(name for name in arm.asked.values() if name in arm.entries)
-    usual, most = usual_prompts(arm), most_prompts(arm)
-    # No tokeniser makes more tokens than bytes.
-    read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
-    calls: dict[str, TrialCalls] = {}
-    for name, number in sides.items():
-        entry = arm.entries[name]
-        worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
-        worst_usd = (cost_usd(entry, worst) or 0.0) * parts[name]
-        made = TrialCalls(number * usual, number * most, worst_usd)
-        other = calls.get(model := plan.registered[name])
-        if other is not None:
-            worst_usd = max(worst_usd, other.worst_usd)
-            made = TrialCalls(made.usual + other.usual, made.most + other.most, worst_usd)
-        calls[model] = made
-    return calls
-
-
-def _measured_usage(totals: CallTotals) -> Usage:
-    """The tokens of an answer on average."""
-    return Usage(
-        input_tokens=round(totals.input_tokens / totals.measured),
-        output_tokens=round(totals.output_tokens / totals.measured),
-    )
-
-
-def _per_call(plan: Plan, arm: Arm, entry: ModelEntry, facts: CallTotals) -> tuple[Usage, float]:
-    """The tokens of a call and its latency in s, as measured or as listed in the registry."""
-    if facts.measured:
-        return _measured_usage(facts), facts.mean_latency_s or entry.typical_latency_s
-    # English has about 4 bytes a token.
-    prompt_tokens = len(typical_prompt(plan, arm).encode()) // 4
-    usage = Usage(input_tokens=prompt_tokens, output_tokens=entry.typical_output_tokens)
-    return usage, entry.typical_latency_s
-
-
-def _limited_s(options: Options, calls: _Calls) -> float:
-    """How long the limits stretch the calls, in s.
-
-    Within a minute's window a call counts with its output cap until its reply is in, and with
-    its actual tokens from then on.
-    """
-    rpm, tpm = options.rates(calls.entry)
-    waiting = min(calls.latency_s / 60, 1.0)
-    tokens = (calls.usage.input_tokens or 0) + (
-        waiting * calls.entry.max_output_tokens + (1 - waiting) * (calls.usage.output_tokens or 0)
-    )
-    number = calls.number
-    return max(60 * number / rpm if rpm else 0.0, 60 * number * tokens / tpm if tpm else 0.0)
+    by_arm: defaultdict[str, float] = defaultdict(float)
+    for arm in plan.arms:
+        # No tokeniser makes more tokens than bytes.
+        read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
+        for name in filter(arm.entries.get, arm.asked.values()):
+            entry, calls = arm.entries[name], _calls(plan, arm, name, 1, facts[name])
+            worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
+            usual_usd, worst_usd = (cost_usd(entry, each) or 0.0 for each in (calls.usage, worst))
+            usd = TRIAL_MARGIN * usual_prompts(arm) * usual_usd + worst_usd
+            by_arm[arm.label] += usd * _part(entry, batch=batch)
+    return {spec.order: by_arm[spec.arm] for spec in plan.trial_specs()}.__getitem__
 
 
 def typical_prompt(plan: Plan, arm: Arm) -> str:
-    """An arm's prompt in the middle of an approach."""
+    """Return an arm's prompt in the middle of an approach."""
     scenario = arm.scenario
     world = World(scenario, CONDITIONS[plan.conditions[0]], TRACK)
     rest = (0.25,) * (scenario.plan_actions - scenario.executed_actions)

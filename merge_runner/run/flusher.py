@@ -12,20 +12,13 @@ from merge_runner.errors import StoreError, StoreLocked
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.store import Store
 
-EVERY_S = 1.0
-BATCH = 64
-"""Trials in one transaction: few enough that a reader gets its turn soon."""
-BATCH_OF_REPLAY = 4 * BATCH
-"""Of trials that take no time: a transaction costs as much as storing dozens of them."""
-MOST_PENDING = 8 * BATCH
+EVERY_S, POLL_S = 1.0, 0.05
+# Trials in one transaction, which costs as much as storing dozens of them; and in memory while
+# storing fails, as when another program holds the file.
+BATCH = 256
+MOST_PENDING = 2 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
-MOST_HELD = 4 * BATCH
-"""Trials in memory while storing fails, as when another program holds the file."""
 LOCK_PATIENCE_S = 2.0
-# How long the end of a sweep retries what is no lock, such as a full disk. A lock is waited for.
-LAST_PATIENCE_S = 3.0
-
-
 AGAIN = (
     "When that is fixed, run the same command again: it writes them from the recorded replies "
     "without a call."
@@ -42,47 +35,38 @@ def size_of(record: TrialRecord) -> int:
 class Flusher:
     """Collects ended trials and stores them about once a second.
 
-    While storing fails, trials beyond MOST_HELD are dropped and others are played; where storing is
+    While storing fails, trials beyond a batch are dropped and others are played; where storing is
     merely slow, new trials wait for it. ``dropped`` trials can be played again from the recorded
     replies; failed ones cannot, and stay in memory. ``differing`` maps trials that were already
     stored with other values to the columns that differ.
     """
 
-    def __init__(
-        self, store: Store, sweep_id: str, say: Callable[[str], None], batch: int = BATCH
-    ) -> None:
+    def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
         self.differing: dict[str, list[str]] = {}
         self.dropped: list[TrialSpec] = []
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
-        self._batch = batch
-        self._pending: list[TrialRecord] = []
-        self._bytes = 0
+        self._pending: list[tuple[TrialRecord, int]] = []  # with their sizes
         self._problem: StoreError | None = None
-        self._said = ""
         self._closing = False
-        self._awake, self._tried = asyncio.Event(), asyncio.Event()
+        self._awake = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
     def add(self, record: TrialRecord) -> None:
         """Store this trial with the next batch, or drop it while storing fails."""
-        self._pending.append(record)
-        self._bytes += size_of(record)
+        self._pending.append((record, size_of(record)))
         if self._problem is not None:
             self._drop_excess()
-        if len(self._pending) >= self._batch or self._bytes >= BATCH_BYTES:
+        if len(self._pending) >= BATCH or self._bytes >= BATCH_BYTES:
             self._awake.set()
 
     async def room(self) -> None:
         """Wait while too much is still to be stored, unless storing fails or has ended."""
-        while self._is_full() and not self._task.done():
-            self._tried.clear()
-            await self._tried.wait()
-
-    def _is_full(self) -> bool:
-        is_much = len(self._pending) > MOST_PENDING or self._bytes > MOST_PENDING_BYTES
-        return is_much and self._problem is None
+        while self._problem is None and not self._task.done():
+            if len(self._pending) <= MOST_PENDING and self._bytes <= MOST_PENDING_BYTES:
+                return
+            await asyncio.sleep(POLL_S)
 
     @property
     def left(self) -> int:
@@ -100,28 +84,30 @@ class Flusher:
     async def close(self) -> None:
         """Store the trials in memory, and leave the database reachable.
 
-        Waits for a program that holds it as long as that does; raises StoreError for anything else
-        that lasts. More trials may be added later, and stored by the next call.
+        Waits for a program that holds it as long as that does; raises StoreError for anything else.
+        More trials may be added later, and stored by the next call.
         """
         self._closing = True
         self._awake.set()
         await self._task
-        loop = asyncio.get_running_loop()
-        began, waiting = loop.time(), False
+        said = False
         while not await self._flush() or self._pending:
             if isinstance(self._problem, StoreLocked):
-                if not waiting:
+                if not said:
                     self._say(
                         f"the playing has ended; {self.problem}. Ctrl-C ends the waiting: all "
                         "replies are in the cache"
                     )
-                waiting = True
-            elif not self.left:
-                return  # whoever opens the database next will say what is wrong with it
-            elif self._problem and loop.time() - began >= LAST_PATIENCE_S:
-                raise StoreError(f"{self.left} trials are not stored: {self._problem}. {AGAIN}")
-            if self._problem:
+                said = True
                 await asyncio.sleep(EVERY_S)
+            elif self._problem and self.left:
+                raise StoreError(f"{self.left} trials are not stored: {self._problem}. {AGAIN}")
+            elif self._problem:
+                return  # whoever opens the database next will say what is wrong with it
+
+    @property
+    def _bytes(self) -> int:
+        return sum(size for _, size in self._pending)
 
     async def _run(self) -> None:
         while not self._closing:
@@ -134,42 +120,32 @@ class Flusher:
 
     async def _flush(self) -> bool:
         """Write one batch, which may be empty; False if that did not work."""
-        sizes = accumulate(map(size_of, self._pending[: self._batch]))
+        sizes = accumulate(size for _, size in self._pending[:BATCH])
         # At least one: a single trial may be larger than a batch should be.
         number = max(1, sum(size <= BATCH_BYTES for size in sizes))
         # It stays in front until it is stored: others are added behind it meanwhile.
-        batch = self._pending[:number]
-        # In a thread, since DuckDB waits for the file's lock and for the disk; the trials go on.
+        batch = [record for record, _ in self._pending[:number]]
         try:
+            # In a thread, since DuckDB waits for the file's lock and for the disk.
             self.differing |= await asyncio.to_thread(
                 self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
             )
         except StoreError as exc:
             self._problem = exc
-            if self.left and str(exc) != self._said:  # it is tried again every second
-                self._said = str(exc)
-                self._say(f"the sweep goes on; {self.problem}")
             self._drop_excess()
             return False
-        else:
-            self._problem = None
-            del self._pending[: len(batch)]
-            self._bytes -= sum(map(size_of, batch))
-            return True
-        finally:
-            self._tried.set()
+        self._problem = None
+        del self._pending[: len(batch)]
+        return True
 
     def _drop_excess(self) -> None:
         """Drop the newest trials beyond what may wait, which are in no batch under way."""
-        newest: list[TrialRecord] = []
-        while len(self._pending) > MOST_HELD or (
-            self._bytes > MOST_PENDING_BYTES and len(self._pending) > 1
-        ):
-            newest.append(self._pending.pop())
-            self._bytes -= size_of(newest[-1])
-        for record in reversed(newest):
-            if record.status == "failed":
-                self._pending.append(record)
-                self._bytes += size_of(record)
-            else:
+        pending, self._pending = self._pending, []
+        held_bytes = 0
+        for record, size in pending:
+            is_much = len(self._pending) >= BATCH or held_bytes + size > MOST_PENDING_BYTES
+            if is_much and self._pending and record.status != "failed":
                 self.dropped.append(record.spec)
+            else:
+                self._pending.append((record, size))
+                held_bytes += size

@@ -8,7 +8,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from itertools import chain, product
 from pathlib import Path
@@ -28,7 +28,6 @@ from merge_runner.config import (
 )
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, HumanTrials, Program
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
@@ -76,9 +75,9 @@ class Options:
     ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
     those of other sweeps.
     ``dask`` names the cluster that plays the trials; if None, this process plays them.
-    ``faults`` are those of the emulator. A ``dry_run`` sends nothing, a ``quiet`` run shows no
-    progress, and one that is to ``keep_going`` asks a model on that gives no valid decision. In a
-    ``batch`` run all trials ask together, at a lower price.
+    A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to
+    ``keep_going`` asks a model on that gives no valid decision. In a ``batch`` run all trials ask
+    together, at a lower price.
     """
 
     db: Path
@@ -90,7 +89,6 @@ class Options:
     ledgers: Sequence[str] = ()
     replay: bool = False
     recordings: Sequence[Path] = ()
-    faults: FaultPlan = field(default_factory=FaultPlan)
     strict_model: bool = False
     keep_going: bool = False
     quiet: bool = False

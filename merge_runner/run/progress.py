@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
 
-from merge_runner.llm.call import Wait
+from merge_runner.llm.client import Wait
 from merge_runner.llm.ledger import Ledger
 from merge_runner.results.progress_file import ProgressFile, Standing, clear_dead
 from merge_runner.run.plan import Plan
@@ -20,7 +20,7 @@ from merge_runner.text_safety import printable
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from merge_runner.run.dask_tasks import DaskTasks
+    from merge_runner.run.cluster import DaskTasks
     from merge_runner.run.local_runner import LocalRunner
 
 PUBLISHED_EVERY_S = 1.0

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from merge_runner.config import PROVIDERS, REHEARSAL, ModelEntry, endpoint_identity
-from merge_runner.emulator.faults import BatchPlan, Fault, FaultPlan
+from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
 from merge_runner.llm.models import load_models
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
@@ -19,14 +19,8 @@ from merge_runner.run.plan import Options, Plan
 
 SPEED = 10
 FOLDER = Path("results/rehearsal")
-# A share of attempts and of lines of a batch in which something goes wrong, as with providers.
-RATES: dict[Fault, float] = {
-    "rate_limit": 0.01,
-    "server_error": 0.005,
-    "overloaded": 0.005,
-    "malformed": 0.005,
-}
-FAILED_LINES = 0.005
+# The share of attempts in which something goes wrong, as with providers.
+RATES = {"rate_limit": 0.01, "server_error": 0.005, "overloaded": 0.005, "malformed": 0.005}
 
 
 def rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]:
@@ -35,10 +29,11 @@ def rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]:
     ``home`` is the folder in which the results of the sweep lie.
     """
     usual = home / DEFAULT_DB, home / DEFAULT_CACHE
-    if options.replay or options.dask or (options.db, options.cache) != usual:
+    elsewhere = options.replay or options.dask or options.batch
+    if elsewhere or (options.db, options.cache) != usual:
         raise UsageError(
-            f"a rehearsal keeps what it makes in {FOLDER} and plays in this process: leave --db, "
-            "--cache, --dask and --replay out"
+            f"a rehearsal keeps what it makes in {FOLDER}, plays in this process and asks one by "
+            "one: leave --db, --cache, --dask, --replay and --batch out"
         )
     models = {plan.registered[name] for name in plan.entries}
     if len(models) != 1 or not all(map(_can_be_rehearsed, plan.entries.values())):
@@ -52,16 +47,14 @@ def rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]:
     return plan, replace(options, db=folder / "merge.duckdb", cache=folder / "responses")
 
 
-def behaviour(plan: Plan) -> FaultPlan:
+def behaviour(plan: Plan) -> Behaviour:
     """Return how the emulator answers in the place of a plan's one model."""
     entry = next(iter(plan.entries.values()))  # the others differ in parameters alone
-    latency_s = entry.typical_latency_s / SPEED
-    return FaultPlan(
+    return Behaviour(
         rates=RATES,
-        latency_s=latency_s,
+        latency_s=entry.typical_latency_s / SPEED,
         delay_s=1.0,
         output_tokens=entry.typical_output_tokens,
-        batch=BatchPlan(delay_s=2 * latency_s, failed=FAILED_LINES),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import zip_longest
 
 from merge_runner.llm.cache import CachedCall
@@ -35,17 +35,15 @@ def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
     same_slot: dict[Slot, list[ChatRequest]] = {}
     same_place: dict[tuple[str, str, int], ChatRequest] = {}
     for entry in recorded:
-        request = entry.request
-        if request.slot in wanted:
-            same_slot.setdefault(request.slot, []).append(request)
-        same_place.setdefault(_place(request.slot), request)
+        if entry.request.slot in wanted:
+            same_slot.setdefault(entry.request.slot, []).append(entry.request)
+        same_place.setdefault(_place(entry.request.slot), entry.request)
     alike: dict[str, list[tuple[Miss, str]]] = {}
     for miss in misses:
-        request, place = miss.request, _place(miss.request.slot)
-        others = same_slot.get(request.slot) or [
-            same_place.get(place) or next(iter(same_place.values()), request)
-        ]
-        nearest = min((list(_differences(other, request)) for other in others), key=len)
+        request, any_place = miss.request, next(iter(same_place.values()), miss.request)
+        near = same_place.get(_place(request.slot), any_place)
+        others = same_slot.get(request.slot, [near])
+        nearest = min((_differences(other, request) for other in others), key=len)
         text = f"the nearest recorded request differs in {'; '.join(nearest)}"
         text = text if nearest else "nothing is recorded at all"
         alike.setdefault(_NUMBER.sub("0", text), []).append((miss, text))
@@ -63,33 +61,32 @@ def _place(slot: Slot) -> tuple[str, str, int]:
     return slot.condition, slot.side, slot.decision
 
 
-def _fields(request: ChatRequest) -> dict[str, object]:
-    return {
-        "endpoint": request.endpoint,
-        "path": request.path,
-        "headers": request.headers,
-        **request.slot.as_dict(),
-        **dict(_leaves("body", json.loads(request.body))),
-    }
-
-
-def _differences(recorded: ChatRequest, wanted: ChatRequest) -> Iterator[str]:
-    """Yield the fields that differ, each with both values; of texts the first lines that differ."""
-    old, new = _fields(recorded), _fields(wanted)
+def _differences(recorded: ChatRequest, wanted: ChatRequest) -> list[str]:
+    """Return the fields that differ, each with both values; of texts the first lines that do."""
+    old, new = (
+        dict(_leaves("", {**asdict(request.slot), **_sent(request)}))
+        for request in (recorded, wanted)
+    )
+    texts = []
     for name in sorted(old.keys() | new.keys()):
         before, after = old.get(name), new.get(name)
-        if before == after:
-            continue
         if isinstance(before, str) and isinstance(after, str):
             lines = zip_longest(before.split("\n"), after.split("\n"))
-            before, after = next((a, b) for a, b in lines if a != b)
-        yield f"{name} (recorded {_short(before)}, wanted {_short(after)})"
+            before, after = next((pair for pair in lines if pair[0] != pair[1]), (None, None))
+        if before != after:
+            texts.append(f"{name} (recorded {_short(before)}, wanted {_short(after)})")
+    return texts
+
+
+def _sent(request: ChatRequest) -> dict[str, object]:
+    asked = {name: getattr(request, name) for name in ("endpoint", "path", "headers")}
+    return asked | {"body": json.loads(request.body)}
 
 
 def _leaves(name: str, value: object) -> Iterator[tuple[str, object]]:
     if isinstance(value, dict):
         for key, inner in value.items():
-            yield from _leaves(f"{name}.{key}", inner)
+            yield from _leaves(f"{name}.{key}".lstrip("."), inner)
     elif isinstance(value, list):
         for index, inner in enumerate(value):
             yield from _leaves(f"{name}[{index}]", inner)

@@ -8,43 +8,34 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, nullcontext, suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, closing, suppress
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, cast
 
 import duckdb
-from pydantic import ValidationError
 
 from merge_runner.audit.checks import audited_database, check_rest, check_sweep
 from merge_runner.audit.findings import Audit, Finding
 from merge_runner.config import ModelEntry
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import (
-    CallFailed,
-    MergeRunnerError,
-    RecordingError,
-    unknown_name,
-)
+from merge_runner.errors import CallFailed, MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
+from merge_runner.llm.content_hashes import DAMAGED, make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply, judge
-from merge_runner.llm.verify import DAMAGED
 from merge_runner.prompts.blocks import blocks_of
 from merge_runner.records import ANSWERS, SIDES, Attempt, Slot, TrialRecord, TrialSpec, Usage
-from merge_runner.registry import in_use, use
+from merge_runner.registry import in_use, require, use
 from merge_runner.results.comparison import (
     FACTORS,
     LONG,
-    PLACES,
     Difference,
     Stored,
     in_order,
-    rows_of_trials,
-    stored_rows,
+    spans,
 )
 from merge_runner.results.database import by_name
 from merge_runner.results.rows import rows_of
@@ -52,8 +43,9 @@ from merge_runner.run.clients import sealed_clients
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.study.crossing import MOST_TRIALS, Arm
+from merge_runner.study.crossing import Arm
 from merge_runner.study.parts import declared_catalogue
+from merge_runner.text_safety import one_line
 
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
@@ -82,6 +74,9 @@ SWEEPS = """
 SELECT sweep_id, config::VARCHAR, coalesce(exit_code = 0, false) FROM sweeps
 ORDER BY started_at DESC, sweep_id DESC
 """
+CALLS = """
+SELECT * FROM calls WHERE rowid BETWEEN ? AND ? AND trial_id = ? AND spec_hash = ? ORDER BY attempt
+"""
 
 
 def audit_database(
@@ -92,25 +87,18 @@ def audit_database(
     A trial that several sweeps have is audited with the newest of them. With a ``cache``, every
     attempt is compared with its folder, too. Raises UsageError.
     """
-    with audited_database(path) as connection:
-        rows = connection.execute(SWEEPS).fetchall()
+    with audited_database(path) as connection, ExitStack() as stack:
+        sweeps = {row[0]: row for row in connection.execute(SWEEPS).fetchall()}
         if sweep_id is not None:
-            known = [row for row in rows if row[0] == sweep_id]
-            if not known:
-                raise unknown_name(
-                    "sweep", sweep_id, [row[0] for row in reversed(rows)], f"in {path}"
-                )
-            rows = known
-        kept = Audit(str(cache), {"trials": 0})
-        with (
-            nullcontext()
-            if cache is None
-            else closing(ResponseCache(cache, read_only=True)) as replies
-        ):
-            audits = [
-                _audit(connection, name, config, replies, kept, finished=finished)
-                for name, config, finished in rows
-            ]
+            oldest_first = dict(reversed(sweeps.items()))
+            sweeps = {sweep_id: require(oldest_first, "sweep", sweep_id, f"in {path}")}
+        replies, kept = None, Audit(str(cache), {"trials": 0})
+        if cache is not None:
+            replies = stack.enter_context(closing(ResponseCache(cache, read_only=True)))
+        audits = [
+            _audit(connection, name, config, replies, kept, finished=finished)
+            for name, config, finished in sweeps.values()
+        ]
         audits.reverse()
         if sweep_id is None:
             audits.append(check_rest(connection, path))
@@ -134,87 +122,55 @@ def _audit(
     try:
         plan = Plan.model_validate_json(config)
         # The stored plug-ins are somebody's code and never run.
-        if plan.study.is_own and not in_use().text:
-            use(declared_catalogue(plan.study.text))
+        if not in_use().text:
+            use(declared_catalogue(plan.study.file))
         stored, members = json.loads(config), plan.model_dump(mode="json").items()
         if wrong := [name for name, value in members if stored.get(name, value) != value]:
             text = f"it disagrees with itself in {', '.join(wrong)}"
             problems.append(Finding("config", text, sweep_id))
-        plan, planned, specs = _installed_part(connection, plan, notes)
-    except ValidationError as exc:
-        error = exc.errors()[0]
-        problems.append(
-            _unreadable(f"{'.'.join(map(str, error['loc']))}: {error['msg']}", sweep_id)
-        )
+        planned = {
+            plan.trial_id_of(arm, condition, repetition): ""
+            for arm in plan.arms
+            for condition in plan.conditions
+            for repetition in range(1, arm.repetitions + 1)
+        }
+        specs = _installed_specs(connection, plan)
+        planned |= {spec.trial_id: spec.spec_hash for spec in specs}
     except (*DAMAGED, AttributeError, MergeRunnerError) as exc:
-        problems.append(_unreadable(exc, sweep_id))
+        if planned and isinstance(exc, MergeRunnerError):
+            notes[str(exc)] += len(planned)
+        else:
+            why = f"its configuration cannot be read, so that its trials are not known: {exc}"
+            problems.append(Finding("config", one_line(why), sweep_id))
     audit = check_sweep(connection, sweep_id, list(planned.items()), finished=finished)
     audit.findings += problems
     if specs:
         specs = _replayable(connection, plan, specs, audit, notes)
         audit.counts["replayed"] = len(specs)
-        stored_replies = StoredReplies(connection, plan)
-        audit.findings += _replay(connection, plan, specs, stored_replies, sweep_id)
+        audit.findings += _replay(
+            connection, plan, specs, StoredReplies(connection, plan), sweep_id
+        )
         if cache is not None:
             kept.counts["trials"] += len(specs)
             kept.findings += _replay(connection, plan, specs, cache, sweep_id)
-    audit.notes += [
-        f"not replayed: {count} trials, since {why}" for why, count in notes.items() if count
-    ]
+    audit.notes += [f"not replayed: {count} trials, since {why}" for why, count in notes.items()]
     return audit
 
 
-def _unreadable(why: object, sweep_id: str) -> Finding:
-    text = f"its configuration cannot be read, so that its trials are not known: {why}"
-    return Finding("config", text, sweep_id)
+def _installed_specs(connection: duckdb.DuckDBPyConnection, plan: Plan) -> list[TrialSpec]:
+    """Return the specs of a plan whose parts are all installed, else raise UsageError.
 
-
-def _installed_part(
-    connection: duckdb.DuckDBPyConnection, plan: Plan, notes: Counter[str]
-) -> tuple[Plan, dict[str, str], list[TrialSpec]]:
-    """Return the part of a plan whose drivers, prompts and conditions are installed.
-
-    Also all its trials, each with the hash of its spec, or none where that cannot be known, and
-    the specs of the part. Raises ValueError for a format that there is not.
+    Reads the human trials that it replays.
     """
-    if plan.trials > MOST_TRIALS:
-        raise ValueError(f"it has {plan.trials} trials")
-    arms = []
-    conditions = tuple(name for name in plan.conditions if name in CONDITIONS)
+    for name in plan.conditions:
+        CONDITIONS.require(name, HINT)
     for arm in plan.arms:
-        if why := _lacking(connection, arm):
-            notes[why] += arm.repetitions * len(plan.conditions)
-        else:
-            arms.append(arm)
-            lacking = len(plan.conditions) - len(conditions)
-            notes["their condition is not installed"] += arm.repetitions * lacking
-    planned = {
-        plan.trial_id_of(arm, condition, repetition): ""
-        for arm in plan.arms
-        for condition in plan.conditions
-        for repetition in range(1, arm.repetitions + 1)
-    }
-    part = plan.model_copy(update={"arms": tuple(arms), "conditions": conditions})
-    specs = part.trial_specs() if part.trials else []
-    return part, planned | {spec.trial_id: spec.spec_hash for spec in specs}, specs
-
-
-def _lacking(connection: duckdb.DuckDBPyConnection, arm: Arm) -> str:
-    """Return what is not installed of an arm, empty: nothing; reads the human trials it replays."""
-    for name, entry in arm.entries.items():
-        if entry.format not in FORMATS:
-            raise ValueError(
-                f"its model {name} has the format {entry.format!r}, which there is not"
-            )
-    try:
         if arm.entries:
             blocks_of(arm.variant)
         for name in {*arm.asked.values()} - {*arm.entries}:
             if (humans := PROGRAMS.require(name, HINT).data) is not None:
                 humans.read(connection)
-    except MergeRunnerError as exc:
-        return str(exc)
-    return ""
+    return plan.trial_specs()
 
 
 def _replayable(
@@ -229,37 +185,31 @@ def _replayable(
     A spec that differs in what follows from the sweep's configuration is a finding; trials that
     another version of the program made are a note.
     """
-    rows = connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall()
-    hashes = dict(rows)
+    hashes = dict(connection.execute("SELECT trial_id, spec_hash FROM audited").fetchall())
     stored = dict(connection.execute("SELECT spec_hash, spec::VARCHAR FROM specs").fetchall())
     wanted = plan.specs()
-    others: dict[tuple[str, str], list[str]] = {}
     for spec in specs:
         actual = hashes.get(spec.trial_id, spec.spec_hash)
-        if actual != spec.spec_hash:
-            others.setdefault((actual, spec.spec_hash), []).append(spec.trial_id)
-    for (actual, expected), trials in others.items():
-        try:
-            old, new = _members(stored.get(actual, "{}")), _members(wanted[expected])
-            names = {name for name in old.keys() | new.keys() if old.get(name) != new.get(name)}
-        except (ValueError, RecursionError, AttributeError):
-            names = {"everything"}
-        listed = ", ".join(sorted(names))
-        if names <= OF_THE_PROGRAM:
-            notes[f"they were made by another version or other data: {listed}"] += len(trials)
+        if actual == spec.spec_hash:
+            continue
+        old, new = _members(stored.get(actual, "{}")), _members(wanted[spec.spec_hash])
+        names = sorted(name for name in {**old, **new} if old.get(name) != new.get(name))
+        if OF_THE_PROGRAM.issuperset(names):
+            notes[f"they were made by another version or other data: {', '.join(names)}"] += 1
         else:
-            text = f"its spec is not what the sweep says in {listed}"
-            audit.findings.append(Finding("spec", text, audit.subject, trials[0]))
+            text = f"its spec is not what the sweep says in {', '.join(names)}"
+            audit.findings.append(Finding("spec", text, audit.subject, spec.trial_id))
     return [spec for spec in specs if hashes.get(spec.trial_id) == spec.spec_hash]
 
 
-def _members(text: str) -> dict[str, object]:
-    """Return the members of a spec, those of drivers one by one."""
-    spec = json.loads(text)
-    drivers = {
-        f"{side}.{name}": value for side in SIDES for name, value in spec.get(side, {}).items()
-    }
-    return {name: value for name, value in spec.items() if name not in SIDES} | drivers
+def _members(text: str) -> dict[str, Any]:
+    """Return the members of a spec, those of drivers one by one; none of a damaged one."""
+    try:
+        spec: dict[str, Any] = json.loads(text)
+        drivers = [(side, spec.pop(side).items()) for side in SIDES]
+    except (*DAMAGED, AttributeError):
+        return {}
+    return spec | {f"{side}.{name}": value for side, items in drivers for name, value in items}
 
 
 def _replay(
@@ -270,51 +220,43 @@ def _replay(
     sweep_id: str,
 ) -> list[Finding]:
     """Play trials by stored replies or those of a cache, and compare their rows."""
-    # An event loop may run in the caller's thread, where no other one can.
-    with ThreadPoolExecutor(max_workers=1) as thread:
-        played = _compared(connection, plan, specs, replies, sweep_id)
-        return thread.submit(asyncio.run, played).result()
-
-
-async def _compared(
-    connection: duckdb.DuckDBPyConnection,
-    plan: Plan,
-    specs: Sequence[TrialSpec],
-    replies: StoredReplies | ResponseCache,
-    sweep_id: str,
-) -> list[Finding]:
     clients = sealed_clients(plan, cast(ResponseCache, replies))  # of which they only ask ``get``
     runner = LocalRunner(plan, clients, in_flight=1)
-    findings: list[Finding] = []
     by_key = {(spec.trial_id, spec.spec_hash): spec for spec in specs}
-    for keys, spans in in_order(connection, by_key):
-        tables = {name: stored_rows(connection, name, keys, spans[name]) for name in PLACES}
-        for key in keys:
+
+    async def compared() -> list[Finding]:
+        findings: list[Finding] = []
+        for key, tables in in_order(connection, by_key):
             if isinstance(replies, StoredReplies):
-                replies.load(by_key[key], spans["calls"])
+                replies.load(by_key[key])
             record = await runner.play_one(by_key[key])
-            findings += _findings(record, tables, replies, sweep_id)
-    return findings
+            kind = "replay" if isinstance(replies, StoredReplies) else "cache"
+            findings += _findings(record, tables, kind, sweep_id)
+        return findings
+
+    # An event loop may run in the caller's thread, where no other one can.
+    with ThreadPoolExecutor(max_workers=1) as thread:
+        return thread.submit(asyncio.run, compared()).result()
 
 
-@dataclass(slots=True)
 class StoredReplies:
     """The replies in the table ``calls``, of one trial at a time, as a client finds them."""
 
-    connection: duckdb.DuckDBPyConnection
-    plan: Plan
-    _spec: TrialSpec | None = None
-    _arm: Arm | None = None
-    _calls: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    def __init__(self, connection: duckdb.DuckDBPyConnection, plan: Plan) -> None:
+        self._connection = connection
+        self._plan = plan
+        self._spans = spans(connection, "calls")
+        self._spec: TrialSpec
+        self._arm: Arm
+        self._calls: dict[str, list[dict[str, Any]]] = {}
 
-    def load(self, spec: TrialSpec, span: tuple[int, int]) -> None:
-        """Read the calls of a trial, which lie within a span of the table's rows."""
+    def load(self, spec: TrialSpec) -> None:
+        """Read the calls of a trial."""
         key = (spec.trial_id, spec.spec_hash)
-        arm = self.plan.by_label()[spec.arm]
-        self._spec, self._arm, self._calls = spec, arm, {}
-        rows = by_name(rows_of_trials(self.connection, "*", "calls", [key], span))
-        for row in sorted(rows, key=lambda row: row["attempt"]):
-            if arm.asked.get(row["side"]) in arm.entries:
+        self._spec, self._arm, self._calls = spec, self._plan.by_label()[spec.arm], {}
+        place = self._spans.get(key, (0, -1))
+        for row in by_name(self._connection.execute(CALLS, [*place, *key])):
+            if self._arm.asked.get(row["side"]) in self._arm.entries:
                 self._calls.setdefault(row["call_key"], []).append(row)
 
     def get(self, key: str) -> CachedCall | None:
@@ -323,27 +265,26 @@ class StoredReplies:
         Raises RecordingError where its request does not have the key, and CallFailed where it
         ended without an answer.
         """
-        spec, arm, rows = self._spec, self._arm, self._calls.get(key)
-        if not rows or spec is None or arm is None:
+        rows = self._calls.get(key)
+        if not rows:
             return None
-        first = rows[0]
-        name = arm.asked[first["side"]]
-        entry = arm.entries[name]
+        spec, side = self._spec, rows[0]["side"]
+        name = self._arm.asked[side]
+        entry = self._arm.entries[name]
         sent = FORMATS[entry.format].request(entry, "")
-        slot = Slot(
-            spec.condition, spec.repetition, first["side"], first["decision"], spec.sample_set
-        )
         try:
             request = make_request(
                 provider=entry.provider,
-                endpoint=self.plan.endpoints[name],
+                endpoint=self._plan.endpoints[name],
                 model=entry.id,
                 path=sent.path,
                 headers=sent.headers,
-                body=json.loads(first["request"]),
-                slot=slot,
+                body=json.loads(rows[0]["request"]),
+                slot=Slot(
+                    spec.condition, spec.repetition, side, rows[0]["decision"], spec.sample_set
+                ),
             )
-        except (TypeError, ValueError, RecursionError) as exc:
+        except DAMAGED as exc:
             raise RecordingError(f"its request cannot be read: {exc}") from exc
         if request.key != key:
             raise RecordingError("its request and slot do not have the key")
@@ -360,83 +301,67 @@ def _attempt(number: int, row: Mapping[str, Any], entry: ModelEntry) -> Attempt:
     A failed attempt is taken as it is stored: its outcome depends on headers, which are not. The
     mark of a stand-in may have been a header too, so that a stored ``scripted`` is believed.
     """
-    raw = RawReply(row["http_status"] or 0, {}, _body(row["reply"]))
-    outcome = judge(raw, FORMATS[entry.format])
-    told: dict[str, Any] = {
-        "number": number,
-        "http_status": row["http_status"],
-        "reply": None if row["reply"] is None else raw.body,
-        "scripted": row["scripted"],
-    }
-    if outcome.action == "accept" or row["outcome"] in ANSWERS:
-        reading = outcome.reading
-        return Attempt(
-            **told,
-            outcome=outcome.name,
-            error=outcome.message,
-            model_served=reading.model_served,
-            finish_reason=reading.finish_reason,
-            usage=reading.usage,
-        )
-    tokens = ("input_tokens", "cached_input_tokens", "output_tokens", "reasoning_tokens")
-    same = ("outcome", "error", "model_served", "finish_reason")
-    usage = Usage(*(row[name] for name in tokens))
-    return Attempt(**told, **{name: row[name] for name in same}, usage=usage)
-
-
-def _body(reply: str | None) -> str:
-    """Return the body as it came: one that is no JSON is stored as a JSON string."""
-    with suppress(ValueError, RecursionError):
-        if reply is not None and isinstance(body := json.loads(reply), str):
-            return body
-    return reply or ""
+    body = row["reply"]
+    with suppress(TypeError, ValueError, RecursionError):
+        if isinstance(text := json.loads(body), str):
+            body = text  # a body that is no JSON is stored as a JSON string
+    names = ("outcome", "http_status", "model_served", "finish_reason", "error", "scripted")
+    usage = Usage(*(row[field.name] for field in fields(Usage)))
+    attempt = Attempt(number, **{name: row[name] for name in names}, usage=usage, reply=body)
+    outcome = judge(RawReply(attempt.http_status or 0, {}, body or ""), FORMATS[entry.format])
+    if outcome.action != "accept" and attempt.outcome not in ANSWERS:
+        return attempt
+    reading = outcome.reading
+    return replace(
+        attempt,
+        outcome=outcome.name,
+        error=outcome.message,
+        model_served=reading.model_served,
+        finish_reason=reading.finish_reason,
+        usage=reading.usage,
+    )
 
 
 def _findings(
-    record: TrialRecord,
-    tables: Mapping[str, Stored],
-    replies: StoredReplies | ResponseCache,
-    sweep_id: str,
+    record: TrialRecord, tables: Mapping[str, Stored], kind: str, sweep_id: str
 ) -> Iterator[Finding]:
-    """Compare a trial as it was played with its stored rows."""
+    """Compare a trial as it was played with its stored rows.
+
+    Where a reply is missing, what was played before is compared.
+    """
     key = (record.spec.trial_id, record.spec.spec_hash)
-    kind = "replay" if isinstance(replies, StoredReplies) else "cache"
     (stored,) = tables["trials"].named(key)
     failed = stored["status"] == "failed"
-    if record.failed_calls and (kind == "cache" or not failed):
-        if not failed:
-            call = record.failed_calls[0]
-            text = f"it cannot be replayed: {record.error}"
-            yield Finding(kind, text, sweep_id, key[0], call.side, call.number)
+    missing = record.failed_calls[0] if record.failed_calls and not failed else None
+    if failed and record.failed_calls and kind == "cache":
         return
-    rows = rows_of(record)
-    ignored: Collection[str] = ("cached",)
+    ignored = {"cached"} | ({"error"} if failed else set())  # the reason of a failure, in words
     if kind == "replay":
-        ignored = [name.partition(".")[2] for name in NOT_REPLAYED if name.startswith("calls.")]
-    if failed:
-        ignored = [*ignored, "error"]  # the reason, in words
-    for table, there in tables.items():
-        if table == FACTORS:  # another study may have others for the same trial
-            mine = {row[2] for row in rows[FACTORS]}
-            there.rows[key] = [row for row in there.rows.get(key, []) if row[2] in mine]
-        for difference in there.differences(key, rows[table], ignored=ignored, tolerance=TOLERANCE):
-            yield _finding(kind, difference, key[0], sweep_id)
+        ignored |= {name.removeprefix("calls.") for name in NOT_REPLAYED}
+    for table, rows in rows_of(record).items():
+        # Another study may have other factors for the same trial.
+        part = missing is not None or table == FACTORS
+        if missing is None or table != "trials":
+            for difference in tables[table].differences(
+                key, rows, ignored=ignored, tolerance=TOLERANCE, part=part
+            ):
+                yield _finding(kind, difference, key[0], sweep_id)
+    if missing is not None:
+        text = f"it cannot be replayed: {record.error}"
+        yield Finding(kind, text, sweep_id, key[0], missing.side, missing.number)
 
 
 def _finding(kind: str, difference: Difference, trial_id: str, sweep_id: str) -> Finding:
     place = difference.place
     at = f" at step {place['step']}" if "step" in place else ""
-    more = f", and {difference.rows - 1} more in the trial" if difference.rows > 1 else ""
     if difference.column is None:
-        text = f"{difference.name} are missing or too many{at}{more}"
+        text = f"{difference.name} are missing or too many{at}"
     elif difference.column in LONG.get(difference.table, ()):
-        text = f"{difference.name} is not what it is replayed{more}"
+        text = f"{difference.name} is not what it is replayed"
     else:
-        stored, wanted = _short(difference.stored), _short(difference.wanted)
-        text = f"{difference.name}{at} is {stored}, and {wanted} replayed{more}"
+        values = (difference.stored, difference.wanted)
+        stored, wanted = ("NULL" if value is None else str(value)[:SHOWN] for value in values)
+        text = f"{difference.name}{at} is {stored}, and {wanted} replayed"
+    if difference.rows > 1:
+        text += f", and {difference.rows - 1} more in the trial"
     return Finding(kind, text, sweep_id, trial_id, place.get("side"), place.get("decision"))
-
-
-def _short(value: object) -> str:
-    text = "NULL" if value is None else str(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."

@@ -200,7 +200,7 @@ def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
         if (audit := outcome.audit) is not None:
             checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
             yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
-            notes = [f"note: {each}" for each in (*audit.notes, *audit.sharings)]
+            notes = [f"note: {each}" for each in audit.notes]
             yield from first_of(notes, "more notes: `merge-runner audit`", SHOWN)
         failed = [f"failed: {trial_id}: {error}" for trial_id, error in facts.failed]
         yield from first_of(failed, "more, in the table trials", SHOWN)
@@ -282,8 +282,6 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     if (batch := expected.batch) is not None:
         yield (
             f"batch   {about(batch.cost_usd)} in about {batch.rounds} rounds, at most "
-            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour; "
-            "after two the rest is asked singly"
+            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour, "
+            "a day at most"
         )
-    if expected.trials_within_cap is not None:
-        yield f"cap     buys about {expected.trials_within_cap} trials"

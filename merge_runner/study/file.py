@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -30,29 +31,21 @@ EVERY_PROMPT = "every prompt"
 EVERY_CONDITION = "all"
 """In the list of conditions: the scenario's own ones."""
 ONE_OF_EACH = "give it a block, a text, or merge and straight"
-
-
-def _texts(value: object) -> object:
-    return {"merge": value, "straight": value} if isinstance(value, str) else value
-
-
-def _added(value: object) -> object:
-    if not isinstance(value, dict) or "text" not in value:
-        return value
-    if value.keys() & {"block", "merge", "straight"}:
-        raise ValueError(ONE_OF_EACH)
-    rest = {key: each for key, each in value.items() if key != "text"}
-    return {**rest, "merge": value["text"], "straight": value["text"]}
+TEMPLATE = Path(__file__).with_name("template")
+PLUGIN = "plugin.py"
+FILES = ("study.toml", "models.toml", PLUGIN, "README.md", "CITATION.cff", "Makefile")
+IGNORED = "gitignore"  # with a dot it would hold for the template itself
 
 
 def _by_name(value: object) -> object:
+    """Conditions as a table: a list holds names, and tables with a name and numbers."""
     by_name: dict[str, object] = {}
-    for each in value if isinstance(value, list) else [None]:
-        numbers = dict(each) if isinstance(each, dict) else {"name": each}
+    for row in value if isinstance(value, list) else [None]:
+        numbers = dict(row) if isinstance(row, dict) else {"name": row}
         name = numbers.pop("name", None)
-        if not isinstance(name, str) or (numbers and by_name.get(name)):
+        if not isinstance(name, str):
             raise ValueError("it should be a list of names, or of tables with a name of their own")
-        by_name[name] = numbers or by_name.get(name)
+        by_name[name] = numbers or None
     return by_name
 
 
@@ -63,18 +56,29 @@ def _for_every_prompt(value: object) -> object:
 class RoadTexts(Frozen):
     """The templates of a paragraph before and after the merge point; where one is left out, none.
 
-    What they may name in braces: ``prompts.fields``.
+    In a file a text, or the key ``text``, stands for both. What they may name in braces:
+    ``prompts.fields``.
     """
 
     merge: str | None = None
     straight: str | None = None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _of_both_roads(cls, value: object) -> object:
+        given = {"text": value} if isinstance(value, str) else value
+        if not isinstance(given, dict) or "text" not in given:
+            return given
+        if given.keys() & {"block", "merge", "straight"}:
+            raise ValueError(ONE_OF_EACH)
+        rest = {key: each for key, each in given.items() if key != "text"}
+        return {"merge": given["text"], "straight": given["text"], **rest}
+
 
 class AddedText(RoadTexts):
     """A paragraph that a prompt adds ``before`` or ``after`` a block; else it stands last.
 
-    In a file ``text`` stands for both roads. ``block`` names a registered one, which has a place of
-    its own.
+    ``block`` names a registered one, which has a place of its own.
     """
 
     block: str | None = None
@@ -98,8 +102,8 @@ class StudyPrompt(Frozen):
 
     based_on: str = BASELINE
     remove: tuple[str, ...] = ()
-    replace: dict[str, Annotated[RoadTexts, BeforeValidator(_texts)]] = Field(default_factory=dict)
-    add: tuple[Annotated[AddedText, BeforeValidator(_added)], ...] = ()
+    replace: dict[str, RoadTexts] = Field(default_factory=dict)
+    add: tuple[AddedText, ...] = ()
     title: str = ""
 
 
@@ -166,22 +170,11 @@ class StudySource:
     path: Path
     plugins: dict[str, str]
 
-    @property
-    def is_own(self) -> bool:
-        """Whether it holds more than names of what there is."""
-        file = self.file
-        own_parts = file.prompts or file.drivers or file.plugins.files or file.factors
-        return bool(own_parts) or any((file.conditions or {}).values())
-
 
 def study_files() -> dict[str, Path]:
     """The studies that a name stands for: those of the working directory, and those that ship."""
-    return {
-        file.stem: file
-        for folder in reversed(experiments())
-        for file in folder.glob("*.toml")
-        if file.stem != "models"
-    }
+    files = [file for folder in reversed(experiments()) for file in folder.glob("*.toml")]
+    return {file.stem: file for file in files if file.stem != "models"}
 
 
 def read_study(name: str) -> StudySource:
@@ -193,20 +186,25 @@ def read_study(name: str) -> StudySource:
             raise unknown_name("sweep", name, sorted(files), "or a path")
         path = files[name]
     file = validated(StudyFile, read_toml(path), str(path))
-    return StudySource(
-        name=path.stem,
-        file=file,
-        text=path.read_text(encoding="utf-8"),
-        path=path,
-        plugins={each: _source(path, each) for each in file.plugins.files},
-    )
+    sources = {}
+    for each in file.plugins.files:
+        plugin = path.parent / each
+        if not plugin.resolve().is_relative_to(path.parent.resolve()):
+            raise UsageError(f"{path}: the plug-in {each} lies outside of the study's folder")
+        try:
+            sources[each] = plugin.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as exc:
+            raise UsageError(f"{path}: the plug-in {each} cannot be read: {exc}") from exc
+    return StudySource(path.stem, file, path.read_text(encoding="utf-8"), path, sources)
 
 
-def _source(study: Path, file: str) -> str:
-    path = study.parent / file
-    if not path.resolve().is_relative_to(study.parent.resolve()):
-        raise UsageError(f"{study}: the plug-in {file} lies outside of the study's folder: move it")
+def write_folder(folder: Path) -> list[Path]:
+    """Write a new folder with a study that runs; raises UsageError where it is not empty."""
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as exc:
-        raise UsageError(f"{study}: the plug-in {file} cannot be read: {exc}") from exc
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise UsageError(f"{folder} is not empty: name a new folder")
+        named = {name: name for name in FILES} | {IGNORED: f".{IGNORED}"}
+        return [shutil.copyfile(TEMPLATE / ours, folder / name) for ours, name in named.items()]
+    except OSError as exc:
+        raise UsageError(f"{folder} cannot be written: {exc.strerror}") from exc

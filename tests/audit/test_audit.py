@@ -26,12 +26,11 @@ from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.recordings import drive, write_folder
 from tests.harness import FAST, PROJECT, RECORDING, watched
+from tests.mock_server import FaultPlan, served
 
-FAULTS = """
-seed = 4
-delay_s = 0.01
-rates = { malformed = 0.15, refused = 0.1, rate_limit = 0.1 }
-"""
+FAULTS = FaultPlan(
+    seed=4, delay_s=0.01, rates={"rate_limit": 0.1, "refused": 0.1, "malformed": 0.15}
+)
 TWO = ("--conditions", "N_0_0,L_4_8")
 RESTARTS = """
 [repetitions]
@@ -43,12 +42,13 @@ control_start = "own_exit"
 # Two prompt variants with bad answers and retries; a third without; a mixed pair; programs alone;
 # and the other rules of when control starts and what is driven after a bad answer.
 SWEEPS = (
-    ("baseline", "--variants", "baseline,A7", "--reps", "2", *TWO, "--faults", "faults.toml"),
+    ("baseline", "--variants", "baseline,A7", "--reps", "2", *TWO),
     ("baseline", "--variants", "A1", "--reps", "3", *TWO),
     ("baseline", "--model", "emulator+constant", "--reps", "1", "--conditions", "N_0_0"),
     ("baseline", "--model", "projected-order", "--reps", "1", *TWO),
-    ("restarts.toml", "--conditions", "R_-4_8", "--faults", "faults.toml"),
+    ("restarts.toml", "--conditions", "R_-4_8"),
 )
+FAULTY = (SWEEPS[0], SWEEPS[-1])
 PAIR = "emulator/baseline/N_0_0/rep01"
 MIXED = "emulator+constant/baseline/N_0_0/rep01"
 OF_PAIR = f"trial_id = '{PAIR}'"
@@ -88,10 +88,11 @@ def audit(*arguments: object) -> Audited:
 def made(tmp_path_factory, prepare):
     """A folder in which the program ran these sweeps."""
     folder = tmp_path_factory.mktemp("made")
-    (folder / "faults.toml").write_text(FAULTS)
     (folder / "restarts.toml").write_text(RESTARTS)
-    for sweep in SWEEPS:
-        assert prepare(folder, "sweep", *sweep).code == 0
+    with served(FAULTS) as url:
+        for sweep in SWEEPS:
+            faulty = {"EMULATOR_BASE_URL": f"{url}/v1"} if sweep in FAULTY else {}
+            assert prepare(folder, "sweep", *sweep, **faulty).code == 0
     return folder
 
 
@@ -118,7 +119,7 @@ def test_whole_sweeps_pass_and_what_was_checked_is_counted(made):
     assert counts["decisions"] >= counts["calls"] == counts["reply ids"] > 100
     assert found.audits[3]["counts"]["calls"] == 0
     assert found.audits[4]["counts"]["invalid"] > 0
-    assert found.notes.splitlines() == [
+    assert [note for note in found.notes.splitlines() if " share " not in note] == [
         f"emulator/{prompt}: not judged: 21 of the 76 decisions of emulator are invalid (27.6 %, "
         "more than 20 %)"
         for prompt in ("A7", "baseline")
@@ -127,10 +128,8 @@ def test_whole_sweeps_pass_and_what_was_checked_is_counted(made):
 
 @pytest.mark.slow
 def test_identical_requests_of_two_variants_are_listed_and_no_finding(made):
-    sharings = audit("--db", made / "results/merge.duckdb").audits[-1]["sharings"]
-    names = {(s["what"], s["first"], s["second"]) for s in sharings}
-    assert ("calls", "emulator/A7", "emulator/baseline") in names
-    assert all(sharing["count"] > 0 for sharing in sharings)
+    notes = audit("--db", made / "results/merge.duckdb").audits[-1]["notes"]
+    assert any(re.match("emulator/A7 and emulator/baseline share [1-9]", note) for note in notes)
 
 
 @pytest.mark.slow
@@ -577,9 +576,7 @@ def test_what_another_sweep_has_played_since_is_not_missing(db):
     found = audit("--db", db)
     assert found.code == 0
     assert "7 of its trials were played by another sweep" in found.notes
-    assert found.audits[1]["sharings"][0] == {
-        "what": "trials", "first": found.audits[1]["subject"], "second": stopped, "count": 1,
-    }  # fmt: skip
+    assert f"{found.audits[1]['subject']} and {stopped} share 1 trials" in found.notes
 
 
 def caching(kept: dict[str, dict], **changes: object):
@@ -736,7 +733,6 @@ def test_the_committed_recording_passes():
     found = audit("--recording", RECORDING)
     assert found.code == 0
     assert found.audits[0]["counts"]["calls"] == 2054
-    assert found.audits[0]["counts"]["answers ok"] == 2054
 
 
 def export(prepare, made: Path, trial: str, file: Path) -> None:
@@ -753,7 +749,6 @@ def test_recordings_of_several_variants_and_of_a_late_start_pass(prepare, made, 
     export(prepare, made, trial, tmp_path / "sweep.parquet")
     found = audit("--recording", tmp_path / "sweep.parquet")
     assert found.code == 0
-    assert found.audits[0]["counts"]["answers refusal"] > 0
 
 
 @pytest.fixture(scope="module")
@@ -791,13 +786,6 @@ def asked_anew(entry: CachedCall, **changes: object) -> CachedCall:
 
 RECORDINGS = {
     "nothing": (lambda e: e, None, ""),
-    "a decision is gone": (lambda e: e[:2] + e[3:], "numbering", "nothing is recorded, though"),
-    "decisions are gone up to the last that a trial can have": (
-        lambda e: [*e, asked_anew(e[0], decision=100_000)], "numbering", "though of later ones",
-    ),
-    "a slot was asked twice": (
-        lambda e: [*e, asked_anew(e[2])], "numbering", "2 requests are recorded, for 1 prompt",
-    ),
     "a reply was given to two samples": (
         lambda e: [answered(e[0], reply=e[1].attempts[-1].reply), *e[1:]],
         "exchanged shared",
@@ -813,7 +801,6 @@ RECORDINGS = {
     "an attempt is gone": (
         lambda e: [answered(e[0], number=2), *e[1:]], "attempt", "its attempts are numbered [2]",
     ),
-    "a trial is gone": (lambda _: [], "missing", "nothing is recorded"),
 }  # fmt: skip
 
 
@@ -832,13 +819,6 @@ def test_each_damage_of_a_recording_is_found_and_nothing_else(exported, tmp_path
     found = audit("--recording", recorded(tmp_path, change(entries), provenance))
     assert [finding["kind"] for finding in found.findings] == (kind or "").split()
     assert not kind or text in found.findings[-1]["text"]
-
-
-def test_a_recording_without_its_origin_is_audited_as_far_as_it_goes(exported, tmp_path):
-    entries, _ = exported
-    found = audit("--recording", recorded(tmp_path, entries, {}))
-    assert found.code == 0
-    assert "it does not say of what sweep it is" in found.notes
 
 
 def test_a_reply_that_two_prompts_of_one_slot_share_is_found(exported, tmp_path):

@@ -3,11 +3,11 @@ from __future__ import annotations
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.emulator.server import serve
 from merge_runner.prompts.render import render_prompt
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from tests.mock_server import serve
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import json
 
 import pytest
 
-from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.prompts.parse import parse_reply
 from tests.emulator.test_sdks import (
     MODEL,
@@ -16,6 +15,7 @@ from tests.emulator.test_sdks import (
     gemini_client,
     openai_client,
 )
+from tests.mock_server import BatchPlan, FaultPlan
 
 pytestmark = pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWarning")
 TWO_POLLS = FaultPlan(batch=BatchPlan(polls=2))

@@ -7,13 +7,12 @@ import json
 import aiohttp
 import pytest
 
-from merge_runner.emulator.batches import Batches
-from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.emulator.formats import CHAT
-from merge_runner.emulator.replies import Asked, Replies
+from merge_runner.emulator.handler import Asked
 from merge_runner.errors import UsageError
 from merge_runner.records import SLOT_HEADER
-from tests.harness import environment
+from tests.mock_server import BatchPlan, FaultPlan, FaultyEmulator
+from tests.mock_server.batches import Batches, Line
 
 
 class Clock:
@@ -30,12 +29,12 @@ def clock():
 
 
 def batches_of(clock, seed=0, **plan):
-    return Batches(Replies(FaultPlan(seed=seed, batch=BatchPlan(**plan))), clock)
+    return Batches(FaultyEmulator(FaultPlan(seed=seed, batch=BatchPlan(**plan))), clock)
 
 
 def chat(prompt, number=0):
     body = {"model": "m", "messages": [{"role": "user", "content": prompt}], "seed": number}
-    return Asked(CHAT, CHAT.path, json.dumps(body).encode(), custom_id=f"line-{number}")
+    return Line(f"line-{number}", Asked(CHAT, CHAT.path, json.dumps(body).encode()))
 
 
 def some(prompt, count=20):
@@ -83,7 +82,7 @@ def test_each_kind_of_line_occurs_at_its_rate(clock, driving_prompt):
 
 def test_tokens_wait_until_their_batch_has_ended(clock, driving_prompt):
     lines = some(driving_prompt)
-    tokens = sum(len(line.raw) for line in lines) // 4
+    tokens = sum(len(line.asked.raw) for line in lines) // 4
     batches = batches_of(clock, delay_s=10.0, enqueued_tokens=tokens)
     assert not batches.create("b", lines, {}).refused
     assert "Limit" in batches.create("b", lines[:1], {}).refused
@@ -93,7 +92,7 @@ def test_tokens_wait_until_their_batch_has_ended(clock, driving_prompt):
 
 def test_a_line_that_cannot_be_read_fails_alone(clock, driving_prompt):
     batches = batches_of(clock)
-    odd = Asked(CHAT, CHAT.path, b'{"messages": 7}', custom_id="odd")
+    odd = Line("odd", Asked(CHAT, CHAT.path, b'{"messages": 7}'))
     batch = batches.create("b", [chat(driving_prompt), odd], {})
     batches.settle()
     assert {each.custom_id: each.status for each in batch.results} == {"line-0": 200, "odd": 400}
@@ -120,15 +119,3 @@ async def test_the_emulator_counts_its_answers_singly_and_in_batches(emulator, d
         (None, slot, 2),
         ("k", None, 1),
     ]
-
-
-async def test_the_command_says_how_long_batches_take(zygote, tmp_path, driving_prompt):
-    body = {"model": "m", "messages": [{"role": "user", "content": driving_prompt}]}
-    requests = {"requests": [{"custom_id": "k", "params": body}]}
-    command = ("emulate", "--port", 0, "--batch-delay", 3600)
-    with zygote.serving(command, cwd=tmp_path, env=environment()) as url:
-        async with aiohttp.ClientSession(url.strip()) as session:
-            async with session.post("/v1/messages/batches", json=requests) as reply:
-                created = await reply.json()
-            async with session.get(f"/v1/messages/batches/{created['id']}") as reply:
-                assert (await reply.json())["processing_status"] == "in_progress"

@@ -10,11 +10,10 @@ import pytest
 
 from merge_runner import Study
 from merge_runner.config import ModelEntry, resolve_endpoint
-from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.handler import Emulator, InProcess
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
 from tests.harness import RECORDING
+from tests.mock_server import FaultPlan, FaultyEmulator
 
 ENTRY = ModelEntry(provider="emulator", format="openai-chat", id="m", max_output_tokens=1)
 
@@ -25,7 +24,7 @@ async def carried():
     transports = []
 
     def make(**rates):
-        carrier = InProcess(Emulator(FaultPlan(rates=rates)))
+        carrier = FaultyEmulator(FaultPlan(rates=rates)).transport()
         endpoint = resolve_endpoint("emulator", ENTRY, {})
         transports.append(HttpTransport(endpoint, connections=1, carrier=carrier))
         return transports[-1]

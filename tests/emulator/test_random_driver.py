@@ -3,7 +3,7 @@
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.emulator.random_driver import answer
+from merge_runner.emulator.driver import random_answer as answer
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.prompts.render import render_prompt

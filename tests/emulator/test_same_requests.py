@@ -16,8 +16,7 @@ import pytest
 from aiohttp import web
 
 from merge_runner.config import resolve_endpoint
-from merge_runner.llm.batch.service import BatchLine
-from merge_runner.llm.batch.terms import SERVICES
+from merge_runner.llm.batch.providers import SERVICES
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
@@ -222,7 +221,7 @@ async def submitted(name, url, prompt):
         own = replace(endpoint, identity=endpoint.provider)
         form = MODELS[name].format
         service = SERVICES[form](transport, own, FORMATS[form])
-        await service.create([BatchLine(request_of(name, prompt))], "a-mark")
+        await service.create([request_of(name, prompt)], "a-mark")
 
 
 async def test_a_batch_of_o3_is_created_as_by_openais_library(driving_prompt):
@@ -239,7 +238,6 @@ async def test_a_batch_of_o3_is_created_as_by_openais_library(driving_prompt):
                 endpoint="/v1/chat/completions",
                 completion_window="24h",
                 metadata={"merge_runner_mark": "a-mark"},
-                output_expires_after={"anchor": "created_at", "seconds": 2_592_000},
             )
     assert ours == requests
 

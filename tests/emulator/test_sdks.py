@@ -6,8 +6,8 @@ import os
 
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.prompts.parse import parse_reply
+from tests.mock_server import FaultPlan
 
 RATE_LIMITED = FaultPlan(rates={"rate_limit": 1.0}, delay_s=0.2)
 MODEL = "some-model"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from merge_runner.emulator.faults import TRANSIENT, FaultPlan
 from merge_runner.results.store import results_digest
 from tests.harness import watched
+from tests.mock_server import TRANSIENT, FaultPlan
 
 pytestmark = pytest.mark.long
 

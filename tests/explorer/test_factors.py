@@ -68,15 +68,15 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
 ASK = """
 import sys
 from pathlib import Path
-from analysis.explorer.analysis_process import worker
+from analysis.explorer.analysis_process import Worker
 from merge_runner.study.parts import load_study
 
 load_study(sys.argv[2], trust=True)
 Path(sys.argv[2]).with_name("mine.py").write_text("raise RuntimeError('nobody agreed to this')")
-child = worker(Path(sys.argv[1]))
-said, _ = child.ask(["tables", "factors"], seconds=60, most_bytes=2**24)
-child.close()
-print(said["tables"][0])
+worker = Worker(Path(sys.argv[1]))
+found = worker.submit(("tables", "factors"), (1, 1), 0.0).result(timeout=60)
+worker.close()
+print(found.content["tables"][0])
 """
 
 

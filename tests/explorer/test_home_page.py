@@ -20,7 +20,6 @@ from analysis.data.study import Study
 from analysis.explorer.analysis_process import Computing
 from analysis.explorer.app import explorer
 from analysis.explorer.assets import STATIC, STYLES
-from analysis.explorer.child import NoAnswer
 from analysis.explorer.pages.home import Played, account_rows, home_page
 from analysis.explorer.site import NothingNew, Site
 from analysis.explorer.task_picture import task_picture
@@ -32,6 +31,7 @@ from analysis.table_format import TableFormat
 from analysis.tables import make_tables
 from analysis.tables.formats import render
 from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK
 from tests.analysis.studies import Said, write_study, yielding
@@ -46,8 +46,8 @@ WORST = "L_0_-8"
 class Never(InProcess):
     """A computation that never comes to anything."""
 
-    def ask(self, request, **limits):
-        raise NoAnswer("not now")
+    def answer(self, request):
+        raise UsageError("not now")
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,11 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.analysis_process import Computing, Result, worker
+from analysis.explorer.analysis_process import Computing, Result, Worker
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
 from tests.explorer.serving import held
+from tests.explorer.test_tables_pages import InProcess
 
 HOST = "127.0.0.1:8700"
 TRIAL = "/trials/emulator/baseline/N_0_0/rep01"
@@ -129,27 +130,22 @@ async def test_a_port_that_is_taken_is_said_in_a_line(merge_runner, study):
 def test_a_file_of_the_users_own_is_not_taken_for_ours(study, tmp_path, monkeypatch):
     (tmp_path / "analysis.py").write_text("print('MINE')")
     monkeypatch.chdir(tmp_path)
-    with closing(worker(study)) as child:
-        said, _ = child.ask(("tables", "attempts"), seconds=60, most_bytes=10**6)
-    assert said["counted"] > 0
+    with closing(Worker(study)) as worker:
+        found = worker.submit(("tables", "attempts"), (1, 1), 0.0).result(timeout=60)
+    assert found.content["counted"] > 0
 
 
 def test_a_fault_in_a_computation_does_not_stay(study):
-    answers = iter([ValueError("a fault"), ({"counted": 1}, b"")])
+    answers = iter([ValueError("a fault"), {"counted": 1}])
 
-    class Faulty:
-        alive = True
-
-        def ask(self, request, **limits):
+    class Faulty(InProcess):
+        def answer(self, request):
             answer = next(answers)
             if isinstance(answer, Exception):
                 raise answer
             return answer
 
-        def close(self):
-            pass
-
-    computing = Computing(study, start=lambda _: Faulty())
+    computing = Computing(study, Faulty)
     with pytest.raises(ValueError, match="a fault"):
         computing.ask(("tables",), (1, 1), wait_s=5)
     assert isinstance(computing.ask(("tables",), (1, 1), wait_s=5), Result)

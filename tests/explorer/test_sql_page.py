@@ -14,11 +14,10 @@ import pytest
 from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
-from analysis.explorer.child import NoAnswer
 from analysis.explorer.pages.sql import EXAMPLES
-from analysis.explorer.query_process import QueryResult
-from analysis.explorer.query_worker import Caps
+from analysis.explorer.queries import Limits, QueryResult
 from analysis.explorer.site import Site
+from merge_runner.errors import UsageError
 from merge_runner.results.data_dictionary import tables
 from merge_runner.results.store import query
 from tests.analysis.studies import write_study, yielding
@@ -33,7 +32,7 @@ NAVIGATION = {"sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sql")
     site = Site(write_study(folder / "study.duckdb", yielding("o3", reps=1)[:2]))
-    site.sandbox.caps = Caps(seconds=60)  # others may use the machine
+    site.queries.limits = Limits(seconds=60)  # others may use the machine
     return site
 
 
@@ -52,8 +51,8 @@ def asked(site, monkeypatch):
         queries.append(sql)
         return QueryResult([("x", "INTEGER")], [[("1", 0)]], False, 0.0)
 
-    monkeypatch.setattr(site.sandbox, "result", result)
-    monkeypatch.setattr(site.sandbox, "csv", lambda sql: queries.append(sql) or b"x\n1\n")
+    monkeypatch.setattr(site.queries, "result", result)
+    monkeypatch.setattr(site.queries, "csv", lambda sql: queries.append(sql) or b"x\n1\n")
     return queries
 
 
@@ -161,7 +160,7 @@ def test_a_result_is_a_table_with_types_and_links_to_trials(client, site, monkey
         False,
         0.0123,
     )
-    monkeypatch.setattr(site.sandbox, "result", lambda sql: result)
+    monkeypatch.setattr(site.queries, "result", lambda sql: result)
     page = client.get("/sql?q=select").text
     assert '<th scope="col" class="number">rep <span class="type">INTEGER</span>' in page
     assert '<td class="number">1</td>' in page
@@ -173,7 +172,7 @@ def test_a_result_is_a_table_with_types_and_links_to_trials(client, site, monkey
 
 def test_a_cut_result_says_so(client, site, monkeypatch):
     result = QueryResult([("trial_id", "VARCHAR")], [[("x" * 2000, 1234)]] * 2, True, 0.0)
-    monkeypatch.setattr(site.sandbox, "result", lambda sql: result)
+    monkeypatch.setattr(site.queries, "result", lambda sql: result)
     page = client.get("/sql?q=select").text
     assert "The first <strong>2</strong> rows of more" in page
     assert "… 1,234 characters more" in page
@@ -186,9 +185,9 @@ def test_nothing_in_a_result_or_an_error_is_more_than_text(client, site, monkeyp
     pages = [client.get("/sql", params=address).text]
 
     def failing(sql):
-        raise NoAnswer("no <script>alert(1)</script>\u202e\0")
+        raise UsageError("no <script>alert(1)</script>\u202e\0")
 
-    monkeypatch.setattr(site.sandbox, "result", failing)
+    monkeypatch.setattr(site.queries, "result", failing)
     pages.append(client.get("/sql", params=address).text)
     for page in pages:
         shown = page[page.index('id="result"') : page.index("</section>")]
@@ -220,9 +219,9 @@ def test_a_slow_query_keeps_nobody_waiting(client, site, monkeypatch):
     def result(sql):
         running.set()
         assert answered.wait(60)
-        raise NoAnswer("stopped after 10 s")
+        raise UsageError("stopped after 10 s")
 
-    monkeypatch.setattr(site.sandbox, "result", result)
+    monkeypatch.setattr(site.queries, "result", result)
     with ThreadPoolExecutor() as others:
         slow = others.submit(client.get, "/sql?q=select")
         assert running.wait(60)

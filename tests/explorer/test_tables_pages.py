@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
@@ -16,16 +18,15 @@ from starlette.testclient import TestClient
 
 from analysis.data.study import Study
 from analysis.explain import explain
-from analysis.explorer.analysis_process import Computing, Result, Waiting, worker
+from analysis.explorer.analysis_process import Answering, Computing, Result, Waiting, Worker
 from analysis.explorer.analysis_worker import Numbers
 from analysis.explorer.app import explorer
-from analysis.explorer.child import Ended, NoAnswer
 from analysis.explorer.pages.ablations import ablations
 from analysis.explorer.pictures import ends_and_ticks
 from analysis.explorer.site import Site
 from analysis.metrics import METRICS, shown_in
 from analysis.tables import make_tables
-from merge_runner.errors import MergeRunnerError
+from merge_runner.errors import UsageError
 from tests.analysis.studies import Said, write_study, yielding
 from tests.gate import HANGS_S
 
@@ -33,22 +34,30 @@ HERE = "127.0.0.1:8700"
 HOSTILE = '<img src=x onerror="alert(1)">'
 
 
-class InProcess:
-    """Computes where the test runs; a process of its own takes seconds to begin."""
-
-    alive = True
+class InProcess(Worker):
+    """Computes in a thread of this process."""
 
     def __init__(self, db):
         self._numbers = Numbers(db)
+        self.begun = 0
+        self._answering = Answering(db, self._begin)
+        self._pool = ThreadPoolExecutor(1)
 
-    def ask(self, request, **limits):
-        try:
-            return self._numbers.answer(request), b""
-        except MergeRunnerError as exc:
-            raise NoAnswer(str(exc)) from exc
+    def _begin(self, db):
+        self.begun += 1
+        return self
+
+    def answer(self, request):
+        return self._numbers.answer(request)
+
+    def read_ahead(self):
+        self._pool.submit(self._answering.read_ahead)
+
+    def submit(self, request, state, since):
+        return self._pool.submit(self._answering.result, request, state, since)
 
     def close(self):
-        pass
+        self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 class Awaited(Computing):
@@ -167,9 +176,9 @@ def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at
     asked = []
 
     class Counting(InProcess):
-        def ask(self, request, **limits):
+        def answer(self, request):
             asked.append(request)
-            return super().ask(request)
+            return super().answer(request)
 
     site = Site(db)
     site.computing = Computing(db, Counting)
@@ -187,8 +196,8 @@ def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_
     found = {(1, 1): {"absent": "no such row"}, (2, 2): {"value": "7"}}
 
     class Once(InProcess):
-        def ask(self, request, **limits):
-            return found[computing._state], b""
+        def answer(self, request):
+            return found[self._answering._state]
 
     computing = Computing(db, Once)
     cell, table = ("cell", "attempts", "o3/A9", "n"), ("tables", "attempts")
@@ -203,26 +212,22 @@ def test_the_trials_are_read_before_anything_is_asked_and_again_where_the_databa
     asked = []
 
     class Noting(InProcess):
-        def __init__(self, path):
-            super().__init__(path)
-            asked.append("a process")
-
-        def ask(self, request, **limits):
+        def answer(self, request):
             asked.append(request[0])
-            return super().ask(request)
+            return super().answer(request)
 
     for changed in (False, True):
         asked.clear()
         computing = Computing(db, Noting)
         computing.begin()
-        while asked != ["a process", "study"]:
-            pass
-        computing._pool.submit(int).result()
+        computing._worker._pool.submit(int).result()
+        assert asked == ["study"]
         if changed:
             os.utime(db)
         found = computing.ask(("tables", "attempts"), (1, 1), wait_s=60)
         assert isinstance(found, Result)
-        assert asked[2:] == (["a process", "tables"] if changed else ["tables"])
+        assert asked == ["study", "tables"]
+        assert computing._worker.begun == (2 if changed else 1)
         computing.close()
 
 
@@ -334,10 +339,10 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
     going, asked = threading.Event(), threading.Event()
 
     class Slow(InProcess):
-        def ask(self, request, **limits):
+        def answer(self, request):
             asked.set()
             going.wait()
-            raise NoAnswer("it broke <off>")
+            raise UsageError("it broke <off>")
 
     site = Site(db)
     site.computing = Computing(db, Slow)
@@ -358,9 +363,9 @@ def test_an_older_answer_says_so_and_is_computed_anew_where_that_is_asked(db):
     made = []
 
     class Counting(InProcess):
-        def ask(self, request, **limits):
+        def answer(self, request):
             made.append(request)
-            return {"counted": len(made)}, b""
+            return {"counted": len(made)}
 
     computing = Computing(db, Counting)
     first = computing.ask(("home", ""), (1, 1), wait_s=5)
@@ -379,28 +384,14 @@ def test_a_process_of_its_own_answers_alike_and_another_one_takes_its_place(db):
     while isinstance(found := computing.ask(request, (1, 1), wait_s=30), Waiting):
         pass
     assert found.content == Numbers(db).answer(request)
-    with pytest.raises(NoAnswer, match=re.escape("nothing answers ['nothing']")):
+    with pytest.raises(UsageError, match=re.escape("nothing answers ('nothing',)")):
         computing.ask(("nothing",), (1, 1), wait_s=30)
-    computing._child.process.kill()
-    computing._child.process.wait()
+    os.kill(computing._worker._pid.result(), signal.SIGKILL)
+    with pytest.raises(UsageError, match="ended without an answer"):
+        computing.ask(("tables", "gap"), (1, 1), wait_s=30)
     while isinstance(found := computing.ask(("tables", "indicators"), (1, 1), wait_s=30), Waiting):
         pass
     assert found.content == Numbers(db).answer(("tables", "indicators"))
-    computing.close()
-    child = worker(db)
-    child.close()
-    with pytest.raises(Ended):
-        child.ask(request, seconds=1, most_bytes=1000)
-
-
-def test_a_process_that_ends_amid_a_request_is_a_failure(db):
-    class Killed(InProcess):
-        def ask(self, request, **limits):
-            raise Ended(-9, late=False)
-
-    computing = Computing(db, Killed)
-    with pytest.raises(NoAnswer, match=r"without an answer \(exit code -9\)"):
-        computing.ask(("tables", "indicators"), (1, 1), wait_s=30)
     computing.close()
 
 

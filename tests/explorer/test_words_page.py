@@ -125,6 +125,22 @@ def test_facets_choose_among_what_is_found_and_count_it(client):
     ]
 
 
+def test_what_is_said_is_chosen_beside_what_is_planned_and_driven(db, tmp_path):
+    path = tmp_path / "t.duckdb"
+    path.write_bytes(db.read_bytes())
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(
+            "UPDATE decisions SET plan = [0.5, 0.1], applied = [-0.2] WHERE trial_id LIKE 'o3/%' "
+            "AND side = 'left' AND decision = 2; UPDATE decisions SET plan = [0.0], applied = [0.0]"
+            " WHERE trial_id NOT LIKE 'o3/%'"
+        )
+    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
+        assert found(client, tactical="Y", planned="go") == [("o3", "left", 2)]
+        assert found(client, driven="brake", planned="go") == [("o3", "left", 2)]
+        assert found(client, tactical="Y", planned="hold") == []
+        assert {trial for trial, *_ in found(client, planned="hold", model="o4")} == {"o4"}
+
+
 def test_a_program_says_nothing(client):
     assert "idm" not in {trial for trial, *_ in found(client, condition="N_0_0")}
 
@@ -164,15 +180,6 @@ def test_while_another_program_holds_the_database_what_was_read_is_searched(db, 
         assert len(found(client, q="brake")) == 2
         with held(path):
             assert len(found(client, q="brake")) == 2
-
-
-def test_a_search_leaves_no_file_behind(db):
-    site = Site(db)
-    with TestClient(explorer(site), base_url=f"http://{HOST}") as client:
-        assert found(client, q="brake")
-        folder = site.words.folder
-        assert folder.exists()
-    assert not folder.exists()
 
 
 def test_words_are_searched_from_the_keyboard_and_lead_to_the_decision(page):

@@ -12,8 +12,8 @@ from collections import Counter
 
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
 from tests.harness import environment, watched
+from tests.mock_server import FaultPlan
 
 LITELLM = shutil.which("litellm")
 BROKEN = ("rate_limit", "server_error", "overloaded", "reset", "truncated_body")

@@ -18,7 +18,6 @@ import pytest
 from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry, Price
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
@@ -41,6 +40,7 @@ from tests.llm.test_scenarios import (  # noqa: F401 # fixtures
     _idle_connections_grow_old_in_virtual_time,
     _no_settings_of_the_user,
 )
+from tests.mock_server import FaultPlan
 from tests.virtual_time import in_virtual_time
 
 PRICE = Price(input=2, output=8, source="test")
@@ -165,7 +165,7 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
             cache=cache,
             transport=transport,
             limiter=Limiter(),
-            budget=Budget(Ledger(cache, name), cap * worst, each(worst, "my-model")),
+            budget=Budget(Ledger(cache, name), cap * worst, each(worst)),
             first=first or FirstCall(passed=True),
         )
 
@@ -232,7 +232,7 @@ async def test_a_server_that_ignores_the_output_cap_does_not_pass_the_other_one(
     shares[f"output cap ignored, {from_now_on} times, {wire}"] = till.usd / cap_usd
     assert 0.6 * cap_usd < till.usd <= cap_usd
     assert spending.spent_usd == pytest.approx(till.usd)
-    assert spending.times(client.driver) == pytest.approx(from_now_on, rel=0.05)
+    assert spending.overruns[client.driver] == pytest.approx(from_now_on, rel=0.05)
     assert any("does not keep to the cap of 16000 output" in note for note in client.meter.notes)
 
 

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.call_totals import CallTotals, call_totals
-from merge_runner.llm.content_hashes import make_request, manner
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.text_disk import TextDisk
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage
+from merge_runner.run.estimate import call_totals
 
 
 def entry(number=0, *, model="m", endpoint="openai", reply="{}", **attempt):
@@ -84,11 +84,11 @@ def stock(cache, folder):
 
 texts = st.text(st.characters(exclude_categories=["Cs"]))
 counts = st.none() | st.integers(0, 10**9)
-numbers = st.floats(allow_nan=False, allow_infinity=False)
+numbers = st.floats(0, 2**31 - 1)
 attempts = st.builds(
     Attempt,
     number=st.integers(1, 99),
-    outcome=texts,
+    outcome=st.from_regex("[a-z][a-z0-9_]{0,39}", fullmatch=True),
     http_status=st.none() | st.integers(100, 599),
     model_served=st.none() | texts,
     finish_reason=st.none() | texts,
@@ -236,15 +236,13 @@ def test_a_planted_value_is_refused_and_not_executed(cache, stock, tmp_path, pad
     stock[key] = [Bomb(tmp_path / "mark"), padding]
     with pytest.raises(RecordingError):
         cache.get(key)
-    assert left_out(cache) == [
-        "the cache holds a pickle or names a file, which is not ours: refused"
-    ]
+    assert left_out(cache) == ["the cache holds a pickle or names a file: it is not ours"]
     assert not (tmp_path / "mark").exists()
 
 
 def test_a_planted_key_is_refused_and_not_executed(cache, stock, tmp_path):
     stock[Bomb(tmp_path / "mark")] = entry().to_json()
-    assert left_out(cache) == ["the cache holds a key that is no text, which is not ours: refused"]
+    assert left_out(cache) == ["the cache holds a key that is no text: it is not ours"]
     assert not (tmp_path / "mark").exists()
 
 
@@ -255,7 +253,7 @@ def test_only_text_can_be_stored(cache, stock, monkeypatch):
         )
         with pytest.raises(TypeError):
             cache.put_now([entry()])
-    assert sorted(stock) == ["format", "opened"]
+    assert sorted(stock) == ["format"]
 
 
 def test_no_key_is_unpickled_where_all_are_listed(cache, stock, tmp_path):
@@ -403,10 +401,9 @@ def told(number, *, model="m", endpoint="openai", effort="low", **attempt):
 
 
 def test_a_line_of_a_batch_tells_its_tokens_and_no_latency():
-    totals = CallTotals()
-    for number, latency_s in enumerate((None, 20.0, None)):
-        totals.add(told(number, latency_s=latency_s))
-    assert (totals.measured, totals.mean_latency_s) == (3, 20.0)
+    lines = [told(number, latency_s=latency) for number, latency in enumerate((None, 20.0, None))]
+    (totals,) = call_totals(lines).values()
+    assert (totals.measured, totals.timed, totals.latency_s) == (3, 1, 20.0)
 
 
 def test_what_is_measured_is_of_one_endpoint_and_one_way_to_ask(cache):
@@ -420,13 +417,13 @@ def test_what_is_measured_is_of_one_endpoint_and_one_way_to_ask(cache):
         ]
     )
     empty = '{"messages":[{"content":""}],"model":"m","reasoning_effort":"%s"}'
-    low, high = (manner("/chat/completions", empty % effort) for effort in ("low", "high"))
+    low, high = (("/chat/completions", empty % effort) for effort in ("low", "high"))
     totals = call_totals(cache.entries())
-    of_low = totals["m", "openai", low]
+    of_low = totals["m", "openai", *low]
     assert (of_low.measured, of_low.output_tokens) == (3, 30)
-    assert totals["m", "openai", high].measured == 1
-    assert totals["m", "http://localhost:8080", low].measured == 1
-    assert ("m", "openai", manner("/responses", empty % "low")) not in totals
+    assert totals["m", "openai", *high].measured == 1
+    assert totals["m", "http://localhost:8080", *low].measured == 1
+    assert ("m", "openai", "/responses", empty % "low") not in totals
     assert endpoints(cache, "m") == ["http://localhost:8080", "openai"]
 
 

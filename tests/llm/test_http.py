@@ -14,8 +14,6 @@ from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry, ScenarioConfig, resolve_endpoint
 from merge_runner.emulator.driver import answer
-from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.server import serve
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
@@ -29,6 +27,7 @@ from merge_runner.records import Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from tests.mock_server import FaultPlan, serve
 
 SLOT = Slot("N_0_0", 1, "left", 0, 0)
 KEY = "sk-dummy-0123456789"

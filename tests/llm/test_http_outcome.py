@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import Reading, WireFormat, WireRequest
-from merge_runner.llm.http_outcome import RawReply, is_web_page, judge, may_be_charged
+from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
 
 OPENAI_QUOTA = (
     "You exceeded your current quota, please check your plan and billing details. For more "
@@ -649,4 +649,4 @@ def test_usage_in_an_error_is_read_in_every_format(status):
     ],
 )
 def test_a_web_page_is_told_from_all_else(body, page):
-    assert is_web_page(RawReply(200, {}, body)) == page
+    assert RawReply(200, {}, body).is_web_page == page

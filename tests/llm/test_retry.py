@@ -8,7 +8,6 @@ from merge_runner.llm import http_outcome
 from merge_runner.llm.http_outcome import (
     Deadline,
     OutOfTime,
-    RequestFailed,
     TryAgain,
     backoff_s,
 )
@@ -139,7 +138,6 @@ async def test_a_wait_that_would_pass_the_deadline_is_not_begun(make_call):
 @pytest.mark.parametrize(
     "error",
     [
-        RequestFailed("rejected"),
         QuotaExhausted("no credit"),
         UsageError("wrong"),
         CallFailed("stopped", None),

@@ -286,8 +286,6 @@ async def test_what_passes_is_tried_again_after_the_servers_delay(cache, scenari
     tolerance_s = WALL_CLOCK_S if scenario == "anthropic/rate_limit" else 0.1
     assert max(row.delay_s, FIRST_BACKOFF_S) - tolerance_s <= waited_s
     assert waited_s <= max(row.delay_s, 2 * FIRST_BACKOFF_S) + tolerance_s
-    told = [note for note in client.meter.notes if "all its calls wait" in note]
-    assert len(told) == (row.outcome == "rate_limited")
 
 
 @pytest.mark.parametrize(("scenario", "wire", "row"), per_format(PASSES))

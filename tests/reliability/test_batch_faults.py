@@ -14,10 +14,10 @@ import httpx
 import pytest
 from aiohttp import web
 
-from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import Options, make_plan
 from tests.harness import run_sweep, watched
+from tests.mock_server import BatchPlan, FaultPlan
 
 FORMATS = {"openai": "openai-chat", "anthropic": "anthropic", "gemini": "gemini"}
 REGISTRY = """
@@ -211,7 +211,7 @@ PLAIN = {}
 def play(tmp_path, monkeypatch):
     """Plays a sweep of a provider; returns its digest, what was said, and the server's counts."""
     monkeypatch.setattr("merge_runner.llm.batch.rounds.ENDING_S", 2.0)
-    monkeypatch.setattr("merge_runner.llm.batch.rounds.ARRIVAL_S", 2.0)
+    monkeypatch.setattr("merge_runner.llm.batch.rounds.ARRIVAL_S", (1.0, 1.0))
 
     async def run(provider, middle=None, plan=None, **options):
         registry = REGISTRY.format(provider=provider, format=FORMATS[provider])

@@ -14,10 +14,9 @@ from collections import Counter
 import httpx
 import pytest
 
-from merge_runner.emulator.faults import BatchPlan, FaultPlan
 from merge_runner.results.store import results_digest
-from merge_runner.run.plan import Options, make_plan
-from tests.harness import FAST, PROJECT, run_sweep, watched
+from tests.harness import FAST, PROJECT, watched
+from tests.mock_server import BatchPlan, FaultPlan
 
 KILLS = 20
 TWO = ("--conditions", "L_4_0,N_0_0", "--reps", 1)
@@ -203,30 +202,10 @@ async def test_first_situations_take_one_batch(merge_runner, tmp_path):
         run = await merge_runner(*first, "--batch", **env)
         plain = await merge_runner(*first, "--db", "plain", "--cache", "new", **env)
     assert [run.code, plain.code] == [0, 0], run.err
-    assert left.count("open batch: round 1 of at most 1: 22 calls of emulator") == 1
+    assert left.count("open batch: 22 calls of emulator wait in batch ") == 1
     (batches,) = await rows(merge_runner, "select count(distinct batch_id) as n from calls")
     assert batches["n"] == 1
     assert results_digest(tmp_path / "results/merge.duckdb") == results_digest(tmp_path / "plain")
-
-
-@pytest.mark.long
-async def test_after_the_deadline_a_batch_is_cancelled_and_the_rest_asked_singly(
-    tmp_path, monkeypatch
-):
-    monkeypatch.setattr("merge_runner.llm.batch.rounds.ROUND_DEADLINE_S", 2.0)
-    said = []
-    plan = BatchPlan(delay_s=1.0, slow=0.5, slow_factor=1000)
-    async with watched(faults=FaultPlan(batch=plan)) as server:
-        monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
-        first = make_plan("baseline", "emulator", repetitions=1, first=True)
-        options = Options(tmp_path / "m.duckdb", tmp_path / "c", batch=True)
-        outcome = await run_sweep(first, options, say=said.append)
-        batched, alone = await answered(server)
-    assert outcome.exit_code == 0, outcome.messages
-    assert any("is cancelled: what it has answered is taken, the rest" in line for line in said)
-    assert batched
-    assert alone
-    assert (batched + alone).total() == len(batched + alone) == 22
 
 
 @pytest.mark.long
@@ -239,7 +218,7 @@ async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
         batched, alone = await answered(server)
     assert last.code == 0, last.err
     (told,) = left["open_batches"]
-    assert "round 1 of at most 4: 4 calls of priced in batch batch_" in told
+    assert "4 calls of priced wait in batch batch_" in told
     assert last.summary["open_batches"] == []
     assert max(batched.values()) == 1
     assert not alone
@@ -248,9 +227,9 @@ async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--batch", "--replay"), "leave --batch out"),
-        (("--batch", "--dask", "local:1"), "leave --dask out"),
-        (("--batch", "--model", "constant"), "no language model is asked: leave --batch out"),
+        (("--batch", "--replay"), "leave it, --replay or --dask out"),
+        (("--batch", "--dask", "local:1"), "leave it, --replay or --dask out"),
+        (("--batch", "--model", "constant"), "leave it, --replay or --dask out"),
         (("--batch", "--model", "local"), "local has no batch mode that is known; valid with"),
     ],
 )
@@ -270,5 +249,5 @@ async def test_a_dry_run_says_what_batches_cost_beside_single_calls(merge_runner
     assert lines[5].endswith("minutes, asked singly")
     assert lines[6] == (
         "batch   about 0.27 USD in about 11 rounds, at most 30; a round takes as long as its "
-        "slowest batch: minutes, an hour; after two the rest is asked singly"
+        "slowest batch: minutes, an hour, a day at most"
     )

@@ -80,6 +80,7 @@ class CacheMachine(RuleBasedStateMachine):
         self.answered: dict[int, CachedCall] = {}
         self.tried: dict[int, tuple[Attempt, ...]] = {}
         self.made = 0
+        self.damaged: set[int] = set()
         self.loop = asyncio.new_event_loop()
         self.running: dict[int, Process] = {}
 
@@ -201,11 +202,17 @@ class CacheMachine(RuleBasedStateMachine):
         with contextlib.closing(sqlite3.connect(self.place / "cache.db")) as database, database:
             rows = database.execute("SELECT rowid, key FROM Cache ORDER BY rowid").fetchall()
             calls = [row for row in rows if len(row[1]) == 64 or row[1].startswith("attempts ")]
+            # What is damaged twice may be whole again.
+            rows = [row for row in rows if row[0] not in self.damaged]
+            calls = [row for row in calls if row in rows]
             others = [row for row in rows if row[1] != "format"]
+            if not others:
+                return
             rowid, name = data.draw(st.sampled_from(calls or others) | st.sampled_from(others))
             ((content,),) = database.execute(
                 "SELECT CAST(value AS BLOB) FROM Cache WHERE rowid = ?", [rowid]
             )
+            self.damaged.add(rowid)
             changed = bytearray(content or b"x")
             changed[data.draw(st.integers(0, len(changed) - 1))] ^= data.draw(st.integers(1, 255))
             database.execute(
@@ -214,6 +221,7 @@ class CacheMachine(RuleBasedStateMachine):
         for question, request in enumerate(REQUESTS):
             if request.key == name:
                 self.answered.pop(question, None)
+                self.tried.pop(question, None)
             if name == f"attempts {request.key}":
                 self.tried.pop(question, None)
 

@@ -11,10 +11,10 @@ import sqlite3
 
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.store import results_digest
 from tests.harness import watched
+from tests.mock_server import FaultPlan
 
 SWEEP = ("sweep", "baseline", "--reps", 2, "--in-flight", 8, "--json")
 KILLS = 20

@@ -65,7 +65,7 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         assert run.summary["cost_usd"] == pytest.approx(bill.usd)
         assert run.summary["trials"]["suspended"] > 0
         assert f"{bill.usd:.2f} of {ROOM_FOR_SOME} over all runs" in run.err.splitlines()[-2]
-        assert "raise --max-cost and run the same command again" in run.err
+        assert "raise --max-cost, or the study's budget, and run the same command" in run.err
         # What is finished is balanced: no condition is far ahead of another one.
         counts = await sql(
             merge_runner, "select condition, count(*) as n from trials group by all order by n"
@@ -327,5 +327,5 @@ async def test_nothing_is_released_while_another_run_asks(merge_runner):
 
 async def test_a_folder_without_a_cache_has_no_ledger(merge_runner, tmp_path):
     run = await merge_runner("ledger", "--cache", tmp_path / "none")
-    assert (run.code, "nothing was spent" in run.err) == (2, True)
+    assert (run.code, "there is no cache" in run.err) == (2, True)
     assert not (tmp_path / "none").exists()

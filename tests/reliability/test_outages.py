@@ -110,7 +110,7 @@ async def test_nobody_listens(merge_runner, tmp_path):
     run = await merge_runner(*sweep, EMULATOR_BASE_URL="http://127.0.0.1:9/v1")
     assert run.code == 1
     assert "Traceback" not in run.err
-    assert "no answer within 1 s to the first call of this run" in run.err
+    assert "the first call of this run: no answer within 1 s" in run.err
     assert run.summary["attempts"].keys() == {"no_connection"}
     assert run.summary["trials"]["failed"] == 0
 
@@ -130,7 +130,6 @@ async def test_waits_are_told(merge_runner, tmp_path):
         run = await merge_runner(*sweep, "--reps", 1, "--conditions", "L_4_8", **env)
     assert run.code == 0
     told = [text for text in run.err.splitlines() if "UTC" in text]
-    assert any("all its calls wait 7.0 s, until" in text and "Slow down." in text for text in told)
     assert any(
         "L_4_8 rep 1" in text and "decision 0 waits until" in text and "HTTP 429" in text
         for text in told

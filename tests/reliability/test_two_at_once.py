@@ -7,10 +7,10 @@ import json
 
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.model_lock import ModelLocks
 from tests.harness import FAST, watched
+from tests.mock_server import FaultPlan
 
 pytestmark = pytest.mark.slow
 

@@ -109,7 +109,7 @@ async def test_a_folder_with_anything_else_is_left_as_it_is(merge_runner, tmp_pa
         (folder / name).write_text(content)
         run = await merge_runner("export", folder)
         assert run.code == 2
-        assert f"holds {name}, which is no export's: name another folder" in run.err
+        assert "is there and no earlier export: name another folder" in run.err
         assert [path.read_text() for path in folder.iterdir()] == [content]
 
 

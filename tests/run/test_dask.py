@@ -7,28 +7,30 @@ from __future__ import annotations
 
 import asyncio
 import json
+import pickle
 import shutil
 import signal
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import psutil
 import pytest
 from aiohttp import web
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.registry import Catalogue, in_use, use
-from merge_runner.run.dask_cluster import connected
-from merge_runner.run.dask_tasks import use_study
-from merge_runner.study.file import read_study
+from merge_runner.run.cluster import Task, connected, fingerprint, play_task
+from merge_runner.run.first_decisions import FirstDecisions
+from merge_runner.run.plan import Options, make_plan
 from tests.gate import HANGS_S, Gate
 from tests.harness import FAST, PROJECT, environment, watched
 from tests.llm.test_limiter import fullest_window
+from tests.mock_server import FaultPlan
 from tests.zygote import Zygote
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
@@ -41,7 +43,7 @@ PAID = ("--model", "o3", "--yes", *FAST)
 @pytest.fixture(scope="session")
 def zygote(shared):
     """What the program is forked from; here it has imported Dask too."""
-    with Zygote(shared / "zygote-dask", "merge_runner.run.dask_tasks") as forking:
+    with Zygote(shared / "zygote-dask", "distributed") as forking:
         yield forking
 
 
@@ -63,10 +65,9 @@ def started(zygote, tmp_path):
 
 
 def workers_of(pid: int) -> list[psutil.Process]:
-    """The workers that a coordinator has started: what is forked from a process of its own."""
+    """The workers that a coordinator has started."""
     children = psutil.Process(pid).children()
-    servers = [child for child in children if "forkserver" in " ".join(child.cmdline())]
-    return [worker for server in servers for worker in server.children()]
+    return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
 
 
 def held_from(gate: Gate, worker: psutil.Process) -> set[str]:
@@ -99,13 +100,23 @@ async def ended(process) -> tuple[int, str, str]:
     return process.returncode, out.decode(), err.decode()
 
 
-def test_threads_of_a_worker_play_by_one_catalogue():
-    study = read_study("baseline")
-    use(Catalogue())
-    with ThreadPoolExecutor() as threads:
-        used = list(threads.map(lambda _: (use_study(study), in_use())[1], range(8)))
-    assert len({id(catalogue) for catalogue in used}) == 1
-    assert used[0].text == study.text
+async def test_tokens_of_a_workers_tasks_count_together_in_its_share(tmp_path):
+    plan = make_plan("baseline", repetitions=1, conditions=["L_4_0"])
+    options = Options(tmp_path / "db", tmp_path / "cache", tpm=10**6)
+    worker = SimpleNamespace(extensions={}, periodic_callbacks={"profile": Mock()})
+    used = []
+    for specs in (plan.trial_specs(), [replace(spec, repetition=2) for spec in plan.trial_specs()]):
+        task = Task(
+            run="run", name="task", specs=specs, plan=plan, options=options,
+            urls={}, earlier={},
+            share=0.5, first=FirstDecisions(), recorded=(), unanswered={}, overruns=(),
+        )  # fmt: skip
+        played = await play_task(fingerprint(), pickle.dumps(task), dask_worker=worker)
+        assert played.error is None
+        used.append(sum(meter.tokens for meter in played.meters.values()))
+    (limiter,) = worker.extensions["run 0.5"].values()
+    assert limiter._tpm == 5 * 10**5
+    assert limiter._tokens_in_window == sum(used) > used[0] > 0
 
 
 @pytest.mark.slow
@@ -137,7 +148,7 @@ async def test_three_workers_come_to_the_results_of_one_process(merge_runner):
         ("", "valid: local:N"),
         ("http://host:1", "valid: local:N"),
         ("tcp://host", "valid: local:N"),
-        ("none.json", "there is no scheduler file none.json"),
+        ("none.json", "valid: local:N"),
     ],
 )
 async def test_a_word_that_names_no_cluster_is_refused(where, says):
@@ -238,7 +249,7 @@ async def test_workers_of_another_scheduler_play_with_their_own_keys(merge_runne
         run = await merge_runner(*sweep, **env)
         assert run.code == 2
         assert "o3 needs a key: set OPENAI_API_KEY" in run.err
-        assert "(told by the worker tcp://127.0.0.1:" in run.err
+        assert "(told by the Dask worker tcp://127.0.0.1:" in run.err
         assert server.requests == 0
     assert "Traceback" not in run.err
 
@@ -336,20 +347,33 @@ async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(merge_ru
 
 
 @pytest.mark.long
-async def test_a_coordinator_that_is_killed_takes_its_workers_along(merge_runner, started):
-    gate = Gate(40)
-    async with watched(gate.middle) as server:
+async def test_a_coordinator_that_is_killed_takes_its_workers_along_and_goes_on(
+    merge_runner, started, tmp_path
+):
+    many = (*SIX, "--reps", 4, "--in-flight", 2, "--dask", "local:2")  # tasks of four trials
+    async with watched(faults=FaultPlan(latency_s=0.02)) as server, asyncio.timeout(HANGS_S):
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await started(*ON_TWO, **env)
-        await all_held(gate, trials=4)
+        process = await started(*many, **env)
+        while not (kept := kept_calls(tmp_path / "cache/responses")):
+            await asyncio.sleep(0.1)
         family = psutil.Process(process.pid).children(recursive=True)
         process.kill()
         await process.wait()
         _, alive = psutil.wait_procs(family, timeout=HANGS_S)
         assert not alive
-        gate.open()
-        run = await merge_runner(*SIX, **env)
-    assert run.code == 0, run.err
+        run = await merge_runner(*many, **env)
+        assert run.code == 0, run.err
+        assert run.summary["calls"]["cached"] >= kept
+        assert server.asked.total() - len(server.asked) < len(server.asked) - kept
+    assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] == 12
+
+
+def kept_calls(folder) -> int:
+    """How many calls a cache holds, which may not be there yet."""
+    if not (folder / "cache.db").exists():
+        return 0
+    with closing(ResponseCache(folder, read_only=True)) as cache:
+        return sum(1 for _ in cache.entries())
 
 
 @pytest.mark.long

@@ -4,11 +4,11 @@ import asyncio
 
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import NoValidDecision
 from merge_runner.records import Decision
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from tests.harness import watched
+from tests.mock_server import FaultPlan
 
 SWEEP = ("sweep", "baseline", "--json")
 PROSE = FaultPlan(rates={"malformed": 1.0})
@@ -25,7 +25,7 @@ async def test_a_live_run_stops_after_20_invalid_decisions_and_keeps_what_was_an
         (message,) = stopped.summary["messages"]
         assert message.startswith("none of the first 20 decisions of emulator is valid")
         assert 'The first reply is "M I would rather describe my plan in words than' in message
-        assert "no_array, it has no list of numbers. To mend that look at the output" in message
+        assert "(no array). To mend that look at what" in message
         again = await merge_runner(*SWEEP, **env)
         assert (again.code, server.requests) == (1, MOST_INVALID), "it asked on"
         whole = await merge_runner(*SWEEP, "--reps", 1, "--keep-going", **env)
@@ -53,7 +53,7 @@ async def test_a_run_of_fewer_decisions_says_at_its_end_that_none_is_valid(merge
             assert run.summary["invalid_decisions"] == decisions < MOST_INVALID
             (message,) = run.summary["messages"]
             assert message.startswith(f"none of the {decisions} decisions of emulator is valid. ")
-            assert "no_array, it has no list of numbers" in message
+            assert "(no array). To mend that look at what" in message
         assert (await merge_runner(*part, "--keep-going", **env)).code == 0
 
 
@@ -106,7 +106,7 @@ def test_one_valid_decision_is_enough_and_each_model_is_counted_by_itself():
     first.count("a", VALID)
     for _ in range(MOST_INVALID):
         first.count("a", INVALID)
-    with pytest.raises(NoValidDecision, match=r"of b is valid.*has no text: no_array"):
+    with pytest.raises(NoValidDecision, match=r"of b is valid.*is \"\" .no array"):
         first.count("b", INVALID)
 
 

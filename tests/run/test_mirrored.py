@@ -6,9 +6,9 @@ import asyncio
 
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.results.store import results_digest
 from tests.harness import watched
+from tests.mock_server import FaultPlan
 
 PAIR = ("baseline", "--model", "emulator+projected-order", "--mirror", "--reps", 1)
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.call_totals import CallTotals
-from merge_runner.llm.ledger import Spending
-from merge_runner.run.estimate import estimate
+from merge_runner.run.estimate import CallTotals, estimate
 from merge_runner.run.plan import PROGRAMS, Options, make_plan
 
 
@@ -147,10 +144,9 @@ def test_the_estimate_takes_the_limits_into_account(limited, minutes):
     expected = estimate(
         plan,
         Options(Path("m.duckdb"), Path("responses"), **limited),
-        trials={"baseline": plan.trials},
+        trials=plan.trials,
         calls={"baseline": {"o3": plan.trials * 21}},
         facts={"o3": CallTotals()},
-        spending=Spending(),
     )
     assert expected.minutes == pytest.approx(minutes, rel=0.08)
     assert expected.calls == 2310
@@ -158,29 +154,17 @@ def test_the_estimate_takes_the_limits_into_account(limited, minutes):
     assert expected.cost_usd == pytest.approx(each, rel=0.05)
 
 
-def test_the_estimate_tells_what_the_cap_buys():
+def test_the_estimate_is_by_what_was_measured():
     plan = make_plan("ablations", "o3", 2, variants=["baseline", "A1"])
-    todo = {
-        "trials": {"baseline": 10, "A1": 30},
-        "calls": {"baseline": {"o3": 210.0}, "A1": {"o3": 630.0}},
-    }
-    options = Options(Path("m.duckdb"), Path("responses"), max_cost_usd=6.0)
-    facts = CallTotals(measured=10, input_tokens=5_000, output_tokens=15_000, latency_s=200)
-    spent = Spending(spent_usd=0.54)
-    expected = estimate(plan, options, **todo, facts={"o3": facts}, spending=spent)
+    options = Options(Path("m.duckdb"), Path("responses"), batch=True)
+    expected = estimate(
+        plan,
+        options,
+        trials=40,
+        calls={"baseline": {"o3": 210.0}, "A1": {"o3": 630.0}},
+        facts={"o3": CallTotals(10, 5_000, 15_000)},
+    )
     each = (500 * 2 + 1500 * 8) / 1e6
     assert (expected.trials, expected.calls) == (40, 840)
     assert expected.cost_usd == pytest.approx(840 * each, abs=0.01)
-    # 5.46 of 10.92 USD are left: every second trial.
-    assert expected.trials_within_cap == 20
-    tight = replace(options, max_cost_usd=0.54 + 10.92 / 40)
-    poor = estimate(plan, tight, **todo, facts={"o3": facts}, spending=spent)
-    assert poor.trials_within_cap == 1
-    free = estimate(
-        plan, replace(options, max_cost_usd=None), **todo, facts={"o3": facts}, spending=spent
-    )
-    assert free.trials_within_cap is None
-    batch = replace(options, batch=True)
-    halved = estimate(plan, batch, **todo, facts={"o3": facts}, spending=spent)
-    assert halved.batch.cost_usd == 5.46
-    assert halved.trials_within_cap == 40
+    assert expected.batch.cost_usd == 5.46

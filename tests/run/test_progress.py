@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
 
-from merge_runner.llm.meter import Meter
+from merge_runner.llm.client import Meter
 from merge_runner.records import Attempt, Usage
 from tests.run.standings import progress, runner
 

@@ -16,7 +16,6 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.recording import (
@@ -29,6 +28,7 @@ from merge_runner.results.store import results_digest
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.text_safety import quoted
 from tests.harness import FAST, PROJECT, RECORDING, environment, watched
+from tests.mock_server import FaultPlan
 
 # The digests of the committed recordings: results, and so these texts, never change by themselves.
 GOLDEN = {
@@ -403,7 +403,7 @@ async def test_a_recording_of_another_format_is_refused(merge_runner, told, tmp_
         run = await merge_runner("recording", command, "other.parquet")
         assert run.code == 1
         (line,) = run.err.splitlines()
-        assert f"has the format 'merge-runner recording {number}', this program reads" in line
+        assert f"has the format 'merge-runner recording {number}' with keys of" in line
 
 
 @pytest.mark.slow

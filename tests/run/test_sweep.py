@@ -12,12 +12,12 @@ import termios
 import pytest
 from aiohttp import web
 
-from merge_runner.emulator.faults import TRANSIENT, FaultPlan
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.database import open_database
 from merge_runner.results.store import results_digest
 from tests.gate import HANGS_S, Gate
 from tests.harness import FAST, PROGRAM, environment, watched
+from tests.mock_server import TRANSIENT, FaultPlan
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--json")
 TWO = ("--conditions", "N_0_0,L_4_8")
@@ -89,15 +89,12 @@ async def test_what_is_recorded_is_not_asked_again_and_what_is_new_is(merge_runn
 
 async def test_the_digest_depends_on_no_schedule_and_no_transient_fault(merge_runner, tmp_path):
     # Of each transient fault a twenty-fifth; a hang ends soon, without a reply.
-    rates = "\n".join(f"{fault} = 0.04" for fault in TRANSIENT)
-    (tmp_path / "faults.toml").write_text(f"seed = 5\nhang_s = 0.3\n[rates]\n{rates}\n")
-    for name, options in {
-        "one": ("--in-flight", 1),
-        "many": ("--in-flight", 500),
-        "faults": ("--faults", "faults.toml"),
-    }.items():
-        places = ("--db", f"{name}.duckdb", "--cache", name)
-        run = await merge_runner(*SMALL, *FIVE, *places, *options)
+    faulty = FaultPlan(seed=5, hang_s=0.3, rates=dict.fromkeys(TRANSIENT, 0.04))
+    for name, in_flight, plan in (("one", 1, None), ("many", 500, None), ("faults", 200, faulty)):
+        places = ("--db", f"{name}.duckdb", "--cache", name, "--in-flight", in_flight)
+        async with watched(faults=plan) as server:
+            env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+            run = await merge_runner(*SMALL, *FIVE, *places, **env)
         assert run.code == 0, run.err
         assert run.summary["trials"]["failed"] == 0
     faults = sum(n for outcome, n in run.summary["attempts"].items() if outcome != "ok")
@@ -305,13 +302,11 @@ async def test_two_signals_at_once_end_it_as_one_does(merge_runner):
     assert b"Traceback" not in err
 
 
-async def test_bad_answers_on_purpose_are_not_kept_as_the_emulators_own(merge_runner, tmp_path):
-    (tmp_path / "bad.toml").write_text("[rates]\nmalformed = 0.4\n")
-    bad = await merge_runner(*SMALL, *TWO, "--faults", "bad.toml")
+async def test_each_bad_answer_is_followed_by_a_fallback(merge_runner):
+    async with watched(faults=FaultPlan(rates={"malformed": 0.4})) as server:
+        bad = await merge_runner(*SMALL, *TWO, EMULATOR_BASE_URL=f"{server.url}/v1")
     assert bad.summary["invalid_decisions"] > 5
     assert bad.summary["fallbacks"] == bad.summary["invalid_decisions"]
-    plain = await merge_runner(*SMALL, *TWO, "--db", "plain.duckdb")
-    assert plain.summary["invalid_decisions"] == 0
 
 
 async def test_another_process_queries_while_a_sweep_runs(merge_runner):
@@ -333,7 +328,7 @@ async def test_another_process_queries_while_a_sweep_runs(merge_runner):
 async def test_a_locked_database_is_waited_for(merge_runner, tmp_path):
     await merge_runner(*SMALL, "--conditions", "N_0_0")
     process = await merge_runner.fork(
-        *SMALL, *TWO, "--reps", 2, "--fault-rate", 0, "--in-flight", 1
+        *SMALL, *TWO, "--reps", 2, "--in-flight", 1, EMULATOR_BASE_URL=""
     )
     await asyncio.sleep(1.2)
     db = tmp_path / "results/merge.duckdb"

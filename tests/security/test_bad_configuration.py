@@ -8,7 +8,6 @@ import pytest
 
 from analysis.commands import main
 from merge_runner.config import PROVIDERS, ModelEntry, ScenarioConfig
-from merge_runner.emulator.faults import FAULTS, FaultPlan
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.file import StudyFile
@@ -107,7 +106,7 @@ def refused(program, *arguments):
         (model(shutdown='"soon"'), "shutdown: Input should be a valid date"),
         (model(aliases='"x"'), "aliases: Input should be a valid tuple"),
         (model(base_url='"nope"'), "must begin with http:// or https://"),
-        (model(base_url='"http://user:word@host/v1"'), "has a user name, a password"),
+        (model(base_url='"http://user:word@host/v1"'), "is no base URL"),
         (b"m = 1", "[m]: Input should be a valid dictionary"),
         (b'["a\\nb"]\nx = 1', "[a?b]: provider: Field required"),
         (b"[m", "is no TOML file: Expected ']'"),
@@ -195,38 +194,6 @@ def test_a_sweep_that_is_wrong(program, tmp_path, content, says):
 
 
 @pytest.mark.parametrize(
-    ("content", "valid"),
-    [
-        (b"unknown = 1", FaultPlan.model_fields),
-        (b"seed = 'x'", ["valid integer"]),
-        (b"rates = 3", ["valid dictionary"]),
-        (b"rates = { nope = 0.1 }", FAULTS),
-        (b"rates = { hang = 1.1 }", ["less than or equal to 1"]),
-        (b"rates = { hang = 0.9, reset = 0.9 }", ["add up to more than 1"]),
-        (b"latency_s = -1", ["latency_s", "greater than or equal to 0"]),
-        (b"hang_s = inf", ["hang_s", "finite"]),
-    ],
-    ids=str,
-)
-def test_a_file_of_faults_that_is_wrong(program, tmp_path, content, valid):
-    (tmp_path / "faults.toml").write_bytes(content)
-    for command in (("sweep", "mine"), ("emulate",)):
-        line = refused(program, *command, "--faults", "faults.toml")
-        assert line.startswith("error: faults.toml: ")
-        assert [name for name in valid if name not in line] == []
-
-
-@pytest.mark.parametrize(
-    "content", [BINARY, DEEP, b"[", None], ids=["binary", "deep", "cut", "none"]
-)
-def test_a_file_of_faults_that_cannot_be_read(program, tmp_path, content):
-    if content is not None:
-        (tmp_path / "faults.toml").write_bytes(content)
-    line = refused(program, "sweep", "mine", "--faults", "faults.toml")
-    assert ("is no TOML file" if content else "does not exist") in line
-
-
-@pytest.mark.parametrize(
     ("arguments", "says"),
     [
         (
@@ -246,10 +213,6 @@ def test_a_file_of_faults_that_cannot_be_read(program, tmp_path, content):
         (["mine", "--variants", "Z"], f"unknown variant 'Z'; valid: {', '.join(VARIANTS)}"),
         (["mine", "--reps", "-1"], "--reps is a whole number from 1"),
         (["mine", "--sample-set", "-1"], "--sample-set is a whole number from 0"),
-        (["mine", "--fault-rate", "-0.1"], "no probability between 0 and 1"),
-        (["mine", "--fault-rate", "1.5"], "no probability between 0 and 1"),
-        (["mine", "--fault-rate", "nan"], "no probability between 0 and 1"),
-        (["mine", "--faults", "folder.toml"], "folder.toml cannot be read: Is a directory"),
         (["mine", "--db", "folder.toml"], "folder.toml"),
         (["mine", "--db", "binary"], "binary cannot be opened as a database"),
         (["mine", "--cache", "binary"], "the cache binary cannot be used"),

@@ -9,8 +9,7 @@ import pytest
 from aiohttp import web
 from rich.console import Console
 
-from merge_runner.llm.call import Wait
-from merge_runner.llm.meter import Meter
+from merge_runner.llm.client import Meter, Wait
 from merge_runner.run.progress import table_of
 from tests.harness import watched
 from tests.run.standings import progress, runner

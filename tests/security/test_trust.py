@@ -11,7 +11,7 @@ import pytest
 from merge_runner import Study
 from merge_runner.config import state_folder
 from merge_runner.errors import UsageError
-from merge_runner.study.folder import write_folder
+from merge_runner.study.file import write_folder
 from merge_runner.study.parts import load_study
 from tests.harness import PROJECT, watched
 
@@ -145,20 +145,14 @@ def test_the_question_shows_the_code_and_comes_once_for_each_content(
         load_study(study)
 
 
-def test_who_always_agrees_to_a_folder_is_not_asked_about_it_again_but_about_others(
-    state, stranger, terminal, tmp_path
+def test_an_agreement_to_a_folder_is_none_to_the_registry_of_the_working_folder(
+    state, stranger, tmp_path
 ):
-    terminal("a", "n", "n")
-    load_study(str(stranger / "study.toml"))
-    (stranger / "driver.py").write_text("edited = True\n")
-    load_study(str(stranger / "study.toml"))
-    other = shutil.copytree(stranger, tmp_path / "other")
-    with pytest.raises(UsageError, match="nothing was run"):
-        load_study(str(other / "study.toml"))
-    # The working folder has a registry, too, and nobody agreed to that one.
+    study = str(stranger / "study.toml")
+    load_study(study, trust=True)
     models_file(tmp_path / "working", "nice", provider="openai", base_url=AT)
-    with pytest.raises(UsageError, match="nothing was run"):
-        load_study(str(stranger / "study.toml"), ["nice"])
+    with pytest.raises(UsageError, match="sends OPENAI_API_KEY to http:"):
+        load_study(study, ["nice"])
 
 
 def test_a_folder_cannot_bring_the_agreement_to_itself(state, stranger, monkeypatch):

@@ -12,9 +12,9 @@ from starlette.testclient import TestClient
 
 from analysis.explorer.app import explorer
 from analysis.explorer.site import Site
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.results.store import query, results_digest
 from tests.harness import FAST, watched
+from tests.mock_server import FaultPlan
 
 STUDY = """
 models = ["emulator", "emulator+projected-order"]

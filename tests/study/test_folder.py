@@ -14,11 +14,11 @@ import pytest
 
 from merge_runner import Study
 from merge_runner.config import ModelEntry
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.paths import DEFAULT_DB, home_of
 from merge_runner.results.store import results_digest
-from merge_runner.study.folder import FILES, TEMPLATE, write_folder
+from merge_runner.study.file import FILES, TEMPLATE, write_folder
 from tests.harness import PROGRAM, watched
+from tests.mock_server import FaultPlan
 
 
 @pytest.fixture

@@ -178,14 +178,6 @@ def test_an_edit_of_what_a_plug_in_imports_is_another_driver(tmp_path):
     assert hashes[0] != hashes[1]
 
 
-def test_a_prompt_may_be_based_on_one_that_stands_below_it(plan_of):
-    plan_of(
-        '[factors]\nprompt = ["a"]\n[prompts.a]\nbased_on = "b"\nremove = ["C1"]\n'
-        '[prompts.b]\nremove = ["C2"]\n'
-    )
-    assert not {"C1", "C2"} & {*blocks_of("a")}
-
-
 def test_what_an_earlier_study_added_is_gone(plan_of):
     plan_of('[plugins]\nfiles = ["mine.py"]\n', ["braking"], plugin=DRIVER.format(action=0))
     with pytest.raises(UsageError, match="unknown model 'braking'"):
@@ -198,14 +190,26 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
 @pytest.mark.parametrize(
     ("text", "plugin", "says"),
     [
-        (persona("{speed}"), None, "names {speed}"),
-        (persona().replace("C3.human", "C9"), None, "names the block 'C9'; those that it has: C0"),
-        (persona().replace("C3.human", "A"), None, "the prompt taxi names the block 'A'"),
+        (
+            persona("{speed}"),
+            None,
+            "block 'added by taxi': 'speed'; valid: ",
+        ),
+        (
+            persona().replace("C3.human", "C9"),
+            None,
+            "unknown block of the prompt taxi 'C9'; valid: C0",
+        ),
+        (
+            persona().replace("C3.human", "A"),
+            None,
+            "unknown block of the prompt taxi 'A'; valid: C0",
+        ),
         ('[prompts.baseline]\nremove = ["C2"]\n', None, "there is a variant 'baseline' already"),
         (
             '[prompts.x]\nremove = ["C2"]\nreplace = { C2 = "x" }\n',
             None,
-            "the prompt x names the block 'C2' (which another prompt has)",
+            "unknown block of the prompt x 'C2'; valid: C0",
         ),
         (
             '[prompts.x]\nadd = [{ after = "C0" }]\n',
@@ -213,12 +217,7 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
             "give it a block, a text, or merge",
         ),
         ('[prompts.x]\nadd = [{ block = "C9" }]\n', None, "unknown prompt block 'C9'; valid: C0"),
-        ('[prompts.x]\nadd = [{ block = "C2" }]\n', None, "'C2', which it has already"),
-        (
-            '[prompts.x]\nadd = [{ block = "state.table" }]\n',
-            None,
-            "says the situation twice, in C0 and in state.table: write remove = ",
-        ),
+        ('[prompts.x]\nadd = [{ block = "C2" }]\n', None, "C2, which it has already"),
         ("[prompts.x]\nad = []\n", None, "unknown key 'prompts.x.ad'; valid: based_on, remove"),
         ('[plugins]\nfiles = ["none.py"]\n', None, "the plug-in none.py cannot be read"),
         (
@@ -250,9 +249,3 @@ def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monke
     make_plan("baseline", "constant")
     assert "elsewhere" in CONDITIONS
     assert "own" not in CONDITIONS
-
-
-def test_a_situation_in_other_words_may_stand_beside_the_table(plan_of):
-    table = '[prompts.x]\nadd = [{ block = "state.table" }]\n'
-    plan_of(table + 'replace = { C0 = "You drive a car." }\n')
-    make_plan("baseline", "constant")  # what the study added is taken out again

@@ -8,9 +8,9 @@ import json
 import pytest
 
 from merge_runner import Study
-from merge_runner.emulator.faults import FaultPlan
 from merge_runner.results.store import results_digest
 from tests.harness import FAST, watched
+from tests.mock_server import FaultPlan
 
 DEAR = """
 [dear]

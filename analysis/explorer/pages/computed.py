@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from analysis.explorer.analysis_process import Request, Result, Waiting
-from analysis.explorer.child import NoAnswer
 from analysis.explorer.site import NotThere, Site
 from analysis.explorer.urls import query_of, seconds
+from merge_runner.errors import MergeRunnerError
 
 # What is kept in the database comes within this time; what takes longer is asked for again.
 AT_ONCE_S = 0.3
@@ -59,7 +59,7 @@ def computed(
     found: Result | Waiting | None = None
     try:
         found = site.computing.ask(request, state, since=since, wait_s=wait_s)
-    except NoAnswer as exc:
+    except MergeRunnerError as exc:
         failure = str(exc)
     result = found if isinstance(found, Result) else None
     if result is not None and "absent" in result.content:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Mapping, Sequence
 
+from analysis.explorer.display_text import csv_cell
 from analysis.explorer.notes import Note, tags_of
 from analysis.explorer.pages.trial import find
-from analysis.explorer.query_worker import csv_cell
 from analysis.explorer.reading import Row
 from analysis.explorer.site import Site
 from analysis.explorer.urls import whole

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from analysis.explorer.child import NoAnswer
 from analysis.explorer.display_text import visible
-from analysis.explorer.query_process import DOWNLOADED_ROWS, LONGEST, QueryResult
+from analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST, QueryResult
 from analysis.explorer.site import Site
 from merge_runner.errors import MergeRunnerError
 from merge_runner.results.data_dictionary import tables, units
 
-UNANSWERED = (NoAnswer, MergeRunnerError)
 NUMBERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
            "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE", "DECIMAL", "BIGNUM")  # fmt: skip
 
@@ -57,8 +55,8 @@ def sql_page(
     result = None
     if is_asked and run and problem is None:
         try:
-            result = site.sandbox.result(query)
-        except UNANSWERED as exc:
+            result = site.queries.result(query)
+        except MergeRunnerError as exc:
             problem = str(exc)
     return site.render(
         "sql.html",
@@ -80,8 +78,8 @@ def sql_page(
 
 
 def sql_csv(site: Site, asked: Mapping[str, str]) -> bytes:
-    """All that a query finds as CSV; raises what is in UNANSWERED."""
-    return site.sandbox.csv(query_in(asked))
+    """All that a query finds as CSV; raises MergeRunnerError."""
+    return site.queries.csv(query_in(asked))
 
 
 def query_in(asked: Mapping[str, str]) -> str:

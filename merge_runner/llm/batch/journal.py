@@ -8,10 +8,8 @@ cache, so that it knows all rows of its models once it has read them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Annotated
 
-from pydantic import AwareDatetime, BaseModel, BeforeValidator, ValidationError
+from pydantic import AwareDatetime, BaseModel, ValidationError
 
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
@@ -19,8 +17,6 @@ from merge_runner.records import Attempt
 
 # The prefix of names in the cache.
 _BATCH = "batch "
-# Notes of earlier versions have an empty text for None: their batches may be open yet.
-Moment = Annotated[AwareDatetime | None, BeforeValidator(lambda value: value or None)]
 
 
 class OpenBatch(BaseModel, frozen=True):
@@ -28,32 +24,19 @@ class OpenBatch(BaseModel, frozen=True):
 
     ``mark`` is its name at the provider, ``batch_id`` its id, empty until the provider has told it.
     ``lines`` has the number of the attempt by the key of each call. ``model`` is its name in the
-    registry, ``ledger`` that of the money. ``number`` is the round: which decision its trials wait
-    for at most, counted from 1. The times are UTC; None: it was not asked to end, or not seen to
-    have ended.
+    registry, ``ledger`` that of the money. ``submitted_at`` is UTC.
     """
 
     mark: str
     model: str
     ledger: str
-    number: int
     submitted_at: AwareDatetime
     lines: dict[str, int]
     batch_id: str = ""
-    cancelled_at: Moment = None
-    ended_at: Moment = None
 
-
-@dataclass(frozen=True, slots=True)
-class OpenLine:
-    """The batch in which a call waits, and the number of the attempt that it is there."""
-
-    batch: OpenBatch
-    attempt: int
-
-    def goes_on(self, attempts: Iterable[Attempt]) -> bool:
-        """Whether that attempt, as far as these tell, has not ended."""
-        return all(each.number != self.attempt or each.outcome == "unknown" for each in attempts)
+    def holds(self, key: str, attempts: Iterable[Attempt]) -> bool:
+        """Whether its attempt at a call, as far as these tell, has not ended."""
+        return all(each.number != self.lines[key] or each.outcome == "unknown" for each in attempts)
 
 
 class Journal:
@@ -69,16 +52,13 @@ class Journal:
         """Return all open batches, the oldest first."""
         return [*self._open.values()]
 
-    def line(self, key: str) -> OpenLine | None:
+    def batch_of(self, key: str) -> OpenBatch | None:
         """Return where a call was submitted last; None: nowhere."""
-        for batch in reversed(self._open.values()):
-            if key in batch.lines:
-                return OpenLine(batch, batch.lines[key])
-        return None
+        return next((each for each in reversed(self._open.values()) if key in each.lines), None)
 
     def waits(self, batch: OpenBatch) -> bool:
-        """Whether a call of the batch waits there yet."""
-        return any(self._is_open(key, self.line(key)) for key in batch.lines)
+        """Whether a call of the batch waits there yet, and in no later one."""
+        return any(self.batch_of(key) is batch and self._waits(key, batch) for key in batch.lines)
 
     async def begin(self, batch: OpenBatch, begins: Callable[[str], bool]) -> OpenBatch:
         """Note that a batch is about to be created, with those of its calls that may begin.
@@ -115,10 +95,9 @@ class Journal:
         if self._open:
             await self._cache.write(operation)
 
-    def _is_open(self, key: str, line: OpenLine | None) -> bool:
+    def _waits(self, key: str, batch: OpenBatch) -> bool:
         try:
-            ended = line is None or not line.goes_on(self._cache.unanswered(key))
-            return not ended and self._cache.get(key) is None
+            return batch.holds(key, self._cache.unanswered(key)) and self._cache.get(key) is None
         except RecordingError:
             return True  # whoever asks for the call will set what is damaged aside
 

@@ -2,8 +2,8 @@
 
 A round is closed when nothing can go on before an answer comes, so that all trials advance by one
 decision at a time, and a sweep takes as many rounds as its longest trial has decisions. A line that
-failed is asked singly. The journal knows of a batch before its provider does: a call
-that waits in an open batch is not asked anew, it joins those that wait there.
+failed is asked singly. The journal knows of a batch before its provider does: a call that waits in
+an open batch is not asked anew, it joins those that wait there.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import itertools
 import math
 import secrets
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from merge_runner.errors import (
     EndpointRefused,
@@ -26,18 +26,14 @@ from merge_runner.errors import (
     QuotaExhausted,
     TrialSuspended,
 )
-from merge_runner.llm.batch.journal import Journal, OpenBatch, OpenLine
-from merge_runner.llm.batch.lines import Line, LineEnd
-from merge_runner.llm.batch.service import (
-    BatchFailed,
-    BatchService,
-    BatchStatus,
-    FailureKind,
-    LineResult,
-    Unreadable,
-)
-from merge_runner.llm.http_outcome import backoff_s
+from merge_runner.llm.batch.journal import Journal, OpenBatch
+from merge_runner.llm.batch.service import BatchFailed, BatchService
+from merge_runner.llm.budget import Budget, PaidAttempt
+from merge_runner.llm.http_outcome import RawReply, backoff_s
 from merge_runner.records import Attempt
+
+if TYPE_CHECKING:
+    from merge_runner.llm.client import Call
 
 # How often it is looked whether a round can be closed: what is seen then decides, not the time.
 LOOK_S = 0.05
@@ -46,97 +42,112 @@ LOOKS = 5
 # Fewer than any provider takes: one batch that is lost or late concerns no more calls.
 MOST_CALLS = 5_000
 SHORTEST_POLL_S, LONGEST_POLL_S, POLL_SHARE = 0.25, 60.0, 0.1
-# A creation whose answer was lost may be in effect only after this: gateways keep requests.
-ARRIVAL_S = 30.0
-# How long the first creation of a run is tried again, and all others: the provider is there.
-FIRST_S, OUTAGE_S = 60.0, 600.0
-# How often a line may be refused for the size of its batch before it is asked singly.
-MOST_REFUSALS = 5
-# How old a batch may be; then it is cancelled, and what it has not answered is asked singly.
-ROUND_DEADLINE_S = 7200.0
-# How long a batch may take to end once it was asked to, and then to show its results.
+# A creation whose answer was lost may be in effect only after 30 s, since gateways keep requests:
+# the pauses between looks.
+ARRIVAL_S = (1.0, 1.0, 2.0, 4.0, 8.0, 14.0)
+# How long a creation is tried again.
+OUTAGE_S = 600.0
+# How long a batch that has ended may take to show its results.
 ENDING_S = 3600.0
 T = TypeVar("T")
 
 
+@dataclass(frozen=True, slots=True)
+class LineEnd:
+    """How a line ended.
+
+    Without a ``raw`` reply ``outcome`` names why, and nothing was charged unless it is ``unclear``.
+    Then it is asked singly. An ``error`` ends the sweep.
+    """
+
+    raw: RawReply | None = None
+    outcome: str = ""
+    message: str = ""
+    unclear: bool = False
+    error: MergeRunnerError | None = None
+
+
+@dataclass(slots=True, eq=False)
+class Line:
+    """A call whose next attempt waits for a batch to be created, or to end.
+
+    ``model`` is its name in the registry, ``batch`` will be the one that it goes to.
+    """
+
+    call: Call
+    model: str
+    paid: PaidAttempt
+    batch: asyncio.Future[Batch] = field(init=False)
+
+    @property
+    def key(self) -> str:
+        """That of its request, which is its id at the provider."""
+        return self.call.request.key
+
+    def begins(self) -> bool:
+        """Set its money aside durably, unless that is done; False if the cap is used up."""
+        return not self.paid.queued or self.paid.set_aside(self.call.attempts)
+
+
 @dataclass(slots=True, eq=False)
 class Batch:
-    """An open batch of which this process waits for ``lines``, by key.
+    """A batch of this process, whose ``work`` ends with it.
 
-    While it is "reading" results may be on their way to their calls; the calls of one that was
-    "never" created go with the next round. ``results`` are those that nobody has asked for yet,
-    ``seen`` hashes of all by key. ``rest`` is the end of the calls without a result, once the batch
-    has ended. It ``is_broken`` where a result could not be used.
+    Then ``ends`` has the lines with a result, by key, until they are taken, and ``rest`` is the end
+    of all others; None: they go with the next round. While its work ``sleeps`` nothing of it is on
+    its way.
     """
 
     note: OpenBatch
-    lines: dict[str, Line] = field(default_factory=dict)
-    state: Literal["waiting", "reading", "never"] = "waiting"
-    status: BatchStatus | None = None
-    results: dict[str, LineResult] = field(default_factory=dict)
-    seen: dict[str, int] = field(default_factory=dict)
+    ends: dict[str, LineEnd] = field(default_factory=dict)
     rest: LineEnd | None = None
-    is_broken: bool = False
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it may bring results yet."""
-        return self.rest is None and self.state != "never"
+    sleeps: bool = False
+    work: asyncio.Task[None] = field(init=False)
 
     @property
     def age_s(self) -> float:
         """How long ago it was submitted."""
-        return _s_ago(self.note.submitted_at)
+        return (datetime.now(UTC) - self.note.submitted_at).total_seconds()
 
-    def take(self, result: LineResult) -> bool:
-        """Give a result to its call; False where it has none, or differs from the first one."""
-        key, content = result.key, hash(result.raw and (result.raw.status, result.raw.body))
-        if key not in self.note.lines or self.seen.setdefault(key, content) != content:
+    async def sleep(self, seconds: float) -> None:
+        """Wait, while others may go on."""
+        self.sleeps = True
+        await asyncio.sleep(seconds)
+        self.sleeps = False
+
+
+@dataclass(frozen=True, slots=True)
+class Batches:
+    """How one model, by its name in the registry, is asked in rounds, and with whose money."""
+
+    rounds: Rounds
+    model: str
+    money: Budget
+    price_factor: float
+
+    def takes_up(self, call: Call) -> bool:
+        """Whether a call waits in a batch already, so that its trial has begun."""
+        if self.rounds.open_batch(call.request.key) is None:
             return False
-        if line := self.lines.pop(key, None):
-            expired = "expired" if result.raw is None else ""
-            line.ends(LineEnd(self.note.batch_id, result.raw, expired, result.message))
-        elif key not in self.results:
-            self.results[key] = result
+        self.money.begin_anew(call.order)
         return True
 
-    def end(
-        self,
-        outcome: str,
-        message: str,
-        *,
-        unclear: bool = False,
-        error: MergeRunnerError | None = None,
-    ) -> None:
-        """End the lines that have not ended yet, and those that join it; see LineEnd."""
-        batch_id = self.note.batch_id or None
-        self.rest = LineEnd(batch_id, None, outcome, message, unclear, error)
-        for line in self.lines.values():
-            line.ends(self.rest)
-        self.lines.clear()
-
-    def fail(self, error: Exception) -> None:
-        """Raise an error for all who wait."""
-        for line in self.lines.values():
-            line.fails(error)
-
-
-@dataclass(slots=True)
-class Crowd:
-    """A model of which a batch was too large: its batches go one after the other.
-
-    The next one has at most ``calls`` calls. The last ``refusals`` batches were refused.
-    """
-
-    calls: int = MOST_CALLS
-    refusals: int = 0
+    async def line(self, call: Call) -> Line:
+        """Return the next attempt at a call with its money, which the caller closes."""
+        asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.price_factor)
+        who = (call.order, call.request.key, asked)
+        if call.open is None:
+            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
+                paid = await self.money.set_aside(*who)
+        else:
+            paid = self.money.going_on(*who, call.open.ledger)
+        return Line(call, self.model, paid)
 
 
 class Rounds:
     """The rounds of a run; ``services`` are the batch modes of its models, by registered name.
 
-    A run that does not ``submits`` takes only what earlier runs have submitted. There are
-    ``most_rounds`` if no line fails. Nobody charges for the models that are ``free``.
+    A run that does not ``submits`` takes only what earlier runs have submitted.
     """
 
     def __init__(
@@ -145,38 +156,40 @@ class Rounds:
         services: dict[str, BatchService],
         *,
         submits: bool,
-        most_rounds: int,
-        free: Collection[str] = (),
         say: Callable[[str], None],
     ) -> None:
         self.submits = submits
         self.services = services
-        self._most_rounds = most_rounds
         self._journal = journal
-        self._free = free
         self._say = say
         self._forming: list[Line] = []
         self._batches: dict[str, Batch] = {}
-        self._tasks: set[asyncio.Task[None]] = set()
         self._creations: set[asyncio.Task[None]] = set()
-        self._reached: set[str] = set()  # models of which a batch was created
-        self._crowds: dict[str, Crowd] = {}
+        # Models of which a batch was refused: the most calls of the next. They go one by one.
+        self._most: dict[str, int] = {}
 
-    def open_line(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenLine | None:
+    def open_batch(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenBatch | None:
         """Return where a call with these attempts waits; None: nowhere that can be reached."""
-        line = self._journal.line(key)
-        if line is None or not line.goes_on(attempts) or line.batch.model not in self.services:
+        batch = self._journal.batch_of(key)
+        if batch is None or not batch.holds(key, attempts) or batch.model not in self.services:
             return None
-        return line
+        return batch
 
-    async def ask(self, line: Line) -> LineEnd:
-        """Wait for the end of a line, in the next round or where it waits already."""
-        line.end = asyncio.get_running_loop().create_future()
-        if line.open is None:
-            self._forming.append(line)
-        else:
-            self._join(line, line.open.batch)
-        return await line.end
+    async def ask(self, line: Line) -> tuple[LineEnd, OpenBatch]:
+        """Wait for the end of a line, in the next round or in the batch where it waits already."""
+        note = line.call.open
+        batch = await self._next_round(line) if note is None else self._taken_up(note)
+        while True:
+            await asyncio.shield(batch.work)
+            if line.key not in batch.note.lines:
+                raise TrialSuspended("another run spends from the same cap, and has used it up")
+            end = batch.ends.pop(line.key, batch.rest)
+            if end is not None:
+                return end, batch.note
+            if not self.submits:
+                end = LineEnd(outcome="not_created", message="the run ended before")
+                return end, batch.note
+            batch = await self._next_round(line)
 
     async def watch(self, is_idle: Callable[[], bool]) -> None:
         """Close each round when nothing else goes on; ``is_idle`` says whether that is so."""
@@ -184,50 +197,65 @@ class Rounds:
             await asyncio.sleep(LOOK_S)
             for _ in range(LOOKS):
                 await asyncio.sleep(0)
-                reading = any(batch.state == "reading" for batch in self._open())
-                if not self._forming or reading or not is_idle():
+                sleep = all(batch.sleeps for batch in self._open())
+                if not (self._forming and sleep and is_idle()):
                     break
             else:
                 self._close_round()
 
     def standing(self) -> list[str]:
         """Return which batches are waited for, a line each."""
-        return [self._described(batch) for batch in self._open()]
+        return [
+            f"{len(note.lines)} calls of {note.model} wait in batch {note.batch_id or 'to be'} "
+            f"since {note.submitted_at:%H:%M:%S} UTC"
+            for note in (batch.note for batch in self._open())
+        ]
 
     async def close(self) -> None:
         """End the waiting; batches that are being created get their ids noted first."""
-        for task in self._tasks:
+        work = [batch.work for batch in self._batches.values()]
+        for task in work:
             task.cancel()
-        await asyncio.gather(*self._tasks, *self._creations, return_exceptions=True)
+        await asyncio.gather(*work, *self._creations, return_exceptions=True)
         await self._journal.tidy()
 
     def _open(self, model: str | None = None) -> list[Batch]:
-        """Return the batches that may bring results yet: they take room at their provider."""
-        return [
-            batch
-            for batch in self._batches.values()
-            if batch.is_open and model in (None, batch.note.model)
-        ]
+        """Return the batches that have not ended: they take room at their provider."""
+        every = self._batches.values()
+        return [b for b in every if not b.work.done() and model in (None, b.note.model)]
+
+    async def _next_round(self, line: Line) -> Batch:
+        line.batch = asyncio.get_running_loop().create_future()
+        self._forming.append(line)
+        return await line.batch
 
     def _close_round(self) -> None:
         groups: defaultdict[tuple[str, str], list[Line]] = defaultdict(list)
         for line in self._forming:
-            groups[line.model, line.ledger].append(line)
+            if not line.batch.done():  # somebody waits for it yet
+                groups[line.model, line.paid.ledger.scope].append(line)
         self._forming = []
-        for (model, _), lines in groups.items():
-            crowd = self._crowds.get(model)
-            if crowd and self._open(model):
-                self._forming += lines
-                continue
-            most = crowd.calls if crowd else MOST_CALLS
-            parts = [*_parts(lines, self.services[model], most)]
-            now, later = (parts[:1], parts[1:]) if crowd else (parts, [])
-            for part in now:
-                batch = _batch_of(part)
-                self._start(self._begin(batch), batch)
-            self._forming += itertools.chain.from_iterable(later)
+        for (model, ledger), lines in groups.items():
+            most = self._most.get(model, MOST_CALLS)
+            parts = [lines[at : at + most] for at in range(0, len(lines), most)]
+            if model in self._most:
+                later = parts if self._open(model) else parts[1:]
+                parts = parts[: len(parts) - len(later)]
+                self._forming += itertools.chain.from_iterable(later)
+            for part in parts:
+                note = OpenBatch(
+                    mark=secrets.token_hex(16),
+                    model=model,
+                    ledger=ledger,
+                    submitted_at=datetime.now(UTC),
+                    lines={line.key: len(line.call.attempts) + 1 for line in part},
+                )
+                batch = Batch(note)
+                self._start(batch, self._submit(batch, part))
+                for line in part:
+                    line.batch.set_result(batch)
 
-    def _start(self, work: Coroutine[Any, Any, None], batch: Batch) -> None:
+    def _start(self, batch: Batch, work: Coroutine[Any, Any, None]) -> None:
         """Do something for a batch in a task of its own; what it raises is raised for its lines."""
 
         async def do() -> None:
@@ -235,68 +263,59 @@ class Rounds:
                 await work
             except BatchFailed as exc:
                 self._lost(batch, exc)
-            except Exception as error:  # noqa: BLE001 # it reaches the calls
-                batch.fail(error)
 
-        task = asyncio.create_task(do())
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        batch.work = asyncio.create_task(do())
+        self._batches[batch.note.mark] = batch
 
-    async def _begin(self, batch: Batch) -> None:
-        """Note a batch with those of its lines that may begin, and submit it."""
-        lines = batch.lines
+    def _taken_up(self, note: OpenBatch) -> Batch:
+        """Go on with a batch that an earlier run has submitted, or was about to."""
 
-        def begins(key: str) -> bool:
-            line = lines[key]
-            if line.end.done():  # nobody waits for it any more
-                return False
-            return line.open is not None or line.money.set_aside(line.attempts)
+        async def go_on() -> None:
+            if not note.batch_id and not self.services[note.model].takes_mark:
+                why = "the run ended before its id was known"
+                batch.rest = LineEnd(outcome="batch_lost", message=why, unclear=True)
+            elif note.batch_id or await self._arrived(batch):
+                await self._follow(batch)
 
-        batch.note = note = await self._journal.begin(batch.note, begins)
-        for key, line in [*lines.items()]:
-            if key not in note.lines:
-                why = "another run spends from the same cap, and has used it up"
-                lines.pop(key).fails(TrialSuspended(why))
-                continue
-            if line.open is None and not line.end.done():
-                line.money.begun()
-            line.open = OpenLine(note, line.line.attempt)
-        if lines:
-            self._batches[note.mark] = batch
-            await self._submit(batch)
+        if note.mark not in self._batches:
+            batch = Batch(note)
+            self._start(batch, go_on())
+        return self._batches[note.mark]
 
-    async def _submit(self, batch: Batch) -> None:
-        """Create a batch, and follow it to its end."""
-        model = batch.note.model
-        patience_s = OUTAGE_S if model in self._reached else FIRST_S
+    async def _submit(self, batch: Batch, lines: Sequence[Line]) -> None:
+        """Note a batch with those of its lines that may begin, create it, and follow it."""
+        by_key = {line.key: line for line in lines}
+        batch.note = await self._journal.begin(batch.note, lambda key: by_key[key].begins())
+        begun = [by_key[key] for key in batch.note.lines]
+        for line in begun:
+            if line.paid.queued:
+                line.paid.begun()
+        if not begun:
+            return
         try:
-            await self._patiently(batch, partial(self._create, batch), patience_s)
+            await self._patiently(batch, partial(self._create, batch, begun), OUTAGE_S)
         except BatchFailed as exc:
+            model = batch.note.model
             if exc.kind == "lost" and not self.services[model].takes_mark:
-                batch.end("batch_lost", str(exc), unclear=True)
+                batch.rest = LineEnd(None, "batch_lost", str(exc), unclear=True)
             elif exc.kind in ("again", "lost"):
                 # It may be there all the same: the next run looks for it, and nothing is settled.
-                why = (
+                raise ProviderDown(
                     f"{model}: no batch can be submitted ({exc}): nothing else is asked. "
                     "When the service answers again, run the same command"
-                )
-                batch.fail(ProviderDown(why))
-            elif exc.kind == "single" and model not in self._reached:
-                why = f"{model}: there is no batch mode there ({exc}): leave --batch out"
-                batch.end("not_created", why, error=EndpointRefused(why))
+                ) from exc
             else:
                 await self._not_asked(batch, exc, "not_created")
-            return
-        self._reached.add(model)
-        await self._follow(batch)
+        else:
+            await self._follow(batch)
 
-    async def _create(self, batch: Batch) -> None:
+    async def _create(self, batch: Batch, lines: Sequence[Line]) -> None:
         """Create a batch; where its answer is lost, look for it."""
         service = self.services[batch.note.model]
 
         async def create() -> None:
-            lines = [line.line for line in batch.lines.values()]
-            await self._note(batch, batch_id=await service.create(lines, batch.note.mark))
+            requests = [line.call.request for line in lines]
+            await self._note(batch, await service.create(requests, batch.note.mark))
 
         creation = asyncio.create_task(create())
         self._creations.add(creation)
@@ -309,275 +328,114 @@ class Rounds:
             if not (exc.sent and await self._arrived(batch)):
                 raise
 
-    async def _note(self, batch: Batch, **known: object) -> None:
-        batch.note = batch.note.model_copy(update=known)
+    async def _arrived(self, batch: Batch) -> bool:
+        """Look for a batch until its creation, if it was ever sent, must be in effect."""
+        find = partial(self.services[batch.note.model].find, batch.note.mark)
+        for pause_s in (0.0, *ARRIVAL_S):
+            await batch.sleep(pause_s)
+            if (batch_id := await self._patiently(batch, find)) is not None:
+                await self._note(batch, batch_id)
+                return True
+        return False
+
+    async def _note(self, batch: Batch, batch_id: str) -> None:
+        batch.note = batch.note.model_copy(update={"batch_id": batch_id})
         await self._journal.note(batch.note)
+
+    async def _follow(self, batch: Batch) -> None:
+        """Wait for the end of a batch, and read its results until no more can be had."""
+        note, message = batch.note, "the batch has ended without a result for it"
+        ask = partial(self.services[note.model].status, note.batch_id)
+        while not (status := await self._patiently(batch, ask)).ended and not status.failure:
+            pause_s = min(LONGEST_POLL_S, POLL_SHARE * batch.age_s)
+            await batch.sleep(max(SHORTEST_POLL_S, pause_s))
+        if status.failure:
+            await self._not_asked(batch, status.failure, "batch_failed")
+            return
+        try:
+            await self._patiently(batch, partial(self._read, batch), ENDING_S)
+        except BatchFailed as exc:
+            if exc.kind != "again":
+                raise
+            message = str(exc)
+        batch.rest = LineEnd(outcome="no_result", message=message, unclear=True)
+        if note.model in self._most:
+            self._most[note.model] = max(self._most[note.model], 2 * len(note.lines))
+
+    async def _read(self, batch: Batch) -> None:
+        """Take the results of a batch; raises BatchFailed where there should be others."""
+        note, service = batch.note, self.services[batch.note.model]
+        status = await service.status(note.batch_id)
+        if not status.ended:
+            raise BatchFailed("again", "a batch that has ended is said to go on")
+        foreign = broken = 0
+        async for key, raw in service.results(note.batch_id, status):
+            end = LineEnd(raw) if raw else LineEnd(None, "expired", "it was not asked in time")
+            broken += not key
+            foreign += bool(key) and (
+                key not in note.lines or batch.ends.setdefault(key, end) != end
+            )
+        if broken or foreign:
+            self._say(
+                f"{note.model}: {broken + foreign} results of batch {note.batch_id} are ignored: "
+                "they are broken, of none of its calls, or differ from an earlier one"
+            )
+        if len(batch.ends) + broken < min(status.results, len(note.lines)):
+            raise BatchFailed(
+                "again", f"{len(batch.ends)} of the {status.results} results are there"
+            )
 
     async def _not_asked(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
         """End a batch of which the provider asks no line, or let its lines go in smaller ones."""
-        model, lines = batch.note.model, len(batch.note.lines)
+        model, calls = batch.note.model, len(batch.note.lines)
+        is_alone = self._open(model) == [batch]
         error: MergeRunnerError | None = None
-        match exc.kind:
-            case "quota":
-                error = QuotaExhausted(
-                    f"{model}: the account's quota is exhausted ({exc}). Every reply so far is "
-                    "saved; when there is credit again, run the same command to go on."
-                )
-            case "refused":
-                error = EndpointRefused(f"{model}: its batch mode refuses: {exc}")
-            case "smaller" | "again" if await self._try_smaller(batch, exc):
-                return
-            case _:
-                self._say(f"{model}: asked singly, at the full price: {_counted(lines)} ({exc})")
-        batch.end(outcome, str(exc), error=error)
-
-    async def _try_smaller(self, batch: Batch, exc: BatchFailed) -> bool:
-        """Let the lines of a batch go in the next ones, when there may be room for them.
-
-        Returns False where one line was refused so often that there seems to be none.
-        """
-        model, lines = batch.note.model, len(batch.note.lines)
-        if model not in self._crowds:
-            self._say(f"{model}: {_counted(lines)} go in smaller batches: {exc}")
-        crowd = self._crowds.setdefault(model, Crowd())
-        if self._open(model) == [batch]:
-            crowd.refusals += 1
-            crowd.calls = max(1, lines // 2)
-            if lines == 1 and crowd.refusals >= MOST_REFUSALS:
-                return False
-            # It counts as open, so that no other one is submitted meanwhile.
-            await asyncio.sleep(max(exc.delay_s or 0.0, backoff_s(crowd.refusals)))
-        self._form_anew(batch)
-        return True
-
-    def _join(self, line: Line, note: OpenBatch) -> None:
-        batch = self._batches.get(note.mark)
-        if batch is None:  # until it was looked at, its results may be there
-            batch = self._batches[note.mark] = Batch(note, state="reading")
-            self._start(self._take_up(batch), batch)
-        batch.lines[line.key] = line
-        if batch.state == "never":
-            self._form_anew(batch)
-        elif line.key in batch.results:
-            batch.take(batch.results.pop(line.key))
-        elif batch.rest is not None:
-            batch.lines.pop(line.key).ends(batch.rest)
-
-    async def _take_up(self, batch: Batch) -> None:
-        """Go on with a batch that an earlier run has submitted, or was about to."""
-        if not batch.note.batch_id and not self.services[batch.note.model].takes_mark:
-            batch.end("batch_lost", "the run ended before its id was known", unclear=True)
-        elif batch.note.batch_id or await self._arrived(batch):
-            await self._follow(batch)
+        if exc.kind in ("quota", "refused"):
+            kind = QuotaExhausted if exc.kind == "quota" else EndpointRefused
+            error = kind(
+                f"{model}: its batch mode refuses: {exc}. Every reply so far is saved: correct "
+                "that, or leave --batch out, and run the same command to go on"
+            )
+        elif is_alone and calls == 1:
+            self._say(f"{model}: a call is asked singly, at the full price ({exc})")
         else:
-            self._form_anew(batch)
-
-    def _form_anew(self, batch: Batch) -> None:
-        """The lines of a batch that was never created go with the next round."""
-        batch.state = "never"
-        lines, batch.lines = batch.lines, {}
-        for line in lines.values():
-            if self.submits:
-                self._forming.append(line)
-            else:
-                line.ends(LineEnd(outcome="not_created", message="the run ended before"))
-
-    async def _arrived(self, batch: Batch) -> bool:
-        """Look for a batch until its creation, if it was ever sent, must be in effect."""
-        note, waited_s = batch.note, 0.0
-        find = partial(self.services[note.model].find, note.mark, note.submitted_at)
-        while (batch_id := await self._patiently(batch, find)) is None:
-            if waited_s >= ARRIVAL_S:
-                return False
-            pause_s = min(max(1.0, waited_s), ARRIVAL_S - waited_s)
-            await asyncio.sleep(pause_s)
-            waited_s += pause_s
-        await self._note(batch, batch_id=batch_id)
-        return True
-
-    async def _follow(self, batch: Batch) -> None:
-        """Wait for the end of a batch, and hand its results out."""
-        status = await self._ended(batch)
-        if status.state == "ended":
-            await self._hand_out(batch)
-        elif status.state == "failed":
-            failure = BatchFailed(status.failure or "again", status.message)
-            await self._not_asked(batch, failure, "batch_failed")
-
-    async def _ended(self, batch: Batch) -> BatchStatus:
-        """Wait for the end of a batch, which is cancelled in time; not for ever after that."""
-        service = self.services[batch.note.model]
-        while (status := await self._look(batch)).state == "waiting":
-            cancelled_at = batch.note.cancelled_at
-            if cancelled_at is None and batch.age_s >= ROUND_DEADLINE_S:
-                await self._patiently(batch, partial(service.cancel, batch.note.batch_id))
-                await self._note(batch, cancelled_at=datetime.now(UTC))
-                self._say(
-                    f"{batch.note.model}: batch {batch.note.batch_id} has waited for "
-                    f"{_duration(batch.age_s)} and is cancelled: what it has answered is taken, "
-                    "the rest is asked singly"
-                )
-            elif cancelled_at and _s_ago(cancelled_at) > ENDING_S:
-                moment = f"{cancelled_at:%Y-%m-%d %H:%M:%S} UTC"
-                why = f"the batch was cancelled at {moment} and does not end"
-                self._say(f"{batch.note.model}: {why}: its calls are asked singly")
-                batch.end("no_result", why, unclear=True)
-                break
-            pause_s = min(LONGEST_POLL_S, POLL_SHARE * batch.age_s)
-            await asyncio.sleep(max(SHORTEST_POLL_S, pause_s))
-        return status
-
-    async def _look(self, batch: Batch) -> BatchStatus:
-        """Ask for the state of a batch; one that was seen to have ended has ended."""
-        service = self.services[batch.note.model]
-        status = await self._patiently(batch, partial(service.status, batch.note.batch_id))
-        if batch.status is None or batch.status.state == "waiting" or status.state == "ended":
-            batch.status = status
-        batch.state = "reading" if batch.status.state == "ended" else "waiting"
-        return batch.status
-
-    async def _hand_out(self, batch: Batch) -> None:
-        """Read the results of a batch until there is one for each call, or no more can be had."""
-        ended_at = batch.note.ended_at or datetime.now(UTC)
-        await self._note(batch, ended_at=ended_at)
-        why, patience_s = "", max(0.0, ENDING_S - _s_ago(ended_at))
-        try:
-            await self._patiently(batch, partial(self._read, batch), patience_s)
-        except BatchFailed as exc:
-            if exc.kind not in ("again", "single"):
-                raise
-            why = str(exc)
-            self._say(f"{batch.note.model}: {why}")
-        # What a cancelled batch does not tell of was not asked, if all was read.
-        unclear = bool(why) or batch.note.cancelled_at is None
-        batch.end(
-            "no_result", why or "the batch has ended without a result for it", unclear=unclear
-        )
-        if crowd := self._crowds.get(batch.note.model):
-            crowd.calls, crowd.refusals = max(crowd.calls, 2 * len(batch.note.lines)), 0
-
-    async def _read(self, batch: Batch) -> None:
-        """Give each result to its call; raises BatchFailed where there should be others."""
-        note, status = batch.note, await self._look(batch)
-        foreign, wrong = 0, []
-        results = self.services[note.model].results(note.batch_id, status, len(note.lines))
-        async for result in results:
-            if isinstance(result, Unreadable):
-                wrong.append(result.why)
-            else:
-                foreign += not batch.take(result)
-        if foreign:
-            self._say(
-                f"{note.model}: {foreign} results of batch {note.batch_id} are ignored: they are "
-                "of none of its calls, or differ from an earlier one"
-            )
-        if len(batch.seen) == len(note.lines):
+            if model not in self._most:
+                self._say(f"{model}: {calls} calls go in smaller batches: {exc}")
+            self._most[model] = max(1, calls // 2) if is_alone else calls
+            # It counts as open, so that no other one is submitted meanwhile.
+            await batch.sleep(exc.delay_s or 1.0)
             return
-        if wrong:  # one may have been broken on its way: all are read twice
-            kind: FailureKind = "single" if batch.is_broken else "again"
-            batch.is_broken = True
-            which = "a result" if len(wrong) == 1 else f"{len(wrong)} results"
-            raise BatchFailed(kind, f"{which} of the batch cannot be used: {wrong[0]}")
-        if len(batch.seen) < status.results:
-            raise BatchFailed(
-                "again", f"{len(batch.seen)} of the {status.results} results are there"
-            )
+        batch.rest = LineEnd(None, outcome, str(exc), error=error)
 
     def _lost(self, batch: Batch, exc: BatchFailed) -> None:
         """End a batch that cannot be read: what was set aside for it stays so."""
         note = batch.note
         # A key that is refused is another account's, perhaps: there the batch goes on.
-        gives_up = not self.submits and exc.kind not in ("refused", "quota")
-        if note.model in self._free or gives_up:
-            batch.end("batch_lost", str(exc), unclear=True)
+        if self.services[note.model].forgets or (not self.submits and exc.kind == "lost"):
+            batch.rest = LineEnd(outcome="batch_lost", message=str(exc), unclear=True)
             return
-        error = EndpointRefused(
+        raise EndpointRefused(
             f"{note.model}: {note.batch_id} is refused to this key ({exc}): set the key of the "
             "account that has submitted it. If it is gone, the same command without --batch asks "
             "its calls anew"
-        )
-        batch.fail(error)
+        ) from exc
 
     async def _patiently(
-        self,
-        batch: Batch,
-        ask: Callable[[], Awaitable[T]],
-        patience_s: float = math.inf,
+        self, batch: Batch, ask: Callable[[], Awaitable[T]], patience_s: float = math.inf
     ) -> T:
         """Ask until a provider answers that may only be down; raises BatchFailed for anything else.
 
         A batch waits for a day: whoever waits for it can wait for its provider.
         """
         clock_s = asyncio.get_running_loop().time
-        began_s = clock_s()
-        for tries in itertools.count(1):
+        began_s, tries = clock_s(), 0
+        while True:
             try:
                 return await ask()
             except BatchFailed as exc:
                 if exc.kind != "again" or clock_s() - began_s > patience_s:
                     raise
-                # Meanwhile nothing of the batch is on its way.
-                state, batch.state = batch.state, "waiting"
-                if tries == 1:
+                if not tries:
                     self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
-                await asyncio.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
-                batch.state = state
-        raise AssertionError("unreachable: it counts for ever")
-
-    def _described(self, batch: Batch) -> str:
-        note, status = batch.note, batch.status
-        most = max(self._most_rounds, note.number)
-        done = (
-            f", {status.done} of {status.total} done"
-            if status is not None and status.done is not None and status.total
-            else ""
-        )
-        where = f"in batch {note.batch_id}" if note.batch_id else "in a batch that is submitted"
-        return (
-            f"round {note.number} of at most {most}: {_counted(len(note.lines))} of {note.model} "
-            f"{where} since {note.submitted_at:%H:%M:%S} UTC ({_duration(batch.age_s)}){done}"
-        )
-
-
-def _batch_of(lines: Sequence[Line]) -> Batch:
-    """A new batch of lines of one model, whose money is in one ledger."""
-    note = OpenBatch(
-        mark=secrets.token_hex(16),
-        model=lines[0].model,
-        ledger=lines[0].ledger,
-        number=1 + max(line.line.request.slot.decision for line in lines),
-        submitted_at=datetime.now(UTC),
-        lines={line.key: line.line.attempt for line in lines},
-    )
-    return Batch(note, {line.key: line for line in lines})
-
-
-def _parts(lines: Iterable[Line], service: BatchService, most: int) -> Iterator[list[Line]]:
-    """The lines in order, in as few batches of at most so many as may be."""
-    part: list[Line] = []
-    filled = 0
-    for line in lines:
-        size = len(service.line(line.line)) + 1
-        if part and (len(part) == most or filled + size > service.most_bytes):
-            yield part
-            part, filled = [], 0
-        part.append(line)
-        filled += size
-    if part:
-        yield part
-
-
-def _s_ago(moment: datetime) -> float:
-    return (datetime.now(UTC) - moment).total_seconds()
-
-
-def _counted(calls: int) -> str:
-    return "1 call" if calls == 1 else f"{calls} calls"
-
-
-def _duration(seconds: float) -> str:
-    """A duration for a reader, such as 1:05 h or 40 s."""
-    if seconds < 60:
-        return f"{seconds:.0f} s"
-    minutes = timedelta(seconds=seconds) // timedelta(minutes=1)
-    return f"{minutes} min" if minutes < 60 else f"{minutes // 60}:{minutes % 60:02} h"
+                tries += 1
+                await batch.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))

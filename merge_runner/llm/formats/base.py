@@ -78,13 +78,10 @@ class WireFormat(ABC):
 
     parameters: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Parameters that a study may vary, by common names: where each stands in an entry's own."""
-
     members: ClassVar[frozenset[str]]
     """Members of a body: an answer has at least one of them, whatever it says."""
-
     headers: ClassVar[Mapping[str, str]] = {}
     """Headers that every request to a batch mode has, since they change its meaning."""
-
     retries_empty: ClassVar[bool] = False
     """Whether an empty answer is a known fault of the service that asking again may mend."""
 
@@ -105,11 +102,6 @@ class WireFormat(ABC):
         return None
 
 
-def plain(*names: str) -> dict[str, tuple[str, ...]]:
-    """Return parameters that stand at the top, under their common names."""
-    return {name: (name,) for name in names}
-
-
 def outcome_of(
     text: str, *, failed: object = False, truncated: bool = False, refused: bool = False
 ) -> str:
@@ -124,6 +116,16 @@ def outcome_of(
     if truncated:
         return "truncated"
     return "ok" if text.strip() else "empty"
+
+
+def at(value: object, path: str) -> Any:  # noqa: ANN401 # whatever JSON holds there
+    """Return the JSON at a path such as ``choices.0.message``, None where there is none."""
+    for name in path.split("."):
+        if isinstance(value, list):
+            value = next(iter(value), None) if name == "0" else None
+        else:
+            value = as_dict(value).get(name)
+    return value
 
 
 def as_dict(value: object) -> dict[str, Any]:
@@ -163,32 +165,15 @@ def as_count(value: object) -> int | None:
     return value if type(value) is int and 0 <= value <= MOST_TOKENS else None
 
 
-def total(*counts: int | None) -> int | None:
-    """Return the sum of the counts that are there; None if none is."""
-    known = [count for count in counts if count is not None]
-    return sum(known) if known else None
-
-
 def read_error(status: int, headers: Mapping[str, str], body: str, payload: object) -> ServerError:
     """Read an error body of any known shape; one that is no JSON is its own message."""
     top = as_dict(payload)
-    nested = top.get("error")
-    if nested is None:
-        nested = first_of(top.get("choices")).get("error")
+    nested = top.get("error") if top.get("error") is not None else at(top, "choices.0.error")
     error = as_dict(nested) or ({"message": nested} if isinstance(nested, str) else top)
-    details = error.get("details")
-    listed = as_dicts(details) or [as_dict(details)]
-    names = {
-        str(name)
-        for name in (
-            error.get("type"),
-            error.get("code"),
-            error.get("status"),
-            *(detail.get("error_code") for detail in listed),
-            *(detail.get("reason") for detail in listed),
-        )
-        if name is not None
-    }
+    details = as_dicts(error.get("details")) or [as_dict(error.get("details"))]
+    names = [error.get(name) for name in ("type", "code", "status")]
+    names += [detail.get(name) for detail in details for name in ("error_code", "reason")]
     # It reaches a user as one line; Gemini's has several.
     message = " ".join((as_text(error.get("message")) or body[:200]).split())
-    return ServerError(status, headers, body, message, frozenset(names), tuple(listed))
+    known = frozenset(str(name) for name in names if name is not None)
+    return ServerError(status, headers, body, message, known, tuple(details))

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from contextlib import suppress
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from typing import TypeGuard
+from math import inf
 
 from merge_runner.llm.formats.base import ServerError, WireFormat
 
-_UNIT_S = {"ms": 0.001, "s": 1, "m": 60, "h": 3600, "d": 86400}
+# The seconds of a unit by its first letter; milliseconds apart.
+_UNIT_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 # 1.574s and 5m, but also 5 minutes.
 _PART = (
     r"(\d+(?:\.\d+)?)\s*"
@@ -35,41 +37,32 @@ def server_delay_s(
     """
     in_text = _IN_TEXT.search(error.message)
     candidates = (
-        _longest(error.headers.get("retry-after-ms", ""), lambda text: float(text) / 1000),
-        _longest(error.headers.get("retry-after", ""), lambda text: _retry_after_s(text, now)),
-        *(wire.delay_s(error) for wire in formats),
-        _duration_s(in_text[1]) if in_text else None,
+        _longest_s(error.headers.get("retry-after-ms", ""), 0.001, now),
+        _longest_s(error.headers.get("retry-after", ""), 1, now),
+        *(wire.delay_s(error) or 0.0 for wire in formats),
+        _duration_s(in_text[1]) if in_text else 0.0,
     )
-    return next((min(delay, MOST_S) for delay in candidates if _is_usable(delay)), None)
+    return next((min(delay, MOST_S) for delay in candidates if 0 < delay < inf), None)
 
 
-def _is_usable(delay_s: float | None) -> TypeGuard[float]:
-    return delay_s is not None and 0 < delay_s < float("inf")
-
-
-def _longest(header: str, read: Callable[[str], float]) -> float | None:
-    delays = []
+def _longest_s(header: str, unit_s: float, now: datetime | None) -> float:
+    """Return the longest usable delay among the values of a header, 0 if there is none."""
+    delays = [0.0]
     for text in _LISTED.findall(header):
-        try:
-            delays.append(read(text))
-        except (ValueError, OverflowError):  # the latter: a zone beyond the first or last date
+        with suppress(ValueError):
+            delays.append(float(text) * unit_s)
             continue
-    return max(filter(_is_usable, delays), default=None)
+        with suppress(ValueError, OverflowError):  # the latter: beyond the first or last date
+            moment = parsedate_to_datetime(text)
+            aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+            delays.append((aware - (now or datetime.now(UTC))).total_seconds())
+    return max(delay for delay in delays if 0 <= delay < inf)
 
 
 def _duration_s(text: str) -> float:
     """Return the seconds of ``6m0s``, ``1h30m``, ``120ms`` or ``5 minutes``."""
-    parts = [(number, unit.lower()) for number, unit in _PARTS.findall(text)]
+    parts = [(float(number), unit.lower()) for number, unit in _PARTS.findall(text)]
     return sum(
-        float(number) * _UNIT_S["ms" if unit.startswith(("ms", "milli")) else unit[0]]
+        number * (0.001 if unit.startswith(("ms", "milli")) else _UNIT_S[unit[0]])
         for number, unit in parts
     )
-
-
-def _retry_after_s(text: str, now: datetime | None) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        moment = parsedate_to_datetime(text)
-    aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    return (aware - (now or datetime.now(UTC))).total_seconds()

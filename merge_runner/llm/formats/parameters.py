@@ -11,14 +11,6 @@ from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.formats import FORMATS
 
 CAP, EFFORT = "max_output_tokens", "reasoning_effort"
-# From the least to the most that any provider takes.
-RANGES = {
-    "temperature": (0, 2),
-    "top_p": (0, 1),
-    "min_p": (0, 1),
-    "presence_penalty": (-2, 2),
-    "frequency_penalty": (-2, 2),
-}
 
 
 def known_parameters(entries: Iterable[ModelEntry]) -> set[str]:
@@ -39,42 +31,24 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
         if type(level) is not int or level < 1:
             raise UsageError(f"{CAP} is a whole number from 1")
         return entry.model_copy(update={CAP: level})
-    _check_range(parameter, level)
     if parameter == EFFORT and entry.efforts:
-        return _with_effort(name, entry, level)
+        if level not in entry.efforts:
+            raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)
+        chosen = {**entry.parameters, **entry.efforts[str(level)]}
+        return entry.model_copy(update={"parameters": chosen})
+    defaults = entry.applied_defaults
     unset = parameter not in entry.parameters
-    if unset and parameter in entry.applied_defaults and entry.applied_defaults[parameter] == level:
+    if unset and parameter in defaults and defaults[parameter] == level:
         return entry
     places = FORMATS.require(entry.format).parameters
     takes = {*places, *PROVIDERS.require(entry.provider).parameters, *entry.parameters, CAP}
     takes -= {*entry.rejects}
     if parameter not in takes:
-        defaults = ", ".join(
-            f"{n} = {v}" for n, v in entry.applied_defaults.items() if n in entry.rejects
-        )
-        raise UsageError(
-            f"{name} takes no parameter {parameter}"
-            + (f" but its default ({defaults})" if parameter in entry.applied_defaults else "")
-            + f"; valid: {', '.join(sorted(takes))}"
-        )
-    return entry.model_copy(
-        update={"parameters": _set(entry.parameters, places.get(parameter, (parameter,)), level)}
-    )
-
-
-def _check_range(parameter: str, level: JsonValue) -> None:
-    if parameter not in RANGES:
-        return
-    low, high = RANGES[parameter]
-    if isinstance(level, bool | str | list | dict) or level is None or not low <= level <= high:
-        raise UsageError(f"{parameter} = {level!r} is no number from {low} to {high}")
-
-
-def _with_effort(name: str, entry: ModelEntry, level: JsonValue) -> ModelEntry:
-    if level not in entry.efforts:
-        raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)
-    parameters = {**entry.parameters, **entry.efforts[str(level)]}
-    return entry.model_copy(update={"parameters": parameters})
+        default = f" but its default ({defaults[parameter]})" if parameter in defaults else ""
+        valid = ", ".join(sorted(takes))
+        raise UsageError(f"{name} takes no parameter {parameter}{default}; valid: {valid}")
+    place = places.get(parameter, (parameter,))
+    return entry.model_copy(update={"parameters": _set(entry.parameters, place, level)})
 
 
 def _set(

@@ -1,4 +1,4 @@
-"""What is kept in the database: equal to what is computed anew, and renewed when it must be."""
+"""What is kept beside the database: equal to what is computed anew, and renewed when it must be."""
 
 from __future__ import annotations
 
@@ -19,15 +19,8 @@ from analysis.tables import TABLES, finished_tables, make_tables
 from analysis.tables.formats import render
 from analysis.tables.model import from_text, to_text
 from merge_runner.errors import UsageError
-from merge_runner.results.store import results_digest
 from tests.analysis.studies import write_study, yielding
 
-HOLDER = """
-import sys, duckdb
-connection = duckdb.connect(sys.argv[1], read_only=True)
-print("held", flush=True)
-sys.stdin.read()
-"""
 # Changes of the results that tables show, and one of each table that they are made of.
 CHANGES = {
     "a speed": "UPDATE states SET velocity_mps = velocity_mps + 1e-9 "
@@ -127,14 +120,10 @@ def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, 
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
-def test_what_is_kept_is_no_result(db):
-    before = results_digest(db)
+def test_what_is_kept_is_not_in_the_database(db):
+    before = db.read_bytes()
     finished_tables(db, None, ["velocity-profiles"])
-    state = present_state(db)
-    finished_tables(db, None, ["gap"])
-    assert results_digest(db) == before
-    assert present_state(db) == state
+    assert db.read_bytes() == before
 
 
 def test_tables_of_results_that_changed_meanwhile_are_not_kept(db):
@@ -163,19 +152,14 @@ def test_a_study_that_was_read_before_a_change_takes_no_table_of_the_later_state
     assert made == ["attempts", "attempts"]
 
 
-@pytest.mark.slow
-def test_beside_another_program_tables_are_made_and_not_kept(db, made, caplog):
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(db)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as holder:
-        assert holder.stdout.readline() == b"held\n"
-        held = finished_tables(db, None, ["velocity-profiles"])
-        assert "is not kept for the next time" in caplog.text
-        holder.communicate()
-    free = finished_tables(db, None, ["velocity-profiles"])
-    assert finished_tables(db, None, ["velocity-profiles"])
+def test_what_cannot_be_kept_is_made_and_said_once(db, made, caplog):
+    before = db.read_bytes()
+    db.with_name(f"{db.name}.derived").mkdir()
+    for _ in range(2):
+        assert finished_tables(db, None, ["velocity-profiles"])
     assert made == ["velocity-profiles"] * 2
-    assert to_text(held[0]) == to_text(free[0])
+    assert caplog.text.count("is not kept for the next time") == 1
+    assert db.read_bytes() == before
 
 
 def test_a_figure_is_not_taken_for_the_table_of_its_name(db, monkeypatch):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from analysis.data.driver_words import stand_in
 from analysis.data.load import load
 from analysis.data.provenance import provenance
 from analysis.data.study import Study
@@ -18,7 +19,6 @@ from analysis.report.alarms import alarms
 from analysis.tables import make_tables
 from analysis.tables.formats import value_rows
 from merge_runner.config import both_sides
-from merge_runner.drivers.registry import stand_in
 from merge_runner.errors import UsageError
 from tests.analysis.studies import changed, write_study, yielding
 

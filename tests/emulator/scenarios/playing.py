@@ -6,16 +6,17 @@ import asyncio
 import json
 from contextlib import asynccontextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from aiohttp import web
 
 from merge_runner.chance import draw
-from merge_runner.emulator.faults import FaultPlan
-from merge_runner.emulator.server import HOST, application
+from merge_runner.emulator.server import HOST
 from merge_runner.records import SCRIPTED_FIELD
 from tests.emulator.scenarios import SCENARIOS
 from tests.emulator.scenarios.base import Scene
+from tests.mock_server import FaultPlan, application
 
 # Of the request that is being answered: its format, and what is played to it.
 FORMAT: ContextVar[str] = ContextVar("format")
@@ -28,6 +29,7 @@ ENDINGS = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
 class ScenarioPlan(FaultPlan):
     """Plays a scenario with a probability, or on the first attempt alone.
 

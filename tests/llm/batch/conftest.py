@@ -6,10 +6,10 @@ import pytest
 from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry
-from merge_runner.emulator.server import serve
-from merge_runner.llm.batch.terms import SERVICES
+from merge_runner.llm.batch.providers import SERVICES
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
+from tests.mock_server import serve
 
 # What stands before the paths of a provider: OpenAI's version belongs to its base URL.
 PROVIDERS = {

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cache
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.llm.batch.service import BatchLine
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.prompts.render import render_prompt
@@ -24,7 +23,7 @@ def prompt(condition):
 
 
 def lines(form, count=11, *, provider=None, first=0):
-    """So many different lines, each of another slot."""
+    """So many different requests, each of another slot."""
     conditions = list(CONDITIONS)
     entry = entry_of(form, provider)
     made = []
@@ -41,7 +40,7 @@ def lines(form, count=11, *, provider=None, first=0):
             body=wire.body,
             slot=Slot(condition, repetition, "left", 0, 0),
         )
-        made.append(BatchLine(request))
+        made.append(request)
     return made
 
 

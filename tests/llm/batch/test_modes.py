@@ -1,20 +1,15 @@
-"""Which models have a batch mode, and how lines are parted."""
+"""Which models have a batch mode, and at what price."""
 
 from __future__ import annotations
 
 import re
-from types import SimpleNamespace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from merge_runner.config import PROVIDERS, BatchTerms
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.rounds import _parts
-from merge_runner.llm.batch.terms import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http import split_lines
 from merge_runner.llm.models import load_models
 from tests.llm.batch.conftest import entry_of
 from tests.llm.batch.lines import lines
@@ -63,30 +58,3 @@ def test_a_model_without_a_batch_mode_is_refused_with_the_valid_ones():
 def test_a_key_is_an_id_that_every_provider_takes(form):
     for line in lines(form, 3):
         assert re.fullmatch("[a-zA-Z0-9_-]{1,64}", line.key)
-
-
-@given(st.lists(st.integers(1, 60)), st.integers(1, 7), st.integers(60, 200))
-def test_lines_are_parted_in_order_into_as_few_batches_as_fit(sizes, most_lines, most_size):
-    service = SimpleNamespace(line=bytes, most_bytes=most_size)
-    waiting = [SimpleNamespace(line=size) for size in sizes]
-    parts = list(_parts(waiting, service, most_lines))
-    assert [line for part in parts for line in part] == waiting
-    # With a byte between two of them.
-    totals = [sum(line.line + 1 for line in part) for part in parts]
-    assert all(len(part) <= most_lines for part in parts)
-    assert all(total <= most_size for total, part in zip(totals, parts, strict=True) if part[1:])
-    for part, total, following in zip(parts, totals, parts[1:], strict=False):
-        assert len(part) == most_lines or total + following[0].line + 1 > most_size
-
-
-@given(st.lists(st.text(alphabet="ab\u2028\u00e9", max_size=9)), st.data())
-async def test_lines_are_the_same_however_a_body_is_cut(texts, data):
-    texts = texts or [""]
-    body = "\n".join(texts).encode()
-    cuts = data.draw(st.lists(st.integers(0, len(body)), max_size=5).map(sorted))
-
-    async def chunks():
-        for start, end in zip([0, *cuts], [*cuts, len(body)], strict=True):
-            yield body[start:end]
-
-    assert [line async for line in split_lines(chunks(), 100)] == [text.encode() for text in texts]

@@ -24,10 +24,9 @@ from merge_runner.errors import (
     ProviderDown,
     QuotaExhausted,
 )
-from merge_runner.llm.batch.journal import Journal, OpenBatch
-from merge_runner.llm.batch.lines import Batches
-from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.batch.service import BatchFailed, BatchStatus, LineResult, Unreadable
+from merge_runner.llm.batch.journal import Journal
+from merge_runner.llm.batch.rounds import Batches, Rounds
+from merge_runner.llm.batch.service import BatchFailed, BatchStatus
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
@@ -61,8 +60,8 @@ class Memory:
     before the usual.
     """
 
-    most_bytes = 10**6
     takes_mark = True
+    forgets = False
 
     def __init__(self):
         self.batches = {}
@@ -70,11 +69,7 @@ class Memory:
         self.fates = {}
         self.creations = []
         self.states = []
-        self.cancelled = []
         self.answered = Counter()
-
-    def line(self, line):
-        return b"line"
 
     async def create(self, lines, mark):
         step = self.creations.pop(0) if self.creations else None
@@ -87,30 +82,27 @@ class Memory:
             raise step
         return batch_id
 
-    async def find(self, mark, since):
+    async def find(self, mark):
         return next((each for each, its in self.marks.items() if its == mark), None)
 
     async def status(self, batch_id):
         if batch_id not in self.batches:
             raise BatchFailed("lost", "HTTP 404: no such batch", sent=False)
-        step = self.states.pop(0) if self.states else BatchStatus("ended")
+        step = self.states.pop(0) if self.states else BatchStatus(ended=True)
         if isinstance(step, BatchFailed):
             raise step
         return step
 
-    async def results(self, batch_id, status, calls):
+    async def results(self, batch_id, status):
         for line in reversed(self.batches[batch_id]):
-            repetition = line.request.slot.repetition
+            repetition = line.slot.repetition
             fates = self.fates.get(repetition, [])
             fate = fates.pop(0) if fates else answer(f"batched {repetition}")
             if fate == "missing":
                 continue
             if fate is not None and fate.status == 200:
                 self.answered[line.key] += 1
-            yield LineResult(line.key, fate, "" if fate else "it has expired")
-
-    async def cancel(self, batch_id):
-        self.cancelled.append(batch_id)
+            yield line.key, fate
 
     @property
     def sizes(self):
@@ -145,8 +137,6 @@ class Run:
             Journal(cache),
             {"m": service},
             submits=submits,
-            most_rounds=30,
-            free={"m"} if price == "free" else set(),
             say=self.said.append,
         )
         self.ledger = Ledger(cache, scope)
@@ -162,7 +152,7 @@ class Run:
             transport=self.alone,
             limiter=Limiter(),
             budget=budget,
-            batches=Batches(self.rounds, "m", scope, budget, 0.5),
+            batches=Batches(self.rounds, "m", budget, 0.5),
         )
 
     async def ask(self, repetitions=1, decision=0):
@@ -219,14 +209,14 @@ async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
     class Watching(Memory):
         async def create(self, lines, mark):
             aside.append(run.ledger.read().reserved_usd)
-            self.size = len(lines[0].request.body.encode())
+            self.size = len(lines[0].body.encode())
             return await super().create(lines, mark)
 
     aside = []
     service = Watching()
     run = Run(cache, service)
     await run.ask(3)
-    bytes_of_one = len(service.batches["batch-0"][0].request.body.encode())
+    bytes_of_one = len(service.batches["batch-0"][0].body.encode())
     assert aside == [pytest.approx(3 * (bytes_of_one + 100 * 100.0) / 1e6 / 2)]
 
 
@@ -293,7 +283,7 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cac
 @in_virtual_time
 async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
     service = Memory()
-    service.states = [BatchStatus("failed", message="enqueued", failure="smaller")]
+    service.states = [BatchStatus(ended=False, failure=BatchFailed("smaller", "enqueued"))]
     run = Run(cache, service)
     replies = await run.ask(4)
     assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
@@ -304,23 +294,12 @@ async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves
 @in_virtual_time
 async def test_where_no_batch_mode_is_at_the_first_creation_the_run_ends(cache):
     service = Memory()
-    service.creations = [BatchFailed("single", "HTTP 404", sent=False)]
+    service.creations = [BatchFailed("refused", "HTTP 404", sent=False)]
     run = Run(cache, service)
     (first, *_) = await run.ask(3)
     assert (type(first), first.exit_code) == (EndpointRefused, 2)
     assert "leave --batch out" in str(first)
     assert (run.alone.asked, run.ledger.read().committed_usd) == ([], 0.0)
-
-
-@in_virtual_time
-async def test_where_the_batch_mode_is_gone_later_everything_is_asked_alone(cache):
-    service = Memory()
-    service.creations = [None, BatchFailed("single", "HTTP 404", sent=False)]
-    run = Run(cache, service)
-    await run.ask(3)
-    replies = await run.ask(3, decision=1)
-    assert texts(replies) == ["alone 1", "alone 2", "alone 3"]
-    assert replies[0].attempts[0].cost_usd == 0.0
 
 
 @in_virtual_time
@@ -343,7 +322,7 @@ async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache,
 
 async def left_behind(cache, service, repetitions=1, **options):
     """A run that is interrupted while a batch waits."""
-    service.states = [BatchStatus("waiting")] * 1000
+    service.states = [BatchStatus(ended=False)] * 1000
     run = Run(cache, service, **options)
     asking = asyncio.create_task(run.ask(repetitions))
     await asyncio.sleep(5)
@@ -354,17 +333,11 @@ async def left_behind(cache, service, repetitions=1, **options):
     return run
 
 
-@pytest.fixture
-def no_patience(monkeypatch):
-    """Every batch that waits is over its time."""
-    monkeypatch.setattr("merge_runner.llm.batch.rounds.ROUND_DEADLINE_S", 0.0)
-
-
 @in_virtual_time
 async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
     class Slow(Memory):
         async def status(self, batch_id):
-            return BatchStatus("waiting" if batch_id == "batch-0" else "ended")
+            return BatchStatus(ended=batch_id != "batch-0")
 
     service = Slow()
     service.creations = [None, BatchFailed("again", "HTTP 504")]
@@ -397,32 +370,14 @@ async def test_a_creation_that_comes_into_effect_late_is_not_repeated(cache):
 
 
 @in_virtual_time
-async def test_a_single_line_that_finds_no_room_is_asked_alone_after_a_few_tries(cache):
+async def test_a_single_line_that_finds_no_room_is_asked_alone(cache):
     service = Memory()
     service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 1000
     run = Run(cache, service)
     (reply,) = await asyncio.wait_for(run.ask(), 120)
     assert reply.text == "alone 1"
-    assert len(service.creations) > 990
-    assert len(run.said) == 2
-
-
-@pytest.mark.usefixtures("no_patience")
-@in_virtual_time
-async def test_what_a_cancelled_batch_answered_unreadably_stays_set_aside(cache):
-    class Broken(Memory):
-        async def results(self, batch_id, status, calls):
-            yield Unreadable("line 1 is no JSON")
-            yield Unreadable("line 2 is no JSON")
-
-    service = Broken()
-    service.states = [BatchStatus("waiting")]
-    run = Run(cache, service)
-    (reply,) = await run.ask()
-    assert service.cancelled == ["batch-0"]
-    assert run.said[-1] == "m: 2 results of the batch cannot be used: line 1 is no JSON"
-    assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
-    assert run.ledger.read().open_attempts == 1
+    assert len(service.creations) == 999
+    assert len(run.said) == 1
 
 
 @in_virtual_time
@@ -444,21 +399,18 @@ async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
     assert len(service.creations) == 1
 
 
-@pytest.mark.parametrize("shown", [[], [Unreadable("line 1 is no JSON")]])
 @in_virtual_time
-async def test_results_that_are_broken_or_fewer_than_the_provider_counts_are_read_again(
-    cache, shown
-):
+async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(cache):
     class Late(Memory):
         looks = 0
 
         async def status(self, batch_id):
-            return BatchStatus("ended", results=3)
+            return BatchStatus(ended=True, results=3)
 
-        async def results(self, batch_id, status, calls):
+        async def results(self, batch_id, status):
             self.looks += 1
-            whole = [each async for each in super().results(batch_id, status, calls)]
-            for result in whole if self.looks > 1 else [whole[0], *shown]:
+            whole = [each async for each in super().results(batch_id, status)]
+            for result in whole if self.looks > 1 else whole[:1]:
                 yield result
 
     service = Late()
@@ -468,7 +420,7 @@ async def test_results_that_are_broken_or_fewer_than_the_provider_counts_are_rea
 
 
 class WithoutResults(Memory):
-    async def results(self, batch_id, status, calls):
+    async def results(self, batch_id, status):
         raise BatchFailed("again", "HTTP 503")
         yield
 
@@ -486,57 +438,30 @@ async def test_an_answer_whose_money_was_released_is_spent_and_is_no_overrun(cac
     assert not run.client.meter.notes
 
 
-async def note(cache, **known):
-    """Change what the journal knows of its only batch."""
-    journal = Journal(cache)
-    (batch,) = journal.batches()
-    await journal.note(batch.model_copy(update=known))
-
-
-def test_a_batch_that_an_earlier_version_has_noted_is_read():
-    told = {"mark": "k", "model": "m", "ledger": "l", "number": 1, "lines": {"key": 1}}
-    times = {"submitted_at": NOON, "cancelled_at": "", "ended_at": ""}
-    batch = OpenBatch.model_validate_json(json.dumps({**told, **times, "batch_id": "b"}))
-    assert batch.submitted_at == datetime.fromisoformat(NOON)
-    assert (batch.cancelled_at, batch.ended_at) == (None, None)
-
-
-NOON = "2026-11-22T12:00:00.000+00:00"
-HOURS_AGO = datetime.now(UTC) - timedelta(hours=5)
-
-
-class Endless(Memory):
-    looks = 0
-
-    async def status(self, batch_id):
-        self.looks += 1
-        return BatchStatus("waiting")
-
-
-@pytest.mark.parametrize(("ended_at", "least_s"), [(None, 3500), (HOURS_AGO, 0)])
 @in_virtual_time
-async def test_results_that_never_come_are_waited_for_an_hour_over_all_runs(
-    cache, ended_at, least_s
-):
-    service = WithoutResults()
-    await left_behind(cache, service)
-    await note(cache, ended_at=ended_at)
-    run, began_s = Run(cache, service), now_s()
+async def test_results_that_never_come_are_waited_for_an_hour(cache):
+    run, began_s = Run(cache, WithoutResults()), now_s()
     (reply,) = await run.ask()
     assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
     assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
     assert run.ledger.read().open_attempts == 1
-    assert least_s <= now_s() - began_s < least_s + 200
+    assert 3500 <= now_s() - began_s < 3800
 
 
 @in_virtual_time
-async def test_a_cancelled_batch_that_does_not_end_is_waited_for_in_bounds(cache):
-    service = Endless()
-    await left_behind(cache, service)
-    await note(cache, cancelled_at=HOURS_AGO)
-    run = Run(cache, service)
+async def test_what_a_batch_answered_unreadably_stays_set_aside(cache):
+    class Broken(Memory):
+        async def results(self, batch_id, status):
+            yield "", None
+            yield "", None
+
+    run = Run(cache, Broken())
     (reply,) = await run.ask()
-    assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
+    assert run.said == [
+        "m: 2 results of batch batch-0 are ignored: they are broken, of none of its calls, or "
+        "differ from an earlier one"
+    ]
+    assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
     assert run.ledger.read().open_attempts == 1
 
 
@@ -592,28 +517,12 @@ async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
     assert run.said == ["m: HTTP 503; it is asked again until it answers"]
 
 
-@pytest.mark.parametrize(("hours", "cancelled"), [(1.9, []), (2.1, ["batch-0"])])
-@in_virtual_time
-async def test_a_batch_is_cancelled_two_hours_after_its_submission_and_what_it_has_is_taken(
-    cache, hours, cancelled
-):
-    service = Memory()
-    await left_behind(cache, service, repetitions=2)
-    submitted_at = datetime.now(UTC) - timedelta(hours=hours)
-    await note(cache, submitted_at=submitted_at)
-    service.states = [BatchStatus("waiting")] * 3
-    service.fates = {2: [None]}
-    run = Run(cache, service)
-    assert texts(await run.ask(2)) == ["batched 1", "alone 2"]
-    assert service.cancelled == cancelled
-
-
 async def killed(run, repetitions, when):
     """Ask, and end the run as a kill does when ``when`` is set: nothing more is written."""
     asking = asyncio.create_task(run.ask(repetitions))
     await when.wait()
     asking.cancel()
-    for task in (*run.rounds._tasks, *run.rounds._creations):
+    for task in (*[each.work for each in run.rounds._batches.values()], *run.rounds._creations):
         task.cancel()
     await run.client.drain()
 
@@ -635,7 +544,7 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
         async def status(self, batch_id):
             if not died.is_set():
                 died.set()
-                return BatchStatus("waiting")
+                return BatchStatus(ended=False)
             return await super().status(batch_id)
 
     died = asyncio.Event()
@@ -731,8 +640,9 @@ async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind)
 
 
 @in_virtual_time
-async def test_a_batch_that_is_gone_is_asked_anew_and_costs_nothing_where_nobody_charges(cache):
+async def test_a_batch_that_ended_with_its_emulator_is_asked_anew(cache):
     service = Memory()
+    service.forgets = True
     await left_behind(cache, service, price="free")
     service.batches.clear()
     again = Run(cache, service, price="free")
@@ -760,18 +670,18 @@ class Dear(Memory):
         self.chance = random.Random(seed)
         self.bill_usd = 0.0
 
-    async def results(self, batch_id, status, calls):
-        async for result in super().results(batch_id, status, calls):
+    async def results(self, batch_id, status):
+        async for key, raw in super().results(batch_id, status):
             read = 10
             written = self.chance.randint(0, 100)
             kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])
             if kind != "ok":
-                yield LineResult(result.key, error(500) if kind == "failed" else None)
+                yield key, error(500) if kind == "failed" else None
                 continue
-            body = json.loads(result.raw.body)
+            body = json.loads(raw.body)
             body["usage"] = {"prompt_tokens": read, "completion_tokens": written}
             self.bill_usd += (read + 100 * written) / 1e6 / 2
-            yield LineResult(result.key, RawReply(200, {}, json.dumps(body)))
+            yield key, RawReply(200, {}, json.dumps(body))
 
 
 @given(seed=st.integers(0, 1000), cents=st.integers(1, 12), runs=st.integers(1, 3))
@@ -795,16 +705,13 @@ def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
 
 
 @in_virtual_time
-async def test_what_is_pending_is_told_by_round_model_and_batch(cache):
+async def test_what_is_pending_is_told_by_model_and_batch(cache):
     service = Memory()
-    service.states = [BatchStatus("waiting", done=1, total=3)] * 10**4
+    service.states = [BatchStatus(ended=False)] * 10**4
     run = Run(cache, service)
-    asking = asyncio.create_task(run.ask(3, decision=6))
-    while not (told := run.rounds.standing()) or "done" not in told[0]:
-        await asyncio.sleep(0.1)
-    (line,) = told
-    since = "[0-9]{2}:[0-9]{2}:[0-9]{2} UTC"
-    told = f"round 7 of at most 30: 3 calls of m in batch batch-0 since {since} .0 s., 1 of 3 done"
-    assert re.fullmatch(told, line)
+    asking = asyncio.create_task(run.ask(3))
+    await asyncio.sleep(5)
+    (line,) = run.rounds.standing()
+    assert re.fullmatch("3 calls of m wait in batch batch-0 since [0-9:]{8} UTC", line)
     asking.cancel()
     await run.end()

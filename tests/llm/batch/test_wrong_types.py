@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import copy
 import json
-from datetime import UTC, datetime
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from merge_runner.llm.batch.service import BatchFailed, Unreadable
+from merge_runner.llm.batch.service import BatchFailed
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import judge
 
@@ -109,13 +108,12 @@ async def uses(service):
 
     async def results():
         return [
-            judge(each.raw, FORMATS["gemini"])
-            async for each in service.results("b1", await service.status("b1"), 10)
-            if not isinstance(each, Unreadable) and each.raw
+            judge(raw, FORMATS["gemini"])
+            async for _, raw in service.results("b1", await service.status("b1"))
+            if raw
         ]
 
-    since = datetime(2026, 11, 22, tzinfo=UTC)
-    finds = [lambda: service.find(MARK, since)] if service.takes_mark else []
+    finds = [lambda: service.find(MARK)] if service.takes_mark else []
     for use in (lambda: service.status("b1"), results, *finds):
         try:
             await use()

@@ -2,42 +2,67 @@
 
 from __future__ import annotations
 
+import email
 import json
 import time
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from email.policy import HTTP
 from functools import partial
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
+
+import httpx
 
 from merge_runner.chance import draw, draw_between, draw_index
-from merge_runner.emulator.exchange import BrokenOff, Request, Response, as_error, as_json
-from merge_runner.emulator.faults import OUTCOMES, STATUS_FAULTS, FaultPlan
+from merge_runner.emulator import handler as served
 from merge_runner.emulator.formats import CHAT, GEMINI, MESSAGES, RESPONSES, ServedFormat
-from merge_runner.emulator.replies import UNREADABLE, Asked, Replies, marked
+from merge_runner.emulator.handler import UNREADABLE, Asked, as_error, as_json, as_response
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER
+from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_FIELD, SLOT_HEADER
 
-ID = "(?P<id>[^/]+?)"
+if TYPE_CHECKING:
+    from tests.mock_server.emulator import FaultyEmulator
+
+ID = "(?P<name>[^/]+?)"
+# The faults that are errors of the provider, beside a rate limit.
+ERRORS = {**served.ERRORS, "request_timeout": 408, "conflict": 409}
 FAILURES = (429, 500, 503)
 GRPC_CODES = {400: 3, 429: 8, 500: 13, 503: 14}
-Handler = Callable[[Request], Response]
-Outcome = Literal["answered", "failed", "not asked"]
+Handler = Callable[..., httpx.Response]
 
 
 class NotThere(Exception):
     """There is no such batch or file, or not yet."""
 
 
+class BrokenOff(httpx.ReadError):
+    """The connection ends before, or within, the response; ``fault`` says how."""
+
+    def __init__(self, fault: str) -> None:
+        super().__init__(f"the emulator broke off: {fault}")
+        self.fault = fault
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A request within a batch."""
+
+    custom_id: str
+    asked: Asked
+
+
 @dataclass(frozen=True, slots=True)
 class Fate:
-    """When a line has its result, in seconds from the batch's beginning, and which."""
+    """When a line has its result, in seconds from the batch's beginning, and which.
+
+    A line is ``answered``, ``failed`` or ``not asked``.
+    """
 
     after_s: float
-    kind: Outcome
+    kind: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +74,7 @@ class Result:
     body: dict[str, Any]
 
     @property
-    def kind(self) -> Outcome:
+    def kind(self) -> str:
         """What became of the line."""
         return "answered" if self.status == 200 else "failed" if self.status else "not asked"
 
@@ -64,7 +89,7 @@ class Batch:
 
     id: str
     told: dict[str, Any]
-    lines: Sequence[Asked]
+    lines: Sequence[Line]
     fates: Sequence[Fate]
     began_s: float
     least_polls: int
@@ -76,7 +101,7 @@ class Batch:
     @property
     def tokens(self) -> int:
         """About how many tokens its requests have."""
-        return sum(len(line.raw) for line in self.lines) // 4
+        return sum(len(line.asked.raw) for line in self.lines) // 4
 
     def finished(self, now_s: float) -> int:
         """Return how many lines have their result by now."""
@@ -86,7 +111,7 @@ class Batch:
             return in_time
         return min(in_time, len(self.lines) * self.polls // self.least_polls)
 
-    def count(self, *kinds: Outcome) -> int:
+    def count(self, *kinds: str) -> int:
         """Return how many lines ended so."""
         return sum(result.kind in kinds for result in self.results or ())
 
@@ -99,20 +124,16 @@ class Batch:
 class Batches:
     """All batches of all providers, the oldest first."""
 
-    def __init__(self, replies: Replies, clock: Callable[[], float] = time.time) -> None:
-        self._replies = replies
+    def __init__(self, emulator: FaultyEmulator, clock: Callable[[], float] = time.time) -> None:
+        self._emulator = emulator
+        self.faults = emulator.plan
         self.now_s = clock
         self.files: dict[str, bytes] = {}
         self.requests: Counter[str] = Counter()
         self._all: dict[str, Batch] = {}
         self._submitted: Counter[str] = Counter()
 
-    @property
-    def faults(self) -> FaultPlan:
-        """What goes wrong."""
-        return self._replies.faults
-
-    def create(self, prefix: str, lines: Sequence[Asked], told: dict[str, Any]) -> Batch:
+    def create(self, prefix: str, lines: Sequence[Line], told: dict[str, Any]) -> Batch:
         """Create a batch, which is ``refused`` where more tokens would wait than may."""
         if not lines or len({line.custom_id for line in lines}) < len(lines):
             raise UsageError("A batch needs lines, and every custom_id must be unique.")
@@ -148,7 +169,7 @@ class Batches:
         for batch in self._all.values():
             self._settle(batch)
 
-    def shown(self, name: str, lines: Sequence[dict[str, Any]]) -> Response:
+    def shown(self, name: str, lines: Sequence[dict[str, Any]]) -> httpx.Response:
         """Return what is there of a file of results; raises NotThere."""
         plan = self.faults.batch
         self.requests[name] += 1
@@ -157,13 +178,14 @@ class Batches:
         if self.requests[name] <= plan.late_results + plan.short_results:
             lines = lines[: len(lines) // 2]
         body = b"".join(json.dumps(line, ensure_ascii=False).encode() + b"\n" for line in lines)
-        return Response(body, headers={"content-type": "application/octet-stream"})
+        return as_response(body, 200, {"content-type": "application/octet-stream"})
 
-    def _fate(self, line: Asked) -> Fate:
+    def _fate(self, line: Line) -> Fate:
         """A function of the seed, the line, and how often it was submitted."""
         plan, seed = self.faults.batch, self.faults.seed
-        self._submitted[line.where] += 1
-        what = (seed, line.where, self._submitted[line.where])
+        where = line.asked.where
+        self._submitted[where] += 1
+        what = (seed, where, self._submitted[where])
         chance = draw("line", *what)
         after_s = plan.delay_s * draw_between(0.2, 1.0, "when", *what)
         if draw("slow", *what) < plan.slow:
@@ -185,28 +207,27 @@ class Batches:
             for number, (fate, line) in enumerate(fates)
         ]
 
-    def _result(self, line: Asked, kind: Outcome) -> Result:
-        assert line.custom_id is not None
+    def _result(self, line: Line, kind: str) -> Result:
+        asked = line.asked
         if kind == "not asked":
             return Result(line.custom_id, 0, {})
-
-        def failed(status: int, message: str) -> Result:
-            return Result(line.custom_id or "", status, marked(line.wire.error(status, message)[0]))
-
+        status, message = 200, "An emulated fault."
         if kind == "failed":
-            status = FAILURES[draw_index(3, "failure", self.faults.seed, line.where)]
-            return failed(status, "An emulated fault.")
-        try:
-            question = self._replies.question(line)
-        except UsageError as exc:
-            return failed(400, str(exc))
-        attempt = self._replies.attempt(line)
-        fault = self.faults.fault(line.where, attempt)
-        answer = self._replies.answer(question, attempt, fault if fault in OUTCOMES else None)
-        return Result(line.custom_id, 200, answer)
+            status = FAILURES[draw_index(3, "failure", self.faults.seed, asked.where)]
+        else:
+            attempt = self._emulator.attempt(asked)
+            fault = self.faults.fault(asked.where, attempt)
+            fault = fault if fault in ("empty", "refused", "malformed") else None
+            try:
+                body = self._emulator.answer(asked, attempt, fault, line.custom_id)
+            except UsageError as exc:
+                status, message = 400, str(exc)
+        if status != 200:
+            body = _marked(asked.wire.error(status, message, 0.0)[0])
+        return Result(line.custom_id, status, body)
 
 
-class BatchMode(ABC):
+class BatchMode:
     """A provider's batch mode: its addresses, and how it puts what it says.
 
     Its batches are at ``path``. ``creation``, ``uploads`` and ``results`` are patterns of paths. A
@@ -227,8 +248,8 @@ class BatchMode(ABC):
         self._batches = batches
 
     def routes(self) -> list[tuple[str, str, Handler]]:
-        """Return the method, the pattern of paths and the handler of each address."""
-        handlers: list[tuple[str, str, Handler]] = [
+        """The method, the pattern of paths and the handler of each address."""
+        handlers = [
             ("POST", self.creation, self._create),
             ("POST", self.uploads, self._upload),
             ("GET", self.path, self._list),
@@ -238,36 +259,35 @@ class BatchMode(ABC):
         ]
         return [(method, path, partial(self._guarded, each)) for method, path, each in handlers]
 
-    @abstractmethod
-    def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
-        """Return the lines of a batch that is created; raises UsageError or what is UNREADABLE."""
+    def lines(self, told: dict[str, Any], model: str | None) -> list[Line]:
+        """The lines of a batch that is created; raises UsageError or what is UNREADABLE."""
+        raise NotImplementedError
 
-    @abstractmethod
     def shown(self, batch: Batch) -> dict[str, Any]:
-        """Return a batch as its state is told."""
+        """A batch as its state is told."""
+        raise NotImplementedError
 
-    @abstractmethod
     def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
-        """Return a line of results; None: it is in no such ``part`` of them."""
+        """A line of results; None: it is in no such ``part`` of them."""
+        raise NotImplementedError
 
     def page(self, batches: Sequence[Batch], more: bool) -> dict[str, Any]:
         """Return a page of the list."""
         last = batches[-1].id if batches else None
         return {"data": [self.shown(batch) for batch in batches], "has_more": more, "last_id": last}
 
-    def _guarded(self, handler: Handler, request: Request) -> Response:
+    def _guarded(self, handler: Handler, request: httpx.Request, **named: str) -> httpx.Response:
         """Answer with the faults of a service, and with errors in the provider's form."""
         faults, requests = self._batches.faults, self._batches.requests
-        where = f"{request.method} {request.path}"
+        where = f"{request.method} {request.url.path}"
         requests[where] += 1
         fault = faults.fault(where, requests[where])
         if fault == "rate_limit":
-            delay_s = faults.wait_s(where, requests[where])
-            return as_error(self.wire, 429, "Rate limit reached.", delay_s)
-        if fault in STATUS_FAULTS:
-            return as_error(self.wire, STATUS_FAULTS[fault], "An emulated fault.")
+            return as_error(self.wire, 429, "Rate limit reached.", faults.delay_s)
+        if fault in ERRORS:
+            return as_error(self.wire, ERRORS[fault], "An emulated fault.")
         try:
-            return handler(request)
+            return handler(request, **named)
         except UsageError as exc:
             return as_error(self.wire, 400, str(exc))
         except NotThere:
@@ -275,9 +295,9 @@ class BatchMode(ABC):
         except UNREADABLE:
             return as_error(self.wire, 400, "The body is not valid.")
 
-    def _create(self, request: Request) -> Response:
-        told = request.json()
-        batch = self._batches.create(self.prefix, self.lines(told, request), told)
+    def _create(self, request: httpx.Request, model: str | None = None) -> httpx.Response:
+        told = json.loads(request.content)
+        batch = self._batches.create(self.prefix, self.lines(told, model), told)
         if batch.refused and self.wire is not CHAT:
             return as_error(self.wire, 429, batch.refused)
         self._batches.requests["created"] += 1
@@ -286,25 +306,24 @@ class BatchMode(ABC):
             raise BrokenOff("lost")  # the answer is lost on its way
         return as_json(self.shown(batch))
 
-    def _list(self, request: Request) -> Response:
+    def _list(self, request: httpx.Request) -> httpx.Response:
         batches = self._batches.listed(self.prefix)
-        after = request.query.get(self.cursor)
+        after = request.url.params.get(self.cursor)
         start = [batch.id for batch in batches].index(after) + 1 if after else 0
-        end = start + int(request.query.get(self.size, 20))
+        end = start + int(request.url.params.get(self.size, 20))
         return as_json(self.page(batches[start:end], len(batches) > end))
 
-    def _status(self, request: Request) -> Response:
-        return as_json(self.shown(self._batches.poll(request.named["id"])))
+    def _status(self, request: httpx.Request, name: str) -> httpx.Response:
+        return as_json(self.shown(self._batches.poll(name)))
 
-    def _cancel(self, request: Request) -> Response:
-        batch = self._batches.poll(request.named["id"])
+    def _cancel(self, request: httpx.Request, name: str) -> httpx.Response:
+        batch = self._batches.poll(name)
         if batch.results is None and batch.cancelled_s is None:
             batch.cancelled_s = self._batches.now_s()  # it ends at the next look
         return as_json(self.shown(batch))
 
-    def _results(self, request: Request) -> Response:
+    def _results(self, request: httpx.Request, name: str) -> httpx.Response:
         """Show a file of results, whose name holds the id of its batch."""
-        name = request.named["id"]
         batch_id, _, part = name.removeprefix("file-").partition("-")
         batch = self._batches.poll(batch_id)
         if batch.results is None:
@@ -312,23 +331,17 @@ class BatchMode(ABC):
         lines = [self.line(batch, result, part) for result in batch.results]
         return self._batches.shown(name, [line for line in lines if line])
 
-    def _upload(self, request: Request) -> Response:
+    def _upload(self, request: httpx.Request) -> httpx.Response:
         raise NotThere
 
     def _asked(
         self, line: dict[str, Any], wire: ServedFormat, path: str, model: str | None = None
-    ) -> Asked:
+    ) -> Line:
         """A line as the request that it stands for, in canonical JSON like one of our client."""
-        slot = line.get(SLOT_HEADER)
-        return Asked(
-            wire=wire,
-            path=path,
-            raw=canonical_json(line[self.body]).encode(),
-            model=model,
-            slot=None if slot is None else canonical_json(slot),
-            attempt=str(line.get(ATTEMPT_HEADER, "")),
-            custom_id=line[self.key],
-        )
+        slot, attempt = line.get(SLOT_HEADER), str(line.get(ATTEMPT_HEADER, ""))
+        raw = canonical_json(line[self.body]).encode()
+        where = None if slot is None else canonical_json(slot)
+        return Line(line[self.key], Asked(wire, path, raw, model, where, attempt))
 
     def _file(self, content: bytes) -> str:
         """Keep an uploaded file; returns its id."""
@@ -349,8 +362,7 @@ class OpenAIMode(BatchMode):
     wire, prefix, path = CHAT, "batch_", "/v1/batches"
     creation, uploads, results = path, "/v1/files", f"/v1/files/{ID}/content"
 
-    def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
-        """See BatchMode."""
+    def lines(self, told: dict[str, Any], model: str | None) -> list[Line]:
         endpoint = told["endpoint"]
         wire = {each.path: each for each in (CHAT, RESPONSES)}[endpoint]
         lines = self._uploaded(told["input_file_id"])
@@ -359,7 +371,6 @@ class OpenAIMode(BatchMode):
         return [self._asked(line, wire, endpoint) for line in lines]
 
     def shown(self, batch: Batch) -> dict[str, Any]:
-        """See BatchMode."""
         ended, answered = batch.results is not None, batch.count("answered")
         failed = batch.count("failed", "not asked")
         status = "in_progress" if batch.cancelled_s is None else "cancelling"
@@ -373,7 +384,7 @@ class OpenAIMode(BatchMode):
             "completed": answered if ended else batch.finished(self._batches.now_s()),
             "failed": failed,
         }
-        return marked(
+        return _marked(
             {
                 "id": batch.id,
                 "object": "batch",
@@ -387,14 +398,18 @@ class OpenAIMode(BatchMode):
             }
         )
 
-    def _upload(self, request: Request) -> Response:
-        form = request.form()
+    def _upload(self, request: httpx.Request) -> httpx.Response:
+        head = f"content-type: {request.headers.get('content-type', '')}\r\n\r\n".encode()
+        parts = email.message_from_bytes(head + request.content, policy=HTTP).iter_parts()
+        form = {
+            part.get_param("name", header="content-disposition"): part.get_payload(decode=True)
+            for part in parts
+        }
         if form.get("purpose") != b"batch" or "file" not in form:
             raise UsageError("A file and the purpose batch are needed.")
-        return as_json(marked({"id": self._file(form["file"]), "object": "file"}))
+        return as_json(_marked({"id": self._file(form["file"]), "object": "file"}))
 
     def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
-        """See BatchMode."""
         if (result.kind == "answered") != (part == "output"):
             return None
         line: dict[str, Any] = {"custom_id": result.custom_id, "response": None, "error": None}
@@ -410,12 +425,10 @@ class AnthropicMode(BatchMode):
     creation, results = path, f"{path}/{ID}/results"
     body, cursor = "params", "after_id"
 
-    def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
-        """See BatchMode."""
+    def lines(self, told: dict[str, Any], model: str | None) -> list[Line]:
         return [self._asked(line, MESSAGES, MESSAGES.path) for line in told["requests"]]
 
     def shown(self, batch: Batch) -> dict[str, Any]:
-        """See BatchMode."""
         ended, cancelled = batch.results is not None, batch.cancelled_s is not None
         counts = {
             "processing": 0 if ended else len(batch.lines),
@@ -425,7 +438,7 @@ class AnthropicMode(BatchMode):
             "expired": 0 if cancelled else batch.count("not asked"),
         }
         going_on = "canceling" if cancelled else "in_progress"
-        return marked(
+        return _marked(
             {
                 "id": batch.id,
                 "type": "message_batch",
@@ -437,7 +450,6 @@ class AnthropicMode(BatchMode):
         )
 
     def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
-        """See BatchMode."""
         told = {
             "answered": {"type": "succeeded", "message": result.body},
             "failed": {"type": "errored", "error": result.body},
@@ -455,15 +467,12 @@ class GeminiMode(BatchMode):
     key, body = "key", "request"
     cursor, size = "pageToken", "pageSize"
 
-    def lines(self, told: dict[str, Any], request: Request) -> list[Asked]:
-        """See BatchMode."""
-        model = request.named["model"]
+    def lines(self, told: dict[str, Any], model: str | None) -> list[Line]:
         name = told["batch"]["inputConfig"]["fileName"].removeprefix("files/")
         path = f"/v1beta/models/{model}:generateContent"
         return [self._asked(line, GEMINI, path, model) for line in self._uploaded(name)]
 
     def shown(self, batch: Batch) -> dict[str, Any]:
-        """See BatchMode."""
         ended = batch.results is not None
         state = "PENDING" if batch.polls < 2 else "RUNNING"
         if ended:
@@ -489,23 +498,23 @@ class GeminiMode(BatchMode):
             output = {"responsesFile": f"files/{batch.id}"}
             metadata["output"] = output
             operation |= {"done": True, "response": output}
-        return marked(operation)
+        return _marked(operation)
 
     def page(self, batches: Sequence[Batch], more: bool) -> dict[str, Any]:
-        """See BatchMode."""
         following = {"nextPageToken": batches[-1].id} if more else {}
         return {"operations": [self.shown(batch) for batch in batches], **following}
 
-    def _upload(self, request: Request) -> Response:
+    def _upload(self, request: httpx.Request) -> httpx.Response:
         """A resumable upload: it is announced, and then sent whole."""
         if request.headers.get("x-goog-upload-command") == "start":
-            url = f"http://{request.host}{request.path}?upload_id=1"
-            return as_json(marked({}), {"x-goog-upload-url": url, "x-goog-upload-status": "active"})
-        file = {"name": f"files/{self._file(request.body)}", "sizeBytes": str(len(request.body))}
-        return as_json(marked({"file": file}), {"x-goog-upload-status": "final"})
+            url = f"http://{request.headers['host']}{request.url.path}?upload_id=1"
+            headers = {"x-goog-upload-url": url, "x-goog-upload-status": "active"}
+            return as_json(_marked({}), headers=headers)
+        content = request.content
+        file = {"name": f"files/{self._file(content)}", "sizeBytes": str(len(content))}
+        return as_json(_marked({"file": file}), headers={"x-goog-upload-status": "final"})
 
     def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
-        """See BatchMode."""
         if result.kind == "not asked":
             return None
         if result.kind == "answered":
@@ -513,6 +522,14 @@ class GeminiMode(BatchMode):
         message = result.body["error"]["message"]
         error = {"code": GRPC_CODES[result.status], "message": message}
         return {"key": result.custom_id, "error": error}
+
+
+MODES = (OpenAIMode, AnthropicMode, GeminiMode)
+
+
+def _marked(body: dict[str, Any]) -> dict[str, Any]:
+    """A body with the field that says that no model made it."""
+    return {**body, SCRIPTED_FIELD: True}
 
 
 def _rfc3339(moment_s: float) -> str:

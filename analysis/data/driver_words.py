@@ -1,0 +1,50 @@
+"""What the spec of a trial says of its drivers: who is a language model, and who cannot react."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.registry import MOCKS
+from merge_runner.records import SIDES, Side
+
+
+def language_models(names: Mapping[Side, str], spec: Mapping[str, Any]) -> dict[Side, str]:
+    """Of the drivers' names those of language models, as the spec of their trials tells them.
+
+    It knows the programs of a study, too, which may not be registered here.
+    """
+    return {side: name for side, name in names.items() if "program" not in (spec.get(side) or {})}
+
+
+def has_chance(spec: Mapping[str, Any], sides: Collection[Side] = SIDES) -> bool:
+    """Return whether drivers of a spec, or what they perceive, are drawn by chance.
+
+    A language model samples; a program declares it.
+    """
+    scenario = ScenarioConfig.model_validate(spec.get("scenario", {}))
+    drivers = [spec.get(side) or {} for side in sides]
+    return any("program" not in driver or driver.get("chance") for driver in drivers) or any(
+        scenario.perception(side).is_random for side in sides
+    )
+
+
+def unresponsive(spec: Mapping[str, Any]) -> str:
+    """Return what to say wherever trials of a spec are shown; empty where no human is replayed."""
+    sides = [side for side in SIDES if "data" in (spec.get(side) or {})]
+    if len(sides) == len(SIDES):
+        return "both humans are replayed and do not react"
+    return f"the human on the {sides[0]} is replayed and does not react" if sides else ""
+
+
+def stand_in(models: Mapping[Side, str], sides: Collection[Side] = SIDES) -> str:
+    """What is said of trials of these language models in which a stand-in answered on these sides.
+
+    A side that a program drives has no model.
+    """
+    named = {side: name for side, name in models.items() if name not in MOCKS}
+    posing = "+".join(dict.fromkeys(name for side, name in named.items() if side in sides))
+    real = [side for side in named if side not in sides]
+    where = f" on the {'left' if real == ['right'] else 'right'}" if real else ""
+    return f"scripted stand-in{where}, {f'not {posing}' if posing else 'no language model'}"

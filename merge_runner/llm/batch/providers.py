@@ -1,0 +1,297 @@
+"""The batch modes of three providers, and which models have one on what terms."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+from urllib.parse import urlsplit
+from uuid import uuid4
+
+from merge_runner.config import PROVIDERS, BatchTerms, ModelEntry, endpoint_identity
+from merge_runner.errors import UsageError
+from merge_runner.llm.batch.service import (
+    BatchFailed,
+    BatchService,
+    BatchStatus,
+    Page,
+    id_of,
+    json_object,
+)
+from merge_runner.llm.content_hashes import LARGEST_STATUS, canonical_json
+from merge_runner.llm.formats.base import (
+    as_count,
+    as_dict,
+    as_dicts,
+    as_text,
+    first_of,
+    read_error,
+)
+from merge_runner.llm.http_outcome import RawReply, status_within
+from merge_runner.records import ChatRequest
+
+# Where a provider's addresses stand, whatever the base URL of the server is.
+OPENAI, GEMINI = "/v1", "/v1beta"
+MARK = "merge_runner_mark"
+NOT_ASKED = frozenset({"batch_expired", "batch_cancelled"})
+# Of ASCII, as a URL is; it may carry a long token.
+UPLOAD_PATH = re.compile("/[!-~]{1,8000}")
+# The status with which the plain endpoint sends an error: a result has its type or its code
+# (google/rpc/code.proto) alone. All others may pass.
+ANTHROPIC_STATUSES = {
+    "invalid_request_error": 400,
+    "request_too_large": 413,
+    "rate_limit_error": 429,
+    "overloaded_error": 529,
+}
+GEMINI_STATUSES = {1: 499, 3: 400, 7: 403, 8: 429, 12: 501, 14: 503}
+CANCELLED = 499
+
+
+class OpenAIBatches(BatchService):
+    """``/files`` and ``/batches`` of OpenAI, and of servers that speak like it."""
+
+    path, pages, cursor = "/batches", "limit=100", "after"
+
+    def line(self, request: ChatRequest) -> bytes:
+        """See BatchService."""
+        url, slot = canonical_json(OPENAI + request.path), self.slot_members(request)
+        members = f'"method":"POST","url":{url},"body":{request.body}{slot}'
+        return f'{{"custom_id":"{request.key}",{members}}}\n'.encode()
+
+    async def upload(self, content: bytes, mark: str) -> str:
+        """See BatchService."""
+        boundary = uuid4().hex
+        purpose = 'content-disposition: form-data; name="purpose"\r\n\r\nbatch'
+        file = 'content-disposition: form-data; name="file"; filename="batch.jsonl"'
+        head = f"--{boundary}\r\n{purpose}\r\n--{boundary}\r\n{file}\r\n"
+        head += "content-type: application/jsonl\r\n\r\n"
+        body = head.encode() + content + f"\r\n--{boundary}--\r\n".encode()
+        form = {"content-type": f"multipart/form-data; boundary={boundary}"}
+        return id_of(json_object(await self.ask("POST", "/files", body, form)))
+
+    def creation(self, requests: Sequence[ChatRequest], file: str, mark: str) -> tuple[str, bytes]:
+        """See BatchService."""
+        batch = {
+            "input_file_id": file,
+            "endpoint": OPENAI + requests[0].path,
+            "completion_window": "24h",
+            "metadata": {MARK: mark},
+        }
+        return self.path, canonical_json(batch).encode()
+
+    def page_of(self, page: dict[str, Any]) -> Page:
+        """See BatchService; the mark is among the metadata."""
+        batches = as_dicts(page.get("data"))
+        listed = [(as_dict(batch.get("metadata")).get(MARK), batch) for batch in batches]
+        return listed, as_text(page.get("last_id")) if page.get("has_more") else None
+
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
+        """See BatchService."""
+        word = (as_text(batch.get("status")) or "").upper()
+        answered = as_count(as_dict(batch.get("request_counts")).get("completed")) or 0
+        error = first_of(as_dict(batch.get("errors")).get("data"))
+        why = read_error(400, {}, "", {"error": error})
+        why = replace(why, status=status_within(why) if why.names else 400)
+        failure = self.failure_of(why) if word == "FAILED" else None
+        ended = word in ("COMPLETED", "EXPIRED", "CANCELLED")
+        return BatchStatus(ended, answered, failure, batch)
+
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """Return those of its files of answers and of errors."""
+        names = [name for name in ("output_file_id", "error_file_id") if batch.get(name)]
+        return [f"/files/{id_of(batch, name)}/content" for name in names]
+
+    def read(self, line: dict[str, Any]) -> RawReply | None:
+        """See BatchService."""
+        response, error = as_dict(line.get("response")), as_dict(line.get("error"))
+        status, body = as_count(response.get("status_code")), response.get("body")
+        if status and status <= LARGEST_STATUS and isinstance(body, dict):
+            return _reply(status, body)
+        if as_text(error.get("code")) in NOT_ASKED:
+            return None
+        if not error:
+            raise ValueError("neither a response nor an error")
+        return _reply(500, {"error": error})
+
+
+class AnthropicBatches(BatchService):
+    """``/v1/messages/batches``, with all requests in the body; a batch takes no mark."""
+
+    takes_mark = False
+    path = "/v1/messages/batches"
+
+    def line(self, request: ChatRequest) -> bytes:
+        """See BatchService."""
+        slot = self.slot_members(request)
+        return f'{{"custom_id":"{request.key}","params":{request.body}{slot}}}'.encode()
+
+    def creation(self, requests: Sequence[ChatRequest], file: str, mark: str) -> tuple[str, bytes]:
+        """See BatchService."""
+        return self.path, b'{"requests":[' + b",".join(map(self.line, requests)) + b"]}"
+
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
+        """See BatchService."""
+        ended = (as_text(batch.get("processing_status")) or "").upper() == "ENDED"
+        counts = as_dict(batch.get("request_counts")).values()
+        return BatchStatus(ended, sum(as_count(count) or 0 for count in counts), batch=batch)
+
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """See BatchService."""
+        if batch.get("archived_at"):
+            raise BatchFailed("lost", "the results of the batch are no longer kept")
+        # Not at the URL that the batch names: the key goes to the configured host alone.
+        return [f"{self.path}/{batch_id}/results"]
+
+    def read(self, line: dict[str, Any]) -> RawReply | None:
+        """See BatchService."""
+        result = as_dict(line.get("result"))
+        match result.get("type"):
+            case "succeeded":
+                return _reply(200, as_dict(result.get("message")))
+            case "errored":
+                error = as_dict(result.get("error"))
+                kind = as_text(as_dict(error.get("error")).get("type")) or ""
+                return _reply(ANTHROPIC_STATUSES.get(kind, 500), error)
+            case "expired" | "canceled":
+                return None
+        raise ValueError("a result of an unknown type")
+
+
+class GeminiBatches(BatchService):
+    """``models/MODEL:batchGenerateContent`` and ``batches``, with the requests in a file.
+
+    They could also stand in the body of the creation; a file has room for more, and each of its
+    results has the key of its request.
+    """
+
+    # A page has few batches, since one may come with all its results.
+    path, pages, cursor = f"{GEMINI}/batches", "pageSize=10", "pageToken"
+    id_member, key_member = "name", "key"
+
+    def line(self, request: ChatRequest) -> bytes:
+        """See BatchService."""
+        slot = self.slot_members(request)
+        return f'{{"key":"{request.key}","request":{request.body}{slot}}}\n'.encode()
+
+    async def upload(self, content: bytes, mark: str) -> str:
+        """See BatchService."""
+        start = {
+            "x-goog-upload-protocol": "resumable",
+            "x-goog-upload-command": "start",
+            "x-goog-upload-header-content-length": str(len(content)),
+            "x-goog-upload-header-content-type": "application/jsonl",
+        }
+        file = canonical_json({"file": {"displayName": mark, "mimeType": "application/jsonl"}})
+        begun = await self.ask("POST", f"/upload{GEMINI}/files", file.encode(), start)
+        # At the configured host, to which alone the key goes, whatever the URL names.
+        url = begun.headers.get("x-goog-upload-url", "")
+        path = "/" + url.partition("://")[2].partition("/")[2]
+        path = path.removeprefix(urlsplit(self.endpoint.base_url).path)
+        if not UPLOAD_PATH.fullmatch(path):
+            raise BatchFailed("again", "the reply names no URL for the upload")
+        finish = {"x-goog-upload-command": "upload, finalize", "x-goog-upload-offset": "0"}
+        uploaded = json_object(await self.ask("POST", path, content, finish))
+        return id_of(as_dict(uploaded.get("file")), "name")
+
+    def creation(self, requests: Sequence[ChatRequest], file: str, mark: str) -> tuple[str, bytes]:
+        """See BatchService."""
+        batch = {"displayName": mark, "inputConfig": {"fileName": file}}
+        path = requests[0].path.replace(":generateContent", ":batchGenerateContent")
+        return path, canonical_json({"batch": batch}).encode()
+
+    def page_of(self, page: dict[str, Any]) -> Page:
+        """See BatchService; the mark is the display name."""
+        batches = as_dicts(page.get("operations"))
+        listed = [(as_dict(batch.get("metadata")).get("displayName"), batch) for batch in batches]
+        return listed, as_text(page.get("nextPageToken")) or None
+
+    def status_of(self, batch: dict[str, Any]) -> BatchStatus:
+        """See BatchService; of an operation that is done the word may be one that nobody knows."""
+        word, done, error = _word(batch), batch.get("done") is True, as_dict(batch.get("error"))
+        ended = word in ("SUCCEEDED", "PARTIALLY_SUCCEEDED", "CANCELLED", "EXPIRED")
+        failed = not ended and (word == "FAILED" or (done and bool(error)))
+        why = read_error(_status_of(error) if error else 400, {}, "", batch)
+        stats = as_dict(as_dict(batch.get("metadata")).get("batchStats"))
+        answered = str(stats.get("successfulRequestCount"))  # 64-bit numbers are texts
+        return BatchStatus(
+            ended=ended or (done and not failed),
+            results=int(answered) if re.fullmatch("[0-9]{1,18}", answered) else 0,
+            failure=self.failure_of(why) if failed else None,
+            batch=batch,
+        )
+
+    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
+        """See BatchService."""
+        metadata = as_dict(batch.get("metadata"))
+        output = as_dict(metadata.get("output")) or as_dict(batch.get("response"))
+        if not output and _word(batch).endswith("SUCCEEDED"):
+            raise BatchFailed("again", "the results are not there yet")
+        if not output.get("responsesFile"):
+            return []
+        return [f"{GEMINI}/{id_of(output, 'responsesFile')}:download?alt=media"]
+
+    def read(self, line: dict[str, Any]) -> RawReply | None:
+        """See BatchService."""
+        response, error = line.get("response"), as_dict(line.get("error"))
+        if isinstance(response, dict):
+            return _reply(200, response)
+        if not error:
+            raise ValueError("neither a response nor an error")
+        status = _status_of(error)
+        return None if status == CANCELLED else _reply(status, {"error": error})
+
+
+def _reply(status: int, body: dict[str, Any]) -> RawReply:
+    # In ASCII, since JSON can spell half of a surrogate pair, which no file can hold.
+    return RawReply(status, {}, json.dumps(body))
+
+
+def _word(batch: Mapping[str, Any]) -> str:
+    """Gemini's word for a state, whether it says JOB_STATE_ or BATCH_STATE_ before it."""
+    word = as_text(as_dict(batch.get("metadata")).get("state")) or ""
+    return word.upper().rpartition("_STATE_")[2]
+
+
+def _status_of(error: dict[str, Any]) -> int:
+    """The HTTP status of an error of Gemini's, whose code may be one already."""
+    code = as_count(error.get("code")) or 2
+    return code if 400 <= code < 600 else GEMINI_STATUSES.get(code, 500)
+
+
+# By wire format.
+SERVICES: Mapping[str, type[BatchService]] = {
+    "openai-chat": OpenAIBatches,
+    "openai-responses": OpenAIBatches,
+    "gemini": GeminiBatches,
+    "anthropic": AnthropicBatches,
+}
+
+
+def batch_terms(entry: ModelEntry) -> BatchTerms | None:
+    """Return the terms on which a model answers in batches; None: it has no known batch mode."""
+    # A path of its own leads to one deployment, which no batch can name.
+    if entry.batch == "none" or entry.path is not None or entry.format not in SERVICES:
+        return None
+    if isinstance(entry.batch, BatchTerms):
+        return entry.batch
+    # A provider's price holds at its own address.
+    is_its_own = endpoint_identity(entry) == entry.provider
+    return PROVIDERS.require(entry.provider).batch if is_its_own else None
+
+
+def require_batch(name: str, entry: ModelEntry, entries: Mapping[str, ModelEntry]) -> BatchTerms:
+    """Return the terms of a model; raises UsageError, which lists those entries that have some."""
+    terms = batch_terms(entry)
+    if terms is None:
+        valid = ", ".join(each for each, its in entries.items() if batch_terms(its))
+        where = endpoint_identity(entry)
+        at = "" if where == entry.provider else f" at {where}"
+        raise UsageError(
+            f"{name} has no batch mode that is known{at}; valid with --batch: {valid}. Leave "
+            "--batch out, or give the entry in experiments/models.toml `batch = "
+            "{ price_factor = 0.5, source = ... }` where its server has one in the same format"
+        )
+    return terms

@@ -1,0 +1,69 @@
+-- What a sweep's summary says. The views read the trials of the sweep in the variable sweep_id, and
+-- the pairs in which another model answered than was asked for.
+CREATE OR REPLACE TEMP TABLE other_models (model_requested VARCHAR, model_served VARCHAR);
+
+CREATE OR REPLACE TEMP TABLE played AS
+FROM trials SEMI JOIN (FROM sweep_trials WHERE sweep_id = getvariable('sweep_id'))
+    USING (trial_id, spec_hash);
+
+-- Their attempts, with the name of the driver that was asked.
+CREATE OR REPLACE TEMP VIEW tried AS
+SELECT *, driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver
+FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash);
+
+CREATE OR REPLACE TEMP VIEW outcomes AS
+SELECT variant, condition, status, merged_first, coalesce(fallen_back, false) AS fallen_back,
+    count(*) AS trials
+FROM played LEFT JOIN (
+    SELECT trial_id, spec_hash, bool_or(fallback) AS fallen_back FROM decisions GROUP BY ALL
+) USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL;
+
+CREATE OR REPLACE TEMP VIEW levels AS
+SELECT factor, value, status, merged_first, count(*) AS trials
+FROM played JOIN trial_levels USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL;
+
+-- Attempts by their fate, as the view of attempts names it.
+CREATE OR REPLACE TEMP VIEW ledger AS
+SELECT driver, variant, fate, if(outcome = 'ok', coalesce(failure, outcome), outcome) AS outcome,
+    count(*) AS attempts
+FROM tried GROUP BY ALL ORDER BY ALL;
+
+CREATE OR REPLACE TEMP VIEW failed AS
+SELECT trial_id, error FROM played WHERE status = 'failed' ORDER BY ALL;
+
+-- Answers of another model than was asked for.
+CREATE OR REPLACE TEMP VIEW others AS
+SELECT model_requested, model_served, count(*) AS answers FROM calls
+SEMI JOIN played USING (trial_id, spec_hash) SEMI JOIN other_models USING (model_requested, model_served)
+WHERE http_status = 200 GROUP BY ALL ORDER BY ALL;
+
+-- Where a mock model answered: its answers, and all answers.
+CREATE OR REPLACE TEMP VIEW stand_ins AS
+SELECT driver, model, provider, count(*) FILTER (scripted) AS scripted, count(*) AS answers
+FROM tried WHERE fate IN ('driven', 'fallback')
+GROUP BY driver, model, provider HAVING bool_or(tried.scripted) ORDER BY ALL;
+
+CREATE OR REPLACE TEMP VIEW decided AS
+SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
+    count(*) FILTER (fallback) AS fallbacks
+FROM decisions SEMI JOIN played USING (trial_id, spec_hash);
+
+-- What was done first where drivers were only asked. The velocity is the driver's own, minus the
+-- other's; the action is the net acceleration over the first step, of the fallback where the reply
+-- was invalid; the share of M is that among answers with a tactical word.
+CREATE OR REPLACE TEMP VIEW first_looks AS
+WITH asked AS (FROM played WHERE source = 'seat' AND status <> 'failed')
+SELECT driver, variant, if(side = 'left', model_left, model_right) AS model, side,
+    if(side = 'left', 1, -1) * relative_velocity_mps + 0 AS relative_velocity_mps,
+    count(*) AS asked, count(*) FILTER (NOT valid) AS invalid,
+    count(tactical) AS with_a_word,
+    count(*) FILTER (tactical = 'M') / nullif(count(tactical), 0) AS share_m,
+    avg(action_mps2) FILTER (valid) AS first_action_mps2
+FROM asked
+JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash)
+JOIN (
+    SELECT trial_id, spec_hash, side, min_by(acceleration_mps2, step) AS action_mps2
+    FROM states SEMI JOIN asked USING (trial_id, spec_hash) WHERE time_s > 0 GROUP BY ALL
+) USING (trial_id, spec_hash, side)
+JOIN trial_drivers USING (trial_id, spec_hash)
+GROUP BY ALL ORDER BY ALL;

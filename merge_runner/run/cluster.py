@@ -1,0 +1,415 @@
+"""Plays a sweep on a Dask cluster whose workers share nothing.
+
+A task is a chunk of trials with a share of the rate limits and of the cap. Its worker plays it with
+the ordinary runner and a reply folder of its own, and returns records and replies. The coordinator
+keeps them in one transaction before it counts the task as done. A worker that dies loses its
+unfinished task, which is given out again; its share of the cap stays reserved.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import logging
+import math
+import os
+import pickle
+import re
+import secrets
+import signal
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, closing
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import merge_runner
+from merge_runner.config import base_urls
+from merge_runner.errors import (
+    ClusterFailed,
+    MergeRunnerError,
+    RecordingError,
+    TrialSuspended,
+    UsageError,
+)
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.client import Meter, Wait
+from merge_runner.llm.ledger import Asked, Ledger, Rows
+from merge_runner.llm.limiter import Limiter
+from merge_runner.records import Attempt, TrialRecord, TrialSpec
+from merge_runner.registry import in_use, plugin_sources, use
+from merge_runner.run.clients import live_clients
+from merge_runner.run.estimate import CallTotals, trial_costs
+from merge_runner.run.first_decisions import FirstDecisions
+from merge_runner.run.local_runner import Ended, LocalRunner, Room
+from merge_runner.run.plan import Options, Plan
+from merge_runner.study.parts import catalogue_of
+
+if TYPE_CHECKING:
+    from distributed import Client, Worker
+
+CONNECT_TIMEOUT_S = 10
+# Workers may come and go: how often they are counted.
+LOOK_EVERY_S = 1.0
+# A worker that dies loses so many times its trials in flight, and the longest trial of a task
+# holds the others up.
+TRIALS_PER_SEAT = 4
+MOST_LOSSES = 3
+_WHERE = re.compile(
+    r"local:(?P<workers>[1-9]\d*)|(?P<file>.+\.json)|((tcp|tls)://)?(?!local:)[^\s/]+:[1-9]\d*",
+    re.ASCII,
+)
+VALID = (
+    "valid: local:N (N workers on this machine), the address of a scheduler "
+    "(tcp://HOST:PORT, tls://HOST:PORT), or its scheduler file (PATH.json)"
+)
+
+
+@asynccontextmanager
+async def connected(where: str) -> AsyncIterator[Client]:
+    """Connect to the cluster that ``--dask`` names, or start a local one; raises UsageError."""
+    named = _WHERE.fullmatch(where)
+    is_file = Path(where).is_file()  # noqa: ASYNC240 # nothing else runs yet
+    if named is None or (named["file"] and not is_file):
+        raise UsageError(f"--dask {where!r} names no cluster; {VALID}")
+    try:
+        import distributed
+    except ModuleNotFoundError as exc:
+        raise UsageError("--dask needs the package distributed: pip install distributed") from exc
+
+    logging.disable()  # Dask logs tracebacks for what we report in a line, such as lost workers
+    async with AsyncExitStack() as stack:
+        scheduler = {"scheduler_file" if named["file"] else "address": where}
+        if named["workers"]:
+            scheduler = {"address": await _local_cluster(int(named["workers"]), stack)}
+        client = distributed.Client(**scheduler, asynchronous=True, timeout=CONNECT_TIMEOUT_S)
+        try:
+            await client
+        except (OSError, ValueError) as exc:
+            raise UsageError(
+                f"no Dask scheduler answers at {where} within {CONNECT_TIMEOUT_S} s; start one "
+                f"with `dask scheduler`, or leave the address out: {VALID}"
+            ) from exc
+        stack.push_async_callback(client.close, timeout=CONNECT_TIMEOUT_S)
+        yield client
+
+
+async def _local_cluster(workers: int, stack: AsyncExitStack) -> str:
+    """Start worker processes, which end with ``stack``; return their scheduler's address."""
+    from multiprocessing import resource_tracker
+
+    from distributed import LocalCluster
+
+    os.environ["PYTHONSAFEPATH"] = "1"  # they import nothing of this folder
+    # A terminal's Ctrl-C reaches this process alone, which stops them in order: children inherit
+    # what is blocked. The tracker, if it were started meanwhile, would unblock it again.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
+    try:
+        cluster = await stack.enter_async_context(
+            LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+                asynchronous=True,
+            )
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return str(cluster.scheduler_address)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Trials for one worker, what is recorded of their calls, and its ``share`` of the limits.
+
+    Its share of the cap is reserved under its ``name``. ``urls`` are the coordinator's base URLs.
+    """
+
+    run: str
+    name: str
+    specs: Sequence[TrialSpec]
+    plan: Plan
+    options: Options
+    urls: Mapping[str, str]
+    earlier: Mapping[str, CallTotals]
+    share: float
+    first: FirstDecisions
+    recorded: Sequence[CachedCall]
+    unanswered: Mapping[str, tuple[Attempt, ...]]
+    overruns: Sequence[tuple[str, float]]
+
+
+@dataclass(slots=True)
+class Played:
+    """What a worker returns: ``spent`` and ``opened`` are rows of its ledger."""
+
+    records: list[TrialRecord] = field(default_factory=list)
+    suspended: list[tuple[TrialSpec, str]] = field(default_factory=list)
+    replies: list[CachedCall] = field(default_factory=list)
+    unanswered: dict[str, tuple[Attempt, ...]] = field(default_factory=dict)
+    spent: Rows = field(default_factory=list)
+    opened: Rows = field(default_factory=list)
+    meters: Mapping[str, Meter] = field(default_factory=dict)
+    error: MergeRunnerError | None = None
+
+
+@cache
+def fingerprint() -> str:
+    """Return the version and a hash of all source and plug-ins."""
+    code = hashlib.sha256()
+    for source in (Path(merge_runner.__file__).parent, *plugin_sources()):
+        for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
+            code.update(f"{source.name}/{path.relative_to(source)}\0".encode() + path.read_bytes())
+    return f"{merge_runner.__version__} ({code.hexdigest()[:12]})"
+
+
+# At a worker, on its event loop
+
+
+def stop(run: str, *, dask_worker: Worker) -> None:
+    """Let the calls of a run's tasks end, and return what there is."""
+    dask_worker.extensions.setdefault(run, asyncio.Event()).set()
+
+
+async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Played:
+    """Play a Task, which only a worker with the same ``program`` can read."""
+    if fingerprint() != program:
+        differs = UsageError(
+            f"it has merge-runner {fingerprint()}, and the coordinator {program}: install the same "
+            "one for all, with the same plug-ins"
+        )
+        return Played(error=differs)
+    # Dask's profiler samples all threads; Python 3.11 can deadlock there.
+    dask_worker.periodic_callbacks["profile"].stop()
+    task: Task = pickle.loads(pickled)  # noqa: S301 # whoever reaches a scheduler can run code
+    study = task.plan.study
+    if (in_use().text, in_use().plugins) != (study.text, study.plugins):
+        use(catalogue_of(study.file, study.text, study.plugins))
+    kept = dask_worker.extensions
+    stopping: asyncio.Event = kept.setdefault(task.run, asyncio.Event())
+    # What the last task asked within a minute counts for this one, too.
+    limiters: dict[str, Limiter] = kept.setdefault(f"{task.run} {task.share}", {})
+    played = Played()
+
+    def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+        if isinstance(record, TrialSuspended):
+            played.suspended.append((spec, str(record)))
+        else:
+            played.records.append(record)
+
+    async with AsyncExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
+        replies = stack.enter_context(closing(ResponseCache(folder)))
+        ledger = Ledger(replies, task.plan.ledger)
+        replies.put_now(task.recorded, task.unanswered.items())
+        ledger.settle_share("", [(driver, 0, 0, ratio) for driver, ratio in task.overruns], [])
+        try:
+            clients = live_clients(
+                task.plan, task.options, task.earlier, replies, ledger,
+                stack=stack, urls=task.urls, share=task.share, limiters=limiters,
+            )  # fmt: skip
+            runner = LocalRunner(task.plan, clients, task.options.in_flight, task.first)
+            played.meters = runner.meters
+            work = asyncio.create_task(runner.play(task.specs, ended))
+            stopped = asyncio.create_task(stopping.wait())
+            await asyncio.wait([work, stopped], return_when=asyncio.FIRST_COMPLETED)
+            work.cancel()
+            stopped.cancel()
+            await asyncio.wait([work])
+            await runner.drain()
+            if not work.cancelled():
+                work.result()
+        except MergeRunnerError as exc:
+            played.error = type(exc)(str(exc))  # without its frames, which no pickle can hold
+        known = {call.request.key for call in task.recorded}
+        played.replies = [call for call in replies.entries() if call.request.key not in known]
+        played.unanswered = replies.all_unanswered()
+        played.spent, played.opened = ledger.rows()
+    return played
+
+
+# At the coordinator
+
+
+@dataclass(eq=False)
+class DaskTasks:
+    """Plays trials on the workers of a cluster, each of which gets one task at a time."""
+
+    _client: Client
+    _plan: Plan
+    _options: Options
+    _earlier: Mapping[str, CallTotals]
+    _cache: ResponseCache
+    _ledger: Ledger
+    first: FirstDecisions
+    waits: Sequence[Wait] = ()
+    workers: int = 0
+    _run: str = field(default_factory=secrets.token_hex)
+    _groups: deque[list[TrialSpec]] = field(default_factory=deque)
+    _given: dict[str, tuple[Task, asyncio.Task[Played | Exception]]] = field(default_factory=dict)
+    _losses: Counter[int] = field(default_factory=Counter)
+    _one_by_one: bool = False
+
+    def __post_init__(self) -> None:
+        self.meters = {name: Meter() for name in self._plan.entries}
+        self._costs = trial_costs(self._plan, self._earlier)
+
+    @property
+    def running(self) -> int:
+        """How many trials are given out."""
+        return sum(len(task.specs) for task, _ in self._given.values())
+
+    @property
+    def unsaved(self) -> str:
+        """What Ctrl-C waits for, in words."""
+        return f"the replies of {len(self._given)} tasks"
+
+    async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room) -> None:
+        """Play trials in order; an error raised by ``ended`` or at a worker ends the run."""
+        self._ended = ended
+        groups: dict[tuple[object, ...], list[TrialSpec]] = {}
+        for spec in specs:  # trials that may ask the same go together, so that one worker asks
+            groups.setdefault((spec.condition, spec.repetition, spec.sample_set), []).append(spec)
+        self._groups.extend(groups.values())
+        try:
+            while self._groups or self._given:
+                addresses = list(await self._client.nthreads())
+                self.workers = len(addresses)
+                for address in addresses:
+                    if self._groups and address not in self._given:
+                        await room()
+                        await self._give(address)
+                await self._collect()
+        except OSError as exc:
+            raise ClusterFailed(
+                "the Dask scheduler is gone, and with it the tasks that were under way; run the "
+                "same command again to go on"
+            ) from exc
+
+    async def drain(self) -> None:
+        """Stop the workers, and keep what their tasks have brought."""
+        with contextlib.suppress(OSError):
+            await self._client.run(stop, self._run, workers=[*self._given], on_error="ignore")
+        while self._given:
+            with contextlib.suppress(MergeRunnerError, OSError):  # the first one is told already
+                await self._collect()
+
+    async def _give(self, address: str) -> None:
+        """Give a task to a worker, unless those under way still hold all shares."""
+        slots = 1 if self._one_by_one else min(self.workers, self._options.in_flight)
+        held = sum(task.share for task, _ in self._given.values())
+        if held + 1 / slots > 1.001:
+            return
+        in_flight, idle = self._options.in_flight // slots, max(1, slots - len(self._given))
+        left = sum(map(len, self._groups))
+        size = min(TRIALS_PER_SEAT * in_flight, math.ceil(left / idle))
+        specs = self._groups.popleft()
+        while self._groups and len(specs) + len(self._groups[0]) <= size:
+            specs = specs + self._groups.popleft()
+        recorded, unanswered = await self._recorded(specs)
+        name = f"task {secrets.token_hex(8)}"
+        cap_usd = self._options.max_cost_usd
+        if any(entry.price != "free" for entry in self._plan.entries.values()):
+            usd = sum((self._costs(spec.order) for spec in specs), 0.0)
+            if cap_usd is not None:
+                usd = cap_usd = max(0.0, cap_usd - self._ledger.read().committed_usd) / idle
+            asked = Asked(f"Dask worker {address}", specs[0].trial_id, usd)
+            self._ledger.reserve(name, 1, usd, None, asked)
+        task = Task(
+            run=self._run,
+            name=name,
+            specs=specs,
+            plan=self._plan,
+            options=replace(self._options, in_flight=in_flight, max_cost_usd=cap_usd),
+            urls=base_urls(self._plan.entries),
+            earlier=self._earlier,
+            share=1 / slots,
+            first=self.first,
+            recorded=recorded,
+            unanswered=unanswered,
+            overruns=[*self._ledger.read().overruns.items()],
+        )
+        self._given[address] = task, asyncio.create_task(self._played(address, task))
+
+    async def _recorded(
+        self, specs: Sequence[TrialSpec]
+    ) -> tuple[list[CachedCall], dict[str, tuple[Attempt, ...]]]:
+        """What the cache holds of the calls of these trials, up to the first that is missing."""
+        player = LocalRunner.sealed(self._plan, self._cache)
+        recorded: dict[str, CachedCall] = {}
+        unanswered: dict[str, tuple[Attempt, ...]] = {}
+        for spec in specs:
+            record = await player.play_one(spec)
+            for row in record.decisions:
+                if (reply := row.decision.reply) is not None:
+                    recorded[reply.request.key] = CachedCall(reply.request, reply.attempts)
+            for call in record.failed_calls:
+                with contextlib.suppress(RecordingError):  # a damaged one is asked again
+                    if attempts := self._cache.unanswered(call.request.key):
+                        unanswered[call.request.key] = attempts
+        return list(recorded.values()), unanswered
+
+    async def _played(self, address: str, task: Task) -> Played | Exception:
+        """Have a worker play a task; the error where it died."""
+        # Out of Dask's scheduling, which would retry it: the share of the cap is spent once.
+        answers = await self._client.run(
+            play_task, fingerprint(), pickle.dumps(task), workers=[address], on_error="return"
+        )
+        if isinstance(error := answers[address], ImportError):
+            why = f"it cannot load merge-runner ({error}): install the same one for all"
+            return Played(error=UsageError(why))
+        return answers[address]  # type: ignore[no-any-return] # Dask has no types
+
+    async def _collect(self) -> None:
+        """Wait a while for tasks, and keep what those that have ended return."""
+        if not self._given:
+            await asyncio.sleep(LOOK_EVERY_S)
+            return
+        works = [work for _, work in self._given.values()]
+        await asyncio.wait(works, timeout=LOOK_EVERY_S, return_when=asyncio.FIRST_COMPLETED)
+        for address in [address for address, (_, work) in self._given.items() if work.done()]:
+            task, work = self._given.pop(address)
+            played = work.result()
+            if not isinstance(played, Played):
+                self._lose(task, address, played)
+                continue
+            self._keep(task, played)
+            if (error := played.error) is not None:
+                raise type(error)(f"{error} (told by the Dask worker {address})")
+
+    def _keep(self, task: Task, played: Played) -> None:
+        """Keep what a task has brought: its replies first."""
+        self._cache.put_now(played.replies, played.unanswered.items())
+        self._ledger.settle_share(task.name, played.spent, played.opened)
+        for model, meter in played.meters.items():
+            self.meters[model].add(meter)
+        for record in played.records:
+            self._ended(record.spec, record)
+            asked = self._plan.by_label()[record.spec.arm].asked
+            for row in record.decisions:
+                if asked[row.side] in self._plan.entries:
+                    self.first.count(asked[row.side], row.decision)
+        for spec, why in played.suspended:
+            if task.share == 1:
+                self._ended(spec, TrialSuspended(why))
+            else:  # all the money that is left goes to one task at a time
+                self._one_by_one = True
+                self._groups.appendleft([spec])
+
+    def _lose(self, task: Task, address: str, error: Exception) -> None:
+        """Give the trials of a lost task out again; its share of the cap stays reserved."""
+        self._losses[task.specs[0].order] += 1
+        if self._losses[task.specs[0].order] == MOST_LOSSES:
+            raise ClusterFailed(
+                f"a task was begun on {MOST_LOSSES} Dask workers, and all died ({error!r}). Look "
+                "at their memory and their logs; run the same command again to go on"
+            )
+        self._groups.appendleft([*task.specs])
+        lost = f"the worker {address} is lost: its {len(task.specs)} trials go to others"
+        next(iter(self.meters.values())).notes.append(lost)
