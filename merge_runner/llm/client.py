@@ -27,8 +27,6 @@ from merge_runner.errors import (
     ReplayMiss,
     SweepStopped,
 )
-from merge_runner.llm.batch.journal import OpenBatch
-from merge_runner.llm.batch.rounds import Batches
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request, reply_object
@@ -64,6 +62,7 @@ from merge_runner.records import (
 )
 
 if TYPE_CHECKING:
+    from merge_runner.llm.batch.rounds import Batch, Rounds
     from merge_runner.llm.http import HttpTransport
 
 # A shorter wait is over before a note of it is read.
@@ -110,7 +109,7 @@ class Call:
     wait: Wait | None = None
     asking: int = 0
     singly: bool = False
-    open: OpenBatch | None = None
+    open: Batch | None = None
     task: asyncio.Task[ChatReply] = field(init=False)
 
     @property
@@ -184,9 +183,10 @@ class LlmClient:
     ``endpoint`` is the identity that enters the keys. ``budget`` is None for a model that costs
     nothing. ``first`` is the run's first call to the endpoint, which goes alone. ``sealed`` says
     that nothing may be asked anew, so that there is no ``transport``; ``strict`` that an answer of
-    another model stops the sweep. ``batches`` are those in which it may be asked, or where its
-    calls may wait already. ``driver`` is its name, with the endpoint where that is not the
-    provider's own.
+    another model stops the sweep. In ``rounds``, which know it as ``model``, its name in the
+    registry, it may be asked at ``batch_price`` as a share of the plain one, or its calls may wait
+    already. ``driver`` is its name, with the endpoint where
+    that is not the provider's own.
 
     ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
     its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
@@ -203,7 +203,9 @@ class LlmClient:
     sealed: bool = False
     strict: bool = False
     first: FirstCall = field(default_factory=lambda: FirstCall(passed=True))
-    batches: Batches | None = None
+    rounds: Rounds | None = None
+    model: str = ""
+    batch_price: float = 1.0
     under_way: dict[str, Call] = field(default_factory=dict)
     meter: Meter = field(default_factory=Meter)
     driver: str = field(init=False)
@@ -301,10 +303,10 @@ class LlmClient:
         try:
             recorded = self.cache.get(request.key)
         except RecordingError as exc:
-            if self.sealed:
-                raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
-            return None
-        return None if recorded is None else self._read(recorded, len(recorded.attempts))
+            if not self.sealed:
+                return None
+            raise CallFailed(f"{self.name}: call {request.key}: {exc}", request) from exc
+        return self._read(recorded, len(recorded.attempts)) if recorded else None
 
     def _count(self, reply: ChatReply) -> None:
         """Count an answer that a trial uses, and who gave it where it is another model."""
@@ -343,7 +345,9 @@ class LlmClient:
 
     async def _call(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
-        opened = self.batches is not None and self.batches.takes_up(call)
+        opened = self.rounds is not None and self.rounds.open_batch(call.request.key) is not None
+        if opened:
+            self._money.begin_anew(call.order)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
             await self._money.admit(call.order)
         first = self.first
@@ -374,10 +378,12 @@ class LlmClient:
                 f"in the cache as 'damaged {name}', and asked again"
             )
         earlier = self.cache.unanswered(key)
-        if self.batches is not None:
-            call.open = self.batches.rounds.open_batch(key, earlier)
+        if self.rounds is not None:
+            call.open = self.rounds.open_batch(key)
         opened = call.open  # the attempt that has begun there is the one that goes on
-        call.attempts = [each for each in earlier if not opened or each.number < opened.lines[key]]
+        call.attempts = [
+            each for each in earlier if not opened or each.number < opened.note.lines[key]
+        ]
         call.earlier = len(call.attempts)
 
     async def _attempts(self, call: Call) -> ChatReply:
@@ -409,9 +415,9 @@ class LlmClient:
 
     async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
         """Make one attempt; return its answer, which is kept, or raise what follows from it."""
-        batches = self.batches
-        if batches and (call.open or (batches.rounds.submits and not call.singly)):
-            return await self._attempt_in_batch(call, batches)
+        rounds = self.rounds
+        if rounds and (call.open or (rounds.submits and not call.singly)):
+            return await self._attempt_in_batch(call, rounds)
         with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
             paid = await self._money.set_aside(call.order, call.request.key, call.asked)
         with closing(paid):
@@ -559,24 +565,27 @@ class LlmClient:
         stray = raw.status == 200 and raw.is_web_page and not self.first.known
         return None if may_be_charged(raw, self._own_host) and not stray else 0.0
 
-    async def _attempt_in_batch(self, call: Call, batches: Batches) -> ChatReply:
+    async def _attempt_in_batch(self, call: Call, rounds: Rounds) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""
-        line = await batches.line(call)
-        with closing(line.paid):
-            with call.waiting(f"for batches of {batches.model}", idle=True):
-                end, batch = await batches.rounds.ask(line)
+        asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.batch_price)
+        who = (call.order, call.request.key, asked)
+        if call.open is None:
+            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
+                paid = await self._money.set_aside(*who)
+        else:
+            paid = self._money.going_on(*who, call.open.note.ledger)
+        with closing(paid):
+            with call.waiting(f"for batches of {self.model}", idle=True):
+                outcome, batch = await rounds.ask(call, paid, self.model)
             call.open, call.singly = None, True
-            outcome = AttemptOutcome("retry", end.outcome, end.message, charged=end.unclear)
-            if end.raw is not None:  # no limit of single calls is meant, and no call waits for one
-                outcome = replace(judge(end.raw, self._wire), pause=False, delay_s=None)
-            record = self._record(call, outcome)
+            record, raw = self._record(call, outcome), outcome.raw
             usd = record.cost_usd
-            if end.raw is not None and end.raw.status != 200 and record.usage == Usage():
+            if raw is not None and raw.status != 200 and record.usage == Usage():
                 usd = 0.0  # no line that failed is charged
             record = replace(
                 record,
-                started_at=batch.submitted_at.isoformat(timespec="milliseconds"),
-                cost_usd=None if usd is None else usd * batches.price_factor,
-                batch_id=batch.batch_id or None,
+                started_at=batch.note.submitted_at.isoformat(timespec="milliseconds"),
+                cost_usd=None if usd is None else usd * self.batch_price,
+                batch_id=batch.note.batch_id or None,
             )
-            return await self._concluded(call, line.paid, outcome, record, end.error)
+            return await self._concluded(call, paid, outcome, record, batch.error)

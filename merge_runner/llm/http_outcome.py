@@ -245,8 +245,7 @@ class Deadline:
     """
 
     def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
-        self._used_s = 0.0
+        self._seconds = self._left_s = seconds
 
     @contextmanager
     def attempt(self) -> Iterator[float]:
@@ -254,9 +253,9 @@ class Deadline:
         loop = asyncio.get_running_loop()
         began = loop.time()
         try:
-            yield self._seconds - self._used_s
+            yield self._left_s
         finally:
-            self._used_s += loop.time() - began
+            self._left_s -= loop.time() - began
 
     async def keep(
         self,
@@ -282,13 +281,13 @@ class Deadline:
             return await attempt()
 
         async def wait(seconds: float) -> None:
-            self._used_s += seconds
+            self._left_s -= seconds
             await sleep(seconds)
 
         again = AsyncRetrying(
             retry=retry_if_exception_type(TryAgain),
             wait=_wait_s,
-            stop=lambda state: self._used_s + state.upcoming_sleep >= self._seconds,
+            stop=lambda state: state.upcoming_sleep >= self._left_s,
             sleep=wait,
             reraise=True,
         )

@@ -8,16 +8,14 @@ from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
 
 from merge_runner.config import (
-    ModelEntry,
     check_network,
     rehearsal_endpoint,
     resolve_endpoint,
 )
 from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.journal import Journal
 from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
-from merge_runner.llm.batch.rounds import Batches, Rounds
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
@@ -53,14 +51,18 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     }
 
 
-def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, CallTotals]:
-    """Return what the cache knows of each model's answers to requests like those of a plan.
+class EarlierAnswers(dict[str, CallTotals]):
+    """Totals of each model's answers; a model whose endpoint has never answered is missing."""
 
-    A model whose endpoint has never given an answer is not among them.
-    """
+    def __missing__(self, name: str) -> CallTotals:
+        return CallTotals()
+
+
+def earlier_answers(plan: Plan, cache: ResponseCache) -> EarlierAnswers:
+    """Return what the cache knows of the models' answers to requests like those of a plan."""
     totals = call_totals(cache.entries())
     answered = {(model, endpoint) for model, endpoint, *_ in totals}
-    earlier = {}
+    earlier = EarlierAnswers()
     for name, entry in plan.entries.items():
         place = entry.id, plan.endpoints[name]
         if place in answered:
@@ -73,7 +75,7 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, CallTotals]:
 def live_clients(
     plan: Plan,
     options: Options,
-    earlier: Mapping[str, CallTotals],
+    earlier: EarlierAnswers,
     cache: ResponseCache,
     ledger: Ledger,
     *,
@@ -117,7 +119,7 @@ def live_clients(
     clients: dict[str, LlmClient] = {}
     under_way: dict[str, Call] = {}  # two names of one model may ask the same
     for name, entry in plan.entries.items():
-        model = plan.registered[name]
+        model, terms = plan.registered[name], batch_terms(entry)
         if model not in transports:
             if plan.is_rehearsal:
                 endpoint = rehearsal_endpoint(entry)
@@ -140,7 +142,7 @@ def live_clients(
                 window_s=WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S,
             )
             limiters.setdefault(model, limiter)
-            if rounds is not None and batch_terms(entry) is not None:
+            if rounds is not None and terms is not None:
                 service = SERVICES[entry.format]
                 rounds.services[model] = service(transports[model], endpoint, FORMATS[entry.format])
         clients[name] = LlmClient(
@@ -157,30 +159,21 @@ def live_clients(
                 passed=rounds is not None and rounds.submits,
                 known=name in earlier,
             ),
-            batches=_batches(model, entry, budget, cache, rounds),
+            rounds=rounds if terms else None,
+            model=model,
+            batch_price=terms.price_factor if terms else 1.0,
             under_way=under_way,
         )
     return clients
-
-
-def _batches(
-    model: str, entry: ModelEntry, budget: Budget, cache: ResponseCache, rounds: Rounds | None
-) -> Batches | None:
-    """The batches in which a model is asked; None where it has none."""
-    terms = batch_terms(entry)
-    if rounds is None or terms is None:
-        return None
-    money = Budget(Ledger(cache, "")) if entry.price == "free" else budget
-    return Batches(rounds, model, money, terms.price_factor)
 
 
 def open_rounds(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
 ) -> Rounds | None:
     """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
-    journal = Journal(cache)
     models = set(plan.registered.values())
-    left = [each for each in journal.batches() if each.model in models and journal.waits(each)]
+    rounds = Rounds(cache, models, submits=options.batch, say=say)
+    left = bool(rounds.batches)
     if options.dask is not None:
         if left:
             raise UsageError(
@@ -192,7 +185,7 @@ def open_rounds(
         say("calls that wait in batches of an earlier run are not asked again")
     if not options.batch and not left:
         return None
-    return Rounds(journal, {}, submits=options.batch, say=say)
+    return rounds
 
 
 def check_batches(plan: Plan, options: Options) -> None:

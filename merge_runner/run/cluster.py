@@ -42,8 +42,8 @@ from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec
 from merge_runner.registry import in_use, plugin_sources, use
-from merge_runner.run.clients import live_clients
-from merge_runner.run.estimate import CallTotals, trial_costs
+from merge_runner.run.clients import EarlierAnswers, live_clients
+from merge_runner.run.estimate import trial_costs
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.local_runner import Ended, LocalRunner, Room
 from merge_runner.run.plan import Options, Plan
@@ -137,7 +137,7 @@ class Task:
     plan: Plan
     options: Options
     urls: Mapping[str, str]
-    earlier: Mapping[str, CallTotals]
+    earlier: EarlierAnswers
     share: float
     first: FirstDecisions
     recorded: Sequence[CachedCall]
@@ -244,7 +244,7 @@ class DaskTasks:
     _client: Client
     _plan: Plan
     _options: Options
-    _earlier: Mapping[str, CallTotals]
+    _earlier: EarlierAnswers
     _cache: ResponseCache
     _ledger: Ledger
     first: FirstDecisions
@@ -389,9 +389,10 @@ class DaskTasks:
         self._ledger.settle_share(task.name, played.spent, played.opened)
         for model, meter in played.meters.items():
             self.meters[model].add(meter)
+        arms = self._plan.by_label()
         for record in played.records:
             self._ended(record.spec, record)
-            asked = self._plan.by_label()[record.spec.arm].asked
+            asked = arms[record.spec.arm].asked
             for row in record.decisions:
                 if asked[row.side] in self._plan.entries:
                     self.first.count(asked[row.side], row.decision)

@@ -243,6 +243,7 @@ class StoredReplies:
     """The replies in the table ``calls``, of one trial at a time, as a client finds them."""
 
     def __init__(self, connection: duckdb.DuckDBPyConnection, plan: Plan) -> None:
+        self.money = None  # the ledger of a sealed client keeps nothing
         self._connection = connection
         self._plan = plan
         self._spans = spans(connection, "calls")

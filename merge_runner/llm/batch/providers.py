@@ -16,7 +16,6 @@ from merge_runner.llm.batch.service import (
     BatchFailed,
     BatchService,
     BatchStatus,
-    Page,
     id_of,
     json_object,
 )
@@ -24,7 +23,6 @@ from merge_runner.llm.content_hashes import LARGEST_STATUS, canonical_json
 from merge_runner.llm.formats.base import (
     as_count,
     as_dict,
-    as_dicts,
     as_text,
     first_of,
     read_error,
@@ -34,7 +32,6 @@ from merge_runner.records import ChatRequest
 
 # Where a provider's addresses stand, whatever the base URL of the server is.
 OPENAI, GEMINI = "/v1", "/v1beta"
-MARK = "merge_runner_mark"
 NOT_ASKED = frozenset({"batch_expired", "batch_cancelled"})
 # Of ASCII, as a URL is; it may carry a long token.
 UPLOAD_PATH = re.compile("/[!-~]{1,8000}")
@@ -53,13 +50,12 @@ CANCELLED = 499
 class OpenAIBatches(BatchService):
     """``/files`` and ``/batches`` of OpenAI, and of servers that speak like it."""
 
+    template = (
+        f'{{{{"custom_id":"{{key}}","method":"POST","url":"{OPENAI}{{path}}",'
+        '"body":{body}{slot}}}\n'
+    )
     path, pages, cursor = "/batches", "limit=100", "after"
-
-    def line(self, request: ChatRequest) -> bytes:
-        """See BatchService."""
-        url, slot = canonical_json(OPENAI + request.path), self.slot_members(request)
-        members = f'"method":"POST","url":{url},"body":{request.body}{slot}'
-        return f'{{"custom_id":"{request.key}",{members}}}\n'.encode()
+    list_member, next_member, mark_member = "data", "last_id", "merge_runner_mark"
 
     async def upload(self, content: bytes, mark: str) -> str:
         """See BatchService."""
@@ -78,15 +74,9 @@ class OpenAIBatches(BatchService):
             "input_file_id": file,
             "endpoint": OPENAI + requests[0].path,
             "completion_window": "24h",
-            "metadata": {MARK: mark},
+            "metadata": {self.mark_member: mark},
         }
         return self.path, canonical_json(batch).encode()
-
-    def page_of(self, page: dict[str, Any]) -> Page:
-        """See BatchService; the mark is among the metadata."""
-        batches = as_dicts(page.get("data"))
-        listed = [(as_dict(batch.get("metadata")).get(MARK), batch) for batch in batches]
-        return listed, as_text(page.get("last_id")) if page.get("has_more") else None
 
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
@@ -96,13 +86,10 @@ class OpenAIBatches(BatchService):
         why = read_error(400, {}, "", {"error": error})
         why = replace(why, status=status_within(why) if why.names else 400)
         failure = self.failure_of(why) if word == "FAILED" else None
-        ended = word in ("COMPLETED", "EXPIRED", "CANCELLED")
-        return BatchStatus(ended, answered, failure, batch)
-
-    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
-        """Return those of its files of answers and of errors."""
+        if word not in ("COMPLETED", "EXPIRED", "CANCELLED"):
+            return BatchStatus(failure=failure)
         names = [name for name in ("output_file_id", "error_file_id") if batch.get(name)]
-        return [f"/files/{id_of(batch, name)}/content" for name in names]
+        return BatchStatus([f"/files/{id_of(batch, name)}/content" for name in names], answered)
 
     def read(self, line: dict[str, Any]) -> RawReply | None:
         """See BatchService."""
@@ -120,13 +107,9 @@ class OpenAIBatches(BatchService):
 class AnthropicBatches(BatchService):
     """``/v1/messages/batches``, with all requests in the body; a batch takes no mark."""
 
+    template = '{{"custom_id":"{key}","params":{body}{slot}}}'
     takes_mark = False
     path = "/v1/messages/batches"
-
-    def line(self, request: ChatRequest) -> bytes:
-        """See BatchService."""
-        slot = self.slot_members(request)
-        return f'{{"custom_id":"{request.key}","params":{request.body}{slot}}}'.encode()
 
     def creation(self, requests: Sequence[ChatRequest], file: str, mark: str) -> tuple[str, bytes]:
         """See BatchService."""
@@ -134,16 +117,14 @@ class AnthropicBatches(BatchService):
 
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService."""
-        ended = (as_text(batch.get("processing_status")) or "").upper() == "ENDED"
-        counts = as_dict(batch.get("request_counts")).values()
-        return BatchStatus(ended, sum(as_count(count) or 0 for count in counts), batch=batch)
-
-    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
-        """See BatchService."""
+        if (as_text(batch.get("processing_status")) or "").upper() != "ENDED":
+            return BatchStatus()
         if batch.get("archived_at"):
             raise BatchFailed("lost", "the results of the batch are no longer kept")
+        counts = as_dict(batch.get("request_counts")).values()
         # Not at the URL that the batch names: the key goes to the configured host alone.
-        return [f"{self.path}/{batch_id}/results"]
+        path = f"{self.path}/{id_of(batch)}/results"
+        return BatchStatus([path], sum(as_count(count) or 0 for count in counts))
 
     def read(self, line: dict[str, Any]) -> RawReply | None:
         """See BatchService."""
@@ -167,14 +148,10 @@ class GeminiBatches(BatchService):
     results has the key of its request.
     """
 
+    template = '{{"key":"{key}","request":{body}{slot}}}\n'
     # A page has few batches, since one may come with all its results.
     path, pages, cursor = f"{GEMINI}/batches", "pageSize=10", "pageToken"
-    id_member, key_member = "name", "key"
-
-    def line(self, request: ChatRequest) -> bytes:
-        """See BatchService."""
-        slot = self.slot_members(request)
-        return f'{{"key":"{request.key}","request":{request.body}{slot}}}\n'.encode()
+    list_member, next_member, mark_member = "operations", "nextPageToken", "displayName"
 
     async def upload(self, content: bytes, mark: str) -> str:
         """See BatchService."""
@@ -202,36 +179,27 @@ class GeminiBatches(BatchService):
         path = requests[0].path.replace(":generateContent", ":batchGenerateContent")
         return path, canonical_json({"batch": batch}).encode()
 
-    def page_of(self, page: dict[str, Any]) -> Page:
-        """See BatchService; the mark is the display name."""
-        batches = as_dicts(page.get("operations"))
-        listed = [(as_dict(batch.get("metadata")).get("displayName"), batch) for batch in batches]
-        return listed, as_text(page.get("nextPageToken")) or None
-
     def status_of(self, batch: dict[str, Any]) -> BatchStatus:
         """See BatchService; of an operation that is done the word may be one that nobody knows."""
-        word, done, error = _word(batch), batch.get("done") is True, as_dict(batch.get("error"))
-        ended = word in ("SUCCEEDED", "PARTIALLY_SUCCEEDED", "CANCELLED", "EXPIRED")
-        failed = not ended and (word == "FAILED" or (done and bool(error)))
-        why = read_error(_status_of(error) if error else 400, {}, "", batch)
-        stats = as_dict(as_dict(batch.get("metadata")).get("batchStats"))
-        answered = str(stats.get("successfulRequestCount"))  # 64-bit numbers are texts
-        return BatchStatus(
-            ended=ended or (done and not failed),
-            results=int(answered) if re.fullmatch("[0-9]{1,18}", answered) else 0,
-            failure=self.failure_of(why) if failed else None,
-            batch=batch,
-        )
-
-    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
-        """See BatchService."""
-        metadata = as_dict(batch.get("metadata"))
+        metadata, error = as_dict(batch.get("metadata")), as_dict(batch.get("error"))
+        # It says JOB_STATE_ or BATCH_STATE_ before it.
+        word = (as_text(metadata.get("state")) or "").upper().rpartition("_STATE_")[2]
+        done = batch.get("done") is True
+        if word not in ("SUCCEEDED", "PARTIALLY_SUCCEEDED", "CANCELLED", "EXPIRED"):
+            if word == "FAILED" or (done and error):
+                why = read_error(_status_of(error) if error else 400, {}, "", batch)
+                return BatchStatus(failure=self.failure_of(why))
+            if not done:
+                return BatchStatus()
         output = as_dict(metadata.get("output")) or as_dict(batch.get("response"))
-        if not output and _word(batch).endswith("SUCCEEDED"):
+        if not output and word.endswith("SUCCEEDED"):
             raise BatchFailed("again", "the results are not there yet")
-        if not output.get("responsesFile"):
-            return []
-        return [f"{GEMINI}/{id_of(output, 'responsesFile')}:download?alt=media"]
+        file = id_of(output, "responsesFile") if output.get("responsesFile") else ""
+        answered = str(as_dict(metadata.get("batchStats")).get("successfulRequestCount"))
+        return BatchStatus(
+            [f"{GEMINI}/{file}:download?alt=media"] if file else [],
+            int(answered) if re.fullmatch("[0-9]{1,18}", answered) else 0,  # numbers are texts
+        )
 
     def read(self, line: dict[str, Any]) -> RawReply | None:
         """See BatchService."""
@@ -247,12 +215,6 @@ class GeminiBatches(BatchService):
 def _reply(status: int, body: dict[str, Any]) -> RawReply:
     # In ASCII, since JSON can spell half of a surrogate pair, which no file can hold.
     return RawReply(status, {}, json.dumps(body))
-
-
-def _word(batch: Mapping[str, Any]) -> str:
-    """Gemini's word for a state, whether it says JOB_STATE_ or BATCH_STATE_ before it."""
-    word = as_text(as_dict(batch.get("metadata")).get("state")) or ""
-    return word.upper().rpartition("_STATE_")[2]
 
 
 def _status_of(error: dict[str, Any]) -> int:
@@ -287,10 +249,8 @@ def require_batch(name: str, entry: ModelEntry, entries: Mapping[str, ModelEntry
     terms = batch_terms(entry)
     if terms is None:
         valid = ", ".join(each for each, its in entries.items() if batch_terms(its))
-        where = endpoint_identity(entry)
-        at = "" if where == entry.provider else f" at {where}"
         raise UsageError(
-            f"{name} has no batch mode that is known{at}; valid with --batch: {valid}. Leave "
+            f"{name} has no batch mode that is known; valid with --batch: {valid}. Leave "
             "--batch out, or give the entry in experiments/models.toml `batch = "
             "{ price_factor = 0.5, source = ... }` where its server has one in the same format"
         )

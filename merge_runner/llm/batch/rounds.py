@@ -2,39 +2,49 @@
 
 A round is closed when nothing can go on before an answer comes, so that all trials advance by one
 decision at a time, and a sweep takes as many rounds as its longest trial has decisions. A line that
-failed is asked singly. The journal knows of a batch before its provider does: a call that waits in
-an open batch is not asked anew, it joins those that wait there.
+failed is asked singly.
+
+A batch is noted in the cache before its provider knows of it. A process that is killed leaves there
+what the next one needs: the batch to look for, or to wait for, and under which of its attempts each
+call waits there. A call that waits in an open batch is not asked anew, it joins those that wait
+there. One process at a time asks a model in a cache, so that it knows all notes of its models once
+it has read them.
 """
 
 from __future__ import annotations
 
 import asyncio
-import itertools
+import contextlib
 import math
 import secrets
 from collections import defaultdict
-from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
+
+from pydantic import AwareDatetime, BaseModel, ValidationError
 
 from merge_runner.errors import (
     EndpointRefused,
     MergeRunnerError,
     ProviderDown,
     QuotaExhausted,
+    RecordingError,
     TrialSuspended,
 )
-from merge_runner.llm.batch.journal import Journal, OpenBatch
-from merge_runner.llm.batch.service import BatchFailed, BatchService
-from merge_runner.llm.budget import Budget, PaidAttempt
-from merge_runner.llm.http_outcome import RawReply, backoff_s
-from merge_runner.records import Attempt
+from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus
+from merge_runner.llm.budget import PaidAttempt
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
+from merge_runner.records import ChatRequest
 
 if TYPE_CHECKING:
     from merge_runner.llm.client import Call
 
+# The prefix of names in the cache.
+_BATCH = "batch "
 # How often it is looked whether a round can be closed: what is seen then decides, not the time.
 LOOK_S = 0.05
 # A task that can go on shows that when the loop has come round once; a chain of them, soon after.
@@ -52,62 +62,37 @@ ENDING_S = 3600.0
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
-class LineEnd:
-    """How a line ended.
+class OpenBatch(BaseModel, frozen=True):
+    """What is noted of a batch that was created, or is about to be.
 
-    Without a ``raw`` reply ``outcome`` names why, and nothing was charged unless it is ``unclear``.
-    Then it is asked singly. An ``error`` ends the sweep.
+    ``mark`` is its name at the provider, ``batch_id`` its id, empty until the provider has told it.
+    ``lines`` has the number of the attempt by the key of each call. ``model`` is its name in the
+    registry, ``ledger`` that of the money. ``submitted_at`` is UTC.
     """
 
-    raw: RawReply | None = None
-    outcome: str = ""
-    message: str = ""
-    unclear: bool = False
-    error: MergeRunnerError | None = None
-
-
-@dataclass(slots=True, eq=False)
-class Line:
-    """A call whose next attempt waits for a batch to be created, or to end.
-
-    ``model`` is its name in the registry, ``batch`` will be the one that it goes to.
-    """
-
-    call: Call
+    mark: str
     model: str
-    paid: PaidAttempt
-    batch: asyncio.Future[Batch] = field(init=False)
-
-    @property
-    def key(self) -> str:
-        """That of its request, which is its id at the provider."""
-        return self.call.request.key
-
-    def begins(self) -> bool:
-        """Set its money aside durably, unless that is done; False if the cap is used up."""
-        return not self.paid.queued or self.paid.set_aside(self.call.attempts)
+    ledger: str
+    submitted_at: AwareDatetime
+    lines: dict[str, int]
+    batch_id: str = ""
 
 
 @dataclass(slots=True, eq=False)
 class Batch:
-    """A batch of this process, whose ``work`` ends with it.
+    """A batch, whose ``work`` ends with it; None where nobody has asked for a call of it yet.
 
-    Then ``ends`` has the lines with a result, by key, until they are taken, and ``rest`` is the end
-    of all others; None: they go with the next round. While its work ``sleeps`` nothing of it is on
-    its way.
+    Then ``ends`` has what became of the lines with a result, by key, until it is taken, and
+    ``rest`` what became of all others; None: they go with the next round. An ``error`` ends the
+    sweep. While its work ``sleeps`` nothing of it is on its way.
     """
 
     note: OpenBatch
-    ends: dict[str, LineEnd] = field(default_factory=dict)
-    rest: LineEnd | None = None
+    ends: dict[str, AttemptOutcome] = field(default_factory=dict)
+    rest: AttemptOutcome | None = None
+    error: MergeRunnerError | None = None
     sleeps: bool = False
-    work: asyncio.Task[None] = field(init=False)
-
-    @property
-    def age_s(self) -> float:
-        """How long ago it was submitted."""
-        return (datetime.now(UTC) - self.note.submitted_at).total_seconds()
+    work: asyncio.Task[None] | None = None
 
     async def sleep(self, seconds: float) -> None:
         """Wait, while others may go on."""
@@ -116,80 +101,74 @@ class Batch:
         self.sleeps = False
 
 
-@dataclass(frozen=True, slots=True)
-class Batches:
-    """How one model, by its name in the registry, is asked in rounds, and with whose money."""
+@dataclass(slots=True, eq=False)
+class Line:
+    """A call whose next attempt waits for a batch; ``batch`` will be the one that it goes to."""
 
-    rounds: Rounds
+    call: Call
+    paid: PaidAttempt
     model: str
-    money: Budget
-    price_factor: float
-
-    def takes_up(self, call: Call) -> bool:
-        """Whether a call waits in a batch already, so that its trial has begun."""
-        if self.rounds.open_batch(call.request.key) is None:
-            return False
-        self.money.begin_anew(call.order)
-        return True
-
-    async def line(self, call: Call) -> Line:
-        """Return the next attempt at a call with its money, which the caller closes."""
-        asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.price_factor)
-        who = (call.order, call.request.key, asked)
-        if call.open is None:
-            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid = await self.money.set_aside(*who)
-        else:
-            paid = self.money.going_on(*who, call.open.ledger)
-        return Line(call, self.model, paid)
+    batch: asyncio.Future[Batch]
 
 
 class Rounds:
     """The rounds of a run; ``services`` are the batch modes of its models, by registered name.
 
-    A run that does not ``submits`` takes only what earlier runs have submitted.
+    A run that does not ``submits`` takes only what earlier runs have submitted. ``batches`` are
+    all that calls of its ``models`` wait in, by mark, the oldest first.
     """
 
     def __init__(
         self,
-        journal: Journal,
-        services: dict[str, BatchService],
+        cache: ResponseCache,
+        models: Collection[str],
         *,
         submits: bool,
         say: Callable[[str], None],
     ) -> None:
+        self.services: dict[str, BatchService] = {}
         self.submits = submits
-        self.services = services
-        self._journal = journal
+        self._cache = cache
         self._say = say
         self._forming: list[Line] = []
-        self._batches: dict[str, Batch] = {}
-        self._creations: set[asyncio.Task[None]] = set()
         # Models of which a batch was refused: the most calls of the next. They go one by one.
         self._most: dict[str, int] = {}
+        noted = []
+        for name in cache.names(_BATCH):
+            with contextlib.suppress(RecordingError, ValidationError):  # a damaged one is none
+                noted.append(OpenBatch.model_validate_json(cache.read(name) or ""))
+        noted.sort(key=lambda note: note.submitted_at)
+        self.batches = {note.mark: Batch(note) for note in noted if note.model in models}
+        ended = [mark for mark, batch in self.batches.items() if not self._waits(batch)]
+        cache.run_now([partial(cache.remove, _BATCH + mark) for mark in ended])
+        for mark in ended:
+            del self.batches[mark]
 
-    def open_batch(self, key: str, attempts: Iterable[Attempt] = ()) -> OpenBatch | None:
-        """Return where a call with these attempts waits; None: nowhere that can be reached."""
-        batch = self._journal.batch_of(key)
-        if batch is None or not batch.holds(key, attempts) or batch.model not in self.services:
+    def open_batch(self, key: str) -> Batch | None:
+        """Return where a call was submitted last, unless its attempt there has ended."""
+        every = reversed(self.batches.values())
+        batch = next((batch for batch in every if key in batch.note.lines), None)
+        if batch is None:
             return None
+        with contextlib.suppress(RecordingError):  # damaged: nothing is known of its attempts
+            tried = {each.number: each.outcome for each in self._cache.unanswered(key)}
+            if tried.get(batch.note.lines[key], "unknown") != "unknown":
+                return None
         return batch
 
-    async def ask(self, line: Line) -> tuple[LineEnd, OpenBatch]:
-        """Wait for the end of a line, in the next round or in the batch where it waits already."""
-        note = line.call.open
-        batch = await self._next_round(line) if note is None else self._taken_up(note)
+    async def ask(self, call: Call, paid: PaidAttempt, model: str) -> tuple[AttemptOutcome, Batch]:
+        """Return what became of a call's next attempt, in the next round or where it waits."""
+        batch = call.open or await self._next_round(call, paid, model)
         while True:
-            await asyncio.shield(batch.work)
-            if line.key not in batch.note.lines:
+            await asyncio.shield(batch.work or self._start(batch))
+            if call.request.key not in batch.note.lines:
                 raise TrialSuspended("another run spends from the same cap, and has used it up")
-            end = batch.ends.pop(line.key, batch.rest)
+            end = batch.ends.pop(call.request.key, batch.rest)
+            if end is None and not self.submits:
+                end = _no_answer("not_created", "the run ended before", charged=False)
             if end is not None:
-                return end, batch.note
-            if not self.submits:
-                end = LineEnd(outcome="not_created", message="the run ended before")
-                return end, batch.note
-            batch = await self._next_round(line)
+                return end, batch
+            batch = await self._next_round(call, paid, model)
 
     async def watch(self, is_idle: Callable[[], bool]) -> None:
         """Close each round when nothing else goes on; ``is_idle`` says whether that is so."""
@@ -213,19 +192,31 @@ class Rounds:
 
     async def close(self) -> None:
         """End the waiting; batches that are being created get their ids noted first."""
-        work = [batch.work for batch in self._batches.values()]
+        work = [batch.work for batch in self.batches.values() if batch.work]
         for task in work:
             task.cancel()
-        await asyncio.gather(*work, *self._creations, return_exceptions=True)
-        await self._journal.tidy()
+        await asyncio.gather(*work, return_exceptions=True)
 
     def _open(self, model: str | None = None) -> list[Batch]:
         """Return the batches that have not ended: they take room at their provider."""
-        every = self._batches.values()
-        return [b for b in every if not b.work.done() and model in (None, b.note.model)]
+        return [
+            batch
+            for batch in self.batches.values()
+            if batch.work and not batch.work.done() and model in (None, batch.note.model)
+        ]
 
-    async def _next_round(self, line: Line) -> Batch:
-        line.batch = asyncio.get_running_loop().create_future()
+    def _waits(self, batch: Batch) -> bool:
+        """Whether a call of a batch waits there yet, and in no later one."""
+        for key in batch.note.lines:
+            with contextlib.suppress(RecordingError):  # damaged: it is asked anew
+                if self._cache.get(key) is not None:
+                    continue
+            if self.open_batch(key) is batch:
+                return True
+        return False
+
+    async def _next_round(self, call: Call, paid: PaidAttempt, model: str) -> Batch:
+        line = Line(call, paid, model, asyncio.get_running_loop().create_future())
         self._forming.append(line)
         return await line.batch
 
@@ -237,100 +228,98 @@ class Rounds:
         self._forming = []
         for (model, ledger), lines in groups.items():
             most = self._most.get(model, MOST_CALLS)
-            parts = [lines[at : at + most] for at in range(0, len(lines), most)]
             if model in self._most:
-                later = parts if self._open(model) else parts[1:]
-                parts = parts[: len(parts) - len(later)]
-                self._forming += itertools.chain.from_iterable(later)
-            for part in parts:
+                now = 0 if self._open(model) else most
+                self._forming += lines[now:]
+                del lines[now:]
+            for part in (lines[at : at + most] for at in range(0, len(lines), most)):
                 note = OpenBatch(
                     mark=secrets.token_hex(16),
                     model=model,
                     ledger=ledger,
                     submitted_at=datetime.now(UTC),
-                    lines={line.key: len(line.call.attempts) + 1 for line in part},
+                    lines={each.call.request.key: len(each.call.attempts) + 1 for each in part},
                 )
-                batch = Batch(note)
-                self._start(batch, self._submit(batch, part))
+                batch = self.batches[note.mark] = Batch(note)
+                self._start(batch, part)
                 for line in part:
                     line.batch.set_result(batch)
 
-    def _start(self, batch: Batch, work: Coroutine[Any, Any, None]) -> None:
-        """Do something for a batch in a task of its own; what it raises is raised for its lines."""
+    def _start(self, batch: Batch, lines: Sequence[Line] = ()) -> asyncio.Task[None]:
+        """Submit lines, or go on with a batch that an earlier run has submitted, or was about to.
 
-        async def do() -> None:
+        That is a task of its own; what it raises is raised for all who wait for it.
+        """
+
+        async def work() -> None:
             try:
-                await work
+                if lines:
+                    requests = await self._begin(batch, lines)
+                    is_there = bool(requests) and await self._submit(batch, requests)
+                else:
+                    is_there = bool(batch.note.batch_id) or await self._arrived(batch)
+                if is_there:
+                    await self._follow(batch)
             except BatchFailed as exc:
                 self._lost(batch, exc)
 
-        batch.work = asyncio.create_task(do())
-        self._batches[batch.note.mark] = batch
+        batch.work = asyncio.create_task(work())
+        return batch.work
 
-    def _taken_up(self, note: OpenBatch) -> Batch:
-        """Go on with a batch that an earlier run has submitted, or was about to."""
+    async def _begin(self, batch: Batch, lines: Sequence[Line]) -> list[ChatRequest]:
+        """Note a batch with those of its lines that may begin; returns their requests.
 
-        async def go_on() -> None:
-            if not note.batch_id and not self.services[note.model].takes_mark:
-                why = "the run ended before its id was known"
-                batch.rest = LineEnd(outcome="batch_lost", message=why, unclear=True)
-            elif note.batch_id or await self._arrived(batch):
-                await self._follow(batch)
+        Their money is set aside in the same transaction, unless that was done.
+        """
+        by_key = {line.call.request.key: line for line in lines}
 
-        if note.mark not in self._batches:
-            batch = Batch(note)
-            self._start(batch, go_on())
-        return self._batches[note.mark]
+        def operation() -> OpenBatch:
+            begun = {}
+            with self._cache.money.transaction():
+                for key, line in by_key.items():
+                    if not line.paid.queued or line.paid.set_aside(line.call.attempts):
+                        begun[key] = batch.note.lines[key]
+            note = batch.note.model_copy(update={"lines": begun})
+            self._write(note)
+            return note
 
-    async def _submit(self, batch: Batch, lines: Sequence[Line]) -> None:
-        """Note a batch with those of its lines that may begin, create it, and follow it."""
-        by_key = {line.key: line for line in lines}
-        batch.note = await self._journal.begin(batch.note, lambda key: by_key[key].begins())
-        begun = [by_key[key] for key in batch.note.lines]
-        for line in begun:
-            if line.paid.queued:
-                line.paid.begun()
-        if not begun:
-            return
-        try:
-            await self._patiently(batch, partial(self._create, batch, begun), OUTAGE_S)
-        except BatchFailed as exc:
-            model = batch.note.model
-            if exc.kind == "lost" and not self.services[model].takes_mark:
-                batch.rest = LineEnd(None, "batch_lost", str(exc), unclear=True)
-            elif exc.kind in ("again", "lost"):
-                # It may be there all the same: the next run looks for it, and nothing is settled.
-                raise ProviderDown(
-                    f"{model}: no batch can be submitted ({exc}): nothing else is asked. "
-                    "When the service answers again, run the same command"
-                ) from exc
-            else:
-                await self._not_asked(batch, exc, "not_created")
-        else:
-            await self._follow(batch)
+        batch.note = await self._cache.write(operation)
+        for key in batch.note.lines:
+            if by_key[key].paid.queued:
+                by_key[key].paid.begun()
+        return [by_key[key].call.request for key in batch.note.lines]
 
-    async def _create(self, batch: Batch, lines: Sequence[Line]) -> None:
-        """Create a batch; where its answer is lost, look for it."""
+    async def _submit(self, batch: Batch, requests: Sequence[ChatRequest]) -> bool:
+        """Create a batch, or find it where the answer is lost; False if it is not created."""
         service = self.services[batch.note.model]
 
         async def create() -> None:
-            requests = [line.call.request for line in lines]
             await self._note(batch, await service.create(requests, batch.note.mark))
 
-        creation = asyncio.create_task(create())
-        self._creations.add(creation)
-        creation.add_done_callback(self._creations.discard)
-        try:
-            await asyncio.shield(creation)  # its id is noted even if the run ends now
-        except BatchFailed as exc:
-            if exc.sent and not service.takes_mark:
-                raise BatchFailed("lost", f"whether it was created is not known ({exc})") from exc
-            if not (exc.sent and await self._arrived(batch)):
+        async def created() -> None:
+            creation = asyncio.create_task(create())
+            try:
+                await asyncio.shield(creation)
+            except asyncio.CancelledError:
+                await asyncio.wait([creation])  # its id is noted even if the run ends now
                 raise
+            except BatchFailed as exc:
+                if not (exc.sent and await self._arrived(batch)):
+                    raise
+
+        try:
+            await self._patiently(batch, created, OUTAGE_S)
+        except BatchFailed as exc:
+            await self._not_asked(batch, exc, "not_created")
+            return False
+        return True
 
     async def _arrived(self, batch: Batch) -> bool:
         """Look for a batch until its creation, if it was ever sent, must be in effect."""
-        find = partial(self.services[batch.note.model].find, batch.note.mark)
+        service = self.services[batch.note.model]
+        if not service.takes_mark:
+            raise BatchFailed("lost", "whether it was created is not known")
+        find = partial(service.find, batch.note.mark)
         for pause_s in (0.0, *ARRIVAL_S):
             await batch.sleep(pause_s)
             if (batch_id := await self._patiently(batch, find)) is not None:
@@ -340,15 +329,18 @@ class Rounds:
 
     async def _note(self, batch: Batch, batch_id: str) -> None:
         batch.note = batch.note.model_copy(update={"batch_id": batch_id})
-        await self._journal.note(batch.note)
+        await self._cache.write(lambda: self._write(batch.note))
+
+    def _write(self, note: OpenBatch) -> None:
+        self._cache.replace(_BATCH + note.mark, note.model_dump_json())
 
     async def _follow(self, batch: Batch) -> None:
         """Wait for the end of a batch, and read its results until no more can be had."""
         note, message = batch.note, "the batch has ended without a result for it"
         ask = partial(self.services[note.model].status, note.batch_id)
-        while not (status := await self._patiently(batch, ask)).ended and not status.failure:
-            pause_s = min(LONGEST_POLL_S, POLL_SHARE * batch.age_s)
-            await batch.sleep(max(SHORTEST_POLL_S, pause_s))
+        while (status := await self._patiently(batch, ask)) == BatchStatus():
+            age_s = (datetime.now(UTC) - note.submitted_at).total_seconds()
+            await batch.sleep(max(SHORTEST_POLL_S, min(LONGEST_POLL_S, POLL_SHARE * age_s)))
         if status.failure:
             await self._not_asked(batch, status.failure, "batch_failed")
             return
@@ -358,7 +350,7 @@ class Rounds:
             if exc.kind != "again":
                 raise
             message = str(exc)
-        batch.rest = LineEnd(outcome="no_result", message=message, unclear=True)
+        batch.rest = _no_answer("no_result", message)
         if note.model in self._most:
             self._most[note.model] = max(self._most[note.model], 2 * len(note.lines))
 
@@ -366,33 +358,35 @@ class Rounds:
         """Take the results of a batch; raises BatchFailed where there should be others."""
         note, service = batch.note, self.services[batch.note.model]
         status = await service.status(note.batch_id)
-        if not status.ended:
+        if status.paths is None:
             raise BatchFailed("again", "a batch that has ended is said to go on")
-        foreign = broken = 0
-        async for key, raw in service.results(note.batch_id, status):
-            end = LineEnd(raw) if raw else LineEnd(None, "expired", "it was not asked in time")
+        broken = 0
+        async for key, raw in service.results(status.paths):
+            end = _no_answer("expired", "it was not asked in time", charged=False)
+            if raw:  # no limit of single calls is meant, and no call waits for one
+                end = replace(judge(raw, service.wire), pause=False, delay_s=None)
             broken += not key
-            foreign += bool(key) and (
-                key not in note.lines or batch.ends.setdefault(key, end) != end
-            )
-        if broken or foreign:
-            self._say(
-                f"{note.model}: {broken + foreign} results of batch {note.batch_id} are ignored: "
-                "they are broken, of none of its calls, or differ from an earlier one"
-            )
-        if len(batch.ends) + broken < min(status.results, len(note.lines)):
-            raise BatchFailed(
-                "again", f"{len(batch.ends)} of the {status.results} results are there"
-            )
+            if key in note.lines:  # others are of other batches; of two the first counts
+                batch.ends.setdefault(key, end)
+        there = len(batch.ends) + broken
+        if there < min(status.results, len(note.lines)):
+            raise BatchFailed("again", f"{there} of the {status.results} results are there")
 
     async def _not_asked(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
         """End a batch of which the provider asks no line, or let its lines go in smaller ones."""
         model, calls = batch.note.model, len(batch.note.lines)
         is_alone = self._open(model) == [batch]
-        error: MergeRunnerError | None = None
+        if exc.kind == "lost":
+            raise exc
+        if exc.kind == "again" and outcome == "not_created":
+            # It may be there all the same: the next run looks for it, and nothing is settled.
+            raise ProviderDown(
+                f"{model}: no batch can be submitted ({exc}): nothing else is asked. When the "
+                "service answers again, run the same command"
+            )
         if exc.kind in ("quota", "refused"):
             kind = QuotaExhausted if exc.kind == "quota" else EndpointRefused
-            error = kind(
+            batch.error = kind(
                 f"{model}: its batch mode refuses: {exc}. Every reply so far is saved: correct "
                 "that, or leave --batch out, and run the same command to go on"
             )
@@ -405,19 +399,20 @@ class Rounds:
             # It counts as open, so that no other one is submitted meanwhile.
             await batch.sleep(exc.delay_s or 1.0)
             return
-        batch.rest = LineEnd(None, outcome, str(exc), error=error)
+        batch.rest = _no_answer(outcome, str(exc), charged=False)
 
     def _lost(self, batch: Batch, exc: BatchFailed) -> None:
         """End a batch that cannot be read: what was set aside for it stays so."""
-        note = batch.note
+        note, service = batch.note, self.services[batch.note.model]
+        is_unknown = not (note.batch_id or service.takes_mark)
         # A key that is refused is another account's, perhaps: there the batch goes on.
-        if self.services[note.model].forgets or (not self.submits and exc.kind == "lost"):
-            batch.rest = LineEnd(outcome="batch_lost", message=str(exc), unclear=True)
+        if is_unknown or service.forgets or (not self.submits and exc.kind == "lost"):
+            batch.rest = _no_answer("batch_lost", str(exc))
             return
         raise EndpointRefused(
-            f"{note.model}: {note.batch_id} is refused to this key ({exc}): set the key of the "
-            "account that has submitted it. If it is gone, the same command without --batch asks "
-            "its calls anew"
+            f"{note.model}: batch {note.batch_id or note.mark} is refused to this key ({exc}): set "
+            "that of the account that has submitted it. If it is gone, the same command without "
+            "--batch asks its calls anew"
         ) from exc
 
     async def _patiently(
@@ -439,3 +434,8 @@ class Rounds:
                     self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
                 tries += 1
                 await batch.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
+
+
+def _no_answer(name: str, why: str, *, charged: bool = True) -> AttemptOutcome:
+    """Return what became of a line without a result, which is asked singly."""
+    return AttemptOutcome("retry", name, why, charged=charged)

@@ -7,14 +7,14 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import aclosing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from urllib.parse import quote
 
 from merge_runner.config import Endpoint, is_own_host
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.llm.formats.base import ServerError, WireFormat, as_dict, as_text
+from merge_runner.llm.formats.base import ServerError, WireFormat, as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import (
     ErrorReply,
     RawReply,
@@ -31,11 +31,7 @@ if TYPE_CHECKING:
 TIMEOUT_S = 300.0
 MOST_BYTES = 256_000_000
 LONGEST_MESSAGE = 500
-# What a server answers of a batch that it does not have, or no longer.
-GONE = frozenset({301, 302, 303, 307, 308, 404, 410})
 ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
-# Batches of a list, each with its mark, and the cursor of the next page, if any.
-Page = tuple[list[tuple[object, dict[str, Any]]], str | None]
 FailureKind = Literal["again", "smaller", "quota", "refused", "lost"]
 
 
@@ -51,7 +47,7 @@ class BatchFailed(MergeRunnerError):
     def __init__(
         self, kind: FailureKind, message: str, *, delay_s: float | None = None, sent: bool = True
     ) -> None:
-        super().__init__(message)
+        super().__init__(message[:LONGEST_MESSAGE])
         self.kind = kind
         self.delay_s = delay_s
         self.sent = sent
@@ -59,16 +55,16 @@ class BatchFailed(MergeRunnerError):
 
 @dataclass(frozen=True, slots=True)
 class BatchStatus:
-    """The state of a batch, and in ``batch`` all that its server says of it.
+    """The state of a batch.
 
-    One that ``ended``, or expired or was cancelled, has results to fetch, at least ``results``,
-    perhaps not of all lines. Where there is a ``failure`` no line was asked or charged.
+    One that has ended, or expired or was cancelled, has its results at ``paths``: JSONL, in any
+    order, at least ``results`` of them, perhaps not of all lines. Where there is a ``failure`` no
+    line was asked or charged. One that goes on has neither.
     """
 
-    ended: bool
+    paths: Sequence[str] | None = None
     results: int = 0
     failure: BatchFailed | None = None
-    batch: Mapping[str, Any] = field(default_factory=dict)
 
 
 class BatchService(ABC):
@@ -76,16 +72,19 @@ class BatchService(ABC):
 
     Where a batch takes no mark, one whose id was lost cannot be found. Batches are at ``path``,
     where ``pages`` is the query for a page of their list, and ``cursor`` that for the one after it.
-    A batch has its id as ``id_member``, a result the key of its request as ``key_member``: 64
-    hexadecimal digits, as many characters as Anthropic takes.
+    A page has its batches as ``list_member``, each with its mark as ``mark_member`` of its
+    metadata, and the cursor of the next page as ``next_member``. A line is made by ``template``,
+    with the key of its request: 64 hexadecimal digits, as many characters as Anthropic takes.
     """
 
+    template: ClassVar[str]
     takes_mark: ClassVar[bool] = True
     path: ClassVar[str]
     pages: ClassVar[str]
     cursor: ClassVar[str]
-    id_member: ClassVar[str] = "id"
-    key_member: ClassVar[str] = "custom_id"
+    list_member: ClassVar[str]
+    next_member: ClassVar[str]
+    mark_member: ClassVar[str]
 
     def __init__(self, transport: HttpTransport, endpoint: Endpoint, wire: WireFormat) -> None:
         self.transport = transport
@@ -93,9 +92,15 @@ class BatchService(ABC):
         self.wire = wire
         self.forgets = endpoint.is_emulator  # what waits there ends with the emulator
 
-    @abstractmethod
     def line(self, request: ChatRequest) -> bytes:
         """Return a line as it is sent, with the body as it is hashed."""
+        slot = canonical_json(request.slot.as_dict())
+        # Only our own emulator is told the slot.
+        told = f',"{SLOT_HEADER}":{slot}' if self.endpoint.is_emulator else ""
+        line = self.template.format(
+            key=request.key, path=request.path, body=request.body, slot=told
+        )
+        return line.encode()
 
     async def upload(self, content: bytes, mark: str) -> str:
         """Return the name of a file with these lines; empty where the creation has them."""
@@ -125,16 +130,12 @@ class BatchService(ABC):
         while cursor is not None and cursor not in seen:  # ends where a server knows no pages
             seen.add(cursor)
             after = f"&{self.cursor}={quote(cursor, safe='')}" if cursor else ""
-            page = await self.ask("GET", f"{self.path}?{self.pages}{after}")
-            listed, cursor = self.page_of(json_object(page))
-            for its, batch in listed:
-                if its == mark:
+            page = json_object(await self.ask("GET", f"{self.path}?{self.pages}{after}"))
+            cursor = as_text(page.get(self.next_member))
+            for batch in as_dicts(page.get(self.list_member)):
+                if as_dict(batch.get("metadata")).get(self.mark_member) == mark:
                     return self._batch_id(batch)
         return None
-
-    def page_of(self, page: dict[str, Any]) -> Page:
-        """Return what a page of the list says."""
-        raise NotImplementedError
 
     async def status(self, batch_id: str) -> BatchStatus:
         """Return the state of a batch."""
@@ -145,10 +146,6 @@ class BatchService(ABC):
         """Return the state of a batch as its server describes it."""
 
     @abstractmethod
-    def result_paths(self, batch_id: str, batch: Mapping[str, Any]) -> list[str]:
-        """Return where the results of a batch that has ended are: JSONL, in any order."""
-
-    @abstractmethod
     def read(self, line: dict[str, Any]) -> RawReply | None:
         """Return what the plain endpoint would have replied: an answer (status 200) or an error.
 
@@ -156,16 +153,12 @@ class BatchService(ABC):
         ValueError where the line has no known form.
         """
 
-    async def results(
-        self, batch_id: str, status: BatchStatus
-    ) -> AsyncIterator[tuple[str, RawReply | None]]:
+    async def results(self, paths: Sequence[str]) -> AsyncIterator[tuple[str, RawReply | None]]:
         """Yield the results of a batch that has ended, by key; it is empty where one is broken.
 
-        Where one file cannot be read, those of the other come all the same. Raises BatchFailed with
-        the kind ``again`` where they can be read from the beginning.
+        Raises BatchFailed with the kind ``again`` where they can be read from the beginning.
         """
-        failure: BatchFailed | None = None
-        for path in self.result_paths(batch_id, status.batch):
+        for path in paths:
             try:
                 body = self.transport.lines(path, self.wire.headers, timeout_s=TIMEOUT_S)
                 async with aclosing(body) as lines:
@@ -173,30 +166,25 @@ class BatchService(ABC):
                         if line:
                             yield self._result(line)
             except ErrorReply as exc:
-                failure = self._refused(exc.raw, exists=True)
+                failure = self.failure_of(exc.raw.error, exists=True)
                 if exc.raw.status == 404:  # it belongs to a batch that is there
                     failure.kind = "again"
+                raise failure from exc
             except TransportFailure as exc:
-                failure = _unanswered(exc)
-        if failure is not None:
-            raise failure
+                raise _unanswered(exc) from exc
 
-    def failure_of(self, error: ServerError) -> BatchFailed:
-        """Return the failure of a batch that is not created, or fails as a whole."""
-        action = judge_error(error, self.wire).action
+    def failure_of(self, error: ServerError, *, exists: bool = False) -> BatchFailed:
+        """Return the failure of a batch that is not created, fails as a whole, or ``exists``."""
+        outcome = judge_error(error, self.wire)
+        kinds: dict[str, FailureKind] = {"retry": "again", "quota": "quota", "refused": "refused"}
+        kind = kinds.get(outcome.action, "again" if exists else "refused")
         enqueued = "token_limit_exceeded" in error.names or "enqueued" in error.message.lower()
-        kind: FailureKind = "refused"
-        if enqueued or error.status == 413:
+        if exists and error.status in (404, 410):  # its server does not have it, or no longer
+            kind = "lost"
+        elif not exists and (enqueued or error.status == 413):
             kind = "smaller"
-        elif action in ("retry", "quota"):
-            kind = "again" if action == "retry" else "quota"
-        return BatchFailed(kind, error.message[:LONGEST_MESSAGE])
-
-    def slot_members(self, request: ChatRequest) -> str:
-        """Return what our own emulator alone is told of a line, as a member of its JSON object."""
-        if not self.endpoint.is_emulator:
-            return ""
-        return f',"{SLOT_HEADER}":{canonical_json(request.slot.as_dict())}'
+        message = f"HTTP {error.status}: {error.message}"
+        return BatchFailed(kind, message, delay_s=outcome.delay_s)
 
     async def ask(
         self, method: str, path: str, body: bytes = b"", headers: Mapping[str, str] | None = None
@@ -209,31 +197,23 @@ class BatchService(ABC):
             )
         except TransportFailure as exc:
             raise _unanswered(exc) from exc
-        if not 200 <= raw.status < 300:
-            raise self._refused(raw, exists=method == "GET")
-        return raw
-
-    def _refused(self, raw: RawReply, *, exists: bool) -> BatchFailed:
-        outcome = judge_error(raw.error, self.wire)
-        kind = self.failure_of(raw.error).kind
-        if exists and raw.status in GONE:
-            kind = "lost"
-        elif exists and outcome.action not in ("quota", "refused"):
-            kind = "again"
+        if 200 <= raw.status < 300:
+            return raw
+        failure = self.failure_of(raw.error, exists=method == "GET")
         # Without a mark it cannot be looked for: what the provider says of itself decides.
         own = is_own_host(self.endpoint.provider, self.endpoint.identity)
-        sent = may_be_charged(raw, self.endpoint.provider if own else None)
-        sent = sent or (self.takes_mark and raw.status >= 500)
-        message = f"HTTP {raw.status}: {raw.error.message[:LONGEST_MESSAGE]}"
-        return BatchFailed(kind, message, delay_s=outcome.delay_s, sent=sent)
+        failure.sent = may_be_charged(raw, self.endpoint.provider if own else None)
+        failure.sent |= self.takes_mark and raw.status >= 500
+        raise failure
 
     def _batch_id(self, batch: dict[str, Any]) -> str:
-        return id_of(batch, self.id_member).rpartition("/")[2]
+        return id_of({"id": batch.get("id", batch.get("name"))}).rpartition("/")[2]
 
     def _result(self, line: str | TransportFailure) -> tuple[str, RawReply | None]:
         try:
             value = as_dict(json.loads(line) if isinstance(line, str) else None)
-            return as_text(value.get(self.key_member)) or "", self.read(value)
+            key = value.get("custom_id", value.get("key"))
+            return as_text(key) or "", self.read(value)
         except ValueError:
             return "", None
 

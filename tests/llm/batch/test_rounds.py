@@ -24,12 +24,12 @@ from merge_runner.errors import (
     ProviderDown,
     QuotaExhausted,
 )
-from merge_runner.llm.batch.journal import Journal
-from merge_runner.llm.batch.rounds import Batches, Rounds
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.service import BatchFailed, BatchStatus
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply
 from merge_runner.llm.ledger import Ledger
 from merge_runner.llm.limiter import Limiter
@@ -62,6 +62,7 @@ class Memory:
 
     takes_mark = True
     forgets = False
+    wire = FORMATS["openai-chat"]
 
     def __init__(self):
         self.batches = {}
@@ -88,13 +89,13 @@ class Memory:
     async def status(self, batch_id):
         if batch_id not in self.batches:
             raise BatchFailed("lost", "HTTP 404: no such batch", sent=False)
-        step = self.states.pop(0) if self.states else BatchStatus(ended=True)
+        step = self.states.pop(0) if self.states else BatchStatus([batch_id])
         if isinstance(step, BatchFailed):
             raise step
         return step
 
-    async def results(self, batch_id, status):
-        for line in reversed(self.batches[batch_id]):
+    async def results(self, paths):
+        for line in reversed(self.batches[paths[0]]):
             repetition = line.slot.repetition
             fates = self.fates.get(repetition, [])
             fate = fates.pop(0) if fates else answer(f"batched {repetition}")
@@ -133,12 +134,8 @@ class Run:
     def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", submits=True):
         self.said = []
         self.alone = Alone()
-        self.rounds = Rounds(
-            Journal(cache),
-            {"m": service},
-            submits=submits,
-            say=self.said.append,
-        )
+        self.rounds = Rounds(cache, {"m"}, submits=submits, say=self.said.append)
+        self.rounds.services["m"] = service
         self.ledger = Ledger(cache, scope)
         budget = Budget(self.ledger, cap)
         entry = ModelEntry(
@@ -152,7 +149,9 @@ class Run:
             transport=self.alone,
             limiter=Limiter(),
             budget=budget,
-            batches=Batches(self.rounds, "m", budget, 0.5),
+            rounds=self.rounds,
+            model="m",
+            batch_price=0.5,
         )
 
     async def ask(self, repetitions=1, decision=0):
@@ -201,7 +200,7 @@ async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
     assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
     assert (run.ledger.read().reserved_usd, run.alone.asked) == (0.0, [])
     await run.end()
-    assert Journal(cache).batches() == []
+    assert not Run(cache, service).rounds.batches
 
 
 @in_virtual_time
@@ -277,13 +276,13 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cac
     assert service.sizes[3:] == [8]  # there is room again
     assert not run.ledger.read().reserved_usd
     await run.end()
-    assert Journal(cache).batches() == []
+    assert not Run(cache, service).rounds.batches
 
 
 @in_virtual_time
 async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
     service = Memory()
-    service.states = [BatchStatus(ended=False, failure=BatchFailed("smaller", "enqueued"))]
+    service.states = [BatchStatus(failure=BatchFailed("smaller", "enqueued"))]
     run = Run(cache, service)
     replies = await run.ask(4)
     assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
@@ -317,12 +316,12 @@ async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache,
     assert texts(await later.ask(2)) == ["batched 1", "batched 2"]
     assert (service.sizes, later.alone.asked) == ([2], [])
     await later.end()
-    assert Journal(cache).batches() == []
+    assert not Run(cache, service).rounds.batches
 
 
 async def left_behind(cache, service, repetitions=1, **options):
     """A run that is interrupted while a batch waits."""
-    service.states = [BatchStatus(ended=False)] * 1000
+    service.states = [BatchStatus()] * 1000
     run = Run(cache, service, **options)
     asking = asyncio.create_task(run.ask(repetitions))
     await asyncio.sleep(5)
@@ -337,7 +336,7 @@ async def left_behind(cache, service, repetitions=1, **options):
 async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
     class Slow(Memory):
         async def status(self, batch_id):
-            return BatchStatus(ended=batch_id != "batch-0")
+            return BatchStatus(None if batch_id == "batch-0" else [batch_id])
 
     service = Slow()
     service.creations = [None, BatchFailed("again", "HTTP 504")]
@@ -405,11 +404,11 @@ async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(ca
         looks = 0
 
         async def status(self, batch_id):
-            return BatchStatus(ended=True, results=3)
+            return BatchStatus([batch_id], 3)
 
-        async def results(self, batch_id, status):
+        async def results(self, paths):
             self.looks += 1
-            whole = [each async for each in super().results(batch_id, status)]
+            whole = [each async for each in super().results(paths)]
             for result in whole if self.looks > 1 else whole[:1]:
                 yield result
 
@@ -420,7 +419,7 @@ async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(ca
 
 
 class WithoutResults(Memory):
-    async def results(self, batch_id, status):
+    async def results(self, paths):
         raise BatchFailed("again", "HTTP 503")
         yield
 
@@ -451,16 +450,12 @@ async def test_results_that_never_come_are_waited_for_an_hour(cache):
 @in_virtual_time
 async def test_what_a_batch_answered_unreadably_stays_set_aside(cache):
     class Broken(Memory):
-        async def results(self, batch_id, status):
+        async def results(self, paths):
             yield "", None
             yield "", None
 
     run = Run(cache, Broken())
     (reply,) = await run.ask()
-    assert run.said == [
-        "m: 2 results of batch batch-0 are ignored: they are broken, of none of its calls, or "
-        "differ from an earlier one"
-    ]
     assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
     assert run.ledger.read().open_attempts == 1
 
@@ -480,7 +475,7 @@ async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothin
     spending = run.ledger.read()
     assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.0, 0.0, 0)
     await run.end()
-    assert Journal(cache).batches() == []
+    assert not Run(cache, service).rounds.batches
 
 
 @in_virtual_time
@@ -522,8 +517,8 @@ async def killed(run, repetitions, when):
     asking = asyncio.create_task(run.ask(repetitions))
     await when.wait()
     asking.cancel()
-    for task in (*[each.work for each in run.rounds._batches.values()], *run.rounds._creations):
-        task.cancel()
+    for batch in run.rounds.batches.values():
+        batch.work and batch.work.cancel()
     await run.client.drain()
 
 
@@ -544,7 +539,7 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
         async def status(self, batch_id):
             if not died.is_set():
                 died.set()
-                return BatchStatus(ended=False)
+                return BatchStatus()
             return await super().status(batch_id)
 
     died = asyncio.Event()
@@ -564,7 +559,7 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
     assert spending.spent_usd == pytest.approx(5 * ONE_USD / 2)
     assert (spending.reserved_usd, spending.open_attempts) == (0.0, 0)
     await second.end()
-    assert Journal(cache).batches() == []
+    assert not Run(cache, service).rounds.batches
 
 
 @in_virtual_time
@@ -670,8 +665,8 @@ class Dear(Memory):
         self.chance = random.Random(seed)
         self.bill_usd = 0.0
 
-    async def results(self, batch_id, status):
-        async for key, raw in super().results(batch_id, status):
+    async def results(self, paths):
+        async for key, raw in super().results(paths):
             read = 10
             written = self.chance.randint(0, 100)
             kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])
@@ -707,7 +702,7 @@ def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
 @in_virtual_time
 async def test_what_is_pending_is_told_by_model_and_batch(cache):
     service = Memory()
-    service.states = [BatchStatus(ended=False)] * 10**4
+    service.states = [BatchStatus()] * 10**4
     run = Run(cache, service)
     asking = asyncio.create_task(run.ask(3))
     await asyncio.sleep(5)

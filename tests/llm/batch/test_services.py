@@ -24,14 +24,14 @@ def plan(seed=0, **batch):
 
 async def ended(service, batch_id):
     """The status of a batch once it no longer waits."""
-    while not (status := await service.status(batch_id)).ended:
+    while (status := await service.status(batch_id)).paths is None:
         await asyncio.sleep(0.01)
     return status
 
 
 async def results_of(service, batch_id):
     status = await ended(service, batch_id)
-    return {key: raw async for key, raw in service.results(batch_id, status)}
+    return {key: raw async for key, raw in service.results(status.paths)}
 
 
 async def answered_by(url):
@@ -115,7 +115,7 @@ async def test_too_many_enqueued_tokens_ask_for_smaller_batches(emulator, servic
     await service.create(batch[:6], MARK)
     if form.startswith("openai"):
         status = await service.status(await service.create(batch, "second"))
-        assert (status.ended, status.failure.kind) == (False, "smaller")
+        assert (status.paths, status.failure.kind) == (None, "smaller")
         assert "Enqueued token limit" in str(status.failure)
     else:
         with pytest.raises(BatchFailed, match="Enqueued token limit") as full:
@@ -123,7 +123,7 @@ async def test_too_many_enqueued_tokens_ask_for_smaller_batches(emulator, servic
         assert (full.value.kind, full.value.sent) == ("smaller", False)
     third = await service.create(batch[6:9], "third")
     status = await service.status(third)
-    assert (status.ended, status.failure) == (False, None)
+    assert (status.paths, status.failure) == (None, None)
 
 
 async def test_results_that_come_late_and_in_part_can_be_read_again(emulator, service_at, form):

@@ -109,7 +109,7 @@ async def uses(service):
     async def results():
         return [
             judge(raw, FORMATS["gemini"])
-            async for _, raw in service.results("b1", await service.status("b1"))
+            async for _, raw in service.results((await service.status("b1")).paths or [])
             if raw
         ]
 
