@@ -18,7 +18,8 @@ from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import VARIANTS, Variant
 from merge_runner.results.store import results_digest
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
-from tests.harness import CONFIGURING
+from tests.harness import CONFIGURING, watched
+from tests.mock_server import BatchPlan, FaultPlan
 
 STUDY = """
 models = ["emulator"]
@@ -139,18 +140,13 @@ async def test_money_is_spent_only_with_leave(folder):
     assert (await study.arun(yes=True)).facts["cost_usd"] > 0
 
 
-async def test_a_study_is_asked_in_batches_for_half_the_price(folder):
-    study = Study("study.toml", models="dear", only={"opponent": "self", "memory_s": 2.0})
-    whole, half = (
-        await study.arun(yes=True),
-        await Study(
-            "study.toml",
-            models="dear",
-            only={"opponent": "self", "memory_s": 2.0},
-            db="batched.duckdb",
-            cache="batched",
-        ).arun(yes=True, batch=True),
-    )
+async def test_a_study_is_asked_in_batches_for_half_the_price(folder, monkeypatch):
+    wanted = {"models": "dear", "only": {"opponent": "self", "memory_s": 2.0}}
+    async with watched(faults=FaultPlan(batch=BatchPlan(delay_s=0.1))) as server:
+        monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
+        whole = await Study("study.toml", **wanted).arun(yes=True)
+        elsewhere = {"db": "batched.duckdb", "cache": "batched"}
+        half = await Study("study.toml", **wanted, **elsewhere).arun(yes=True, batch=True)
     assert half.facts["cost_usd"] == pytest.approx(whole.facts["cost_usd"] / 2)
     assert half.calls()["batch_id"].notna().all()
 

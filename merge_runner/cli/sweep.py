@@ -99,9 +99,7 @@ def sweep(
     if replay and dask:
         raise UsageError("a replay needs no cluster: leave --dask out")
     known = {each.name for each in fields(Options)} & given.keys() - {"dry_run"}
-    options = Options(
-        **{name: given[name] for name in known},
-    )
+    options = Options(**{name: given[name] for name in known})
     wanted = {name: given[name] for name in signature(make_plan).parameters if name in given}
     wanted |= {"conditions": cli.listed(conditions), "variants": cli.listed(variants)}
     wanted["only"] = cli.levels(only or (), "--only")
