@@ -53,9 +53,7 @@ class CallFailed(MergeRunnerError):
         earlier: int = 0,
     ) -> None:
         super().__init__(message)
-        self.request = request
-        self.attempts = attempts
-        self.earlier = earlier
+        self.request, self.attempts, self.earlier = request, attempts, earlier
 
 
 class ReplayMiss(CallFailed):

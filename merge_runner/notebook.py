@@ -11,12 +11,12 @@ import asyncio
 import threading
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
-from functools import wraps
+from functools import partialmethod, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from merge_runner.drivers.base import Driver
-from merge_runner.drivers.program_seat import Parameter, ProgramSeat
+from merge_runner.drivers.program_seat import ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
@@ -89,28 +89,21 @@ class StudyOutcome:
 
         return load_trials(self.db, self.sweep_id)
 
-    def decisions(self) -> pd.DataFrame:
-        """One row a decision."""
-        return self._rows("decisions")
+    def rows(self, table: str) -> pd.DataFrame:
+        """The rows of one of the tables that hold its trials."""
+        from merge_runner.results.frames import load_of_sweep
 
-    def calls(self) -> pd.DataFrame:
-        """One row an attempt at a call."""
-        return self._rows("calls")
+        return load_of_sweep(self.db, self.sweep_id, table)
 
-    def states(self) -> pd.DataFrame:
-        """One row a vehicle and step."""
-        return self._rows("states")
+    # One row a decision, an attempt at a call, a vehicle and step.
+    decisions = partialmethod(rows, "decisions")
+    calls, states = partialmethod(rows, "calls"), partialmethod(rows, "states")
 
     def sql(self, query: str) -> pd.DataFrame:
         """The rows of one read-only query over the whole database; raises UsageError."""
         from merge_runner.results.frames import load
 
         return load(self.db, query)
-
-    def _rows(self, table: str) -> pd.DataFrame:
-        from merge_runner.results.frames import load_of_sweep
-
-        return load_of_sweep(self.db, self.sweep_id, table)
 
 
 class Study:
@@ -160,14 +153,10 @@ class Study:
         name: str,
         driver: Callable[[ProgramSeat], Driver],
         meaning: str,
-        parameters: Mapping[str, Parameter] | None = None,
-        rate_hz: float | None = None,
-        *,
-        chance: bool = False,
+        **more: Any,  # noqa: ANN401 # fields of Program
     ) -> None:
-        """Add a driver; see ``Program``. Where its source is edited, it is another driver."""
-        program = Program(driver, meaning, parameters or {}, rate_hz, chance=chance)
-        self.register(PROGRAMS, name, program)
+        """Add a driver, with fields of ``Program``. Where its source is edited, it is another."""
+        self.register(PROGRAMS, name, Program(driver, meaning, **more))
 
     def plan(self, *, first: bool = False, grid: str | None = None) -> Plan:
         """What would be played, or only asked ``first``; raises UsageError."""

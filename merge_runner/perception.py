@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 from itertools import takewhile
 from math import exp, inf, sqrt, tanh
 from statistics import NormalDist
@@ -15,44 +17,34 @@ TOP = 2**31
 """The error processes last so many milliseconds; time 0 is in the middle."""
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorProcess:
+def error_process(
+    stream: tuple[object, ...], sd: float, autocorrelation_s: float
+) -> Callable[[float], float]:
     """Gaussian errors with exponential autocorrelation (Uhlenbeck and Ornstein, 1930), by time.
 
-    The value at a time is a function of the ``stream`` and the time alone, to the millisecond:
+    The value at a time in s is a function of the ``stream`` and the time alone, to the millisecond:
     whoever asks, in whatever steps and order, finds the same process. It is laid out by halves
     (as Levy's construction of Brownian motion is): the process is Markov, so that the value in the
     middle of two known ones, x to either side, has the mean of both over cosh(x / tau), and the
     variance sd^2 tanh(x / tau).
     """
 
-    stream: tuple[object, ...]
-    sd: float
-    autocorrelation_s: float
-    _values: dict[int, float] = field(default_factory=dict)
-
-    def at(self, time_s: float) -> float:
-        """The error at a time."""
-        return self.sd * self._standard(TOP // 2 + round(1000 * time_s)) if self.sd else 0.0
-
-    def _standard(self, place: int) -> float:
-        if place not in self._values:
-            self._values[place] = self._drawn(place)
-        return self._values[place]
-
-    def _drawn(self, place: int) -> float:
-        uniform = draw(*self.stream, place)
+    @cache
+    def standard(place: int) -> float:
+        uniform = draw(*stream, place)
         chance = NormalDist().inv_cdf(0.5 + (uniform - 0.5) * (1 - 2**-52))
         if place == 0:
             return chance
         aside = place & -place  # to the neighbours of which it is the middle
-        ratio = aside / (1000 * self.autocorrelation_s) if self.autocorrelation_s else inf
+        ratio = aside / (1000 * autocorrelation_s) if autocorrelation_s else inf
         if place == TOP:
             kept = exp(-ratio)
-            return kept * self._standard(0) + sqrt(1 - kept**2) * chance
+            return kept * standard(0) + sqrt(1 - kept**2) * chance
         variance = tanh(ratio)
-        ends = self._standard(place - aside) + self._standard(place + aside)
+        ends = standard(place - aside) + standard(place + aside)
         return ends / 2 * sqrt(1 - variance**2) + sqrt(variance) * chance
+
+    return lambda time_s: sd * standard(TOP // 2 + round(1000 * time_s)) if sd else 0.0
 
 
 class Eyes:
@@ -66,7 +58,7 @@ class Eyes:
     ) -> None:
         self._perception, self._seed, self._step_s = perception, seed, step_s
         self._distance, self._speed, self._own_distance, self._own_speed = (
-            ErrorProcess((seed, f"error of {name}"), sd, perception.autocorrelation_s)
+            error_process((seed, f"error of {name}"), sd, perception.autocorrelation_s)
             for name, sd in (
                 ("distance", perception.position_sd_m),
                 ("speed", perception.speed_sd_mps),
@@ -86,8 +78,8 @@ class Eyes:
         now_s, truth = (len(self._truth) - 1) * self._step_s, self._truth[-1]
         if draw(self._seed, "received", round(1000 * now_s)) >= self._perception.dropout:
             self._received = self._perceived(now_s - self._perception.delay_s)
-        own_speed_mps = _forwards(truth.own_speed_mps + self._own_speed.at(now_s))
-        farther_m = self._own_distance.at(now_s)
+        own_speed_mps = _forwards(truth.own_speed_mps + self._own_speed(now_s))
+        farther_m = self._own_distance(now_s)
         to_merge_m = truth.distance_to_merge_m
         other = self._received
         if not other.other_seen:
@@ -119,12 +111,12 @@ class Eyes:
             truth,
             other_seen=self._in_sight(truth),
             other_speed_mps=self._appears(truth.other_speed_mps, time_s),
-            relative_distance_m=truth.relative_distance_m + self._distance.at(time_s),
+            relative_distance_m=truth.relative_distance_m + self._distance(time_s),
             other_speeds_mps=tuple(self._appears(speed, then_s) for then_s, speed in seen)[::-1],
         )
 
     def _appears(self, speed_mps: float, time_s: float) -> float:
-        return _forwards(speed_mps + self._speed.at(time_s))
+        return _forwards(speed_mps + self._speed(time_s))
 
     def _in_sight(self, truth: Observation) -> bool:
         near = abs(truth.relative_distance_m) <= (self._perception.range_m or inf)

@@ -66,7 +66,7 @@ class Registry(Mapping[str, T]):
         """Add a thing, and return it; raises UsageError where the name is taken or odd."""
         if not NAME.fullmatch(name):
             raise UsageError(f"the {self.kind} {name!r} needs a name of letters, digits, _ - and .")
-        if name in self._all:
+        if name in self._things or name in in_use().parts.get(self.kind, {}):
             raise UsageError(f"there is a {self.kind} {name!r} already")
         things = in_use().parts.setdefault(self.kind, {}) if self.collecting else self._things
         things[name] = thing
@@ -88,21 +88,16 @@ class Registry(Mapping[str, T]):
     @property
     def _all(self) -> ChainMap[str, T]:
         """Those of the study, and before them those that are installed."""
+        load_plugins()
         return ChainMap(in_use().parts.get(self.kind, {}), self._things)
 
     def __getitem__(self, name: str) -> T:
-        """The thing of this name; raises KeyError."""
-        load_plugins()
         return self._all[name]
 
     def __iter__(self) -> Iterator[str]:
-        """All names."""
-        load_plugins()
         return iter(self._all)
 
     def __len__(self) -> int:
-        """How many there are."""
-        load_plugins()
         return len(self._all)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import ast
 import hashlib
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
-from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, resolve_name
 from io import StringIO
 from tokenize import COMMENT, NL, generate_tokens
@@ -14,8 +14,8 @@ from tokenize import COMMENT, NL, generate_tokens
 from merge_runner.errors import UsageError
 
 SHARED = "merge_runner.drivers"
-# It makes no decision.
-WITHOUT = f"{SHARED}.registry"
+# The registry makes no decision, and what is typed into a notebook is in no file.
+WITHOUT = (f"{SHARED}.registry", "__main__")
 
 
 @cache
@@ -32,8 +32,10 @@ def source_digest(driver: type) -> str:
     waiting = [driver.__module__]
     while waiting:
         name = waiting.pop()
-        wanted = name not in {*sources, WITHOUT} and f"{name}.".startswith(packages)
-        module = _spec(name) if wanted else None
+        module = None
+        if name not in {*sources, *WITHOUT} and f"{name}.".startswith(packages):
+            with suppress(ModuleNotFoundError, ValueError):  # it may be something within a module
+                module = find_spec(name)
         if module is not None:
             read = getattr(module.loader, "get_source", None)
             source = read(name) if read else None
@@ -76,16 +78,6 @@ def code_of(source: str) -> tuple[str, ...]:
         if isinstance(node.value.value, str) and not around.strip():
             dropped.update(range(first, last + 1))
     return tuple(line for row, line in enumerate(lines, 1) if row not in dropped)
-
-
-def _spec(name: str) -> ModuleSpec | None:
-    """The spec of a module; None where the name is that of something within one."""
-    if name == "__main__":  # what is typed into a notebook is in no file
-        return None
-    try:
-        return find_spec(name)
-    except (ModuleNotFoundError, ValueError):
-        return None
 
 
 def _imported(source: str, package: str) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import re
+from types import SimpleNamespace
 from typing import Any, TextIO
 
 
@@ -38,22 +39,12 @@ def in_spreadsheet(value: object) -> object:
 
 
 def csv_writer(file: TextIO) -> Any:  # noqa: ANN401 # the library does not name its kind
-    """A writer of CSV, whose lines end as those of all our files do."""
-    return csv.writer(_Lines(file))
-
-
-class _Lines:
-    """Ends each row with LF alone.
+    """A writer of CSV, whose lines end as those of all our files do: with LF alone.
 
     The csv module can do so by itself, but would then leave a CR within a value unquoted.
     """
-
-    def __init__(self, file: TextIO) -> None:
-        self._file = file
-
-    def write(self, row: str) -> int:
-        """Write a row, which the library hands over as one text."""
-        return self._file.write(row.removesuffix("\r\n") + "\n")
+    lines = SimpleNamespace(write=lambda row: file.write(row.removesuffix("\r\n") + "\n"))
+    return csv.writer(lines)
 
 
 def first_line(exc: BaseException) -> str:

@@ -15,7 +15,7 @@ from merge_runner.config import Perception, ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import program_pace
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.perception import ErrorProcess, Eyes
+from merge_runner.perception import Eyes, error_process
 from merge_runner.records import FAR_BEHIND_M, SIDES, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -142,8 +142,8 @@ def test_what_is_seen_late_at_the_start_is_the_cruise_before_it():
 def test_errors_have_the_stated_size_and_fade_at_the_stated_pace():
     sd, tau_s, step_s = 0.5, 0.8, 0.4
     series = [
-        [error.at(k * step_s) for k in range(100)]
-        for error in (ErrorProcess((seed,), sd, tau_s) for seed in range(400))
+        [error(k * step_s) for k in range(100)]
+        for error in (error_process((seed,), sd, tau_s) for seed in range(400))
     ]
     flat = [value for values in series for value in values]
     assert fmean(flat) == pytest.approx(0, abs=0.02)
@@ -155,8 +155,8 @@ def test_errors_have_the_stated_size_and_fade_at_the_stated_pace():
 
 
 def test_without_autocorrelation_each_instant_has_an_error_of_its_own():
-    error = ErrorProcess(("x",), 1.0, 0.0)
-    values = [error.at(k / 20) for k in range(4000)]
+    error = error_process(("x",), 1.0, 0.0)
+    values = [error(k / 20) for k in range(4000)]
     assert pstdev(values) == pytest.approx(1, rel=0.03)
     assert fmean(a * b for a, b in pairwise(values)) == pytest.approx(0, abs=0.04)
 
@@ -167,10 +167,10 @@ def test_the_errors_do_not_depend_on_the_steps_and_the_order_in_which_they_are_a
     seed, tau_s, chance: Random
 ):
     times = [k / 20 for k in range(-60, 600)]
-    coarse = {t: ErrorProcess((seed,), 1.0, tau_s).at(t) for t in times[::40]}
-    fine = ErrorProcess((seed,), 1.0, tau_s)
+    coarse = {t: error_process((seed,), 1.0, tau_s)(t) for t in times[::40]}
+    fine = error_process((seed,), 1.0, tau_s)
     chance.shuffle(times)
-    values = {t: fine.at(t) for t in times}
+    values = {t: fine(t) for t in times}
     assert {t: values[t] for t in coarse} == coarse
 
 

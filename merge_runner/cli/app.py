@@ -6,7 +6,6 @@ import errno
 import gc
 import os
 import sys
-from collections.abc import Callable
 from copy import copy
 from typing import Annotated
 
@@ -58,16 +57,11 @@ def alone(command: str | None) -> typer.Typer:
     light = copy(app)
     light.registered_commands = [copy(info) for info in app.registered_commands]
     for info in light.registered_commands:
-        if info.callback is not None and command != (info.name or info.callback.__name__):
-            info.callback = _without_options(info.callback)
+        assert info.callback is not None
+        name = info.name or info.callback.__name__
+        if name != command:
+            info.name, info.help, info.callback = name, info.callback.__doc__, lambda: None
     return light
-
-
-def _without_options(command: Callable[..., object]) -> Callable[[], None]:
-    def bare() -> None: ...
-
-    bare.__name__, bare.__doc__ = command.__name__, command.__doc__
-    return bare
 
 
 def main() -> None:

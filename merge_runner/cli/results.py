@@ -14,16 +14,7 @@ from typing import Annotated
 
 import typer
 
-from merge_runner.cli.options import (
-    CacheOption,
-    DbOption,
-    JsonOption,
-    StudyOption,
-    TrustOption,
-    YesOption,
-    option,
-    use_study,
-)
+from merge_runner.cli import options as cli
 from merge_runner.cli.output import agree, print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
@@ -49,9 +40,9 @@ class Format(StrEnum):
 
 def sql(
     query: Annotated[str, typer.Argument(metavar="QUERY", help="One SQL query.")],
-    db: DbOption = DEFAULT_DB,
+    db: cli.DbOption = DEFAULT_DB,
     output: Annotated[Format, typer.Option("--format", help="Form of the result.")] = Format.TEXT,
-    as_json: JsonOption = False,
+    as_json: cli.JsonOption = False,
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
     from merge_runner.results.database import fetched, names_of
@@ -67,7 +58,7 @@ def sql(
         shutil.copyfileobj(spooled, sys.stdout)
 
 
-def digest(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
+def digest(db: cli.DbOption = DEFAULT_DB, as_json: cli.JsonOption = False) -> None:
     """Print one line: a hash of all results, equal for equal results."""
     from merge_runner.results.store import results_digest
 
@@ -77,23 +68,23 @@ def digest(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
 
 
 def audit(
-    db: DbOption = DEFAULT_DB,
+    db: cli.DbOption = DEFAULT_DB,
     sweep_id: Annotated[
-        str | None, option("ID", "A sweep_id; everything if not given.", "--sweep")
+        str | None, cli.option("ID", "A sweep_id; everything if not given.", "--sweep")
     ] = None,
     recording: Annotated[
-        Path | None, option("FILE", "Check this recording instead of a database.")
+        Path | None, cli.option("FILE", "Check this recording instead of a database.")
     ] = None,
-    cache: Annotated[Path | None, option("DIR", CACHE)] = None,
-    study: StudyOption = None,
-    trust: TrustOption = False,
-    as_json: JsonOption = False,
+    cache: Annotated[Path | None, cli.option("DIR", CACHE)] = None,
+    study: cli.StudyOption = None,
+    trust: cli.TrustOption = False,
+    as_json: cli.JsonOption = False,
 ) -> None:
     """Check that each trial is there and follows from its replies."""
     from merge_runner.audit.checks import audit_recording
     from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 
-    use_study(study, trust=trust)
+    cli.use_study(study, trust=trust)
     skipped: list[str] = []
     if recording is not None:
         if sweep_id is not None or cache is not None:
@@ -120,8 +111,8 @@ def forget(
     sweeps: Annotated[
         list[str], typer.Argument(metavar="SWEEP...", help="A sweep_id; * stands for anything.")
     ],
-    db: DbOption = DEFAULT_DB,
-    yes: YesOption = False,
+    db: cli.DbOption = DEFAULT_DB,
+    yes: cli.YesOption = False,
 ) -> None:
     """Remove sweeps and their trials from the database.
 
@@ -143,9 +134,9 @@ def forget(
 @recording_app.command("export")
 def recording_export(
     file: RecordingFile,
-    db: DbOption = DEFAULT_DB,
-    cache: CacheOption = DEFAULT_CACHE,
-    sweeps: Annotated[list[str] | None, option("ID", SWEEP, "--sweep")] = None,
+    db: cli.DbOption = DEFAULT_DB,
+    cache: cli.CacheOption = DEFAULT_CACHE,
+    sweeps: Annotated[list[str] | None, cli.option("ID", SWEEP, "--sweep")] = None,
 ) -> None:
     """Write what sweeps asked and were answered into one file."""
     from merge_runner.llm.cache import ResponseCache
@@ -165,7 +156,7 @@ def recording_import(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="A recording (.parquet), or a cache folder.")
     ],
-    cache: CacheOption = DEFAULT_CACHE,
+    cache: cli.CacheOption = DEFAULT_CACHE,
 ) -> None:
     """Verify a recording or a cache folder, and add it to the cache."""
     from merge_runner.llm.cache import ResponseCache, import_folder
@@ -188,7 +179,7 @@ def recording_verify(file: RecordingFile) -> None:
 @recording_app.command("info")
 def recording_info(
     file: RecordingFile,
-    as_json: JsonOption = True,
+    as_json: cli.JsonOption = True,
 ) -> None:
     """Verify a recording and print what it holds, as JSON."""
     from merge_runner.results.recording import summarise
@@ -196,7 +187,7 @@ def recording_info(
     print_out(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
 
 
-def models(as_json: JsonOption = False) -> None:
+def models(as_json: cli.JsonOption = False) -> None:
     """List the models and programs that can drive."""
     from merge_runner.config import Price, key_status
     from merge_runner.drivers.registry import PROGRAMS

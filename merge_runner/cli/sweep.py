@@ -16,22 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from merge_runner.cli.options import (
-    CacheOption,
-    ConditionsOption,
-    DbOption,
-    JsonOption,
-    ModelOption,
-    OnlyOption,
-    RepsOption,
-    TrustOption,
-    VariantsOption,
-    YesOption,
-    flag,
-    levels,
-    listed,
-    option,
-)
+from merge_runner.cli import options as cli
 from merge_runner.cli.output import agree, print_out, say
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
@@ -74,34 +59,34 @@ def sweep(
             help="experiments/NAME.toml, or a path. Several are played one after the other.",
         ),
     ],
-    first: Annotated[bool, flag("--first", "Only the first decision of both sides.")] = False,
-    grid: Annotated[str | None, option("GRID", GRID)] = None,
-    models: ModelOption = None,
-    only: OnlyOption = None,
-    mirror: Annotated[bool, flag("--mirror", "Also play two drivers both ways.")] = False,
-    repetitions: RepsOption = None,
-    conditions: ConditionsOption = None,
-    variants: VariantsOption = None,
-    sample_set: Annotated[int, option("N", "Another number draws a fresh set of samples.")] = 0,
-    order_seed: Annotated[int, option("N", "Another number draws another order.")] = 0,
-    db: DbOption = DEFAULT_DB,
-    cache: CacheOption = DEFAULT_CACHE,
-    in_flight: Annotated[int, option("N", "Trials at once, over all workers.", min=1)] = 200,
-    rpm: Annotated[int | None, option("N", "Requests a minute.", min=1)] = None,
-    tpm: Annotated[int | None, option("N", "Tokens a minute.", min=1)] = None,
-    max_cost_usd: Annotated[float | None, option("USD", MAX_COST, "--max-cost", min=0)] = None,
-    dask: Annotated[str | None, option("CLUSTER", DASK)] = None,
-    batch: Annotated[bool, flag("--batch", BATCH)] = False,
-    strict_model: Annotated[bool, flag("--strict-model", STRICT)] = False,
-    keep_going: Annotated[bool, flag("--keep-going", KEEP_GOING)] = False,
-    dry_run: Annotated[bool, flag("--dry-run", "Only estimate.")] = False,
-    rehearse: Annotated[bool, flag("--rehearse", REHEARSE)] = False,
-    yes: YesOption = False,
-    trust: TrustOption = False,
-    replay: Annotated[bool, flag("--replay", "From recorded replies alone.")] = False,
-    recordings: Annotated[list[Path] | None, option("FILE", RECORDING, "--recording")] = None,
-    quiet: Annotated[bool, flag("--quiet", "Show no progress.")] = False,
-    as_json: JsonOption = False,
+    first: Annotated[bool, cli.flag("--first", "Only the first decision of both sides.")] = False,
+    grid: Annotated[str | None, cli.option("GRID", GRID)] = None,
+    models: cli.ModelOption = None,
+    only: cli.OnlyOption = None,
+    mirror: Annotated[bool, cli.flag("--mirror", "Also play two drivers both ways.")] = False,
+    repetitions: cli.RepsOption = None,
+    conditions: cli.ConditionsOption = None,
+    variants: cli.VariantsOption = None,
+    sample_set: Annotated[int, cli.option("N", "Another number draws a fresh set of samples.")] = 0,
+    order_seed: Annotated[int, cli.option("N", "Another number draws another order.")] = 0,
+    db: cli.DbOption = DEFAULT_DB,
+    cache: cli.CacheOption = DEFAULT_CACHE,
+    in_flight: Annotated[int, cli.option("N", "Trials at once, over all workers.", min=1)] = 200,
+    rpm: Annotated[int | None, cli.option("N", "Requests a minute.", min=1)] = None,
+    tpm: Annotated[int | None, cli.option("N", "Tokens a minute.", min=1)] = None,
+    max_cost_usd: Annotated[float | None, cli.option("USD", MAX_COST, "--max-cost", min=0)] = None,
+    dask: Annotated[str | None, cli.option("CLUSTER", DASK)] = None,
+    batch: Annotated[bool, cli.flag("--batch", BATCH)] = False,
+    strict_model: Annotated[bool, cli.flag("--strict-model", STRICT)] = False,
+    keep_going: Annotated[bool, cli.flag("--keep-going", KEEP_GOING)] = False,
+    dry_run: Annotated[bool, cli.flag("--dry-run", "Only estimate.")] = False,
+    rehearse: Annotated[bool, cli.flag("--rehearse", REHEARSE)] = False,
+    yes: cli.YesOption = False,
+    trust: cli.TrustOption = False,
+    replay: Annotated[bool, cli.flag("--replay", "From recorded replies alone.")] = False,
+    recordings: Annotated[list[Path] | None, cli.option("FILE", RECORDING, "--recording")] = None,
+    quiet: Annotated[bool, cli.flag("--quiet", "Show no progress.")] = False,
+    as_json: cli.JsonOption = False,
 ) -> None:
     """Play all trials of one or more sweeps that are not stored yet."""
     given = {name: value for name, value in locals().items() if value is not None}
@@ -118,8 +103,8 @@ def sweep(
         **{name: given[name] for name in known},
     )
     wanted = {name: given[name] for name in signature(make_plan).parameters if name in given}
-    wanted |= {"conditions": listed(conditions), "variants": listed(variants)}
-    wanted["only"] = levels(only or (), "--only")
+    wanted |= {"conditions": cli.listed(conditions), "variants": cli.listed(variants)}
+    wanted["only"] = cli.levels(only or (), "--only")
 
     def planned(name: str) -> Plan:
         plan = make_plan(name, **wanted)

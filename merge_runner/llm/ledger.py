@@ -211,7 +211,8 @@ class Ledger:
 
     def read(self) -> Spending:
         """Return the current state; raises UsageError where its record is damaged."""
-        self.spending = self._money.spending(self.scope, self._money.read)
+        if self.scope:
+            self.spending = self._money.spending(self.scope, self._money.read)
         return self.spending
 
     def reserve(

@@ -10,16 +10,16 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import dropwhile
 from string import Formatter
-from typing import get_args
 
 from merge_runner.errors import UsageError
 from merge_runner.prompts.fields import FIELDS
-from merge_runner.records import Road
-from merge_runner.registry import Registry
+from merge_runner.registry import Registry, require
 
 OUTPUT_FORMAT = "C5"
 LAST = "the end"
+TO_MERGE = "distance_to_merge"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,31 +27,22 @@ class Block:
     """One paragraph of the prompt.
 
     ``meaning`` says in a few words what it is for. ``merge`` and ``straight`` are its templates
-    before and after the merge point, None where it is left out. It is in the prompt of every
-    variant that does not remove it if ``in_baseline``, else of those that add it, and stands
-    before the block ``before``, None for those of the paper, which stand as they are registered.
-    Raises UsageError where a template names what there is not.
+    before and after the merge point, None where it is left out. Those of the paper have no
+    ``before``: they are in the prompt of every variant that does not remove them, as they are
+    registered. Any other stands before the block ``before`` in those variants that add it. Raises
+    UsageError where a template names what there is not.
     """
 
     meaning: str
     merge: str | None
     straight: str | None
-    in_baseline: bool = False
     before: str | None = OUTPUT_FORMAT
 
     def __post_init__(self) -> None:
-        for road in get_args(Road):
-            fields = [name for name in FIELDS if (road, name) != ("straight", "distance_to_merge")]
-            for name in named(self.template(road) or ""):
-                if name not in fields:
-                    raise UsageError(
-                        f"the block {self.meaning!r} names {{{name}}} on the road {road}; valid: "
-                        + ", ".join(fields)
-                    )
-
-    def template(self, road: Road) -> str | None:
-        """The block's text on a road."""
-        return self.merge if road == "merge" else self.straight
+        for road, template in (("merge", self.merge), ("straight", self.straight)):
+            fields = {n: f for n, f in FIELDS.items() if (road, n) != ("straight", TO_MERGE)}
+            for name in named(template or ""):
+                require(fields, f"field on the road {road} of the block {self.meaning!r}:", name)
 
     @property
     def digest(self) -> str:
@@ -81,11 +72,11 @@ def named(template: str) -> list[str]:
     """What a template names in braces; raises UsageError."""
     try:
         parts = [part for part in Formatter().parse(template) if part[1] is not None]
+        # Fields are texts already; a width could be so large that it fills the memory.
+        if any(spec or conversion for _, _, spec, conversion in parts):
+            raise ValueError("a field stands alone in its braces")
     except ValueError as exc:
         raise UsageError(f"a prompt block cannot be read, {exc}: {template!r}") from exc
-    # Fields are texts already; a width could be so large that it fills the memory.
-    if any(spec or conversion for _, _, spec, conversion in parts):
-        raise UsageError(f"in a prompt block a field stands alone in its braces: {template!r}")
     return [name for _, name, _, _ in parts if name is not None]
 
 
@@ -154,20 +145,6 @@ numbers, one for every {step_s} s. Each number lies between -1 and 1, where 1 st
 acceleration of {max_acceleration} m/s^2 and -1 for a deceleration of {max_acceleration} m/s^2. \
 Write the list in a Python code block that holds nothing but the list."""
 
-BLOCKS = Registry[Block]("prompt block")
-for _name, _meaning, _merge, _straight in (
-    ("C0", "situation", _APPROACHING, _MERGED),
-    ("C1", "history", _HISTORY, _HISTORY),
-    ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
-    ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
-    ("C3.human", "drive like a human", _HUMAN, _HUMAN),
-    ("C3.distance", "keep a distance", _DISTANCE, _DISTANCE),
-    ("C3.reassess", "reassess", _REASSESS, _REASSESS),
-    ("C4", "tactical decision", _TACTICAL, None),
-    (OUTPUT_FORMAT, "output format", _SCHEMA, _SCHEMA),
-):
-    BLOCKS.register(_name, Block(_meaning, _merge, _straight, in_baseline=True, before=None))
-
 _HEADWAY = """\
 Projected headway (which car is ahead when the first of you reaches the merge point at present \
 speeds): {projected_headway}"""
@@ -179,8 +156,20 @@ _GAP = "Time gap (how long the car behind takes to where the car ahead is now): 
 _FASTER = "Relative speed: {relative_speed_in_words}"
 _KMH = "In km/h: your speed is {own_speed_kmh}, the speed of the other car {other_speed_kmh}"
 _MPH = "In mph: your speed is {own_speed_mph}, the speed of the other car {other_speed_mph}"
+
+_PAPER = (
+    ("C0", "situation", _APPROACHING, _MERGED),
+    ("C1", "history", _HISTORY, _HISTORY),
+    ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
+    ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
+    ("C3.human", "drive like a human", _HUMAN, _HUMAN),
+    ("C3.distance", "keep a distance", _DISTANCE, _DISTANCE),
+    ("C3.reassess", "reassess", _REASSESS, _REASSESS),
+    ("C4", "tactical decision", _TACTICAL, None),
+    (OUTPUT_FORMAT, "output format", _SCHEMA, _SCHEMA),
+)
 _TABLES = _tabled(_APPROACHING), _tabled(_MERGED)
-for _name, _meaning, _merge, _straight in (
+_READY = (
     ("state.projected_headway", "projected headway", _HEADWAY, None),
     ("state.time_to_merge", "times to the merge point", _TIMES, None),
     ("state.time_gap", "time gap", _GAP, _GAP),
@@ -188,8 +177,11 @@ for _name, _meaning, _merge, _straight in (
     ("state.kmh", "speeds in km/h", _KMH, _KMH),
     ("state.mph", "speeds in mph", _MPH, _MPH),
     ("state.table", "situation as a table, in place of C0", *_TABLES),
-):
-    BLOCKS.register(_name, Block(_meaning, _merge, _straight, before="C1"))
+)
+BLOCKS = Registry[Block]("prompt block")
+for _before, _blocks in ((None, _PAPER), ("C1", _READY)):
+    for _name, _meaning, _merge, _straight in _blocks:
+        BLOCKS.register(_name, Block(_meaning, _merge, _straight, _before))
 
 VARIANTS = Registry[Variant]("variant")
 VARIANTS.register("baseline", Variant(title="Baseline"))
@@ -215,10 +207,10 @@ def blocks_of(variant: str) -> dict[str, Block]:
         return dict(chosen.blocks)
     for name in sorted(chosen.removes | chosen.adds):
         BLOCKS.require(name, f"the variant {variant} names it")
-    kept = {n: b for n, b in BLOCKS.items() if b.in_baseline and n not in chosen.removes}
-    blocks = {name: block for name, block in kept.items() if block.before is None}
+    paper = {name: block for name, block in BLOCKS.items() if block.before is None}
+    blocks = {name: block for name, block in paper.items() if name not in chosen.removes}
     # In the order of names, which is that of no import.
-    for name in sorted({*kept, *chosen.adds} - blocks.keys()):
+    for name in sorted(chosen.adds - blocks.keys()):
         blocks = with_block(blocks, name, BLOCKS[name])
     return {name: BLOCKS[name] for name in blocks}
 
@@ -237,12 +229,9 @@ def with_block(
     follows there; else at the end. Raises UsageError for a place that there is not.
     """
     if anchor is None and block.before is not None:
-        paper = [each for each, known in BLOCKS.items() if known.before is None]
-        if block.before not in paper:
-            raise UsageError(
-                f"the prompt block {name} stands before {block.before}; valid: {', '.join(paper)}"
-            )
-        later = paper[paper.index(block.before) :]
+        paper = {each: known for each, known in BLOCKS.items() if known.before is None}
+        require(paper, f"place of the prompt block {name}, before", block.before)
+        later = dropwhile(lambda each: each != block.before, paper)
         anchor = next((each for each in later if each in blocks), None)
     names = list(blocks)
     place = len(names) if anchor is None else names.index(anchor) + after

@@ -33,11 +33,6 @@ class Situation:
         return decimal(value) if self.seen.other_seen else NOT_SEEN
 
 
-def _distance_to_merge(now: Situation) -> str:
-    distance_m = now.seen.distance_to_merge_m
-    return "" if distance_m is None else decimal(distance_m)
-
-
 def _own_accelerations(now: Situation) -> str:
     """The means of the world's samples over each action, the last of which ends now."""
     values, every = now.seen.own_accelerations_mps2, now.task.action_steps
@@ -76,7 +71,7 @@ FIELDS: Mapping[str, Callable[[Situation], str]] = {
     # How far the other car is ahead, negative if it is behind.
     "relative_distance": lambda now: now.of_other(now.seen.relative_distance_m),
     # Before the merge point alone.
-    "distance_to_merge": _distance_to_merge,
+    "distance_to_merge": lambda now: decimal(now.seen.distance_to_merge_m or 0.0),
     "own_accelerations": _own_accelerations,
     "other_speeds": _other_speeds,
     "remaining_plan": _remaining_plan,

@@ -37,6 +37,7 @@ def render_prompt(
 @lru_cache
 def _template(variant: str, road: Road, _: Catalogue) -> tuple[str, frozenset[str]]:
     """The blocks of a variant that a road has, one below the other; and the fields they name."""
-    templates = (block.template(road) for block in blocks_of(variant).values())
+    blocks = blocks_of(variant).values()
+    templates = (block.merge if road == "merge" else block.straight for block in blocks)
     whole = "\n\n".join(template for template in templates if template is not None) + "\n"
     return whole, frozenset(named(whole))

@@ -21,17 +21,19 @@ _UNITS = {
 # A column without a comment means what the first of its name does.
 _DESCRIBED = """
 WITH relations AS (
-    SELECT table_oid AS oid, table_name AS name, comment, false AS is_view FROM duckdb_tables()
+    SELECT table_oid AS oid, table_name AS name, comment, false AS is_view, database_name
+    FROM duckdb_tables()
     UNION ALL
-    SELECT view_oid, view_name, comment, true FROM duckdb_views() WHERE NOT internal
+    SELECT view_oid, view_name, comment, true, database_name FROM duckdb_views() WHERE NOT internal
 ), columns AS (
     SELECT *, coalesce(comment, arg_min(comment, table_oid) OVER (PARTITION BY column_name), '')
         AS meaning
-    FROM duckdb_columns() WHERE NOT internal
+    FROM duckdb_columns()
+    WHERE NOT internal AND database_name IN (current_database(), 'temp')
 )
 SELECT name, is_view, relations.comment,
     list((column_name, data_type, meaning) ORDER BY column_index)
-FROM relations JOIN columns ON oid = table_oid
+FROM relations JOIN columns ON oid = table_oid AND relations.database_name = columns.database_name
 GROUP BY oid, name, is_view, relations.comment ORDER BY is_view, oid
 """
 
@@ -65,10 +67,14 @@ def tables() -> list[SchemaTable]:
     """Tables, then views, in the order of their definitions."""
     with duckdb.connect() as connection:
         connection.execute(schema_sql())
-        found = connection.execute(_DESCRIBED).fetchall()
+        return described(connection)
+
+
+def described(connection: duckdb.DuckDBPyConnection) -> list[SchemaTable]:
+    """The tables and views of an open database, and the temporary ones of the connection."""
     return [
         SchemaTable(name, is_view, comment, [SchemaColumn(*column) for column in columns])
-        for name, is_view, comment, columns in found
+        for name, is_view, comment, columns in connection.execute(_DESCRIBED).fetchall()
     ]
 
 

@@ -9,15 +9,16 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.errors import StoreError, UsageError
-from merge_runner.results.data_dictionary import SchemaColumn, SchemaTable, tables, units
+from merge_runner.results.data_dictionary import SchemaTable, described, units
 from merge_runner.results.database import fetched, names_of, read_database
 from merge_runner.results.provenance import program
 from merge_runner.results.query_output import Rows, write_csv
-from merge_runner.results.wide_trials import COMMENT, FACTORS, NAME, fixed_columns, wide_trials
+from merge_runner.results.wide_trials import COMMENT, FACTORS, NAME, wide_trials
 from merge_runner.text_safety import first_line, quoted
 
 TITLE = "# Results of merge-runner"
 README, DICTIONARY = "README.md", "dictionary.csv"
+OF_A_FACTOR = "the level of a factor of the study"  # what no other table has
 HEADINGS = ["table", "column", "type", "unit", "meaning"]
 EXPLAINED = """
 The tables and views of `{name}`, each as Parquet and as CSV, written by {program}.
@@ -39,8 +40,11 @@ def export_tables(
     _refuse_other_content(folder)
     try:
         with read_database(db) as connection:
-            wide = wide_trials(connection.execute(FACTORS.format(only="")).fetchall())
-            known = [*tables(), *(table for table, _ in also), _described(connection, wide)]
+            factors = connection.execute(FACTORS.format(only="")).fetchall()
+            connection.execute(f"CREATE OR REPLACE TEMP VIEW {NAME} AS {wide_trials(factors)}")
+            connection.execute(f"COMMENT ON VIEW {NAME} IS {quoted(COMMENT)}")
+            stored = described(connection)
+            known = [*stored, *(table for table, _ in also)]
             folder.mkdir(parents=True, exist_ok=True)
             rows = [f"| `{t.name}`{' (view)' * t.is_view} | {t.comment} |" for t in known]
             said = EXPLAINED.format(name=db.name, program=program(), units=units())
@@ -48,15 +52,17 @@ def export_tables(
             (folder / README).write_text(text, encoding="utf-8")
             yield folder / README
             meanings = (
-                (table.name, column.name, column.kind, column.unit, column.comment)
+                (table.name, column.name, column.kind, column.unit, column.comment or otherwise)
                 for table in known
+                for otherwise in [OF_A_FACTOR if table.name == NAME else ""]
                 for column in table.columns
             )
             yield _write_csv(folder / DICTIONARY, HEADINGS, meanings)
-            for name, query in [*((t.name, f"FROM {t.name}") for t in tables()), (NAME, wide)]:
-                yield _write_parquet(connection, folder / f"{name}.parquet", query)
+            for table in stored:
+                query = f"FROM {table.name}"
+                yield _write_parquet(connection, folder / f"{table.name}.parquet", query)
                 result = connection.execute(query)
-                yield _write_csv(folder / f"{name}.csv", names_of(result), fetched(result))
+                yield _write_csv(folder / f"{table.name}.csv", names_of(result), fetched(result))
             for table, file in also:
                 yield shutil.copyfile(file, copy := folder / f"{table.name}.csv")
                 query = f"FROM read_csv({quoted(copy.resolve())})"
@@ -65,16 +71,6 @@ def export_tables(
         raise UsageError(f"{folder} cannot be written: {exc}") from exc
     except duckdb.Error as exc:
         raise StoreError(f"{db} cannot be exported: {first_line(exc)}") from exc
-
-
-def _described(connection: duckdb.DuckDBPyConnection, wide: str) -> SchemaTable:
-    """The columns of the wide trials; what no table has is a factor."""
-    known = {column.name: column for column in fixed_columns()}
-    columns = [
-        known.get(name, SchemaColumn(name, kind, "the level of a factor of the study"))
-        for name, kind, *_ in connection.execute(f"DESCRIBE {wide}").fetchall()
-    ]
-    return SchemaTable(NAME, is_view=True, comment=COMMENT, columns=columns)
 
 
 def _refuse_other_content(folder: Path) -> None:

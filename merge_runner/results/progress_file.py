@@ -2,66 +2,44 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import platform
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 from urllib.parse import quote
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, NonNegativeInt, ValidationError
 
-# While a sweep checks what it stored, the file is silent: only its process shows that it lives.
+# While a sweep checks what it stored, the file is silent.
 STALE_S = {"playing": 10.0, "checking": 600.0}
 MOST_BYTES = 1_000_000
-# Identifies the machine among those that share a folder: process ids mean nothing on another one.
-MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 class Standing(BaseModel):
     """Snapshot of a sweep, for its display and for other processes.
 
-    ``ended`` trials have an outcome, those that were ``stored_before`` this run among them.
-    ``committed_usd`` counts against ``cap_usd``, over all runs.
-    ``left_s`` is the estimated time left, None while there is no estimate. ``waiting`` says what
-    its calls wait for, ``warnings`` what its user should know.
+    ``ended`` trials have an outcome, those that were stored before this run among them. ``left_s``
+    is the estimated time left, None while there is no estimate. ``rows`` are what is shown, each
+    with its name: ``WARNING``, ``waiting`` (for what), ``trials``, ``cost`` and so on.
     """
 
     model_config = ConfigDict(frozen=True)
 
     sweep_id: str
-    name: str
-    model: str
-    pid: Annotated[int, Field(ge=1, lt=2**31)]
-    machine: str
-    started_at: AwareDatetime
     updated_at: AwareDatetime
     doing: Literal["playing", "checking"]
-    trials: NonNegativeInt
-    stored_before: NonNegativeInt
-    running: NonNegativeInt
-    workers: NonNegativeInt | None
     ended: NonNegativeInt
     failed: NonNegativeInt
-    calls_live: NonNegativeInt
-    calls_cached: NonNegativeInt
     cost_usd: float
-    cap_usd: float | None
-    committed_usd: float
     left_s: float | None
-    worst_stall_s: float
-    waiting: tuple[str, ...]
-    warnings: tuple[str, ...]
+    rows: tuple[tuple[str, str], ...]
 
     @property
     def alive(self) -> bool:
-        """Whether the sweep is still running, by its file and its process."""
-        if self.machine == MACHINE and not _exists(self.pid):
-            return False
+        """Whether the sweep was heard of lately."""
         return (datetime.now(UTC) - self.updated_at).total_seconds() < STALE_S[self.doing]
 
 
@@ -129,11 +107,3 @@ def _read(path: Path) -> Standing | None:
             return Standing.model_validate_json(file.read(MOST_BYTES))
     except (OSError, ValidationError):
         return None
-
-
-def _exists(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except OSError as exc:
-        return isinstance(exc, PermissionError)
-    return True

@@ -10,11 +10,20 @@ from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    JsonValue,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+)
 
 from merge_runner.llm.cache import CachedCall
-from merge_runner.results.recording import opened, sweeps_of
+from merge_runner.results.recording import SWEEPS, opened
 from merge_runner.text_safety import one_line
+
+ROWS = TypeAdapter(list[dict[str, str]])
 
 
 class RecordedSweep(BaseModel):
@@ -69,8 +78,10 @@ class RecordedSweep(BaseModel):
 
 def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
     """Return the sweeps as a recording says itself, without those whose configuration is odd."""
-    sweeps = []
-    for row in sweeps_of(provenance):
+    rows, sweeps = [provenance], []
+    with suppress(KeyError, ValidationError):
+        rows = ROWS.validate_json(provenance[SWEEPS])
+    for row in rows:
         with suppress(KeyError, TypeError, ValueError, RecursionError):
             told = {**json.loads(row["config"]), "name": row.get("name", "")}
             sweeps.append(RecordedSweep(**told))

@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import duckdb
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
@@ -62,7 +62,6 @@ COLUMNS = {
 """docs/reference/recordings.md says what they mean."""
 SLOT = ("condition", "repetition", "side", "decision", "sample_set")
 HEADERS = TypeAdapter(dict[str, str])
-ROWS = TypeAdapter(list[dict[str, str]])
 # Far beyond any sweep; a file that claims more was made to do harm.
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
@@ -359,18 +358,8 @@ def read_provenance(file: Path) -> dict[str, str]:
         return metadata
 
 
-def sweeps_of(provenance: dict[str, str]) -> list[dict[str, str]]:
-    """Return the rows of the sweeps whose calls a recording holds, as it says itself."""
-    if SWEEPS not in provenance:
-        return [provenance]
-    try:
-        return ROWS.validate_json(provenance[SWEEPS])
-    except ValidationError:
-        return []
-
-
 def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
-    """Return the metadata of the sweeps that a recording is made of; see ``sweeps_of``."""
+    """Return the metadata of the sweeps that a recording is made of."""
     rows = [
         {name: str(value) for name, value in row.items() if value is not None} for row in sweeps
     ]

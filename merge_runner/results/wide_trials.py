@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import chain
 
-from merge_runner.results.data_dictionary import SchemaColumn, tables
+from merge_runner.results.data_dictionary import tables
 from merge_runner.text_safety import quoted
 
 # Each factor with the type that all its levels have; they are written as ``level_text`` does.
@@ -47,16 +48,11 @@ def wide_trials(factors: Iterable[tuple[str, str]], sweep_id: str | None = None)
 
     A factor that is called like a column of the trials has ``factor_`` before its name.
     """
-    taken, levels = {column.name for column in fixed_columns()}, ""
+    relations = ("trials", "trial_drivers", "trial_metrics")
+    fixed = (table.columns for table in tables() if table.name in relations)
+    taken, levels = {column.name for column in chain.from_iterable(fixed)}, ""
     for factor, kind in factors:
         name = f"factor_{factor}" if factor.lower() in taken else factor
         column = '"' + name.replace('"', '""') + '"'
         levels += f", max(value) FILTER (factor = {quoted(factor)})::{kind} AS {column}"
     return WIDE.format(levels=levels, only=only(sweep_id))
-
-
-def fixed_columns() -> list[SchemaColumn]:
-    """The columns beside those of the factors."""
-    names = ("trials", "trial_drivers", "trial_metrics")
-    every = {c.name: c for table in tables() if table.name in names for c in table.columns}
-    return list(every.values())

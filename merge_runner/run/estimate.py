@@ -136,7 +136,7 @@ def estimate(
     knows about each model's earlier answers to similar requests at its endpoint.
     """
     todo = [
-        _calls(plan, arm, name, round(calls[label][name]), facts[name])
+        _calls(plan, arm, name, round(calls[label][name]), facts)
         for label, arm in plan.by_label().items()
         for name in arm.entries
     ]
@@ -163,21 +163,23 @@ def estimate(
         minutes=minutes,
         free=all(entry.price == "free" for entry in plan.entries.values()),
         measured=tuple(
-            driver_name(name, plan.endpoints[name]) for name in plan.entries if facts[name].measured
+            driver_name(name, plan.endpoints[name])
+            for name in plan.entries
+            if name in facts and facts[name].measured
         ),
         batch=batch,
     )
 
 
-def _calls(plan: Plan, arm: Arm, name: str, number: int, facts: CallTotals) -> _Calls:
+def _calls(plan: Plan, arm: Arm, name: str, number: int, facts: Mapping[str, CallTotals]) -> _Calls:
     """Return the calls of a model in an arm, as measured or as listed in the registry."""
-    entry = arm.entries[name]
-    usage = facts.mean or Usage(
+    entry, known = arm.entries[name], facts.get(name, CallTotals())
+    usage = known.mean or Usage(
         # English has about 4 bytes a token.
         input_tokens=len(typical_prompt(plan, arm).encode()) // 4,
         output_tokens=entry.typical_output_tokens,
     )
-    latency_s = facts.latency_s / facts.timed if facts.timed else entry.typical_latency_s
+    latency_s = known.latency_s / known.timed if known.timed else entry.typical_latency_s
     return _Calls(plan.registered[name], entry, number, usage, latency_s)
 
 
@@ -211,7 +213,7 @@ def trial_costs(
         # No tokeniser makes more tokens than bytes.
         read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
         for name in filter(arm.entries.get, arm.asked.values()):
-            entry, calls = arm.entries[name], _calls(plan, arm, name, 1, facts[name])
+            entry, calls = arm.entries[name], _calls(plan, arm, name, 1, facts)
             worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
             usual_usd, worst_usd = (cost_usd(entry, each) or 0.0 for each in (calls.usage, worst))
             usd = TRIAL_MARGIN * usual_prompts(arm) * usual_usd + worst_usd

@@ -186,15 +186,11 @@ class Plan(BaseModel):
         return sum(arm.repetitions for arm in self.arms) * len(self.conditions)
 
     @property
-    def calls_of_a_trial(self) -> float:
-        """How many calls a trial usually takes, on the average over the arms."""
-        calls = sum(
-            arm.repetitions
-            * usual_prompts(arm)
-            * sum(name in arm.entries for name in arm.asked.values())
-            for arm in self.arms
-        )
-        return calls / sum(arm.repetitions for arm in self.arms)
+    def usual_calls(self) -> float:
+        """How many calls all trials usually take."""
+        asked = {arm.label: sum(n in arm.entries for n in arm.asked.values()) for arm in self.arms}
+        calls = (a.repetitions * usual_prompts(a) * asked[a.label] for a in self.arms)
+        return sum(calls) * len(self.conditions)
 
     @property
     def scripted(self) -> bool:
@@ -224,12 +220,9 @@ class Plan(BaseModel):
 
     def within_budget(self, options: Options) -> Options:
         """Return the options with the cap of the study's budget; ``--max-cost`` goes before it."""
-        budget_usd = self.study.file.budget.total_usd
-        return (
-            options
-            if options.max_cost_usd is not None
-            else replace(options, max_cost_usd=budget_usd)
-        )
+        if options.max_cost_usd is not None:
+            return options
+        return replace(options, max_cost_usd=self.study.file.budget.total_usd)
 
     def by_label(self) -> dict[str, Arm]:
         """The arms by the labels that their trials carry."""
@@ -415,15 +408,12 @@ def grid_conditions(text: str) -> list[str]:
 
     ``h`` or ``dv`` may be one number, or be left out for that of the usual grid. Raises UsageError.
     """
-    axes = dict(map(_axis, USUAL_GRID.split(",")))
-    given = list(map(_axis, [] if text == "usual" else text.split(",")))
-    if len({name for name, _ in given}) < len(given):
-        raise UsageError(f"--grid: {text!r} has an axis twice; write it once, as FROM:TO:STEP")
-    names = []
-    for headway_m, velocity_mps in product(*(axes | dict(given)).values()):
-        Condition(headway_m, velocity_mps)  # raises where a vehicle would not drive forwards
-        names.append(condition_name(headway_m, velocity_mps))
-    return names
+    parts = USUAL_GRID if text == "usual" else f"{USUAL_GRID},{text}"
+    axes = dict(map(_axis, parts.split(",")))
+    points = list(product(*axes.values()))
+    for point in points:
+        Condition(*point)  # raises where a vehicle would not drive forwards
+    return [condition_name(*point) for point in points]
 
 
 def _axis(text: str) -> tuple[str, list[float]]:
@@ -486,16 +476,14 @@ def _repetitions(
     if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
     given = study.file.repetitions
-    wanted: dict[str, int] = {}
+    wanted = {}
     for variant in file_prompts(study.file) if variants is None else variants:
         blocks_of(variant)  # raises where there is none
-        repetitions = chosen or given.get(variant, given.get(EVERY_PROMPT))
-        if repetitions is None:
-            raise UsageError(
-                f"the sweep {study.name} has no variant {variant}; it has {', '.join(given)}. "
-                "With --reps N any variant can be run."
-            )
-        wanted[variant] = repetitions
-    if not wanted:
-        raise UsageError(f"the sweep {study.name} has no variant; valid: {', '.join(VARIANTS)}")
+        wanted[variant] = chosen or given.get(variant, given.get(EVERY_PROMPT, 0))
+    lacking = [variant for variant, repetitions in wanted.items() if not repetitions]
+    if lacking or not wanted:
+        raise UsageError(
+            f"the sweep {study.name} has no variant{' '.join(['', *lacking])}; valid: "
+            f"{', '.join(VARIANTS)}. With --reps N any variant can be run."
+        )
     return wanted

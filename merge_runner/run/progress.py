@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import errno
-import os
 import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, nullcontext, suppress
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
 
 from merge_runner.llm.client import Wait
 from merge_runner.llm.ledger import Ledger
-from merge_runner.results.progress_file import MACHINE, ProgressFile, Standing, clear_dead
+from merge_runner.results.progress_file import ProgressFile, Standing, clear_dead
 from merge_runner.run.plan import Plan
 from merge_runner.text_safety import printable
 
@@ -25,9 +23,10 @@ if TYPE_CHECKING:
     from merge_runner.run.cluster import DaskTasks
     from merge_runner.run.local_runner import LocalRunner
 
+PUBLISHED_EVERY_S = 1.0
 LIVE_EVERY_S = 0.25
 PLAIN_EVERY_S = 5.0
-PULSE_S, PULSES = 0.05, 20  # between two writings of the file
+PULSE_S = 0.05
 NOTES_SHOWN = 10
 REASONS_SHOWN = 3
 CLOSE_IT = "you may close this: the same command goes on"
@@ -62,42 +61,50 @@ class Progress:
         elapsed_s = (now - self.began_at).total_seconds()
         failed = self.outcome_counts["failed"]
         ended = self.outcome_counts.total() - self.outcome_counts["suspended"] - failed
+        live, cached = (sum(m.calls_live for m in meters), sum(m.calls_cached for m in meters))
+        cost_usd = sum(meter.cost_usd for meter in meters)
         batches = _first(self.batches(), "others")
+        # How long a batch takes nobody knows.
+        left_s = None if batches else self._left_s(elapsed_s, ended + failed, live + cached)
+        before = f" (+{self.stored} stored before)" if self.stored else ""
+        workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
+        cap = ""
+        if self.cap_usd is not None:
+            cap = f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+        rows = [
+            *(("WARNING", text) for text in self._warnings()),
+            (
+                "trials",
+                f"{ended + failed}/{self.planned - self.stored} ended{before}, "
+                f"{self.runner.running} running{workers}",
+            ),
+            ("failed", str(failed)),
+            ("calls", f"{live} live, {cached} from recordings"),
+            ("cost", f"{cost_usd:.2f} USD{cap}"),
+            *(("waiting", text) for text in batches + [CLOSE_IT] * bool(batches) + self._waits()),
+            (
+                "time",
+                f"{elapsed_s:.0f} s" + ("" if left_s is None else f", about {left_s:.0f} s left"),
+            ),
+        ]
         return Standing(
             sweep_id=sweep_id,
-            name=self.plan.name,
-            model=self.plan.driver + " (a mock)" * self.plan.scripted,
-            pid=os.getpid(),
-            machine=MACHINE,
-            started_at=self.began_at,
             updated_at=now,
             doing=self.doing,
-            trials=self.planned,
-            stored_before=self.stored,
-            running=self.runner.running,
-            workers=self.runner.workers,
             ended=self.stored + ended,
             failed=failed,
-            calls_live=sum(meter.calls_live for meter in meters),
-            calls_cached=sum(meter.calls_cached for meter in meters),
-            cost_usd=sum(meter.cost_usd for meter in meters),
-            cap_usd=self.cap_usd,
-            committed_usd=self.ledger.spending.committed_usd,
-            # How long a batch takes nobody knows.
-            left_s=None if batches else self._left_s(elapsed_s, ended + failed),
-            worst_stall_s=self.worst_stall_s,
-            waiting=tuple(map(printable, [*batches, *[CLOSE_IT] * bool(batches), *self._waits()])),
-            warnings=tuple(map(printable, self._warnings())),
+            cost_usd=cost_usd,
+            left_s=left_s,
+            rows=tuple((name, printable(text)) for name, text in rows),
         )
 
-    def _left_s(self, elapsed_s: float, ended: int) -> float | None:
+    def _left_s(self, elapsed_s: float, ended: int, calls: int) -> float | None:
         """The estimated time left in s; None while there is nothing to estimate it from.
 
         Trials that run in step all end late, so early in a run the calls are a better basis.
         """
         total = self.planned - self.stored
-        calls = sum(m.calls_live + m.calls_cached for m in self.runner.meters.values())
-        expected_calls = total * self.plan.calls_of_a_trial
+        expected_calls = self.plan.usual_calls * total / self.plan.trials
         by_calls = min(calls / expected_calls, 0.99) if expected_calls else 0.0
         part = max(ended / total, by_calls) if ended < total else 0.0
         return elapsed_s / part - elapsed_s if part else None
@@ -132,22 +139,14 @@ def _first(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[st
 
 @asynccontextmanager
 async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
-    """Keep a sweep's progress file up to date while the body runs; remove the file at the end.
+    """Keep a sweep's progress file up to date while the body runs; remove the file at the end."""
 
-    Also measures how late the event loop wakes a task that sleeps.
-    """
-
-    async def publish() -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            file.write(progress.standing(file.sweep_id))
-            for _ in range(PULSES):
-                due = loop.time() + PULSE_S
-                await asyncio.sleep(PULSE_S)
-                progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
+    def publish() -> None:
+        file.write(progress.standing(file.sweep_id))
 
     clear_dead(file.db)
-    publishing = asyncio.create_task(publish())
+    publish()
+    publishing = asyncio.create_task(_repeat(progress, PUBLISHED_EVERY_S, publish))
     try:
         yield
     finally:
@@ -161,75 +160,55 @@ async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[
 
     ``quiet``: only the clients' messages.
     """
-    stop = asyncio.Event()
-    display = asyncio.create_task(_show(progress, stop, quiet=quiet))
-    try:
-        yield
-    finally:
-        stop.set()
-        try:
-            await display
-        except OSError as exc:
-            if exc.errno != errno.EIO:  # that of a terminal that is closed
-                raise
-
-
-async def _show(progress: Progress, stop: asyncio.Event, *, quiet: bool) -> None:
     live = None
     if not quiet and sys.stderr.isatty():
         from rich.console import Console
         from rich.live import Live
 
         live = Live(console=Console(stderr=True), auto_refresh=False)
-    with live or nullcontext():  # the table stays below what is printed meanwhile
-        while True:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(LIVE_EVERY_S if live else PLAIN_EVERY_S):
-                    await stop.wait()
+        live.start()  # the table stays below what is printed meanwhile
+
+    def show() -> None:
+        with suppress(OSError):  # the terminal may be closed
             for note in _notes(progress):
                 say(note)
             if live is not None:
-                live.update(table_of(progress.standing("")), refresh=True)
+                live.update(table_of(progress), refresh=True)
             elif not quiet:
-                rows = rows_of(progress.standing(""))
-                say("; ".join(f"{name}: {text}" for name, text in rows))
-            if stop.is_set():
-                return
+                say("; ".join(f"{name}: {text}" for name, text in progress.standing("").rows))
+
+    every_s = PLAIN_EVERY_S if live is None else LIVE_EVERY_S
+    showing = asyncio.create_task(_repeat(progress, every_s, show))
+    try:
+        yield
+    finally:
+        showing.cancel()
+        show()
+        with suppress(OSError):
+            if live is not None:
+                live.stop()
 
 
-def rows_of(now: Standing) -> list[tuple[str, str]]:
-    """Name and text of every figure that is shown."""
-    this_run = now.ended + now.failed - now.stored_before
-    before = f" (+{now.stored_before} stored before)" if now.stored_before else ""
-    workers = "" if now.workers is None else f" on {now.workers} workers"
-    cap = ""
-    if now.cap_usd is not None:
-        cap = f", {now.committed_usd:.2f} of {now.cap_usd:g} over all runs"
-    left = "" if now.left_s is None else f", about {now.left_s:.0f} s left"
-    elapsed_s = (now.updated_at - now.started_at).total_seconds()
-    return [
-        *(("WARNING", text) for text in now.warnings),
-        (
-            "trials",
-            f"{this_run}/{now.trials - now.stored_before} ended{before}, {now.running} "
-            f"running{workers}",
-        ),
-        ("failed", str(now.failed)),
-        ("calls", f"{now.calls_live} live, {now.calls_cached} from recordings"),
-        ("cost", f"{now.cost_usd:.2f} USD{cap}"),
-        *(("waiting", text) for text in now.waiting),
-        ("time", f"{elapsed_s:.0f} s{left}"),
-    ]
+async def _repeat(progress: Progress, every_s: float, do: Callable[[], None]) -> None:
+    """Do it so often, and measure how late the event loop wakes a task that sleeps."""
+    loop = asyncio.get_running_loop()
+    while True:
+        for _ in range(round(every_s / PULSE_S)):
+            due = loop.time() + PULSE_S
+            await asyncio.sleep(PULSE_S)
+            progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
+        do()
 
 
-def table_of(now: Standing) -> Table:
-    """The same as a table for a terminal."""
+def table_of(progress: Progress) -> Table:
+    """What is shown on a terminal."""
     from rich.table import Table
     from rich.text import Text
 
-    title = Text(printable(f"{now.name}: {now.model}"))
+    mock = " (a mock)" if progress.plan.scripted else ""
+    title = Text(printable(f"{progress.plan.name}: {progress.plan.driver}{mock}"))
     table = Table(title=title, title_justify="left", show_header=False, box=None)
-    for name, text in rows_of(now):
+    for name, text in progress.standing("").rows:
         table.add_row(name, Text(text))  # text from a server must not be read as markup
     return table
 

@@ -122,8 +122,8 @@ def _audit(
     try:
         plan = Plan.model_validate_json(config)
         # The stored plug-ins are somebody's code and never run.
-        if plan.study.is_own and not in_use().text:
-            use(declared_catalogue(plan.study.text))
+        if not in_use().text:
+            use(declared_catalogue(plan.study.file))
         stored, members = json.loads(config), plan.model_dump(mode="json").items()
         if wrong := [name for name, value in members if stored.get(name, value) != value]:
             text = f"it disagrees with itself in {', '.join(wrong)}"
@@ -243,6 +243,7 @@ class StoredReplies:
     """The replies in the table ``calls``, of one trial at a time, as a client finds them."""
 
     def __init__(self, connection: duckdb.DuckDBPyConnection, plan: Plan) -> None:
+        self.money = None  # the ledger of a sealed client keeps nothing
         self._connection = connection
         self._plan = plan
         self._spans = spans(connection, "calls")

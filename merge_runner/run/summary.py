@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from contextlib import closing
+from dataclasses import asdict, replace
 from io import StringIO
 from itertools import groupby
 from operator import itemgetter
+from pathlib import Path
 from typing import Any, get_args
 
 from merge_runner.audit.findings import Audit
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.records import Status
 from merge_runner.results.query_output import write_table
+from merge_runner.results.recorded_study import recorded_part
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
-from merge_runner.run.recorded_plan import replayed
 from merge_runner.run.sweep import Outcome, open_sweep
 
 COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
@@ -35,13 +39,20 @@ async def play(
 ) -> tuple[dict[str, Any], str]:
     """Play what is not stored yet of a plan; return the summary as JSON values and as text.
 
-    A replay that is not ``whole`` plays what its recordings hold. ``agree`` gets an estimate before
-    money is spent, and raises where it is not to be. Raises UsageError.
+    A replay without a recording, or replies of the models in the cache, is of the recording that
+    ships with the program; one that is not ``whole`` plays what its recordings hold. ``agree`` gets
+    an estimate before money is spent, and raises where it is not to be. Raises UsageError.
     """
     if options.replay:
-        plan, options, notes = replayed(plan, options, whole=whole)
-        for note in notes:
-            say(note)
+        shipped = SHIPPED_RECORDINGS / f"{plan.model}-{plan.study.name}.parquet"
+        # A user's own replies are never mixed with those of somebody else.
+        if not options.recordings and shipped.is_file() and not _has_replies(options.cache, plan):
+            options = replace(options, recordings=(shipped,))
+            say(f"The replies are from the recording that ships with merge-runner: {shipped}")
+        part = plan if whole else _recorded(plan, options.recordings)
+        if part.trials < plan.trials:
+            say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
+        plan = part
     expected = None
     options = plan.within_budget(options)
     async with open_sweep(plan, options, say=say) as sweep:
@@ -51,6 +62,34 @@ async def play(
         outcome = await sweep.run()
     summary = as_dict(outcome, options, expected)
     return summary, "\n".join(as_lines(outcome, summary))
+
+
+def _has_replies(folder: Path, plan: Plan) -> bool:
+    """Whether a cache holds replies of the plan's models."""
+    if not (folder / "cache.db").is_file():
+        return False
+    ids = {entry.id for entry in plan.entries.values()}
+    with closing(ResponseCache(folder, read_only=True)) as cache:
+        return any(True for _ in cache.recorded(lambda request: request.model in ids))
+
+
+def _recorded(plan: Plan, recordings: Sequence[Path]) -> Plan:
+    """The part of a plan that recordings of the same sweep hold; all of it if they do not say.
+
+    A sweep's recording holds its first situations, too.
+    """
+    names = {plan.study.name, plan.name}
+    held = recorded_part(recordings, names, plan.model, plan.sample_set)
+    if held is None:
+        return plan
+    arms = tuple(
+        replace(arm, repetitions=min(arm.repetitions, held.repetitions[arm.variant]))
+        for arm in plan.arms
+        if held.repetitions.get(arm.variant) and (not held.arms or arm.label in held.arms)
+    )
+    conditions = tuple(one for one in plan.conditions if one in held.conditions)
+    part = plan.model_copy(update={"arms": arms, "conditions": conditions})
+    return part if part.trials else plan
 
 
 def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> dict[str, Any]:
@@ -82,7 +121,6 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
         "sweep_cost_usd": round(spending.spent_usd, 6),
         "set_aside_usd": round(spending.reserved_usd, 6),
         "attempts_of_unknown_cost": spending.open_attempts,
-        "overrun_usd": round(spending.overrun_usd, 6),
         "cache_cost_usd": round(outcome.cache_cost_usd, 6),
         "damaged_entries": meter.damaged,
         "open_batches": outcome.batches,
@@ -260,6 +298,6 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     if (batch := expected.batch) is not None:
         yield (
             f"batch   {about(batch.cost_usd)} in about {batch.rounds} rounds, at most "
-            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour; "
-            "after two the rest is asked singly"
+            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour, "
+            "a day at most"
         )

@@ -42,7 +42,7 @@ from merge_runner.run.clients import (
     open_rounds,
 )
 from merge_runner.run.cluster import DaskTasks, connected
-from merge_runner.run.estimate import CallTotals, Estimate, estimate
+from merge_runner.run.estimate import Estimate, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, Flusher
 from merge_runner.run.local_runner import LocalRunner
@@ -186,13 +186,12 @@ class Sweep:
                 if name in arm.entries:
                     answered = sum(row.side == side for row in record.decisions) if record else 0
                     calls[spec.arm][name] += max(1.0, usual_prompts(arm) - answered)
-        nothing = {name: CallTotals() for name in self._plan.entries}
         return estimate(
             self._plan,
             self._options,
             trials=trials,
             calls=calls,
-            facts={**nothing, **earlier_answers(self._plan, self._cache)},
+            facts=earlier_answers(self._plan, self._cache),
         )
 
     async def _nothing_is_recorded(self) -> bool:

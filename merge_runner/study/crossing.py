@@ -14,7 +14,7 @@ from pydantic import JsonValue
 from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, ego_side, validated
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
-from merge_runner.errors import UsageError, unknown_name
+from merge_runner.errors import UsageError
 from merge_runner.llm.formats.parameters import known_parameters, with_parameter
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES, Side, other_side
@@ -97,7 +97,10 @@ def cross(
     arm is played in so many ``conditions``.
     """
     _check_names(file, registry)
-    axes = _axes(file, models, repetitions)
+    factors = {MODEL: models, **{n: each for n, each in file.factors.items() if n != PROMPT}}
+    if PROMPT in file.factors or len(repetitions) > 1:
+        factors[PROMPT] = tuple(repetitions)
+    axes = {name: _by_text(file, name, levels) for name, levels in factors.items()}
     varying = [name for name, levels in axes.items() if len(levels) > 1]
     mirrored = mirror or file.mirror
     arms: dict[tuple[str, ...], Arm] = {}
@@ -121,7 +124,7 @@ def cross(
                     "one out, by skip"
                 )
     if not arms:
-        raise UsageError("nothing is left to play: look at skip, and at --only")
+        raise UsageError("nothing is left to play: look at [factors] and skip, and at --only")
     if mirror and not any(arm.is_mixed for arm in arms.values()):
         raise UsageError(
             f"there are no two different drivers to mirror: name them, as --model {models[0]}+OTHER"
@@ -137,10 +140,7 @@ def listed_levels(
     The ``models`` are those that are played, and so are the ``prompts`` beside the file's.
     """
     axes = {MODEL: [*models], **file.factors, PROMPT: [*file_prompts(file), *prompts]}
-    return {
-        name: _reference_first(file, name, dict.fromkeys(map(level_text, levels)))
-        for name, levels in axes.items()
-    }
+    return {name: [*_by_text(file, name, levels)] for name, levels in axes.items()}
 
 
 def file_prompts(file: StudyFile) -> list[str]:
@@ -160,26 +160,11 @@ def level_text(level: JsonValue) -> str:
     return level if isinstance(level, str) else json.dumps(level, separators=(",", ":"))
 
 
-def _reference_first(file: StudyFile, factor: str, texts: Iterable[str]) -> list[str]:
+def _by_text(file: StudyFile, factor: str, levels: Iterable[JsonValue]) -> dict[str, JsonValue]:
+    """The levels of a factor by their texts, its reference first."""
     reference = level_text(file.reference.get(factor))
-    return sorted(texts, key=lambda text: text != reference)
-
-
-def _axes(
-    file: StudyFile, models: Sequence[str], prompts: Iterable[str]
-) -> dict[str, dict[str, JsonValue]]:
-    """The levels of each factor by their texts; raises UsageError for none, or one twice."""
-    factors = {MODEL: models, **{n: each for n, each in file.factors.items() if n != PROMPT}}
-    if PROMPT in file.factors or len([*prompts]) > 1:
-        factors[PROMPT] = tuple(prompts)
-    axes = {}
-    for name, levels in factors.items():
-        whole = (int(x) if isinstance(x, float) and x.is_integer() else x for x in levels)
-        if not levels or len({*map(level_text, whole)}) < len(levels):
-            raise UsageError(f"the factor {name} needs levels, and each of them once")
-        axis = {level_text(level): level for level in levels}
-        axes[name] = {text: axis[text] for text in _reference_first(file, name, axis)}
-    return axes
+    by_text = {level_text(level): level for level in levels}
+    return dict(sorted(by_text.items(), key=lambda item: item[0] != reference))
 
 
 def _crossings(
@@ -247,9 +232,8 @@ def _arm(
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
     programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
-    parameters = {
-        name: level for name, level in levels.items() if _is_parameter(name) and level != DEFAULT
-    }
+    others = {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields}
+    parameters = {n: x for n, x in levels.items() if n not in others and x != DEFAULT}
     if parameters and not changed & {*registry}:
         raise UsageError(f"{model} is a program and takes no {min(parameters)}, only {DEFAULT!r}")
     asked, entries = dict(sides), {}
@@ -316,17 +300,12 @@ def _world_step(scenario: ScenarioConfig, programs: Mapping[str, Program]) -> di
     return {} if usual else {"step_s": step_s, "plan_step_s": scenario.action_s}
 
 
-def _is_parameter(name: str) -> bool:
-    return name not in {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields}
-
-
 def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     """Raise UsageError for a factor that there is not, and for a name that is taken."""
-    switches = ScenarioConfig.model_fields
     parameters = sorted(known_parameters(registry.values()))
-    valid = (PROMPT, OPPONENT, PERCEPTION, *parameters, *switches)
-    if unknown := [name for name in file.factors if name not in valid]:
-        raise unknown_name("factor", unknown[0], valid, "models and skip stand above [factors]")
+    valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
+    for name in file.factors:
+        require(valid, "factor", name, "models and skip stand above [factors]")
     taken = [f"drivers.{name}" for name in file.drivers if name in registry]
     taken += [f"{PERCEPTION}.{name}" for name in file.perception if name == PERFECT_ONE]
     if taken:

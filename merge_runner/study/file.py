@@ -170,13 +170,6 @@ class StudySource:
     path: Path
     plugins: dict[str, str]
 
-    @property
-    def is_own(self) -> bool:
-        """Whether it holds more than names of what there is."""
-        file = self.file
-        own_parts = file.prompts or file.drivers or file.plugins.files or file.factors
-        return bool(own_parts) or any((file.conditions or {}).values())
-
 
 def study_files() -> dict[str, Path]:
     """The studies that a name stands for: those of the working directory, and those that ship."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import re
 import sys
-import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from pathlib import Path
 from traceback import extract_tb
 from types import CodeType, ModuleType
 
-from merge_runner.config import both_sides, validated
+from merge_runner.config import both_sides
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of, with_block
@@ -76,17 +75,12 @@ def catalogue_of(file: StudyFile, text: str, plugins: Mapping[str, str]) -> Cata
     return catalogue
 
 
-def declared_catalogue(text: str) -> Catalogue:
+def declared_catalogue(file: StudyFile) -> Catalogue:
     """Return what a study's file declares itself; none of its plug-ins run.
 
     It has no text, since nobody named that study: another sweep's may take its place.
     Drivers of a program that is not here are left out. Raises UsageError.
     """
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as exc:
-        raise UsageError(f"the stored study cannot be read: {exc}") from exc
-    file = validated(StudyFile, content, "the stored study")
     here = {name: driver for name, driver in file.drivers.items() if driver.program in PROGRAMS}
     return catalogue_of(file.model_copy(update={"drivers": here}), "", {})
 

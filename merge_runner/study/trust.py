@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -25,19 +24,8 @@ SHIPPED_REGISTRY = SHIPPED_EXPERIMENTS / REGISTRY
 IDENTITY = {"provider", "format", "id", "base_url", "path", "key_env", "auth", "price"}
 
 
-@dataclass(frozen=True)
-class Risk:
-    """Something that a file of a folder does, in ``words``; ``content`` is what is agreed to."""
-
-    file: Path
-    words: str
-    content: object
-    shown: str = ""
-
-    @property
-    def digest(self) -> str:
-        """The hash under which an agreement is kept."""
-        return hashlib.sha256(canonical_json([self.words, self.content]).encode()).hexdigest()
+Risk = tuple[Path, str, object]
+"""A file, in words what it does, and the content that is agreed to."""
 
 
 def require_agreement(study: StudySource, models: Iterable[str], *, trust: bool) -> None:
@@ -45,21 +33,28 @@ def require_agreement(study: StudySource, models: Iterable[str], *, trust: bool)
 
     ``trust`` agrees. Raises UsageError where the user does not, and where there is no terminal.
     """
-    risks = [*_code(study), *_endpoints(study.path.parent, models)]
+    risks, code = [*_endpoints(study.path.parent, models)], study.plugins
+    # The plug-in that ``init`` writes is ours, as it writes it.
+    if code and code != {PLUGIN: (TEMPLATE / PLUGIN).read_text(encoding="utf-8")}:
+        risks.insert(0, (study.path, f"runs code ({', '.join(code)})", [*code.items()]))
     if not risks:
         return
+    by_digest = {
+        hashlib.sha256(canonical_json([words, content]).encode()).hexdigest(): (file, words)
+        for file, words, content in risks
+    }
     kept = state_folder() / "agreements"
     try:
         lines = kept.read_text("utf-8", errors="replace").splitlines() if kept.exists() else []
-        agreed = {line.partition(" ")[0] for line in lines}
-        risks = [risk for risk in risks if risk.digest not in agreed]
-        if not risks:
+        for agreed in lines:
+            by_digest.pop(agreed.partition(" ")[0], None)
+        if not by_digest:
             return
         if not trust:
-            _ask(risks)
+            _ask(study, by_digest.values())
         kept.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with kept.open("a", encoding="utf-8") as file:
-            file.writelines(f"{risk.digest} {one_line(str(risk.file))}\n" for risk in risks)
+            file.writelines(f"{n} {one_line(str(path))}\n" for n, (path, _) in by_digest.items())
     except OSError as exc:
         if not trust:  # a script says so again
             raise UsageError(
@@ -68,29 +63,21 @@ def require_agreement(study: StudySource, models: Iterable[str], *, trust: bool)
             ) from exc
 
 
-def _ask(risks: Iterable[Risk]) -> None:
-    """Show what is risked and raise UsageError unless the user agrees."""
-    words = one_line("; ".join(f"{risk.file} {risk.words}" for risk in risks))
+def _ask(study: StudySource, risks: Collection[tuple[Path, str]]) -> None:
+    """Show what files do, and code that is to run; raise UsageError unless the user agrees."""
+    words = one_line("; ".join(f"{file} {does}" for file, does in risks))
     if not sys.stdin.isatty():
         raise UsageError(
             f"{words}. There is no terminal to ask at: read these files, then add --trust (in "
             "Python: trust=True)"
         )
-    shown = "".join(risk.shown for risk in risks)
-    sys.stderr.write(printable(f"{shown}{words}\nGo ahead? [y]es, [N]o: "))
+    if study.path in [file for file, _ in risks]:
+        for name, source in study.plugins.items():
+            sys.stderr.write(printable(f"---- {study.path.parent / name}\n{source}\n----\n"))
+    sys.stderr.write(f"{words}\nGo ahead? [y]es, [N]o: ")
     sys.stderr.flush()
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise UsageError("nothing was run")
-
-
-def _code(study: StudySource) -> Iterator[Risk]:
-    """The plug-ins, but for the one that ``init`` writes, as it writes it."""
-    sources = study.plugins
-    if sources and sources != {PLUGIN: (TEMPLATE / PLUGIN).read_text(encoding="utf-8")}:
-        folder = study.path.parent
-        shown = (f"---- {folder / name}\n{source}\n----\n" for name, source in sources.items())
-        words = f"runs code ({', '.join(sources)})"
-        yield Risk(study.path, words, [*sources.items()], "".join(shown))
 
 
 def _endpoints(beside: Path, models: Iterable[str]) -> Iterator[Risk]:
@@ -121,4 +108,4 @@ def _endpoints(beside: Path, models: Iterable[str]) -> Iterator[Risk]:
             sent = entry.key_env or " or ".join(provider.key_envs) or "prompts"
             instead = ", in place of merge-runner's own" if replaces else ""
             words = f"sends {sent} to {origin} for the model {name}{instead}"
-            yield Risk(path, words, identity if replaces else None)
+            yield path, words, identity if replaces else None

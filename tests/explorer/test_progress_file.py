@@ -17,7 +17,7 @@ from merge_runner.run.progress import Progress
 from tests.gate import HANGS_S
 from tests.harness import run_sweep
 
-NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
+LONG_AGO = datetime(2026, 1, 1, tzinfo=UTC)
 LEDGER = SimpleNamespace(spending=Spending())
 SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm", 100)
 
@@ -34,29 +34,25 @@ async def begun(db):
         while True:
             for path in db.parent.glob("*.progress/*.json"):
                 found = read_standing(db, path.stem)
-                if found and found.calls_live and any("rate limits" in w for w in found.waiting):
+                if found and any("rate limits" in text for _, text in found.rows):
                     return found, path
             await asyncio.sleep(0.1)
 
 
 @pytest.mark.slow
-async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_tidies_up(
+async def test_a_sweep_says_where_it_stands_until_it_is_killed(
     merge_runner, tmp_path, emulator_url
 ):
     db = tmp_path / "m.duckdb"
     process = await merge_runner.start(*SWEEP, "--db", db, EMULATOR_BASE_URL=emulator_url)
     try:
         found, path = await begun(db)
-        text, alive = path.read_text(), found.alive
     finally:
         process.kill()
         await process.communicate()
-    assert found.pid == process.pid
-    assert (found.trials, found.running) == (4, 4)
-    assert str(tmp_path) not in text
-    assert (alive, read_standing(db, found.sweep_id).alive) == (True, False)
-    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--db", db)).code == 0
-    assert not path.parent.exists()
+    assert dict(found.rows)["trials"] == "0/4 ended, 4 running"
+    assert found.alive
+    assert str(tmp_path) not in path.read_text()
 
 
 async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, monkeypatch):
@@ -66,7 +62,7 @@ async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, m
     await run_sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print)
     first, last = said[0], said[-1]
     assert (first.doing, last.doing) == ("playing", "checking")
-    assert (first.trials, first.ended, last.ended, last.failed) == (4, 0, 4, 0)
+    assert (first.ended, last.ended, last.failed) == (0, 4, 0)
 
 
 @pytest.mark.parametrize(
@@ -75,12 +71,10 @@ async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, m
         ({}, 9, True),
         ({}, 11, False),  # frozen
         ({"doing": "checking"}, 11, True),  # it does nothing else meanwhile
-        ({"doing": "checking", "pid": NO_PROCESS}, 1, False),
-        ({"pid": NO_PROCESS}, 1, False),
-        ({"pid": NO_PROCESS, "machine": "another"}, 1, True),  # its ids mean nothing here
+        ({"doing": "checking"}, 601, False),
     ],
 )
-def test_a_sweep_is_dead_when_its_process_is_gone_or_silent(changes, age_s, alive):
+def test_a_sweep_is_dead_when_it_is_silent(changes, age_s, alive):
     updated_at = datetime.now(UTC) - timedelta(seconds=age_s)
     assert standing(updated_at=updated_at, **changes).alive == alive
 
@@ -88,15 +82,15 @@ def test_a_sweep_is_dead_when_its_process_is_gone_or_silent(changes, age_s, aliv
 def test_a_living_sweep_of_the_same_database_keeps_its_file(tmp_path):
     db = tmp_path / "m.duckdb"
     ProgressFile(db, "a").write(standing("a"))
-    ProgressFile(db, "b").write(standing("b", pid=NO_PROCESS))
+    ProgressFile(db, "b").write(standing("b", updated_at=LONG_AGO))
     clear_dead(db)
-    assert (read_standing(db, "a").pid, read_standing(db, "b")) == (os.getpid(), None)
+    assert (read_standing(db, "a").alive, read_standing(db, "b")) == (True, None)
 
 
 def test_only_what_a_killed_sweep_wrote_is_tidied_up(tmp_path):
     """A folder from elsewhere may lead to one of the user's, or hold files of other programs."""
     db, documents = tmp_path / "m.duckdb", tmp_path / "documents"
-    ProgressFile(db, "a").write(standing("a", pid=NO_PROCESS))
+    ProgressFile(db, "a").write(standing("a", updated_at=LONG_AGO))
     (tmp_path / "m.duckdb.progress").rename(documents)
     for name in ("notes.json", "thesis.tmp"):
         (documents / name).write_text("{}")

@@ -7,7 +7,7 @@ import json
 import re
 from collections import Counter
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime
 from urllib.parse import parse_qs, urlsplit
 
 import duckdb
@@ -207,7 +207,7 @@ def test_what_a_server_wrote_is_shown_as_text(study):
         connection.execute("UPDATE trials SET error = ? WHERE status = 'failed'", [hostile])
         connection.execute("UPDATE calls SET model_served = ? WHERE model_served = 'another'",
                            [hostile])  # fmt: skip
-    running(study, warnings=(f"another model answers: {hostile}",), waiting=(hostile,))
+    running(study, rows=(("WARNING", f"another model answers: {hostile}"), ("waiting", hostile)))
     shown = browser(study).get(URL).text
     assert shown.count("&lt;script&gt;alert(1)&lt;/script&gt;[U+202E]&lt;img src=x&gt;") >= 4
     assert "<script>alert" not in shown
@@ -215,10 +215,10 @@ def test_what_a_server_wrote_is_shown_as_text(study):
 
 
 def test_while_it_runs_its_totals_are_its_progress_file_s_and_the_cells_those_stored(study):
-    running(study, ended={"finished": 1, "failed": 1}, cost_usd=1.5, cap_usd=9.0, committed_usd=2.5)
+    running(study, ended={"finished": 1, "failed": 1}, rows=(("cost", "1.50 USD"),))
     text = text_of(browser(study))
     assert "Running: 1 of 33 trials ended, 1 failed, about 20 s left." in text
-    assert "1.50 USD in this run; 2.50 of at most 9.00 USD over all runs" in text
+    assert "cost 1.50 USD" in text
     assert "all 29 of 33 1 failed" in text
 
 
@@ -267,7 +267,7 @@ def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(stud
 
 
 def test_a_sweep_that_slept_goes_on_on_the_same_page(study):
-    running(study, pid=2**22 + 1)
+    running(study, updated_at=datetime(2026, 1, 1, tzinfo=UTC))
     client = browser(study)
     shown = client.get(URL).text
     assert "Stopped without a word" in shown

@@ -132,9 +132,6 @@ def test_programs_are_listed_with_what_they_do(study, installed):
     named = {line.split()[0] for line in listed if " program " in line}
     assert {"constant", "projected-order", "idm", "impulsive", "hesitant"} <= named
     programs = {name: words for name, _, words in (line.partition(": ") for line in listed)}
-    assert (
-        "(20 times a second); parameters: steady_from_m = 20.0, strength = 0.5"
-        in programs["impulsive"]
-    )
+    assert "(20 Hz); parameters: steady_from_m = 20.0, strength = 0.5" in programs["impulsive"]
     assert "set = highway-env | treiber-kesting" in programs["idm"]
     assert "this human does not react" in programs["human-replay"]

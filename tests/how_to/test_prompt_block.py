@@ -85,9 +85,12 @@ def test_where_it_is_not_installed_it_is_shown_by_name(study, played):
     [
         (
             ("The time is {time}.", None),
-            "the block 'x' names {time} on the road merge; valid: vehicle_length, own_speed, ",
+            "unknown field on the road merge of the block 'x': 'time'; valid: vehicle_length, own_",
         ),
-        ((None, "To go: {distance_to_merge}."), "{distance_to_merge} on the road straight"),
+        (
+            (None, "To go: {distance_to_merge}."),
+            "road straight of the block 'x': 'distance_to_merge'",
+        ),
         (("An open {", None), "a prompt block cannot be read"),
     ],
 )
@@ -105,5 +108,5 @@ def test_a_block_with_no_place_is_told_before_anything_is_asked(study, tmp_path)
     env = plugin(tmp_path / "installed", source)
     done = study.run("sweep", "baseline", "--variants", "A8", "--reps", 1, **env)
     assert done.code == 2
-    assert done.err.startswith("error: the prompt block C6 stands before C9; valid: ")
+    assert done.err.startswith("error: unknown place of the prompt block C6, before 'C9'; valid: ")
     assert done.err.count("\n") == 1

@@ -70,7 +70,6 @@ async def test_the_study_of_the_readme_fits_its_cap_with_models_that_answer_in_2
     expected = await unsent(plan, options, say=pytest.fail)
     assert (expected.trials, round(expected.cost_usd)) == (int(trials), int(usd))
     assert expected.cost_usd < options.max_cost_usd
-    assert expected.trials_within_cap == expected.trials
     for entry in plan.entries.values():
         assert entry.shutdown is None or entry.shutdown.year > 2027
 

@@ -258,5 +258,5 @@ def test_the_seven_ablations_remove_seven_different_blocks():
 
 @pytest.mark.parametrize("field", ["{own_speed:>999999999}", "{own_speed!r}"])
 def test_a_field_of_a_block_stands_alone_in_its_braces(field):
-    with pytest.raises(UsageError, match="a field stands alone in its braces"):
+    with pytest.raises(UsageError, match="cannot be read, a field stands alone in its braces"):
         Block("too wide", f"You drive at {field} m/s.", None)

@@ -68,7 +68,7 @@ def test_every_golden_file_is_checked():
 
 def test_the_table_says_what_the_list_says():
     for road in ("merge", "straight"):
-        listed, tabled = (BLOCKS[name].template(road) for name in ("C0", "state.table"))
+        listed, tabled = (getattr(BLOCKS[name], road) for name in ("C0", "state.table"))
         introduction, _, items = listed.partition("\n- ")
         assert tabled.startswith(introduction)
         rows = [line.strip("| ").split(" | ") for line in tabled.splitlines()[5:]]

@@ -201,11 +201,9 @@ class CacheMachine(RuleBasedStateMachine):
         """One byte of one row changes on the disk."""
         with contextlib.closing(sqlite3.connect(self.place / "cache.db")) as database, database:
             rows = database.execute("SELECT rowid, key FROM Cache ORDER BY rowid").fetchall()
-            calls = [row for row in rows if len(row[1]) == 64 or row[1].startswith("attempts ")]
             # What is damaged twice may be whole again.
-            rows = [row for row in rows if row[0] not in self.damaged]
-            calls = [row for row in calls if row in rows]
-            others = [row for row in rows if row[1] != "format"]
+            others = [row for row in rows if row[1] != "format" and row[0] not in self.damaged]
+            calls = [row for row in others if len(row[1]) == 64 or row[1].startswith("attempts ")]
             if not others:
                 return
             rowid, name = data.draw(st.sampled_from(calls or others) | st.sampled_from(others))

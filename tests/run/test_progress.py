@@ -6,7 +6,6 @@ from datetime import UTC, datetime, timedelta
 
 from merge_runner.llm.client import Meter
 from merge_runner.records import Attempt, Usage
-from merge_runner.run.progress import rows_of
 from tests.run.standings import progress, runner
 
 
@@ -15,7 +14,7 @@ def ago(seconds):
 
 
 def rows(shown):
-    return rows_of(shown.standing(""))
+    return shown.standing("").rows
 
 
 def test_every_figure_is_that_of_the_meters():

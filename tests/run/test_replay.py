@@ -234,7 +234,7 @@ async def test_a_replay_plays_what_a_smaller_recording_holds_and_says_so(merge_r
     run = await merge_runner(*replay, "--db", "part.duckdb")
     assert run.code == 0, run.err
     assert run.summary["trials"]["planned"] == 4
-    assert "2 x baseline in 2 conditions, 4 trials; the sweep baseline has 110" in run.err
+    assert "the recording holds 4 of the plan's 110 trials" in run.err
     digest = results_digest(tmp_path / "results/merge.duckdb")
     assert results_digest(tmp_path / "part.duckdb") == digest
     asked = await merge_runner(*replay, "--reps", 3, "--db", "asked.duckdb")

@@ -67,6 +67,6 @@ def test_a_servers_words_are_no_markup_in_the_display():
     wait = Wait("m: L_4_0", f"after HTTP 503: [/nope] {ESCAPE}")
     shown = io.StringIO()
     waiting = progress(runner(Meter(), running=1, waits=[wait]))
-    Console(file=shown, width=200).print(table_of(waiting.standing("")))
+    Console(file=shown, width=200).print(table_of(waiting))
     assert "[/nope]" in shown.getvalue()
     assert "\x1b" not in shown.getvalue()

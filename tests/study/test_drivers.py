@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 
 import pytest
 
@@ -12,6 +13,7 @@ from merge_runner.errors import UsageError
 from merge_runner.records import SIDES, ChatReply, ChatRequest
 from merge_runner.registry import use
 from merge_runner.run.plan import make_plan
+from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.trial import play_trial
 
@@ -147,7 +149,8 @@ def test_what_cannot_be_a_driver_is_refused_with_the_valid_choices(plan_of, text
 def test_a_stored_study_has_its_drivers_without_running_its_plugins(plan_of):
     text = plan_of(MINE + '[drivers.slow]\nprogram = "constant"\nclock = 2.0\n', "mine").study.text
     plan_of("", "constant")
-    use(declared_catalogue(text.replace("braking", "not-installed")))
+    content = tomllib.loads(text.replace("braking", "not-installed"))
+    use(declared_catalogue(StudyFile.model_validate(content)))
     assert PROGRAMS["slow"].rate_hz == 0.5
     assert "mine" not in PROGRAMS
 

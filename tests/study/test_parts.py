@@ -190,7 +190,11 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
 @pytest.mark.parametrize(
     ("text", "plugin", "says"),
     [
-        (persona("{speed}"), None, "names {speed}"),
+        (
+            persona("{speed}"),
+            None,
+            "block 'added by taxi': 'speed'; valid: ",
+        ),
         (
             persona().replace("C3.human", "C9"),
             None,

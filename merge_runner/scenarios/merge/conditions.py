@@ -79,16 +79,14 @@ class Condition:
         return start_left + speed_left * time_s, start_right + speed_right * time_s
 
 
-def _human(name: str) -> Condition:
-    _, headway, velocity = name.split("_")
-    return Condition(float(headway), int(velocity) / 10)
-
-
 # A name says who has the projected headway advantage (L, R or N), the projected headway in m and
 # the relative velocity in 0.1 m/s: in ``L_4_-8`` the left vehicle would be 4 m ahead at the merge
 # point and is 0.8 m/s slower.
 _NAMES = "R_-4_-8 R_-4_0 R_-4_8 R_-2_8 R_0_8 N_0_0 L_0_-8 L_2_-8 L_4_-8 L_4_0 L_4_8"
-HUMAN_CONDITIONS = {name: _human(name) for name in _NAMES.split()}
+HUMAN_CONDITIONS = {
+    name: Condition(float(name.split("_")[1]), int(name.split("_")[2]) / 10)
+    for name in _NAMES.split()
+}
 """Those of the human experiment (Siebinga et al., 4TU 19550377), which are the paper's, too."""
 
 NUMBER = r"-?\d{1,4}(?:\.\d{1,4})?"
@@ -117,16 +115,13 @@ class _Conditions(Registry[Condition]):
     def __getitem__(self, name: str) -> Condition:
         with suppress(KeyError):
             return super().__getitem__(name)
-        found = _COMPUTED.fullmatch(name)
-        if found is None:
-            raise KeyError(name)
-        headway_m, velocity_mps = map(float, found.groups())
-        if condition_name(headway_m, velocity_mps) != name:  # each has one name
-            raise KeyError(name)
-        try:
-            return Condition(headway_m, velocity_mps)
-        except UsageError as exc:
-            raise KeyError(name) from exc
+        if found := _COMPUTED.fullmatch(name):
+            headway_m, velocity_mps = map(float, found.groups())
+            with suppress(UsageError):
+                condition = Condition(headway_m, velocity_mps)
+                if condition_name(headway_m, velocity_mps) == name:  # each has one name
+                    return condition
+        raise KeyError(name)
 
 
 CONDITIONS = _Conditions("condition")
