@@ -69,24 +69,14 @@ class ServedFormat:
 
 
 def _chat(said: Completion) -> Body:
+    """Whole, as in the shipped recording, which the emulator makes byte for byte."""
+    message = {"role": "assistant", "content": said.text, "refusal": None, "annotations": []}
     return {
         "id": f"chatcmpl-{said.reply}",
         "object": "chat.completion",
         "created": CREATED,
         "model": said.model,
-        "choices": [
-            {
-                "index": 0,
-                "message": {
-                    "role": "assistant",
-                    "content": said.text,
-                    "refusal": None,
-                    "annotations": [],
-                },
-                "logprobs": None,
-                "finish_reason": "stop",
-            }
-        ],
+        "choices": [{"index": 0, "message": message, "logprobs": None, "finish_reason": "stop"}],
         "usage": {
             "prompt_tokens": said.tokens_in,
             "completion_tokens": said.output,
@@ -100,36 +90,21 @@ def _chat(said: Completion) -> Body:
 
 
 def _response(said: Completion) -> Body:
+    content = [{"type": "output_text", "text": said.text, "annotations": []}]
+    message = {"type": "message", "role": "assistant", "status": "completed", "content": content}
     return {
         "id": f"resp_{said.reply}",
         "object": "response",
         "created_at": CREATED,
         "status": "completed",
         "model": said.model,
-        "error": None,
-        "incomplete_details": None,
-        "parallel_tool_calls": True,
-        "tool_choice": "auto",
-        "tools": [],
-        "output": [
-            {"type": "reasoning", "id": f"rs_{said.reply}", "summary": []},
-            {
-                "type": "message",
-                "id": f"msg_{said.reply}",
-                "role": "assistant",
-                "status": "completed",
-                "content": [{"type": "output_text", "text": said.text, "annotations": []}],
-            },
-        ],
+        "output": [{"type": "reasoning", "summary": []}, message],
         "usage": {
             "input_tokens": said.tokens_in,
-            "input_tokens_details": {"cached_tokens": 0},
             "output_tokens": said.output,
             "output_tokens_details": {"reasoning_tokens": said.reasoning},
             "total_tokens": said.tokens_in + said.output,
         },
-        "temperature": 1.0,
-        "top_p": 1.0,
     }
 
 
@@ -156,14 +131,10 @@ def _message(said: Completion) -> Body:
         "model": said.model,
         "content": [{"type": "text", "text": said.text}],
         "stop_reason": "end_turn",
-        "stop_sequence": None,
         "usage": {
             "input_tokens": said.tokens_in,
-            "cache_creation_input_tokens": 0,
-            "cache_read_input_tokens": 0,
             "output_tokens": said.output,
             "output_tokens_details": {"thinking_tokens": said.reasoning},
-            "service_tier": "standard",
         },
     }
 

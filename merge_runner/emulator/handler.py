@@ -91,18 +91,15 @@ class Emulator:
                     request.headers.get(SLOT_HEADER),
                     request.headers.get(ATTEMPT_HEADER, ""),
                 )
-                return await self._chat(asked)
+                attempt = self.attempt(asked)
+                fault = self.behaviour.fault(asked.where, attempt)
+                try:
+                    answer = self.answer(asked, attempt, fault)
+                except UsageError as exc:
+                    return as_error(wire, 400, str(exc))
+                await asyncio.sleep(self.behaviour.latency_s)
+                return await self.deliver(asked, fault, answer)
         return as_response(b"404: Not Found", 404, {"content-type": "text/plain"})
-
-    async def _chat(self, asked: Asked) -> httpx.Response:
-        attempt = self.attempt(asked)
-        fault = self.behaviour.fault(asked.where, attempt)
-        try:
-            answer = self.answer(asked, attempt, fault)
-        except UsageError as exc:
-            return as_error(asked.wire, 400, str(exc))
-        await asyncio.sleep(self.behaviour.latency_s)
-        return await self.deliver(asked, fault, answer)
 
     def attempt(self, asked: Asked) -> int:
         """Return the attempt's number: the client's own count, or how often this was asked."""

@@ -10,7 +10,6 @@ from aiohttp import web
 
 from merge_runner.emulator.handler import Emulator
 from merge_runner.errors import UsageError
-from merge_runner.records import SCRIPTED_HEADER
 
 HOST = "127.0.0.1"
 # The names under which a browser or a client may reach it.
@@ -28,20 +27,15 @@ def application(emulator: Emulator | None = None) -> web.Application:
         response = await answering.respond(
             httpx.Request(request.method, str(request.url), headers=headers, content=body)
         )
-        body = await response.aread()
-        return web.Response(body=body, status=response.status_code, headers=response.headers)
+        answer = web.Response(status=response.status_code, headers=response.headers)
+        answer.body = await response.aread()
+        if ID_HEADER in request.headers:  # many gateways repeat it
+            answer.headers[ID_HEADER] = request.headers[ID_HEADER]
+        return answer
 
     app = web.Application(client_max_size=MOST_BYTES, middlewares=[_only_by_own_name])
-    app.on_response_prepare.append(_add_headers)
     app.router.add_route("*", "/{path:.*}", respond)
     return app
-
-
-async def _add_headers(request: web.Request, response: web.StreamResponse) -> None:
-    """Say that a mock model made it, and repeat the request's id, as many gateways do."""
-    response.headers[SCRIPTED_HEADER] = "true"
-    if ID_HEADER in request.headers:
-        response.headers[ID_HEADER] = request.headers[ID_HEADER]
 
 
 @web.middleware
