@@ -82,16 +82,8 @@ class ProviderDown(SweepStopped):
     """Nobody listens, or one trial after the other fails and no call is answered between them."""
 
 
-class ModelSwapped(SweepStopped):
-    """Another model answers than was asked for, and the user wants none of it."""
-
-
 class NoValidDecision(SweepStopped):
     """The first decisions of a model are all invalid, and the user has not said to go on."""
-
-
-class ClusterFailed(SweepStopped):
-    """The Dask cluster is gone, or loses one worker after the other."""
 
 
 class CacheFailed(SweepStopped):

@@ -9,16 +9,16 @@ from types import SimpleNamespace
 from typing import Any, TextIO
 
 
-def printable(text: str) -> str:
+def printable(text: str, kept: str = "\n\t") -> str:
     """A text that cannot speak to a terminal: what a model or a server wrote may hold any code."""
-    if text.replace("\n", "").replace("\t", "").isprintable():
+    if text.isprintable():
         return text  # as most are, and some are long
-    return "".join(c if c.isprintable() or c in "\n\t" else "?" for c in text)
+    return "".join(c if c.isprintable() or c in kept else "?" for c in text)
 
 
 def one_line(text: str) -> str:
     """A printable text on one line: a name that somebody else chose may hold any character."""
-    return "".join(c if c.isprintable() else "?" for c in text)
+    return printable(text, kept="")
 
 
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_.+-]")

@@ -80,11 +80,8 @@ class Program:
             raise UsageError(f"the driver {name} needs a rate_hz above 0")
         if self.sets:
             require(self.sets, f"{SET} of the driver {name}", str(self.parameters.get(SET)))
-        for value in self.values.values():
-            if not isinstance(value, str) and not _is_number(value):
-                raise UsageError(
-                    f"the parameters of the driver {name} must be finite numbers or texts"
-                )
+        if not all(isinstance(each, str) or _is_number(each) for each in self.values.values()):
+            raise UsageError(f"the parameters of the driver {name} must be finite numbers or texts")
         if self.check is not None:
             self.check(self.values)
         if self.check_clock is not None and self.rate_hz is not None:

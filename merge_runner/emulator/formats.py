@@ -24,20 +24,15 @@ ERROR_NAMES = {
 class Completion:
     """An answer of the model; ``reply`` becomes part of its id.
 
-    ``visible`` are the output tokens of the text, ``reasoning`` those that no reply shows.
+    ``output`` are the billed output tokens, ``reasoning`` those of them that no reply shows.
     """
 
     reply: str
     model: str
     text: str
     tokens_in: int
-    visible: int
+    output: int
     reasoning: int
-
-    @property
-    def output(self) -> int:
-        """Billed output tokens."""
-        return self.visible + self.reasoning
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +65,7 @@ class ServedFormat:
 
 def _chat(said: Completion) -> Body:
     """Whole, as in the shipped recording, which the emulator makes byte for byte."""
-    message = {"role": "assistant", "content": said.text, "refusal": None, "annotations": []}
+    message: Body = {"role": "assistant", "content": said.text, "refusal": None, "annotations": []}
     return {
         "id": f"chatcmpl-{said.reply}",
         "object": "chat.completion",
@@ -91,7 +86,12 @@ def _chat(said: Completion) -> Body:
 
 def _response(said: Completion) -> Body:
     content = [{"type": "output_text", "text": said.text, "annotations": []}]
-    message = {"type": "message", "role": "assistant", "status": "completed", "content": content}
+    message: Body = {
+        "type": "message",
+        "role": "assistant",
+        "status": "completed",
+        "content": content,
+    }
     return {
         "id": f"resp_{said.reply}",
         "object": "response",
@@ -114,7 +114,7 @@ def _content(said: Completion) -> Body:
         "candidates": [{"content": content, "finishReason": "STOP", "index": 0}],
         "usageMetadata": {
             "promptTokenCount": said.tokens_in,
-            "candidatesTokenCount": said.visible,
+            "candidatesTokenCount": said.output - said.reasoning,
             "thoughtsTokenCount": said.reasoning,
             "totalTokenCount": said.tokens_in + said.output,
         },

@@ -135,7 +135,7 @@ class Emulator:
         # comes back for an answer that was given twice.
         which = f"{asked.path} {asked.where} {attempt}".encode()
         reply = hashlib.sha256(asked.raw + which).hexdigest()[:24]
-        said = Completion(reply, model, text, tokens_in, visible, reasoning)
+        said = Completion(reply, model, text, tokens_in, visible + reasoning, reasoning)
         request = {"body_sha256": asked.body_sha256, "slot": slot and slot.as_dict()}
         return {**asked.wire.answer(said), ANSWERED_FIELD: request, SCRIPTED_FIELD: True}
 

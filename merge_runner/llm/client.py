@@ -20,7 +20,6 @@ from merge_runner.errors import (
     CallFailed,
     EndpointRefused,
     MergeRunnerError,
-    ModelSwapped,
     ProviderDown,
     QuotaExhausted,
     RecordingError,
@@ -257,7 +256,7 @@ class LlmClient:
         self._count(reply)
         served = reply.attempts[-1].model_served
         if self.strict and served not in self._own_names:
-            raise ModelSwapped(
+            raise SweepStopped(
                 f"{self.driver}: {served} answered where {self.entry.id} was asked for, at {slot}; "
                 "the reply is kept. To go on with it, leave --strict-model out, or name it in "
                 "`aliases` in experiments/models.toml"

@@ -30,9 +30,9 @@ from typing import TYPE_CHECKING
 import merge_runner
 from merge_runner.config import base_urls
 from merge_runner.errors import (
-    ClusterFailed,
     MergeRunnerError,
     RecordingError,
+    SweepStopped,
     TrialSuspended,
     UsageError,
 )
@@ -287,7 +287,7 @@ class DaskTasks:
                         await self._give(address)
                 await self._collect()
         except OSError as exc:
-            raise ClusterFailed(
+            raise SweepStopped(
                 "the Dask scheduler is gone, and with it the tasks that were under way; run the "
                 "same command again to go on"
             ) from exc
@@ -407,7 +407,7 @@ class DaskTasks:
         """Give the trials of a lost task out again; its share of the cap stays reserved."""
         self._losses[task.specs[0].order] += 1
         if self._losses[task.specs[0].order] == MOST_LOSSES:
-            raise ClusterFailed(
+            raise SweepStopped(
                 f"a task was begun on {MOST_LOSSES} Dask workers, and all died ({error!r}). Look "
                 "at their memory and their logs; run the same command again to go on"
             )

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import product
 
 from pydantic import JsonValue
 
-from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, ego_side, validated
+from merge_runner.config import (
+    PERFECT,
+    PROVIDERS,
+    ModelEntry,
+    ScenarioConfig,
+    both_sides,
+    ego_side,
+    validated,
+)
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
-from merge_runner.errors import UsageError
-from merge_runner.llm.formats.parameters import known_parameters, with_parameter
+from merge_runner.errors import UsageError, unknown_name
+from merge_runner.llm.formats import FORMATS
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES, Side, other_side
 from merge_runner.registry import require
@@ -23,6 +31,7 @@ from merge_runner.study.file import BASELINE, EVERY_PROMPT, StudyFile
 
 MODEL, PROMPT, OPPONENT, SELF, DEFAULT = "model", "prompt", "opponent", "self", "default"
 PERCEPTION, PERFECT_ONE = "perception", "perfect"
+CAP, EFFORT = "max_output_tokens", "reasoning_effort"
 _PERCEPTIONS = tuple(f"{PERCEPTION}_{side}" for side in SIDES)
 SET_BY = {PERCEPTION: _PERCEPTIONS, **{name: (name,) for name in _PERCEPTIONS}}
 """The factors of perception, with the switches of the scenario that each sets."""
@@ -105,15 +114,7 @@ def cross(
     mirrored = mirror or file.mirror
     arms: dict[tuple[str, ...], Arm] = {}
     for prompt, chosen in _crossings(file, axes, repetitions, only, conditions):
-        try:
-            arm = _arm(file, chosen, prompt, repetitions[prompt], registry, varying)
-        except UsageError as exc:
-            if not file.factors:
-                raise
-            here = ", ".join(f"{name} = {json.dumps(level)}" for name, level in chosen.items())
-            raise UsageError(
-                f"{exc}; to leave such crossings out, write above [factors]: skip = [{{ {here} }}]"
-            ) from exc
+        arm = _arm(file, chosen, prompt, repetitions[prompt], registry, varying)
         for each in (arm, arm.turned()) if mirrored and arm.is_mixed else (arm,):
             apart = (f"{n}={t}" for n, t in each.factors.items() if n not in (PROMPT, OPPONENT))
             twin = arms.setdefault((each.model, each.variant, *apart), each)
@@ -173,47 +174,37 @@ def _crossings(
     repetitions: Mapping[str, int],
     only: Mapping[str, Collection[str]],
     conditions: int,
-) -> list[tuple[str, Levels]]:
+) -> Iterator[tuple[str, Levels]]:
     """Each crossing that is to be played: its prompt and its levels; raises UsageError."""
-    # What is left out may be a model or a prompt that is not asked for today.
-    known = {**axes, PROMPT: VARIANTS, MODEL: {*axes[MODEL], *file.models}}
     skip = [
         {n: {*map(level_text, w if isinstance(w, list) else [w])} for n, w in row.items()}
         for row in file.skip
     ]
     reference = {name: {level_text(level)} for name, level in file.reference.items()}
-    _check_levels(axes, only)
-    for row in (*skip, reference):
-        _check_levels(known, row)
-    axes = {
-        name: {text: level for text, level in levels.items() if text in only.get(name, levels)}
+    # What is left out may be a model or a prompt that is not asked for today.
+    models = dict.fromkeys((*axes[MODEL], *file.models))
+    known: dict[str, Mapping[str, object]] = {**axes, PROMPT: VARIANTS, MODEL: models}
+    for there, named in ((axes, only), *((known, row) for row in (*skip, reference))):
+        for name, texts in named.items():
+            levels = require(there, "factor", name)
+            for text in texts:
+                require(levels, f"level of {name}", text)
+    wanted = {
+        name: [text for text in levels if text in only.get(name, levels)]
         for name, levels in axes.items()
     }
-    crossings: list[tuple[str, Levels]] = []
-    trials = conditions * math.prod(map(len, axes.values()))
-    if trials <= MOST_TRIALS:  # few enough to go through
-        for chosen in product(*axes.values()):
-            texts = {PROMPT: next(iter(repetitions)), **dict(zip(axes, chosen, strict=True))}
-            if not any(all(texts[name] in wanted for name, wanted in row.items()) for row in skip):
-                crossings.append((texts[PROMPT], {name: axes[name][texts[name]] for name in axes}))
-        trials = conditions * sum(repetitions[prompt] for prompt, _ in crossings)
+    wanted.setdefault(PROMPT, list(repetitions))
+    asked = sum(repetitions[prompt] for prompt in wanted[PROMPT])
+    trials = conditions * asked * math.prod(len(wanted[name]) for name in axes if name != PROMPT)
     if trials > MOST_TRIALS:
         raise UsageError(
-            f"these are {trials:,} trials or more, and at most {MOST_TRIALS:,} can be played: "
-            "leave out levels, conditions or repetitions, in the file or by --only, --conditions "
-            "or --reps"
+            f"these are {trials:,} trials, and at most {MOST_TRIALS:,} can be played: leave out "
+            "levels, conditions or repetitions, in the file or by --only, --conditions or --reps"
         )
-    return crossings
-
-
-def _check_levels(
-    axes: Mapping[str, Collection[str]], named: Mapping[str, Collection[str]]
-) -> None:
-    """Raise UsageError for a factor, or a level of it, that there is not."""
-    for name, texts in named.items():
-        levels = dict.fromkeys(require(axes, "factor", name))
-        for text in texts:
-            require(levels, f"level of {name}", text)
+    for chosen in product(*wanted.values()):
+        texts = dict(zip(wanted, chosen, strict=True))
+        if not any(all(texts[name] in levels for name, levels in row.items()) for row in skip):
+            yield texts[PROMPT], {name: axes[name][texts[name]] for name in axes}
 
 
 def _arm(
@@ -241,7 +232,7 @@ def _arm(
         if name in registry:
             label, entry = name, registry[name]
             for parameter, level in parameters.items() if name in changed else ():
-                before, entry = entry, with_parameter(name, entry, parameter, level)
+                before, entry = entry, _with_parameter(name, entry, parameter, level)
                 label += "" if entry == before else f" {parameter}={level_text(level)}"
             asked[side], entries[label] = label, entry
     texts = {name: level_text(level) for name, level in levels.items()}
@@ -302,8 +293,13 @@ def _world_step(scenario: ScenarioConfig, programs: Mapping[str, Program]) -> di
 
 def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     """Raise UsageError for a factor that there is not, and for a name that is taken."""
-    parameters = sorted(known_parameters(registry.values()))
-    valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
+    parameters = {CAP, EFFORT}.union(
+        *(form.parameters for form in FORMATS.values()),
+        *(provider.parameters for provider in PROVIDERS.values()),
+        *(entry.parameters for entry in registry.values()),
+    )
+    named = (PROMPT, OPPONENT, PERCEPTION, *sorted(parameters), *ScenarioConfig.model_fields)
+    valid = dict.fromkeys(named)
     for name in file.factors:
         require(valid, "factor", name, "models and skip stand above [factors]")
     taken = [f"drivers.{name}" for name in file.drivers if name in registry]
@@ -314,3 +310,43 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
         raise UsageError(
             f"the factor {PERCEPTION} is of both sides: name it, or {' and '.join(_PERCEPTIONS)}"
         )
+
+
+def _with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValue) -> ModelEntry:
+    """The entry ``name`` with a parameter set; raises UsageError if the model rejects it.
+
+    What is the provider's default already is not sent.
+    """
+    if parameter == CAP:
+        if type(level) is not int or level < 1:
+            raise UsageError(f"{CAP} is a whole number from 1")
+        return entry.model_copy(update={CAP: level})
+    if parameter == EFFORT and entry.efforts:
+        if level not in entry.efforts:
+            raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)
+        chosen = {**entry.parameters, **entry.efforts[str(level)]}
+        return entry.model_copy(update={"parameters": chosen})
+    defaults = entry.applied_defaults
+    unset = parameter not in entry.parameters
+    if unset and parameter in defaults and defaults[parameter] == level:
+        return entry
+    places = FORMATS.require(entry.format).parameters
+    takes = {*places, *PROVIDERS.require(entry.provider).parameters, *entry.parameters, CAP}
+    takes -= {*entry.rejects}
+    if parameter not in takes:
+        default = f" but its default ({defaults[parameter]})" if parameter in defaults else ""
+        valid = ", ".join(sorted(takes))
+        raise UsageError(f"{name} takes no parameter {parameter}{default}; valid: {valid}")
+    place = places.get(parameter, (parameter,))
+    return entry.model_copy(update={"parameters": _placed(entry.parameters, place, level)})
+
+
+def _placed(
+    values: dict[str, JsonValue], place: tuple[str, ...], level: JsonValue
+) -> dict[str, JsonValue]:
+    """The values with one set at a place, a name within a name."""
+    first, *rest = place
+    if not rest:
+        return {**values, first: level}
+    inner = values.get(first)
+    return {**values, first: _placed(inner if isinstance(inner, dict) else {}, tuple(rest), level)}
