@@ -43,7 +43,12 @@ async def play_trial(
     if given:
         some = next(iter(given.values()))
         world.start_at({side: given.get(side, some)[side] for side in SIDES})
-    seats = {side: _seated(drivers[side], world) for side in SIDES}
+    seats = {side: _Seated(drivers[side]) for side in SIDES}
+    for side in SIDES:
+        perception, seed = scenario.perception(side), drivers[side].seat.seed
+        if not perception.is_perfect:
+            start = world.observe(side)
+            seats[side].eyes = Eyes(perception, seed, scenario.step_s, start)
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}
     while world.status is None:
@@ -127,15 +132,6 @@ class _Seated:
             return None
         driven = (step - self.decided_at) // self.driver.seat.pace.action_steps
         return self.decision.applied[driven]
-
-
-def _seated(driver: Driver, world: World) -> _Seated:
-    seat = driver.seat
-    perception = seat.scenario.perception(seat.side)
-    if perception.is_perfect:
-        return _Seated(driver)
-    start = world.observe(seat.side)
-    return _Seated(driver, Eyes(perception, seat.seed, seat.scenario.step_s, start))
 
 
 async def _answer(seated: _Seated, world: World) -> Decision | CallFailed:

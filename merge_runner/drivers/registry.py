@@ -166,19 +166,17 @@ class Program:
 
     def in_spec(self, name: str) -> dict[str, object]:
         """What the spec of its trials says of it; its version covers what all drivers share."""
-        # What there is not is left out, so that specs from before it keep their hashes.
-        optional = {
-            "chance": self.chance or None,
-            "rate_hz": self.rate_hz,
-            "data": None if self.data is None else self.data.digest,
-            "based_on": self.based_on or None,
-        }
-        return {
+        said = {
             "program": name,
             "parameters": self.values,
             "source": self.source,
-            **{key: value for key, value in optional.items() if value is not None},
+            "chance": self.chance or None,
+            "rate_hz": self.rate_hz,
+            "data": self.data and self.data.digest,
+            "based_on": self.based_on or None,
         }
+        # What there is not is left out, so that specs from before it keep their hashes.
+        return {key: value for key, value in said.items() if value is not None}
 
 
 def _is_number(value: object) -> TypeGuard[float]:

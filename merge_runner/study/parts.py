@@ -46,11 +46,8 @@ from merge_runner.text_safety import one_line, printable
 
 PACKAGE = "study_plugins"
 """The package of a study's plug-ins: one imports from another by ``from .other import thing``."""
-SHIPPED_REGISTRY = SHIPPED_EXPERIMENTS / REGISTRY
 # Who answers, where, with which key, at what price: the rest is how the same model is asked.
 IDENTITY = {"provider", "format", "id", "base_url", "path", "key_env", "auth", "price"}
-Risk = tuple[Path, str, object]
-"""A file, in words what it does, and the content that is agreed to."""
 
 
 def load_study(
@@ -125,15 +122,16 @@ def _ask(study: StudySource, risks: Collection[tuple[Path, str]]) -> None:
         raise UsageError("nothing was run")
 
 
-def _endpoints(beside: Path, models: Iterable[str]) -> Iterator[Risk]:
+def _endpoints(beside: Path, models: Iterable[str]) -> Iterator[tuple[Path, str, object]]:
     """The models of registries that do not ship, where their calls may not go unasked.
 
     That is where one replaces a model that ships, or where a key that is not the provider's is
     sent, or anything to a URL that is not its own. Loopback is the provider's own where that needs
-    no key.
+    no key. Of each its file, what it does in words, and the content that is agreed to.
     """
-    files = [path for path in registry_files(beside) if not path.samefile(SHIPPED_REGISTRY)]
-    shipped = read_entries(SHIPPED_REGISTRY) if files else {}
+    ours = SHIPPED_EXPERIMENTS / REGISTRY
+    files = [path for path in registry_files(beside) if not path.samefile(ours)]
+    shipped = read_entries(ours) if files else {}
     defined = {name: (path, entry) for path in files for name, entry in read_entries(path).items()}
     for name in sorted({*models} & {*defined}):
         path, entry = defined[name]
