@@ -78,7 +78,7 @@ class Eyes:
         now_s, truth = (len(self._truth) - 1) * self._step_s, self._truth[-1]
         if draw(self._seed, "received", round(1000 * now_s)) >= self._perception.dropout:
             self._received = self._perceived(now_s - self._perception.delay_s)
-        own_speed_mps = _forwards(truth.own_speed_mps + self._own_speed(now_s))
+        own_speed_mps = max(0.0, truth.own_speed_mps + self._own_speed(now_s))
         farther_m = self._own_distance(now_s)
         to_merge_m = truth.distance_to_merge_m
         other = self._received
@@ -116,7 +116,8 @@ class Eyes:
         )
 
     def _appears(self, speed_mps: float, time_s: float) -> float:
-        return _forwards(speed_mps + self._speed(time_s))
+        """An error lets no speed appear negative: nobody drives backwards."""
+        return max(0.0, speed_mps + self._speed(time_s))
 
     def _in_sight(self, truth: Observation) -> bool:
         near = abs(truth.relative_distance_m) <= (self._perception.range_m or inf)
@@ -135,8 +136,3 @@ class Eyes:
             relative_distance_m=start.relative_distance_m + ahead_m,
             distance_to_merge_m=(start.distance_to_merge_m or 0.0) - start.own_speed_mps * time_s,
         )
-
-
-def _forwards(speed_mps: float) -> float:
-    """An error lets no speed appear negative: nobody drives backwards."""
-    return max(0.0, speed_mps)
