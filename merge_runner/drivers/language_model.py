@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import model_pace
+from merge_runner.prompts.blocks import render_prompt
 from merge_runner.prompts.parse import ParsedReply, parse_reply
-from merge_runner.prompts.render import render_prompt
 from merge_runner.records import ChatReply, Decision, Observation, Side, Slot, TrialSpec
 
 Ask = Callable[[str, Slot, TrialSpec], Awaitable[ChatReply]]

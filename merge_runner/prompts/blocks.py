@@ -8,18 +8,23 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import dropwhile
 from string import Formatter
 
+from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.prompts.fields import FIELDS
-from merge_runner.registry import Registry, require
+from merge_runner.prompts.fields import FIELDS, Situation
+from merge_runner.prompts.state_lines import NOT_SEEN
+from merge_runner.records import Observation, Road
+from merge_runner.registry import Catalogue, Registry, in_use, require
 
 OUTPUT_FORMAT = "C5"
 LAST = "the end"
 TO_MERGE = "distance_to_merge"
+_UNIT_OF_NOTHING = re.compile(rf"({NOT_SEEN}) (?:m/s\^2|m/s|km/h|mph|m|s)(?![\w/^])")
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,3 +249,30 @@ def with_block(
 def block_digests(variant: str) -> dict[str, str]:
     """Block name to digest, for the blocks of a variant."""
     return {name: block.digest for name, block in blocks_of(variant).items()}
+
+
+def render_prompt(
+    observation: Observation,
+    remaining_plan: Sequence[float] | None,
+    *,
+    variant: str,
+    scenario: ScenarioConfig,
+) -> str:
+    """The prompt of a variant.
+
+    ``remaining_plan`` is the unexecuted rest of the last valid plan (normalised accelerations),
+    None before the first.
+    """
+    template, names = _template(variant, observation.road, in_use())
+    now = Situation(observation, scenario, remaining_plan)
+    prompt = template.format_map({name: FIELDS[name](now) for name in names})
+    return prompt if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", prompt)
+
+
+@lru_cache
+def _template(variant: str, road: Road, _: Catalogue) -> tuple[str, frozenset[str]]:
+    """The blocks of a variant that a road has, one below the other; and the fields they name."""
+    blocks = blocks_of(variant).values()
+    templates = (block.merge if road == "merge" else block.straight for block in blocks)
+    whole = "\n\n".join(template for template in templates if template is not None) + "\n"
+    return whole, frozenset(named(whole))

@@ -12,7 +12,7 @@ from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import without_prompt
 from merge_runner.llm.prices import cost_usd
-from merge_runner.prompts.render import render_prompt
+from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import Usage, is_scripted
 from merge_runner.run.plan import Options, Plan, most_prompts, usual_prompts
 from merge_runner.scenarios.merge.conditions import CONDITIONS

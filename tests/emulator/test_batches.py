@@ -7,8 +7,7 @@ import json
 import aiohttp
 import pytest
 
-from merge_runner.emulator.formats import CHAT
-from merge_runner.emulator.handler import Asked
+from merge_runner.emulator.handler import CHAT, Asked
 from merge_runner.errors import UsageError
 from merge_runner.records import SLOT_HEADER
 from tests.mock_server import BatchPlan, FaultPlan, FaultyEmulator

@@ -4,9 +4,8 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import random_answer as answer
-from merge_runner.prompts.blocks import VARIANTS
+from merge_runner.prompts.blocks import VARIANTS, render_prompt
 from merge_runner.prompts.parse import parse_reply
-from merge_runner.prompts.render import render_prompt
 from merge_runner.records import SIDES, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK

@@ -17,8 +17,18 @@ import httpx
 
 from merge_runner.chance import draw, draw_between, draw_index
 from merge_runner.emulator import handler as served
-from merge_runner.emulator.formats import CHAT, GEMINI, MESSAGES, RESPONSES, ServedFormat
-from merge_runner.emulator.handler import UNREADABLE, Asked, as_error, as_json, as_response
+from merge_runner.emulator.handler import (
+    CHAT,
+    GEMINI,
+    MESSAGES,
+    RESPONSES,
+    UNREADABLE,
+    Asked,
+    ServedFormat,
+    as_error,
+    as_json,
+    as_response,
+)
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_FIELD, SLOT_HEADER

@@ -16,8 +16,17 @@ import httpx
 from aiohttp import web
 
 from merge_runner.emulator import server
-from merge_runner.emulator.formats import CHAT, GEMINI, MESSAGES, RESPONSES
-from merge_runner.emulator.handler import Asked, Emulator, as_error, as_json, as_response
+from merge_runner.emulator.handler import (
+    CHAT,
+    GEMINI,
+    MESSAGES,
+    RESPONSES,
+    Asked,
+    Emulator,
+    as_error,
+    as_json,
+    as_response,
+)
 from merge_runner.records import SCRIPTED_HEADER
 from tests.mock_server.batches import ERRORS, MODES, Batches, BrokenOff
 from tests.mock_server.plans import FaultPlan

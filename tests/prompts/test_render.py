@@ -14,8 +14,14 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, block_digests
-from merge_runner.prompts.render import render_prompt
+from merge_runner.prompts.blocks import (
+    BLOCKS,
+    VARIANTS,
+    Block,
+    Variant,
+    block_digests,
+    render_prompt,
+)
 from merge_runner.records import SIDES, Observation
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts import state_lines
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
-from merge_runner.prompts.render import render_prompt
+from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant, render_prompt
 from merge_runner.records import FAR_BEHIND_M
 from tests.prompts.test_render import FIRST, FORMS, STRAIGHT
 

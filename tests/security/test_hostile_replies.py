@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
+from merge_runner.prompts.blocks import render_prompt
 from merge_runner.prompts.parse import parse_reply
-from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK

@@ -6,8 +6,7 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.prompts.blocks import block_digests, blocks_of
-from merge_runner.prompts.render import render_prompt
+from merge_runner.prompts.blocks import block_digests, blocks_of, render_prompt
 from merge_runner.run.plan import make_plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK

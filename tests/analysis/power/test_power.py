@@ -20,7 +20,7 @@ from analysis.stats.regressions import who_first_firth
 from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.planted_effect import PlantedEffect
-from merge_runner.prompts.render import render_prompt
+from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import SIDES, Slot
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.sweep import unsent
