@@ -121,14 +121,6 @@ class TransportFailure(MergeRunnerError):
         self.action = action
 
 
-class ErrorReply(MergeRunnerError):
-    """The server replied with an error in place of what it was asked for."""
-
-    def __init__(self, raw: RawReply) -> None:
-        super().__init__(f"HTTP {raw.status}: {raw.error.message}")
-        self.raw = raw
-
-
 @dataclass(frozen=True, slots=True)
 class AttemptOutcome:
     """What an attempt brought, and what to do about it.
