@@ -20,6 +20,7 @@ from httpx_aiohttp import AiohttpTransport
 from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, proxy_secrets
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json
+from merge_runner.llm.formats.base import as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import RawReply, TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
 KEPT_S = 5.0
+# A server that answers one call at a time may be busy with one.
+LIST_TIMEOUT_S = 60.0
 HEADERS = {
     "accept": "*/*",
     "accept-encoding": "gzip",
@@ -264,3 +267,19 @@ class Connections(aiohttp.TCPConnector):
             if not (handler.should_close or arrived.poll(0) or self._transport.one_each):
                 return connection
             connection.close()
+
+
+async def listed_models(endpoint: Endpoint) -> list[str]:
+    """Return the ids of the models that a server says it serves, by ``GET /models``.
+
+    Raises TransportFailure, ``no_list`` if there is no list.
+    """
+    transport = HttpTransport(endpoint, connections=1)
+    try:
+        raw = await transport.ask("GET", "/models", {}, timeout_s=LIST_TIMEOUT_S)
+    finally:
+        await transport.close()
+    payload = as_dict(raw.payload)
+    if raw.status != 200 or "data" not in payload:
+        raise TransportFailure("no_list", f"HTTP {raw.status}: {raw.error.message or 'no list'}")
+    return [name for model in as_dicts(payload["data"]) if (name := as_text(model.get("id")))]

@@ -111,7 +111,12 @@ class Limiter:
     async def _dispatch(self) -> None:
         """Serve the queue until it is empty."""
         loop = asyncio.get_running_loop()
-        while turn := self._head():
+        while self._waiting:
+            turn = self._waiting[0]
+            # One that was cancelled is done before its turn, and nobody will use it.
+            if turn.given.done():
+                heapq.heappop(self._waiting)
+                continue
             wait = self._blocked_for(turn, loop.time())
             if wait > 0:
                 # A new turn, or a settlement, may change what can be done.
@@ -128,12 +133,6 @@ class Limiter:
                 self._window.append(turn)
                 self._tokens_in_window += turn.tokens
             turn.given.set_result(None)
-
-    def _head(self) -> _Turn | None:
-        # One that was cancelled is done before its turn, and nobody will use it.
-        while self._waiting and self._waiting[0].given.done():
-            heapq.heappop(self._waiting)
-        return self._waiting[0] if self._waiting else None
 
     def _blocked_for(self, turn: _Turn, now: float) -> float:
         """Return the least wait in s of the head of the queue."""

@@ -72,8 +72,7 @@ class WireFormat(ABC):
     """One format of requests and replies, with all that is particular to it.
 
     What a format says of errors may be asked of a reply in any format, since gateways pass on the
-    errors of others. None leaves a question to the rules for all servers (http_outcome.py,
-    delays.py).
+    errors of others. None leaves a question to the rules for all servers (http_outcome.py).
     """
 
     parameters: ClassVar[Mapping[str, tuple[str, ...]]] = {}
