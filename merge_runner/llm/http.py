@@ -17,7 +17,7 @@ import aiohttp
 import httpx
 from httpx_aiohttp import AiohttpTransport
 
-from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, proxy_secrets
+from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url, proxy_secrets
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats.base import as_dict, as_dicts, as_text
@@ -238,7 +238,13 @@ class HttpTransport:
         named = proxies.get(url.scheme) or proxies.get("all")
         proxy = None
         if named and url.host not in LOOPBACK and not proxy_bypass(url.netloc.decode()):
-            proxy = httpx.Proxy(named if "://" in named else f"http://{named}")
+            named = named if "://" in named else f"http://{named}"
+            if http_url(named) is None:  # which is not shown: it may hold a password
+                raise UsageError(
+                    f"{url.scheme.upper()}_PROXY or ALL_PROXY is no URL of an HTTP proxy: set it "
+                    "to http://HOST:PORT or unset it; a SOCKS proxy needs an HTTP proxy before it"
+                )
+            proxy = httpx.Proxy(named)
         return AiohttpTransport(verify=trusted, client=session, proxy=proxy)
 
 

@@ -209,7 +209,7 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
     """Classify an error, whatever was asked for."""
     # What a format knows of an error, else what a format knows that gateways pass on.
     told = filter(None, (each.meaning(error) for each in (wire, *PASSED_ON)))
-    name: str = next(told, None) or STATUSES.get(error.status, "bad_request")
+    name = next(told, None) or STATUSES.get(error.status, "bad_request")
     action = ACTIONS.get(name, "fail")
     wish = error.headers.get("x-should-retry")
     if wish == "true" and action in ("fail", "refused") and name != "request_too_large":

@@ -8,7 +8,6 @@ from merge_runner.config import (
     PROVIDERS,
     UNNAMED,
     ModelEntry,
-    check_network,
     driver_name,
     resolve_endpoint,
 )
@@ -29,7 +28,6 @@ async def served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None
 
     endpoint = resolve_endpoint(name, entry)
     driver = driver_name(name, endpoint.identity)
-    check_network(endpoint.base_url)
     try:
         listed = await listed_models(endpoint)
     except TransportFailure as exc:

@@ -240,13 +240,15 @@ async def test_a_bad_certificate_ends_a_sweep_at_once_and_nothing_is_sent(
     ("variables", "says"),
     [
         ({"SSL_CERT_FILE": "/nowhere.pem"}, "SSL_CERT_FILE names cannot be read (No such file"),
-        ({"SSL_CERT_DIR": "/nowhere"}, "SSL_CERT_DIR names no folder that exists"),
-        ({"HTTPS_PROXY": "ftp://proxy.invalid"}, "HTTPS_PROXY is no URL of an HTTP proxy"),
+        (
+            {"HTTPS_PROXY": "ftp://proxy.invalid"},
+            "HTTPS_PROXY or ALL_PROXY is no URL of an HTTP proxy",
+        ),
         (
             {"ALL_PROXY": f"socks5://u:{KEY}@proxy.invalid"},
             "a SOCKS proxy needs an HTTP proxy before it",
         ),
-        ({"https_proxy": "http://[::1"}, "https_proxy is no URL of an HTTP proxy"),
+        ({"https_proxy": "http://[::1"}, "HTTPS_PROXY or ALL_PROXY is no URL of an HTTP proxy"),
         ({"OPENAI_BASE_URL": "https://a..b/v1"}, "OPENAI_BASE_URL is no base URL"),
         ({"OPENAI_BASE_URL": f"https://{'a' * 300}/v1"}, "OPENAI_BASE_URL is no base URL"),
     ],
