@@ -15,7 +15,7 @@ from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides,
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
 from merge_runner.errors import UsageError
-from merge_runner.llm.formats.parameters import known_parameters, with_parameter
+from merge_runner.llm.models import known_parameters, with_parameter
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES, Side, other_side
 from merge_runner.registry import require
