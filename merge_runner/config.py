@@ -500,7 +500,7 @@ def normalised_url(url: str, named: str = "base_url") -> str:
     Raises UsageError, which shows nothing of it: a key may have been pasted there. It is told apart
     by what it is ``named``.
     """
-    parts = _http_url(url.strip())
+    parts = http_url(url.strip())
     if parts is None or "@" in parts.netloc or parts.query or parts.fragment:
         raise UsageError(
             f"{named} is no base URL: it must begin with http:// or https:// and name a host that "
@@ -514,7 +514,7 @@ def normalised_url(url: str, named: str = "base_url") -> str:
     return f"{parts.scheme}://{host}{port}{parts.path.rstrip('/')}"
 
 
-def _http_url(url: str) -> SplitResult | None:
+def http_url(url: str) -> SplitResult | None:
     """The parts of a URL, or None where no host can be reached at it by HTTP."""
     if not (url.isascii() and url.isprintable()) or " " in url:
         return None
@@ -530,36 +530,11 @@ def _http_url(url: str) -> SplitResult | None:
     return parts if is_host and parts.scheme in ("http", "https") else None
 
 
-def check_network(base_url: str, env: Mapping[str, str] = os.environ) -> None:
-    """Raise UsageError where a variable keeps an endpoint from being reached.
-
-    Calls to loopback never go through a proxy, so the proxy variables do not matter there. Their
-    values are not shown: they may hold a password.
-    """
-    by_proxy = urlsplit(base_url).hostname not in LOOPBACK
-    for variable, value in _proxies(env):
-        if by_proxy and _http_url(value) is None:
-            raise UsageError(
-                f"{variable} is no URL of an HTTP proxy: set it to http://HOST:PORT or unset it; a "
-                "SOCKS proxy needs an HTTP proxy before it (privoxy, for one)"
-            )
-    folders = env.get("SSL_CERT_DIR", "")
-    if folders and not any(Path(folder).is_dir() for folder in folders.split(":")):
-        raise UsageError("SSL_CERT_DIR names no folder that exists: correct it or unset it")
-
-
-def _proxies(env: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Yield the variables that name a proxy, and its URL."""
-    for variable, value in env.items():
-        if value and variable.lower() in PROXY_VARIABLES:
-            yield variable, value if "://" in value else f"http://{value}"
-
-
 def proxy_secrets(env: Mapping[str, str] = os.environ) -> Iterator[str]:
     """Yield the user info of the proxies' URLs and its password, as given, decoded and as sent."""
-    for _, url in _proxies(env):
+    for url in (env[variable] for variable in env if variable.lower() in PROXY_VARIABLES):
         with suppress(ValueError):  # it is no URL, and nothing goes there
-            info = urlsplit(url).netloc.rpartition("@")[0]
+            info = urlsplit(url if "://" in url else f"//{url}").netloc.rpartition("@")[0]
             for given in {info, unquote(info)}:
                 yield from (given, given.partition(":")[2], b64encode(given.encode()).decode())
 

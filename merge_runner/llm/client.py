@@ -6,6 +6,7 @@ A Call is one that is asked, with all its attempts; a Meter counts them for disp
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import Counter, deque
 from collections.abc import Iterator
@@ -119,8 +120,7 @@ class Call:
     @property
     def last_failure(self) -> str:
         """The reason why the last attempt brought no answer."""
-        last = self.attempts[-1]
-        return last.error or last.outcome
+        return self.attempts[-1].error or self.attempts[-1].outcome
 
     @contextmanager
     def waiting(
@@ -210,18 +210,15 @@ class LlmClient:
     driver: str = field(init=False)
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
-    _money: Budget = field(init=False)
-    _own_host: str | None = field(init=False)  # the provider whose own host is asked
+    money: Budget = field(init=False)
     _stopping: bool = False
 
     def __post_init__(self) -> None:
         """Derive what every call needs."""
-        provider = self.entry.provider
         self.driver = driver_name(self.name, self.endpoint)
         self._wire = FORMATS[self.entry.format]
         self._own_names = frozenset({None, self.entry.id, *self.entry.aliases})
-        self._money = self.budget or Budget(Ledger(self.cache, ""))  # a ledger that keeps nothing
-        self._own_host = provider if is_own_host(provider, self.endpoint) else None
+        self.money = self.budget or Budget(Ledger(self.cache, ""))  # a ledger that keeps nothing
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """Return the model's reply for a slot; lower ``order`` is served first.
@@ -269,12 +266,7 @@ class LlmClient:
         calls = self._calls
         for call in calls:
             call.stop()
-        tasks = [call.task for call in calls]
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-    def leave(self, order: int) -> None:
-        """Release the money of the trial of this order, which has ended."""
-        self._money.leave(order)
+        await asyncio.gather(*(call.task for call in calls), return_exceptions=True)
 
     @property
     def in_flight_calls(self) -> int:
@@ -289,8 +281,7 @@ class LlmClient:
     @property
     def idle_askers(self) -> int:
         """Number of trials that wait for calls that are blocked on another call."""
-        calls = self._calls
-        return sum(call.asking for call in calls if call.wait is not None and call.wait.idle)
+        return sum(call.asking for call in self._calls if call.wait and call.wait.idle)
 
     @property
     def _calls(self) -> list[Call]:
@@ -313,8 +304,8 @@ class LlmClient:
         meter.calls_cached += reply.cached
         meter.calls_live += not reply.cached
         if last.model_served not in self._own_names:
-            meter.mismatches[f"{reply.request.model} -> {last.model_served}"] += 1
-        if reply.request.provider != "emulator":
+            meter.mismatches[f"{self.entry.id} -> {last.model_served}"] += 1
+        if self.entry.provider != "emulator":
             meter.stand_ins += is_scripted(reply.request, last)
 
     def _read(self, recorded: CachedCall, earlier: int) -> ChatReply:
@@ -328,8 +319,7 @@ class LlmClient:
         worst = Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
-        worst_usd = cost_usd(self.entry, worst) or 0.0
-        asked = Asked(self.driver, str(request.slot), worst_usd)
+        asked = Asked(self.driver, str(request.slot), cost_usd(self.entry, worst) or 0.0)
         call = Call(request, order, asked, worst, self._stopping)
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call
@@ -346,9 +336,9 @@ class LlmClient:
         """Make a call when there is money for its trial, and the first call has been answered."""
         opened = self.rounds is not None and self.rounds.open_batch(call.request.key) is not None
         if opened:
-            self._money.begin_anew(call.order)
+            self.money.begin_anew(call.order)
         with call.waiting("for trials before it to end, under --max-cost", idle=True):
-            await self._money.admit(call.order)
+            await self.money.admit(call.order)
         first = self.first
         alone = not first.passed and not opened  # nobody waits for an answer that may take hours
         if alone:
@@ -417,8 +407,9 @@ class LlmClient:
         rounds = self.rounds
         if rounds and (call.open or (rounds.submits and not call.singly)):
             return await self._attempt_in_batch(call, rounds)
+        assert self.transport is not None, "a sealed client asks nothing"
         with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-            paid = await self._money.set_aside(call.order, call.request.key, call.asked)
+            paid = await self.money.set_aside(call.order, call.request.key, call.asked)
         with closing(paid):
             # A turn must be used as soon as it is given, or the limits do not hold.
             with call.waiting("for a turn under the rate limits"):
@@ -429,7 +420,14 @@ class LlmClient:
             await paid.begin(call.attempts)
             started_at, started = datetime.now(UTC), time.perf_counter()
             with deadline.attempt() as seconds_left:
-                outcome = await self._send(call, seconds_left)
+                number, timeout_s = len(call.attempts) + 1, min(self.entry.timeout_s, seconds_left)
+                try:
+                    raw = await self.transport.send(
+                        call.request, attempt=number, timeout_s=timeout_s
+                    )
+                    outcome = judge(raw, self._wire)
+                except TransportFailure as exc:
+                    outcome = AttemptOutcome(exc.action, exc.outcome, str(exc), charged=exc.sent)
             record = replace(
                 self._record(call, outcome),
                 started_at=started_at.isoformat(timespec="milliseconds"),
@@ -438,16 +436,6 @@ class LlmClient:
             if record.usage.output_tokens is not None:
                 settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
             return await self._concluded(call, paid, outcome, record)
-
-    async def _send(self, call: Call, seconds_left: float) -> AttemptOutcome:
-        """Send the request once."""
-        assert self.transport is not None, "a sealed client asks nothing"
-        number, timeout_s = len(call.attempts) + 1, min(self.entry.timeout_s, seconds_left)
-        try:
-            raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
-        except TransportFailure as exc:
-            return AttemptOutcome(exc.action, exc.outcome, str(exc), charged=exc.sent)
-        return judge(raw, self._wire)
 
     async def _concluded(
         self,
@@ -460,7 +448,13 @@ class LlmClient:
         """Keep an attempt and return its answer, or raise why there is none."""
         call.attempts.append(record)
         self.meter.count_attempt(record)
-        self._tell_overrun(call, paid.aside_usd)
+        aside_usd = paid.aside_usd or math.inf  # none: a user has released it meanwhile
+        if (record.cost_usd or 0.0) > aside_usd + TOLERANCE_USD:
+            self.meter.notes.append(
+                f"{self.driver}: {call.asked.slot}: the reply cost {record.cost_usd:.4f} USD, and "
+                f"{aside_usd:.4f} were set aside for it: the server does not keep to the cap of "
+                f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
+            )
         error = error or self._error(call, outcome)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
@@ -497,12 +491,9 @@ class LlmClient:
         if why is not None:
             first.refused += outcome.action == "fail"
             # An endpoint that has answered before may mean this prompt alone.
-            known = first.known and outcome.action != "refused"
-            return (
-                None
-                if known and first.refused < SEVERAL
-                else EndpointRefused(f"{self.driver}: {why}")
-            )
+            if first.known and outcome.action != "refused" and first.refused < SEVERAL:
+                return None
+            return EndpointRefused(f"{self.driver}: {why}")
         if outcome.name == "no_connection" and not first.passed:
             # A server that is just starting is waited for, but only for seconds.
             if asyncio.get_running_loop().time() - call.began_s < NOBODY_S:
@@ -513,22 +504,11 @@ class LlmClient:
             why = "the account's quota is exhausted"
         elif outcome.pause and delay_s > self.entry.deadline_s:
             why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
-        if why is None:
+        else:
             return None
         return QuotaExhausted(
             f"{self.driver}: {why} ({outcome.message}). Every reply so far is saved; run the same "
             "command later to go on."
-        )
-
-    def _tell_overrun(self, call: Call, aside_usd: float) -> None:
-        spent_usd = call.attempts[-1].cost_usd or 0.0
-        released = aside_usd == 0  # by a user, while a batch was waited for
-        if released or spent_usd <= aside_usd + TOLERANCE_USD:
-            return
-        self.meter.notes.append(
-            f"{self.driver}: {call.asked.slot}: the reply cost {spent_usd:.4f} USD, and "
-            f"{aside_usd:.4f} were set aside for it: the server does not keep to the cap of "
-            f"{self.entry.max_output_tokens} output tokens. More is set aside from now on"
         )
 
     def _record(self, call: Call, outcome: AttemptOutcome) -> Attempt:
@@ -562,7 +542,9 @@ class LlmClient:
         if (usage.output_tokens or 0) > self.entry.max_output_tokens:
             return cost_usd(self.entry, replace(worst, output_tokens=usage.output_tokens))
         stray = raw.status == 200 and raw.is_web_page and not self.first.known
-        return None if may_be_charged(raw, self._own_host) and not stray else 0.0
+        own = is_own_host(self.entry.provider, self.endpoint)
+        charged = may_be_charged(raw, self.entry.provider if own else None)
+        return None if charged and not stray else 0.0
 
     async def _attempt_in_batch(self, call: Call, rounds: Rounds) -> ChatReply:
         """Make one attempt as a line of a batch; see ``_attempt``."""
@@ -570,9 +552,9 @@ class LlmClient:
         who = (call.order, call.request.key, asked)
         if call.open is None:
             with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid = await self._money.set_aside(*who)
+                paid = await self.money.set_aside(*who)
         else:
-            paid = self._money.going_on(*who, call.open.note.ledger)
+            paid = self.money.going_on(*who, call.open.note.ledger)
         with closing(paid):
             with call.waiting(f"for batches of {self.model}", idle=True):
                 outcome, batch = await rounds.ask(call, paid, self.model)

@@ -7,8 +7,7 @@ import itertools
 import re
 import select
 import ssl
-import zlib
-from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 from urllib.request import getproxies, proxy_bypass
 from uuid import uuid4
@@ -18,10 +17,11 @@ import aiohttp
 import httpx
 from httpx_aiohttp import AiohttpTransport
 
-from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, proxy_secrets
+from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url, proxy_secrets
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.llm.http_outcome import ErrorReply, RawReply, TransportFailure
+from merge_runner.llm.formats.base import as_dict, as_dicts, as_text
+from merge_runner.llm.http_outcome import RawReply, TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
 if TYPE_CHECKING:
@@ -30,11 +30,10 @@ if TYPE_CHECKING:
 
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
-# Of a reply, and of the results of a whole batch.
-MOST_BYTES, MOST_LINES_BYTES = 16_000_000, 1_000_000_000
+MOST_BYTES = 16_000_000
 KEPT_S = 5.0
-MOST_UNPACKED = 2**18  # bytes at a time
-ENCODINGS = ("", "identity", "gzip", "x-gzip", "deflate")
+# A server that answers one call at a time may be busy with one.
+LIST_TIMEOUT_S = 60.0
 HEADERS = {
     "accept": "*/*",
     "accept-encoding": "gzip",
@@ -52,29 +51,27 @@ class Mask:
     """Replaces secrets, and RUN characters of one in a row or more, in texts."""
 
     def __init__(self, secrets: Iterable[str]) -> None:
-        # The longest first, since one may hold another.
+        given = [*secrets]
         self._pieces = {
-            secret: [secret[at : at + PIECE] for at in range(0, len(secret) - PIECE + 1, PIECE)]
-            for secret in sorted(secrets, key=len, reverse=True)
+            secret[at : at + PIECE]
+            for secret in given
+            for at in range(0, len(secret) - PIECE + 1, PIECE)
         }
+        runs = {s[at : at + RUN] for s in given for at in range(max(1, len(s) - RUN + 1))}
+        # Each run wherever it begins; of a short secret, which may begin a run, there is one alone.
+        longest_first = sorted(map(re.escape, runs), key=len, reverse=True)
+        self._runs = re.compile(f"(?=({'|'.join(longest_first)}))")
 
     def __call__(self, text: str) -> str:
         """Return the text without the secrets."""
-        for secret, pieces in self._pieces.items():
-            if any(piece in text for piece in pieces):
-                text = _without_runs(text.replace(secret, MASK), secret)
-        return text
-
-
-def _without_runs(text: str, secret: str) -> str:
-    runs = {re.escape(secret[at : at + RUN]) for at in range(len(secret) - RUN + 1)}
-    spans = sorted(match.span() for run in runs for match in re.finditer(run, text))
-    kept, done = [], 0
-    for begin, end in spans:
-        if begin >= done:
-            kept += [text[done:begin], MASK]
-        done = max(done, end)
-    return "".join([*kept, text[done:]])
+        if not any(piece in text for piece in self._pieces):
+            return text
+        kept, done = [], 0
+        for begin, end in (match.span(1) for match in self._runs.finditer(text)):
+            if begin >= done:
+                kept += [text[done:begin], MASK]
+            done = max(done, end)
+        return "".join([*kept, text[done:]])
 
 
 class HttpTransport:
@@ -98,7 +95,7 @@ class HttpTransport:
         self._endpoint = endpoint
         self._base = httpx.URL(endpoint.base_url)
         self._urls: dict[str, httpx.URL] = {}
-        self._most_bytes = most_bytes
+        self.most_bytes = most_bytes
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}
         self._mask = Mask(secret for secret in secrets if len(secret) >= SHORTEST_SECRET)
@@ -146,7 +143,7 @@ class HttpTransport:
                 reply = await self._carrier.handle_async_request(request)
                 try:
                     self._refuse_others(reply, own_id)
-                    return await self._read(reply, most_bytes or self._most_bytes)
+                    return await self._read(reply, most_bytes or self.most_bytes)
                 finally:
                     await reply.aclose()
         except TransportFailure:
@@ -155,21 +152,8 @@ class HttpTransport:
         except TimeoutError as exc:
             self.doubted = True
             raise TransportFailure("timeout", f"no reply within {timeout_s:.0f} s") from exc
-        except (httpx.RequestError, aiohttp.ClientError, zlib.error) as exc:
+        except (httpx.RequestError, aiohttp.ClientError) as exc:
             raise self._failure(exc) from exc
-
-    async def lines(
-        self, path: str, headers: Mapping[str, str], *, timeout_s: float
-    ) -> AsyncGenerator[str | TransportFailure]:
-        """Get a body of lines, each up to ``most_bytes`` long, or why it is refused.
-
-        Raises ErrorReply where the status is not 200, and TransportFailure.
-        """
-        raw = await self.ask("GET", path, headers, timeout_s=timeout_s, most_bytes=MOST_LINES_BYTES)
-        if raw.status != 200:
-            raise ErrorReply(raw)
-        for line in raw.body.split("\n"):
-            yield line.strip() if len(line) <= self._most_bytes else _too_long(self._most_bytes)
 
     async def close(self) -> None:
         """Close all connections."""
@@ -185,10 +169,13 @@ class HttpTransport:
 
     async def _read(self, reply: httpx.Response, most_bytes: int) -> RawReply:
         pieces, size = [], 0
-        async for piece in _unpacked(reply):
+        async for piece in reply.aiter_bytes():
             size += len(piece)
             if size > most_bytes:
-                raise _too_long(most_bytes)
+                why = f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)"
+                raise TransportFailure(
+                    "reply_refused", f"the reply is refused: {why}", action="fail"
+                )
             pieces.append(piece)
         # UTF-8 is the encoding of JSON, whatever a header says. A provider may echo the key in an
         # error; it must not get into a log or a database.
@@ -251,7 +238,13 @@ class HttpTransport:
         named = proxies.get(url.scheme) or proxies.get("all")
         proxy = None
         if named and url.host not in LOOPBACK and not proxy_bypass(url.netloc.decode()):
-            proxy = httpx.Proxy(named if "://" in named else f"http://{named}")
+            named = named if "://" in named else f"http://{named}"
+            if http_url(named) is None:  # which is not shown: it may hold a password
+                raise UsageError(
+                    f"{url.scheme.upper()}_PROXY or ALL_PROXY is no URL of an HTTP proxy: set it "
+                    "to http://HOST:PORT or unset it; a SOCKS proxy needs an HTTP proxy before it"
+                )
+            proxy = httpx.Proxy(named)
         return AiohttpTransport(verify=trusted, client=session, proxy=proxy)
 
 
@@ -282,33 +275,17 @@ class Connections(aiohttp.TCPConnector):
             connection.close()
 
 
-def _too_long(most_bytes: int) -> TransportFailure:
-    return _refused(f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)")
+async def listed_models(endpoint: Endpoint) -> list[str]:
+    """Return the ids of the models that a server says it serves, by ``GET /models``.
 
-
-def _refused(why: str) -> TransportFailure:
-    """Return the failure of a reply that is not taken, and not asked for again."""
-    return TransportFailure("reply_refused", f"the reply is refused: {why}", action="fail")
-
-
-async def _unpacked(reply: httpx.Response) -> AsyncIterator[bytes]:
-    """Yield the decompressed pieces of a body, which may be a thousand times as long."""
-    encoding = reply.headers.get("content-encoding", "").strip().lower()
-    if encoding not in ENCODINGS:
-        raise _refused(f"it is encoded as {encoding[:40]!r}, which was not asked for")
-    if encoding in ("", "identity"):
-        async for chunk in reply.aiter_raw():
-            yield chunk
-        return
-    unpacking = zlib.decompressobj(wbits=32 + zlib.MAX_WBITS)  # tells gzip from deflate
-    packed = b""
-    async for packed in reply.aiter_raw():
-        waiting = packed
-        while waiting:
-            yield unpacking.decompress(waiting, MOST_UNPACKED)
-            waiting = unpacking.unconsumed_tail
-            if unpacking.unused_data:
-                raise _refused(f"it goes on after the end of its {encoding}")
-            await asyncio.sleep(0)  # other calls go on while a large body is unpacked
-    if packed and not unpacking.eof:
-        raise TransportFailure("connection_lost", f"the reply is cut within its {encoding}")
+    Raises TransportFailure, ``no_list`` if there is no list.
+    """
+    transport = HttpTransport(endpoint, connections=1)
+    try:
+        raw = await transport.ask("GET", "/models", {}, timeout_s=LIST_TIMEOUT_S)
+    finally:
+        await transport.close()
+    payload = as_dict(raw.payload)
+    if raw.status != 200 or "data" not in payload:
+        raise TransportFailure("no_list", f"HTTP {raw.status}: {raw.error.message or 'no list'}")
+    return [name for model in as_dicts(payload["data"]) if (name := as_text(model.get("id")))]

@@ -11,10 +11,13 @@ import asyncio
 import json
 import random
 import re
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
 from functools import cached_property
+from math import inf
 from typing import TYPE_CHECKING, Literal, TypeVar
 from urllib.parse import urlsplit
 
@@ -22,7 +25,6 @@ from merge_runner.config import PROVIDERS, ModelEntry
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.formats import PASSED_ON
 from merge_runner.llm.formats.base import Reading, ServerError, WireFormat, as_dict, read_error
-from merge_runner.llm.formats.delays import server_delay_s
 
 if TYPE_CHECKING:
     from tenacity import RetryCallState
@@ -68,6 +70,20 @@ ACTIONS: dict[str, Action] = {
     "overloaded": "retry",
     "server_timeout": "retry",
 }
+
+# The seconds of a unit by its first letter; milliseconds apart.
+_UNIT_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
+# 1.574s and 5m, but also 5 minutes.
+_PART = (
+    r"(\d+(?:\.\d+)?)\s*"
+    r"(ms|milliseconds?|s|secs?|seconds?|m|mins?|minutes?|h|hrs?|hours?|d|days?)(?![a-z])"
+)
+_PARTS = re.compile(_PART, re.I)
+_IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_PART}(?:(?:,|\s|and)*{_PART})*)", re.I)
+# A header that is sent several times has all its values in one, and a date has a comma of its own.
+_LISTED = re.compile(r"(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*,)?[^,]+", re.I)
+# A server that asks for longer means for ever, and dates end somewhere.
+MOST_S = 366 * 86400.0
 
 
 @dataclass(frozen=True)
@@ -119,14 +135,6 @@ class TransportFailure(MergeRunnerError):
         self.outcome = outcome
         self.sent = sent
         self.action = action
-
-
-class ErrorReply(MergeRunnerError):
-    """The server replied with an error in place of what it was asked for."""
-
-    def __init__(self, raw: RawReply) -> None:
-        super().__init__(f"HTTP {raw.status}: {raw.error.message}")
-        self.raw = raw
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +209,7 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
     """Classify an error, whatever was asked for."""
     # What a format knows of an error, else what a format knows that gateways pass on.
     told = filter(None, (each.meaning(error) for each in (wire, *PASSED_ON)))
-    name: str = next(told, None) or STATUSES.get(error.status, "bad_request")
+    name = next(told, None) or STATUSES.get(error.status, "bad_request")
     action = ACTIONS.get(name, "fail")
     wish = error.headers.get("x-should-retry")
     if wish == "true" and action in ("fail", "refused") and name != "request_too_large":
@@ -217,6 +225,48 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
         server_delay_s(error, (wire, *PASSED_ON)) if action == "retry" else None,
         pause=action == "retry" and name == "rate_limited",
         of_prompt=of_prompt,
+    )
+
+
+def server_delay_s(
+    error: ServerError, formats: Iterable[WireFormat], now: datetime | None = None
+) -> float | None:
+    """Return the delay in s that a failed reply asks for, None if it says nothing usable.
+
+    Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), a member of the
+    error that one of the ``formats`` knows, and "try again in 1.574s" or "retry after 5 minutes" in
+    the message. Of several values of a header the longest counts, and of a delay a year at most.
+    """
+    in_text = _IN_TEXT.search(error.message)
+    candidates = (
+        _longest_s(error.headers.get("retry-after-ms", ""), 0.001, now),
+        _longest_s(error.headers.get("retry-after", ""), 1, now),
+        *(wire.delay_s(error) or 0.0 for wire in formats),
+        _duration_s(in_text[1]) if in_text else 0.0,
+    )
+    return next((min(delay, MOST_S) for delay in candidates if 0 < delay < inf), None)
+
+
+def _longest_s(header: str, unit_s: float, now: datetime | None) -> float:
+    """Return the longest usable delay among the values of a header, 0 if there is none."""
+    delays = [0.0]
+    for text in _LISTED.findall(header):
+        with suppress(ValueError):
+            delays.append(float(text) * unit_s)
+            continue
+        with suppress(ValueError, OverflowError):  # the latter: beyond the first or last date
+            moment = parsedate_to_datetime(text)
+            aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+            delays.append((aware - (now or datetime.now(UTC))).total_seconds())
+    return max(delay for delay in delays if 0 <= delay < inf)
+
+
+def _duration_s(text: str) -> float:
+    """Return the seconds of ``6m0s``, ``1h30m``, ``120ms`` or ``5 minutes``."""
+    parts = [(float(number), unit.lower()) for number, unit in _PARTS.findall(text)]
+    return sum(
+        number * (0.001 if unit.startswith(("ms", "milli")) else _UNIT_S[unit[0]])
+        for number, unit in parts
     )
 
 
@@ -331,8 +381,8 @@ class FirstCall:
 
 def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | None:
     """Return why all calls of a run would fail, and what to set; None: they might not."""
-    raw, base_url, place = outcome.raw, set_base_url(name, entry), f"[{name}] in {REGISTRY}"
-    why = None
+    raw, place = outcome.raw, f"[{name}] in {REGISTRY}"
+    base_url = set_base_url(name, entry)
     if outcome.name == "bad_certificate":
         why = (
             "the endpoint's certificate cannot be trusted, and nothing was sent; check the base "
@@ -340,25 +390,24 @@ def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | 
         )
     elif raw is None or outcome.of_prompt:
         return None
-    elif raw.is_web_page and raw.status == 200:
-        return f"a web page answers there, and no language model: {base_url}"
-    elif outcome.name == "bad_body" and isinstance(raw.payload, dict):
-        return f"what answers there does not speak {entry.format}: {base_url}"
     elif outcome.action == "refused" and outcome.name == "not_allowed":
         key_envs = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
         key = " or ".join(key_envs) or f"`key_env` of {place}"
         why = f"the endpoint does not accept the key; set {key} to a valid one"
     elif outcome.action == "refused":
-        until = f", which was announced to shut down on {entry.shutdown}" if entry.shutdown else ""
-        model = f"the endpoint has no model {entry.id!r}{until}"
+        model = f"the endpoint has no model {entry.id!r}"
         why = f"{model}; see `merge-runner models`, or {base_url}"
-    elif outcome.action == "fail" and raw.status not in REQUEST_ITSELF:
-        why = f"no language model answers there: {base_url}"
-    elif outcome.action == "fail":
-        said = f"{as_dict(as_dict(raw.first).get('error')).get('param')} {outcome.message}"
-        named = next((f"`parameters.{each}` of " for each in entry.parameters if each in said), "")
-        why = f"the request is refused: look at {named}{place}"
-    return why and f"{why} ({outcome.message})"
+    elif outcome.action == "fail" and raw.status in REQUEST_ITSELF:
+        why = f"the request is refused: look at {place}"
+    elif (
+        outcome.action == "fail"
+        or (raw.is_web_page and raw.status == 200)
+        or (outcome.name == "bad_body" and isinstance(raw.payload, dict))
+    ):
+        why = f"what answers there does not speak {entry.format}: {base_url}"
+    else:
+        return None
+    return f"{why} ({outcome.message})"
 
 
 def if_nobody(name: str, entry: ModelEntry) -> str:

@@ -22,8 +22,6 @@ from asyncio_throttle.throttler import Throttler
 
 from merge_runner.errors import UsageError
 
-# Replaces the estimate with which a request was let through by the tokens that it used.
-Settle = Callable[[int], None]
 WINDOW_S = 60.0
 BURST_S = 0.5
 CLOCK_STEP_S, POLL_S = 1e-6, 1e-3
@@ -66,7 +64,12 @@ class Limiter:
     ) -> None:
         self._tpm = tpm
         self._window_s = window_s
-        self._throttles = [] if rpm is None else _throttles(rpm, window_s)
+        self._throttles: list[_Throttle] = []
+        if rpm is not None:
+            # Half a second's worth goes at a time: a whole window at once would trip finer limits.
+            burst = max(1, int(rpm * BURST_S / window_s))
+            for rule in ((burst, burst * window_s / rpm), (rpm, window_s)):
+                self._throttles.append(_Throttle(*rule, retry_interval=POLL_S))
         self._waiting: list[_Turn] = []
         self._arrivals = itertools.count()
         self._window: deque[_Turn] = deque()
@@ -75,8 +78,11 @@ class Limiter:
         self._changed = asyncio.Event()
         self._dispatcher: asyncio.Task[None] | None = None
 
-    async def acquire(self, tokens: int, *, order: int = 0) -> Settle:
-        """Wait for a turn; ``tokens`` is the estimate of what the request will use."""
+    async def acquire(self, tokens: int, *, order: int = 0) -> Callable[[int], None]:
+        """Wait for a turn; ``tokens`` is the estimate of what the request will use.
+
+        What is returned replaces it by the tokens that the request used.
+        """
         if self._tpm is not None and tokens > self._tpm:
             raise UsageError(
                 f"one request may use {tokens} tokens, more than the limit of {self._tpm} tokens "
@@ -111,7 +117,12 @@ class Limiter:
     async def _dispatch(self) -> None:
         """Serve the queue until it is empty."""
         loop = asyncio.get_running_loop()
-        while turn := self._head():
+        while self._waiting:
+            turn = self._waiting[0]
+            # One that was cancelled is done before its turn, and nobody will use it.
+            if turn.given.done():
+                heapq.heappop(self._waiting)
+                continue
             wait = self._blocked_for(turn, loop.time())
             if wait > 0:
                 # A new turn, or a settlement, may change what can be done.
@@ -128,12 +139,6 @@ class Limiter:
                 self._window.append(turn)
                 self._tokens_in_window += turn.tokens
             turn.given.set_result(None)
-
-    def _head(self) -> _Turn | None:
-        # One that was cancelled is done before its turn, and nobody will use it.
-        while self._waiting and self._waiting[0].given.done():
-            heapq.heappop(self._waiting)
-        return self._waiting[0] if self._waiting else None
 
     def _blocked_for(self, turn: _Turn, now: float) -> float:
         """Return the least wait in s of the head of the queue."""
@@ -157,13 +162,3 @@ class _Throttle(Throttler):
         full = len(self._task_logs) >= self.rate_limit
         # A little later, since it keeps a turn until more than its period has passed.
         return self._task_logs[0] + self.period + CLOCK_STEP_S if full else 0.0
-
-
-def _throttles(rpm: int, window_s: float) -> list[_Throttle]:
-    """Return throttles for an even flow and for at most ``rpm`` requests in any window.
-
-    Half a second's worth goes at a time: a whole window at once would trip finer limits.
-    """
-    burst = max(1, int(rpm * BURST_S / window_s))
-    rules = [(burst, burst * window_s / rpm), (rpm, window_s)]
-    return [_Throttle(*rule, retry_interval=POLL_S) for rule in rules]

@@ -1,12 +1,17 @@
-"""The models of ``experiments/models.toml``, and those that a user adds to them."""
+"""The models of ``experiments/models.toml``, those that a user adds, and what each may be sent."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from copy import deepcopy
 from datetime import date
 from pathlib import Path
+from typing import Any
+
+from pydantic import JsonValue
 
 from merge_runner.config import (
+    PROVIDERS,
     ModelEntry,
     endpoint_identity,
     experiments,
@@ -14,13 +19,14 @@ from merge_runner.config import (
     read_toml,
     validated,
 )
-from merge_runner.errors import UsageError
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.llm.formats import FORMATS
 from merge_runner.registry import load_plugins
 from merge_runner.text_safety import one_line
 
 REGISTRY = "models.toml"
 SOON_DAYS = 30
+CAP, EFFORT = "max_output_tokens", "reasoning_effort"
 HOW_TO_RECORD = "docs/how-to/record-before-shutdown.md"
 
 
@@ -48,10 +54,8 @@ def read_entries(path: Path) -> dict[str, ModelEntry]:
 
     Raises UsageError.
     """
-    return {
-        name: validated(ModelEntry, table, _where(path, name))
-        for name, table in read_toml(path).items()
-    }
+    tables = read_toml(path).items()
+    return {name: validated(ModelEntry, table, f"{path}: [{name}]") for name, table in tables}
 
 
 def read_models(path: Path) -> dict[str, ModelEntry]:
@@ -64,7 +68,7 @@ def read_models(path: Path) -> dict[str, ModelEntry]:
             if "id" not in entry.model_fields_set and model_id(entry, {}) is not None:
                 raise UsageError("`id` is missing: the model's name at the provider")
         except UsageError as exc:
-            raise UsageError(one_line(f"{_where(path, name)}: {exc}")) from exc
+            raise UsageError(one_line(f"{path}: [{name}]: {exc}")) from exc
     return entries
 
 
@@ -74,16 +78,56 @@ def shutdown_notes(entries: Mapping[str, ModelEntry], today: date) -> Iterator[s
         if entry.shutdown is None:
             continue
         days = (entry.shutdown - today).days
-        successor = f"; its successor is {entry.successor}" if entry.successor else ""
         closes = f"{name} closes in {days} day{'s' * (days != 1)}, on {entry.shutdown}"
         if days <= 0:
-            closed = f"{name} closed on {entry.shutdown}: only a recording answers for it"
-            yield f"WARNING: {closed} (replay --recording FILE){successor}"
+            said = f"WARNING: {name} closed on {entry.shutdown}: only a recording answers for it"
         elif days <= SOON_DAYS:
-            yield f"WARNING: {closes}: record it now ({HOW_TO_RECORD}){successor}"
+            said = f"WARNING: {closes}: record it now ({HOW_TO_RECORD})"
         else:
-            yield f"note: {closes}{successor}"
+            said = f"note: {closes}"
+        yield said + (f"; its successor is {entry.successor}" if entry.successor else "")
 
 
-def _where(path: Path, name: str) -> str:
-    return f"{path}: [{name}]"
+def known_parameters(entries: Iterable[ModelEntry]) -> set[str]:
+    """Return the parameters that some model takes, by common names."""
+    return {CAP, EFFORT}.union(
+        *(form.parameters for form in FORMATS.values()),
+        *(provider.parameters for provider in PROVIDERS.values()),
+        *(entry.parameters for entry in entries),
+    )
+
+
+def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValue) -> ModelEntry:
+    """Return the entry ``name`` with a parameter set; raises UsageError if the model rejects it.
+
+    What is the provider's default already is not sent.
+    """
+    if parameter == CAP:
+        if type(level) is not int or level < 1:
+            raise UsageError(f"{CAP} is a whole number from 1")
+        return entry.model_copy(update={CAP: level})
+    if parameter == EFFORT and entry.efforts:
+        if level not in entry.efforts:
+            raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)
+        chosen = {**entry.parameters, **entry.efforts[str(level)]}
+        return entry.model_copy(update={"parameters": chosen})
+    defaults = entry.applied_defaults
+    unset = parameter not in entry.parameters
+    if unset and parameter in defaults and defaults[parameter] == level:
+        return entry
+    places = FORMATS.require(entry.format).parameters
+    takes = {*places, *PROVIDERS.require(entry.provider).parameters, *entry.parameters, CAP}
+    takes -= {*entry.rejects}
+    if parameter not in takes:
+        default = f" but its default ({defaults[parameter]})" if parameter in defaults else ""
+        valid = ", ".join(sorted(takes))
+        raise UsageError(f"{name} takes no parameter {parameter}{default}; valid: {valid}")
+    parameters: dict[str, Any] = deepcopy(entry.parameters)
+    *outer, last = places.get(parameter, (parameter,))
+    table = parameters
+    for each in outer:
+        if not isinstance(table.get(each), dict):
+            table[each] = {}
+        table = table[each]
+    table[last] = level
+    return entry.model_copy(update={"parameters": parameters})

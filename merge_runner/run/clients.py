@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
 
 from merge_runner.config import (
-    check_network,
     rehearsal_endpoint,
     resolve_endpoint,
 )
@@ -125,7 +124,6 @@ def live_clients(
                 endpoint = rehearsal_endpoint(entry)
             else:
                 endpoint = resolve_endpoint(name, entry, env)
-            check_network(endpoint.base_url)
             transports[model] = HttpTransport(
                 endpoint,
                 connections=options.connections,

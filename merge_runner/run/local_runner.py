@@ -125,7 +125,7 @@ class LocalRunner:
                 self.running -= 1
                 self._asking.pop(spec.order, None)
                 for client in self.clients.values():
-                    client.leave(spec.order)
+                    client.money.leave(spec.order)
 
     async def drain(self) -> None:
         """Let calls in flight end and be saved, and drop those that still wait for a turn."""

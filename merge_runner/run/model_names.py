@@ -8,7 +8,6 @@ from merge_runner.config import (
     PROVIDERS,
     UNNAMED,
     ModelEntry,
-    check_network,
     driver_name,
     resolve_endpoint,
 )
@@ -25,11 +24,10 @@ def recorded_name(entry: ModelEntry, cache: ResponseCache) -> str:
 
 async def served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
     """The one model that a server lists; raises ProviderDown where nobody listens, UsageError."""
-    from merge_runner.llm.model_list import listed_models  # imports httpx, which no replay needs
+    from merge_runner.llm.http import listed_models  # imports httpx, which no replay needs
 
     endpoint = resolve_endpoint(name, entry)
     driver = driver_name(name, endpoint.identity)
-    check_network(endpoint.base_url)
     try:
         listed = await listed_models(endpoint)
     except TransportFailure as exc:

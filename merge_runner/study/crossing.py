@@ -13,7 +13,6 @@ from pydantic import JsonValue
 
 from merge_runner.config import (
     PERFECT,
-    PROVIDERS,
     ModelEntry,
     ScenarioConfig,
     both_sides,
@@ -22,8 +21,8 @@ from merge_runner.config import (
 )
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
-from merge_runner.errors import UsageError, unknown_name
-from merge_runner.llm.formats import FORMATS
+from merge_runner.errors import UsageError
+from merge_runner.llm.models import known_parameters, with_parameter
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.records import SIDES, Side, other_side
 from merge_runner.registry import require
@@ -31,7 +30,6 @@ from merge_runner.study.file import BASELINE, EVERY_PROMPT, StudyFile
 
 MODEL, PROMPT, OPPONENT, SELF, DEFAULT = "model", "prompt", "opponent", "self", "default"
 PERCEPTION, PERFECT_ONE = "perception", "perfect"
-CAP, EFFORT = "max_output_tokens", "reasoning_effort"
 _PERCEPTIONS = tuple(f"{PERCEPTION}_{side}" for side in SIDES)
 SET_BY = {PERCEPTION: _PERCEPTIONS, **{name: (name,) for name in _PERCEPTIONS}}
 """The factors of perception, with the switches of the scenario that each sets."""
@@ -232,7 +230,7 @@ def _arm(
         if name in registry:
             label, entry = name, registry[name]
             for parameter, level in parameters.items() if name in changed else ():
-                before, entry = entry, _with_parameter(name, entry, parameter, level)
+                before, entry = entry, with_parameter(name, entry, parameter, level)
                 label += "" if entry == before else f" {parameter}={level_text(level)}"
             asked[side], entries[label] = label, entry
     texts = {name: level_text(level) for name, level in levels.items()}
@@ -293,13 +291,8 @@ def _world_step(scenario: ScenarioConfig, programs: Mapping[str, Program]) -> di
 
 def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     """Raise UsageError for a factor that there is not, and for a name that is taken."""
-    parameters = {CAP, EFFORT}.union(
-        *(form.parameters for form in FORMATS.values()),
-        *(provider.parameters for provider in PROVIDERS.values()),
-        *(entry.parameters for entry in registry.values()),
-    )
-    named = (PROMPT, OPPONENT, PERCEPTION, *sorted(parameters), *ScenarioConfig.model_fields)
-    valid = dict.fromkeys(named)
+    parameters = sorted(known_parameters(registry.values()))
+    valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
     for name in file.factors:
         require(valid, "factor", name, "models and skip stand above [factors]")
     taken = [f"drivers.{name}" for name in file.drivers if name in registry]
@@ -310,43 +303,3 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
         raise UsageError(
             f"the factor {PERCEPTION} is of both sides: name it, or {' and '.join(_PERCEPTIONS)}"
         )
-
-
-def _with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValue) -> ModelEntry:
-    """The entry ``name`` with a parameter set; raises UsageError if the model rejects it.
-
-    What is the provider's default already is not sent.
-    """
-    if parameter == CAP:
-        if type(level) is not int or level < 1:
-            raise UsageError(f"{CAP} is a whole number from 1")
-        return entry.model_copy(update={CAP: level})
-    if parameter == EFFORT and entry.efforts:
-        if level not in entry.efforts:
-            raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)
-        chosen = {**entry.parameters, **entry.efforts[str(level)]}
-        return entry.model_copy(update={"parameters": chosen})
-    defaults = entry.applied_defaults
-    unset = parameter not in entry.parameters
-    if unset and parameter in defaults and defaults[parameter] == level:
-        return entry
-    places = FORMATS.require(entry.format).parameters
-    takes = {*places, *PROVIDERS.require(entry.provider).parameters, *entry.parameters, CAP}
-    takes -= {*entry.rejects}
-    if parameter not in takes:
-        default = f" but its default ({defaults[parameter]})" if parameter in defaults else ""
-        valid = ", ".join(sorted(takes))
-        raise UsageError(f"{name} takes no parameter {parameter}{default}; valid: {valid}")
-    place = places.get(parameter, (parameter,))
-    return entry.model_copy(update={"parameters": _placed(entry.parameters, place, level)})
-
-
-def _placed(
-    values: dict[str, JsonValue], place: tuple[str, ...], level: JsonValue
-) -> dict[str, JsonValue]:
-    """The values with one set at a place, a name within a name."""
-    first, *rest = place
-    if not rest:
-        return {**values, first: level}
-    inner = values.get(first)
-    return {**values, first: _placed(inner if isinstance(inner, dict) else {}, tuple(rest), level)}

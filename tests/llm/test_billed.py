@@ -175,7 +175,7 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
             except MergeRunnerError:
                 pass
             finally:
-                client.leave(number)
+                client.money.leave(number)
 
         try:
             await asyncio.gather(*map(ask, range(calls)))

@@ -4,7 +4,7 @@ import pytest
 
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import read_error
-from merge_runner.llm.formats.delays import MOST_S, server_delay_s
+from merge_runner.llm.http_outcome import MOST_S, server_delay_s
 
 NOW = datetime(2026, 10, 21, 7, 28, 0, tzinfo=UTC)
 

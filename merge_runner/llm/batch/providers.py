@@ -24,7 +24,7 @@ from merge_runner.llm.formats.base import (
     as_count,
     as_dict,
     as_text,
-    first_of,
+    at,
     read_error,
 )
 from merge_runner.llm.http_outcome import RawReply, status_within
@@ -82,7 +82,7 @@ class OpenAIBatches(BatchService):
         """See BatchService."""
         word = (as_text(batch.get("status")) or "").upper()
         answered = as_count(as_dict(batch.get("request_counts")).get("completed")) or 0
-        error = first_of(as_dict(batch.get("errors")).get("data"))
+        error = at(batch, "errors.data.0")
         why = read_error(400, {}, "", {"error": error})
         why = replace(why, status=status_within(why) if why.names else 400)
         failure = self.failure_of(why) if word == "FAILED" else None

@@ -12,10 +12,9 @@ from merge_runner.llm.formats.builtin import (
 from merge_runner.registry import Registry
 
 FORMATS: Registry[WireFormat] = Registry("wire format")
-FORMATS.register("openai-chat", OpenAIChat())
+# Gateways pass on the errors of these providers, whatever format they speak themselves. What an
+# added format knows is its own alone: it must not change how the replies of another are read.
+PASSED_ON = (FORMATS.register("openai-chat", OpenAIChat()),)
 FORMATS.register("openai-responses", OpenAIResponses())
 FORMATS.register("gemini", GeminiGenerateContent())
 FORMATS.register("anthropic", AnthropicMessages())
-# Gateways pass on the errors of these providers, whatever format they speak themselves. What an
-# added format knows is its own alone: it must not change how the replies of another are read.
-PASSED_ON = (FORMATS["openai-chat"],)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from pydantic import JsonValue
 
@@ -55,25 +55,11 @@ class ServerError:
     details: tuple[dict[str, Any], ...]
 
 
-# What an error can mean where its status does not tell. All but ``bad_prompt``, which speaks of one
-# prompt alone, are outcomes of the table of calls.
-Meaning = Literal[
-    "refusal",
-    "quota_exhausted",
-    "unknown_model",
-    "not_allowed",
-    "rate_limited",
-    "request_too_large",
-    "bad_prompt",
-]
-
-
 class WireFormat(ABC):
     """One format of requests and replies, with all that is particular to it.
 
     What a format says of errors may be asked of a reply in any format, since gateways pass on the
-    errors of others. None leaves a question to the rules for all servers (http_outcome.py,
-    delays.py).
+    errors of others. None leaves a question to the rules for all servers (http_outcome.py).
     """
 
     parameters: ClassVar[Mapping[str, tuple[str, ...]]] = {}
@@ -93,8 +79,13 @@ class WireFormat(ABC):
     def read(self, payload: dict[str, Any]) -> Reading:
         """Read a body of status 200; unknown keys and missing ones are normal."""
 
-    def meaning(self, error: ServerError) -> Meaning | None:
-        """Return the meaning of an error whose status does not tell it."""
+    def meaning(self, error: ServerError) -> str | None:
+        """Return the meaning of an error whose status does not tell it.
+
+        It is ``refusal``, ``quota_exhausted``, ``unknown_model``, ``not_allowed``,
+        ``rate_limited`` or ``request_too_large``, as in the table of calls, or ``bad_prompt``,
+        which speaks of one prompt alone.
+        """
         return None
 
     def delay_s(self, error: ServerError) -> float | None:
@@ -109,13 +100,13 @@ def outcome_of(
 
     ``failed`` is what the body reports as an error, where it does.
     """
-    if failed:
-        return "error"
-    if refused:
-        return "refusal"
-    if truncated:
-        return "truncated"
-    return "ok" if text.strip() else "empty"
+    outcomes = {
+        "error": failed,
+        "refusal": refused,
+        "truncated": truncated,
+        "empty": not text.strip(),
+    }
+    return next((outcome for outcome, is_so in outcomes.items() if is_so), "ok")
 
 
 def at(value: object, path: str) -> Any:  # noqa: ANN401 # whatever JSON holds there
@@ -136,11 +127,6 @@ def as_dict(value: object) -> dict[str, Any]:
 def as_dicts(value: object) -> list[dict[str, Any]]:
     """Return the objects of a JSON array; anything else counts as an empty one."""
     return [as_dict(item) for item in value] if isinstance(value, list) else []
-
-
-def first_of(value: object) -> dict[str, Any]:
-    """Return the first object of a JSON array, or an empty one."""
-    return next(iter(as_dicts(value)), {})
 
 
 def joined(parts: Iterable[dict[str, Any]], member: str = "text") -> str:

@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 
 from merge_runner.config import ModelEntry
 from merge_runner.llm.formats.base import (
-    Meaning,
     Reading,
     ServerError,
     WireFormat,
@@ -81,7 +80,7 @@ class BuiltIn(WireFormat):
             Usage(**counts),
         )
 
-    def meaning(self, error: ServerError) -> Meaning | None:
+    def meaning(self, error: ServerError) -> str | None:
         """Tell filters, quotas, unknown models and what can never be sent, at any provider."""
         status, names = error.status, error.names
         # Azure's content filter, and OpenRouter's moderation.
