@@ -40,9 +40,9 @@ from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.client import Meter, Wait
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import Limiter
-from merge_runner.records import Attempt, TrialRecord, TrialSpec
+from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import in_use, plugin_sources, use
-from merge_runner.run.clients import EarlierAnswers, live_clients
+from merge_runner.run.clients import live_clients
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.local_runner import Ended, LocalRunner, Room
@@ -137,7 +137,7 @@ class Task:
     plan: Plan
     options: Options
     urls: Mapping[str, str]
-    earlier: EarlierAnswers
+    earlier: Mapping[str, Usage | None]
     share: float
     first: FirstDecisions
     recorded: Sequence[CachedCall]
@@ -244,7 +244,7 @@ class DaskTasks:
     _client: Client
     _plan: Plan
     _options: Options
-    _earlier: EarlierAnswers
+    _earlier: Mapping[str, Usage | None]
     _cache: ResponseCache
     _ledger: Ledger
     first: FirstDecisions

@@ -37,12 +37,11 @@ from merge_runner.results.recording import Spilled
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     check_batches,
-    earlier_answers,
     live_clients,
     open_rounds,
 )
 from merge_runner.run.cluster import DaskTasks, connected
-from merge_runner.run.estimate import Estimate, estimate
+from merge_runner.run.estimate import Estimate, earlier_answers, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, Flusher
 from merge_runner.run.local_runner import LocalRunner
