@@ -18,8 +18,7 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.sqlite_files import Connection, connect, making
-from merge_runner.llm.write_batcher import BatchWriter, Operation
+from merge_runner.llm.durable import BatchWriter, Connection, Operation, connect, making
 from merge_runner.records import Attempt
 
 if TYPE_CHECKING:
