@@ -153,21 +153,15 @@ def open_rounds(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
 ) -> Rounds | None:
     """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
-    models = set(plan.registered.values())
-    rounds = Rounds(cache, models, submits=options.batch, say=say)
-    left = bool(rounds.batches)
-    if options.dask is not None:
-        if left:
-            raise UsageError(
-                "calls wait in batches of an earlier run: run the same command without --dask "
-                "until they have ended"
-            )
-        return None
-    if left and not options.batch:
+    rounds = Rounds(cache, {*plan.registered.values()}, submits=options.batch, say=say)
+    if options.dask is not None and rounds.batches:
+        raise UsageError(
+            "calls wait in batches of an earlier run: run the same command without --dask until "
+            "they have ended"
+        )
+    if rounds.batches and not options.batch:
         say("calls that wait in batches of an earlier run are not asked again")
-    if not options.batch and not left:
-        return None
-    return rounds
+    return rounds if rounds.batches or options.batch else None
 
 
 def check_batches(plan: Plan, options: Options) -> None:

@@ -12,6 +12,7 @@ from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import ProviderDown, TrialSuspended
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient, Wait
 from merge_runner.records import SIDES, ChatReply, Slot, TrialRecord, TrialSpec
@@ -32,12 +33,16 @@ A_FEW = 16
 
 @dataclass
 class LocalRunner:
-    """Plays at most ``in_flight`` trials at once, of which so many are ``running``."""
+    """Plays at most ``in_flight`` trials at once, of which so many are ``running``.
+
+    What they ask in ``rounds`` is submitted when none of them can go on.
+    """
 
     plan: Plan
     clients: Mapping[str, LlmClient]
     in_flight: int
     first: FirstDecisions = field(default_factory=FirstDecisions)
+    rounds: Rounds | None = None
     running: int = 0
     workers: None = None
     # The open questions of each trial that is running and has asked.
@@ -68,8 +73,7 @@ class LocalRunner:
         """What the calls wait for that are not in flight."""
         return [wait for client in self.clients.values() for wait in client.waits]
 
-    @property
-    def is_idle(self) -> bool:
+    def _is_idle(self) -> bool:
         """Whether no trial goes on by itself: all ask, and wait for the answers to others."""
         idle = sum(client.idle_askers for client in self.clients.values())
         asking = +self._asking  # without the trials that ask nothing now
@@ -101,8 +105,11 @@ class LocalRunner:
 
         try:
             async with asyncio.TaskGroup() as group:
-                for _ in range(self.in_flight):
-                    group.create_task(work())
+                playing = [group.create_task(work()) for _ in range(self.in_flight)]
+                if self.rounds is not None:
+                    watching = group.create_task(self.rounds.watch(self._is_idle))
+                    await asyncio.gather(*playing)
+                    watching.cancel()
         except BaseExceptionGroup as errors:  # the first one has cancelled the others
             raise errors.exceptions[0] from None
 

@@ -253,7 +253,7 @@ class Sweep:
             stack.push_async_callback(rounds.close)
         # A trial that waits for a round takes up nobody's time.
         in_flight = len(self._todo) if options.batch else options.in_flight
-        return LocalRunner(plan, clients, in_flight, first)
+        return LocalRunner(plan, clients, in_flight, first, rounds)
 
     async def _play(
         self,
@@ -278,17 +278,9 @@ class Sweep:
             await asyncio.wait([work])
             await runner.drain()
 
-        async def watched() -> None:
-            if self._rounds is None or not isinstance(runner, LocalRunner):
-                await asyncio.Event().wait()
-            else:
-                await self._rounds.watch(lambda: runner.is_idle)
-
         # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
         work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
         drain = asyncio.create_task(drained())
-        watching = asyncio.create_task(watched())
-        watching.add_done_callback(lambda _: work.cancel())  # nobody would close a round
 
         def interrupted() -> None:
             work.cancel()  # before anything is written: the terminal may be closed
@@ -297,10 +289,6 @@ class Sweep:
         with on_interrupt(interrupted, drain.cancel):
             await asyncio.wait([drain])
             await asyncio.wait([work])
-        watching.cancel()
-        await asyncio.wait([watching])
-        if not watching.cancelled():
-            watching.result()
         if work.cancelled():
             outcome.fail(INTERRUPTED, f"Interrupted. {GO_ON}")
         else:
@@ -424,19 +412,13 @@ async def _named(
 
 
 def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
-    """The endpoint's identity: in a replay, the one under which the model is recorded."""
-    entry, configured = plan.entries[name], plan.endpoints[name]
-    if not options.replay:
-        return configured
-    recorded = sorted({r.endpoint for r in cache.recorded(lambda r: r.model == entry.id)})
-    if configured in recorded or not recorded:
-        return configured
-    if len(recorded) > 1:
-        raise UsageError(
-            f"replies of {name} are recorded from several endpoints: {', '.join(recorded)}. "
-            "Set the base URL variable of its provider to the one to replay."
-        )
-    return recorded[0]
+    """The endpoint's identity: in a replay, the only one under which the model is recorded."""
+    if options.replay:
+        model = plan.entries[name].id
+        recorded = {request.endpoint for request in cache.recorded(lambda r: r.model == model)}
+        if len(recorded) == 1:
+            return recorded.pop()
+    return plan.endpoints[name]
 
 
 def _less_what_is_spent(
