@@ -71,7 +71,11 @@ class FirstDecisions:
             self._changed.set()
         if invalid:
             self._invalid[model] += invalid
-            self._described.setdefault(model, _described(failure or "", text or ""))
+            shown, why = one_line(" ".join((text or "").split()))[:SHOWN], failure or ""
+            is_short = why in ("truncated", "empty")
+            advice = f"set a higher `max_output_tokens` in {REGISTRY}" if is_short else ADVICE
+            line = f'The first reply is "{shown}" ({why.replace("_", " ")}). To mend that {advice}'
+            self._described.setdefault(model, line)
 
     def without_a_valid_one(self) -> list[str]:
         """A line for each model none of whose decisions is valid."""
@@ -88,11 +92,3 @@ class FirstDecisions:
                 f"nothing else is asked. {self._described[model]}. What was answered is kept; "
                 "--keep-going goes on with such a model"
             )
-
-
-def _described(failure: str, text: str) -> str:
-    """The reply, why it is invalid, and what to look at."""
-    shown = one_line(" ".join(text.split()))[:SHOWN]
-    is_short = failure in ("truncated", "empty")
-    advice = f"set a higher `max_output_tokens` in {REGISTRY}" if is_short else ADVICE
-    return f'The first reply is "{shown}" ({failure.replace("_", " ")}). To mend that {advice}'

@@ -57,7 +57,7 @@ async def play(
     options = plan.within_budget(options)
     async with open_sweep(plan, options, say=say) as sweep:
         is_free = all(entry.price == "free" for entry in plan.entries.values())
-        if sweep.trials_to_play and not (options.replay or is_free):
+        if sweep.todo and not (options.replay or is_free):
             expected = await sweep.estimate()
             agree(expected)
         outcome = await sweep.run()

@@ -105,16 +105,11 @@ class Sweep:
     _options: Options
     _cache: ResponseCache
     _stored: list[TrialSpec]
-    _todo: list[TrialSpec]
+    todo: list[TrialSpec]
     _say: Callable[[str], None]
     _ledger: Ledger
     _misses: list[Miss] = field(default_factory=list)
     _rounds: Rounds | None = None
-
-    @property
-    def trials_to_play(self) -> int:
-        """How many trials are not stored yet."""
-        return len(self._todo)
 
     async def run(self) -> Outcome:
         """Play what is missing and store it; what goes wrong is in the outcome."""
@@ -135,7 +130,7 @@ class Sweep:
             flusher = Flusher(store, outcome.sweep_id, self._say)
             progress = Progress(
                 plan=self._plan,
-                planned=len(self._stored) + len(self._todo),
+                planned=len(self._stored) + len(self.todo),
                 stored=len(self._stored),
                 runner=runner,
                 ledger=self._ledger,
@@ -175,7 +170,7 @@ class Sweep:
         arms = self._plan.by_label()
         calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in arms.items()}
         runner = LocalRunner.sealed(self._plan, self._cache)
-        for spec in [*self._stored, *self._todo] if whole else self._todo:
+        for spec in [*self._stored, *self.todo] if whole else self.todo:
             arm = arms[spec.arm]
             record = await runner.play_one(spec) if arm.entries and not whole else None
             if record is not None and record.status != "failed":
@@ -196,7 +191,7 @@ class Sweep:
     async def _nothing_is_recorded(self) -> bool:
         """Whether all calls are missing, of which the first of each trial are noted."""
         runner = LocalRunner.sealed(self._plan, self._cache)
-        for spec in self._todo:
+        for spec in self.todo:
             self._note_misses(await runner.play_one(spec))
             if any(meter.calls_cached for meter in runner.meters.values()):
                 return False
@@ -252,7 +247,7 @@ class Sweep:
         if rounds is not None:
             stack.push_async_callback(rounds.close)
         # A trial that waits for a round takes up nobody's time.
-        in_flight = len(self._todo) if options.batch else options.in_flight
+        in_flight = len(self.todo) if options.batch else options.in_flight
         return LocalRunner(plan, clients, in_flight, first, rounds)
 
     async def _play(
@@ -279,7 +274,7 @@ class Sweep:
             await runner.drain()
 
         # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
-        work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
+        work = asyncio.create_task(runner.play(self.todo, ended, room=flusher.room))
         drain = asyncio.create_task(drained())
 
         def interrupted() -> None:
@@ -341,11 +336,8 @@ class Sweep:
             ledgers = (Ledger(self._cache, scope) for scope in scopes(self._cache))
             outcome.cache_cost_usd = sum(ledger.read().spent_usd for ledger in ledgers)
             outcome.spending = self._ledger.read()
-        except MergeRunnerError as exc:
-            if self._options.replay:  # which spends nothing
-                outcome.messages.append(str(exc))
-            else:
-                outcome.fail_by(exc)
+        except MergeRunnerError as exc:  # a run that spends has been refused for that already
+            outcome.messages.append(str(exc))
 
     def _check(self, store: Store, first: FirstDecisions, outcome: Outcome) -> None:
         """Read back what the database holds of the sweep, audit it, and note how it ended."""
