@@ -21,10 +21,9 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Ledger, cost_usd
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
-from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Usage
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan

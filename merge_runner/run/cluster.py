@@ -45,8 +45,7 @@ from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import in_use, plugin_sources, use
 from merge_runner.run.clients import live_clients
 from merge_runner.run.estimate import trial_costs
-from merge_runner.run.first_decisions import FirstDecisions
-from merge_runner.run.local_runner import Ended, LocalRunner, Room
+from merge_runner.run.local_runner import Ended, FirstDecisions, LocalRunner, Room
 from merge_runner.run.plan import Options, Plan
 from merge_runner.study.parts import catalogue_of
 

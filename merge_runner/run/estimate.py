@@ -13,7 +13,7 @@ from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.content_hashes import canonical_json, without_prompt
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.prices import cost_usd
+from merge_runner.llm.ledger import cost_usd
 from merge_runner.prompts.render import render_prompt
 from merge_runner.records import Usage, is_scripted
 from merge_runner.run.plan import Options, Plan, most_prompts, usual_prompts

@@ -42,9 +42,8 @@ from merge_runner.run.clients import (
 )
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate
-from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, Flusher
-from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions, LocalRunner
 from merge_runner.run.model_names import recorded_name, served_name
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress

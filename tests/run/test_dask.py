@@ -25,7 +25,7 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.run.cluster import Task, connected, fingerprint, play_task
-from merge_runner.run.first_decisions import FirstDecisions
+from merge_runner.run.local_runner import FirstDecisions
 from merge_runner.run.plan import Options, make_plan
 from tests.gate import HANGS_S, Gate
 from tests.harness import FAST, PROJECT, environment, watched
