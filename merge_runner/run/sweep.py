@@ -201,8 +201,13 @@ class Sweep:
         self._misses += [Miss(record.spec.trial_id, request) for request in missed]
 
     def _explain(self, outcome: Outcome) -> None:
-        for line in explain(self._misses, self._cache.entries()) if self._misses else ():
+        left_out: list[str] = []
+        for line in explain(self._misses, self._cache.entries(left_out)) if self._misses else ():
             outcome.fail(ReplayMiss.exit_code, line)
+        if left_out:
+            outcome.messages.append(
+                f"{len(left_out)} rows of the cache are left out, the first: {left_out[0]}"
+            )
 
     async def _begin(self, store: Store) -> str:
         started_at = datetime.now(UTC).replace(tzinfo=None)
