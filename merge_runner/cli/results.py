@@ -183,8 +183,8 @@ def models(as_json: cli.JsonOption = False) -> None:
     """List the models and programs that can drive."""
     from merge_runner.config import Price, key_status
     from merge_runner.drivers.registry import PROGRAMS
+    from merge_runner.llm.ledger import cost_usd
     from merge_runner.llm.models import load_models, shutdown_notes
-    from merge_runner.llm.prices import cost_usd
     from merge_runner.records import Usage
     from merge_runner.results.query_output import write_json, write_table
 

@@ -27,9 +27,8 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import RecordingError, SweepStopped, UsageError
 from merge_runner.llm.content_hashes import DAMAGED, check_body, check_call
+from merge_runner.llm.durable import BatchWriter, ModelLocks, Operation, ResultT, connect, making
 from merge_runner.llm.ledger import LedgerFile
-from merge_runner.llm.model_lock import ModelLocks
-from merge_runner.llm.sqlite_files import connect, making
 from merge_runner.llm.text_disk import (
     FILE,
     FORMAT,
@@ -39,7 +38,6 @@ from merge_runner.llm.text_disk import (
     open_texts,
     refuse_others,
 )
-from merge_runner.llm.write_batcher import BatchWriter, Operation, ResultT
 from merge_runner.records import Attempt, ChatRequest
 
 CHECKSUM_LENGTH = 32

@@ -47,9 +47,8 @@ from merge_runner.llm.http_outcome import (
     may_be_charged,
     why_refused,
 )
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger, cost_usd
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.prices import cost_usd
 from merge_runner.records import (
     SCRIPTED_HEADER,
     Attempt,

@@ -1,5 +1,7 @@
 """The money of sweeps: what attempts cost, and a reservation for each whose cost is not known.
 
+What tokens cost is told by the registry's figures, or by the table of genai-prices.
+
 Before each attempt at a paid call its worst case is reserved, in one transaction that sums what is
 spent and open. A process that dies leaves its reservations: each attempt counts with its worst case
 until a user releases it, and stands in the call's list of attempts with an unknown outcome.
@@ -12,21 +14,25 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from decimal import Decimal
 from functools import partial
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
+from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import UsageError
-from merge_runner.llm.sqlite_files import Connection, connect, making
-from merge_runner.llm.write_batcher import BatchWriter, Operation
-from merge_runner.records import Attempt
+from merge_runner.llm.durable import BatchWriter, Connection, Operation, connect, making
+from merge_runner.records import Attempt, Usage
 
 if TYPE_CHECKING:
     from merge_runner.llm.cache import ResponseCache
 
 FILE = "ledger.db"
 TOLERANCE_USD = 1e-9  # sums of floats
+# The provider names of genai-prices where they differ from ours.
+GENAI_PRICES_PROVIDER = {"gemini": "google"}
+PER_MILLION = Decimal(1_000_000)
 Rows = list[tuple[Any, ...]]
 # Sums of what is spent, since a sum over all attempts at each reservation would take ever longer.
 TABLES = """
@@ -64,6 +70,33 @@ _REASONS = """
 SELECT driver, outcome, count(*), sum(usd), min(since), max(since), min(slot) FROM open
 WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
 """
+
+
+def cost_usd(entry: ModelEntry, usage: Usage) -> float | None:
+    """Return the cost of an attempt in USD, None where the price or the tokens are unknown."""
+    price, read, written = entry.price, usage.input_tokens, usage.output_tokens
+    if price == "free":
+        return 0.0
+    if read is None or written is None:
+        return None
+    cached = usage.cached_input_tokens or 0
+    if cached > read:
+        cached = 0  # the server counts wrongly: none is taken for cheap
+    if isinstance(price, Price):
+        cached_price = price.input if price.cached_input is None else price.cached_input
+        parts = ((read - cached, price.input), (cached, cached_price), (written, price.output))
+        # Decimals of the written figures, so that sums of costs have no digits that nobody wrote.
+        return float(sum(n * Decimal(str(usd)) for n, usd in parts) / PER_MILLION)
+    from genai_prices import Usage as PricedUsage  # here, since it takes long to load
+    from genai_prices import calc_price
+
+    priced = PricedUsage(input_tokens=read, cache_read_tokens=cached, output_tokens=written)
+    provider = GENAI_PRICES_PROVIDER.get(entry.provider, entry.provider)
+    try:
+        found = calc_price(priced, model_ref=entry.id, provider_id=provider)
+    except LookupError:
+        return None
+    return float(found.total_price)
 
 
 @dataclass(frozen=True, slots=True)

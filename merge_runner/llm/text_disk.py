@@ -14,7 +14,7 @@ import diskcache
 from diskcache.core import METADATA, MODE_RAW, UNKNOWN
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.sqlite_files import BUSY_S, connect
+from merge_runner.llm.durable import BUSY_S, connect
 from merge_runner.text_safety import one_line
 
 FILE = "cache.db"

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import resource
 from collections.abc import Callable, Mapping
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
+from resource import RLIM_INFINITY, RLIMIT_NOFILE, getrlimit, setrlimit
 
 from merge_runner.config import (
     rehearsal_endpoint,
@@ -18,15 +18,13 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
-from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Ledger, cost_usd
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
-from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Usage
-from merge_runner.run.estimate import CallTotals, call_totals, trial_costs
+from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan
 from merge_runner.run.rehearsal import SPEED, behaviour
 
@@ -50,31 +48,10 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
     }
 
 
-class EarlierAnswers(dict[str, CallTotals]):
-    """Totals of each model's answers; a model whose endpoint has never answered is missing."""
-
-    def __missing__(self, name: str) -> CallTotals:
-        return CallTotals()
-
-
-def earlier_answers(plan: Plan, cache: ResponseCache) -> EarlierAnswers:
-    """Return what the cache knows of the models' answers to requests like those of a plan."""
-    totals = call_totals(cache.entries())
-    answered = {(model, endpoint) for model, endpoint, *_ in totals}
-    earlier = EarlierAnswers()
-    for name, entry in plan.entries.items():
-        place = entry.id, plan.endpoints[name]
-        if place in answered:
-            sent = FORMATS[entry.format].request(entry, "")
-            asked = *place, sent.path, canonical_json(sent.body)
-            earlier[name] = totals.get(asked, CallTotals())
-    return earlier
-
-
 def live_clients(
     plan: Plan,
     options: Options,
-    earlier: EarlierAnswers,
+    earlier: Mapping[str, Usage | None],
     cache: ResponseCache,
     ledger: Ledger,
     *,
@@ -104,7 +81,11 @@ def live_clients(
         ledger.read()  # raises where it is damaged, before anything is spent
     costs = trial_costs(plan, earlier, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
-    _allow_open_files(options.connections + SPARE_FILES)
+    # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.
+    wanted, (soft, hard) = options.connections + SPARE_FILES, getrlimit(RLIMIT_NOFILE)
+    with suppress(ValueError):  # more than this system allows
+        if wanted > soft != RLIM_INFINITY:
+            setrlimit(RLIMIT_NOFILE, (wanted, hard))
     env = {**os.environ, **(urls or {})}
     in_process = None
     if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
@@ -169,21 +150,15 @@ def open_rounds(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
 ) -> Rounds | None:
     """The rounds of a run; None where it submits none, and no earlier run has left a batch open."""
-    models = set(plan.registered.values())
-    rounds = Rounds(cache, models, submits=options.batch, say=say)
-    left = bool(rounds.batches)
-    if options.dask is not None:
-        if left:
-            raise UsageError(
-                "calls wait in batches of an earlier run: run the same command without --dask "
-                "until they have ended"
-            )
-        return None
-    if left and not options.batch:
+    rounds = Rounds(cache, {*plan.registered.values()}, submits=options.batch, say=say)
+    if options.dask is not None and rounds.batches:
+        raise UsageError(
+            "calls wait in batches of an earlier run: run the same command without --dask until "
+            "they have ended"
+        )
+    if rounds.batches and not options.batch:
         say("calls that wait in batches of an earlier run are not asked again")
-    if not options.batch and not left:
-        return None
-    return rounds
+    return rounds if rounds.batches or options.batch else None
 
 
 def check_batches(plan: Plan, options: Options) -> None:
@@ -198,17 +173,3 @@ def check_batches(plan: Plan, options: Options) -> None:
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         require_batch(plan.registered[name], entry, registry)
-
-
-def _allow_open_files(wanted: int) -> None:
-    """Raise this process's limit on open files to what the connections need."""
-    # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    try:
-        if wanted > soft != resource.RLIM_INFINITY:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-    except ValueError as exc:
-        raise UsageError(
-            f"{wanted} connections exceed this system's limit of {hard} open files: choose a lower "
-            "--in-flight or raise `ulimit -n`"
-        ) from exc

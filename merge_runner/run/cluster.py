@@ -23,6 +23,7 @@ from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
 from functools import cache
+from multiprocessing import resource_tracker
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -40,12 +41,11 @@ from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.client import Meter, Wait
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import Limiter
-from merge_runner.records import Attempt, TrialRecord, TrialSpec
+from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import in_use, plugin_sources, use
-from merge_runner.run.clients import EarlierAnswers, live_clients
+from merge_runner.run.clients import live_clients
 from merge_runner.run.estimate import trial_costs
-from merge_runner.run.first_decisions import FirstDecisions
-from merge_runner.run.local_runner import Ended, LocalRunner, Room
+from merge_runner.run.local_runner import Ended, FirstDecisions, LocalRunner, Room
 from merge_runner.run.plan import Options, Plan
 from merge_runner.study.parts import catalogue_of
 
@@ -64,8 +64,8 @@ _WHERE = re.compile(
     re.ASCII,
 )
 VALID = (
-    "valid: local:N (N workers on this machine), the address of a scheduler "
-    "(tcp://HOST:PORT, tls://HOST:PORT), or its scheduler file (PATH.json)"
+    "valid: local:N (N workers on this machine), a scheduler's tcp://HOST:PORT or tls://HOST:PORT, "
+    "or its file PATH.json"
 )
 
 
@@ -85,43 +85,32 @@ async def connected(where: str) -> AsyncIterator[Client]:
     async with AsyncExitStack() as stack:
         scheduler = {"scheduler_file" if named["file"] else "address": where}
         if named["workers"]:
-            scheduler = {"address": await _local_cluster(int(named["workers"]), stack)}
+            os.environ["PYTHONSAFEPATH"] = "1"  # workers import nothing of this folder
+            # A terminal's Ctrl-C reaches this process alone, which stops them in order: children
+            # inherit what is blocked. The tracker, if it were started meanwhile, would unblock it.
+            resource_tracker.ensure_running()
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
+            try:
+                local = distributed.LocalCluster(
+                    n_workers=int(named["workers"]),
+                    threads_per_worker=1,
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL,
+                    asynchronous=True,
+                )
+                cluster = await stack.enter_async_context(local)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            scheduler = {"address": str(cluster.scheduler_address)}
         client = distributed.Client(**scheduler, asynchronous=True, timeout=CONNECT_TIMEOUT_S)
         try:
             await client
         except (OSError, ValueError) as exc:
             raise UsageError(
-                f"no Dask scheduler answers at {where} within {CONNECT_TIMEOUT_S} s; start one "
-                f"with `dask scheduler`, or leave the address out: {VALID}"
+                f"no Dask scheduler answers at {where} within {CONNECT_TIMEOUT_S} s; {VALID}"
             ) from exc
         stack.push_async_callback(client.close, timeout=CONNECT_TIMEOUT_S)
         yield client
-
-
-async def _local_cluster(workers: int, stack: AsyncExitStack) -> str:
-    """Start worker processes, which end with ``stack``; return their scheduler's address."""
-    from multiprocessing import resource_tracker
-
-    from distributed import LocalCluster
-
-    os.environ["PYTHONSAFEPATH"] = "1"  # they import nothing of this folder
-    # A terminal's Ctrl-C reaches this process alone, which stops them in order: children inherit
-    # what is blocked. The tracker, if it were started meanwhile, would unblock it again.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
-    try:
-        cluster = await stack.enter_async_context(
-            LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,
-                dashboard_address=None,
-                silence_logs=logging.CRITICAL,
-                asynchronous=True,
-            )
-        )
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    return str(cluster.scheduler_address)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +126,7 @@ class Task:
     plan: Plan
     options: Options
     urls: Mapping[str, str]
-    earlier: EarlierAnswers
+    earlier: Mapping[str, Usage | None]
     share: float
     first: FirstDecisions
     recorded: Sequence[CachedCall]
@@ -244,7 +233,7 @@ class DaskTasks:
     _client: Client
     _plan: Plan
     _options: Options
-    _earlier: EarlierAnswers
+    _earlier: Mapping[str, Usage | None]
     _cache: ResponseCache
     _ledger: Ledger
     first: FirstDecisions

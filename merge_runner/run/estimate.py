@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+from statistics import fmean
 
 from merge_runner.config import ModelEntry, driver_name
 from merge_runner.llm.batch.providers import batch_terms
-from merge_runner.llm.cache import CachedCall
-from merge_runner.llm.content_hashes import without_prompt
-from merge_runner.llm.prices import cost_usd
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.content_hashes import canonical_json, without_prompt
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.ledger import cost_usd
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import Usage, is_scripted
 from merge_runner.run.plan import Options, Plan, most_prompts, usual_prompts
@@ -26,42 +28,34 @@ PROMPT_MARGIN = 1.25
 TRIAL_MARGIN = 1.5
 
 
-@dataclass(slots=True)
-class CallTotals:
-    """Sums over the answers that state their tokens and are the model's own, no mock model's.
+def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]:
+    """Return the mean tokens of the models' own answers to requests like those of a plan.
 
-    ``measured`` is their number; ``timed`` of them have a latency: a batch tells none.
+    None: the endpoint has answered, but no such request; a model whose endpoint has never answered
+    is missing. No mock model's answers count, and none that leaves its tokens out.
     """
-
-    measured: int = 0
-    input_tokens: int = 0
-    output_tokens: int = 0
-    timed: int = 0
-    latency_s: float = 0.0
-
-    @property
-    def mean(self) -> Usage | None:
-        """The tokens of an answer on average; None before any is measured."""
-        sums = (self.input_tokens, self.output_tokens)
-        read, written = (round(tokens / max(1, self.measured)) for tokens in sums)
-        return Usage(input_tokens=read, output_tokens=written) if self.measured else None
-
-
-def call_totals(entries: Iterable[CachedCall]) -> dict[tuple[str, str, str, str], CallTotals]:
-    """Return the totals by model, endpoint, path and the body without its prompt."""
-    totals: defaultdict[tuple[str, str, str, str], CallTotals] = defaultdict(CallTotals)
-    for entry in entries:
-        sent, last = entry.request, entry.attempts[-1]
-        each = totals[sent.model, sent.endpoint, sent.path, without_prompt(sent.body)]
+    like = {}
+    for name, entry in plan.entries.items():
+        sent = FORMATS[entry.format].request(entry, "")
+        like[name] = entry.id, plan.endpoints[name], sent.path, canonical_json(sent.body)
+    answers: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
+    for each in cache.entries():
+        request, last = each.request, each.attempts[-1]
+        asked = request.model, request.endpoint, request.path, without_prompt(request.body)
+        own = request.provider == "emulator" or not is_scripted(request, last)
         read, written = last.usage.input_tokens, last.usage.output_tokens
-        own = sent.provider == "emulator" or not is_scripted(sent, last)
-        if own and read is not None and written is not None:
-            each.measured += 1
-            each.input_tokens += read
-            each.output_tokens += written
-            each.timed += last.latency_s is not None
-            each.latency_s += last.latency_s or 0.0
-    return totals
+        for name in (name for name, wanted in like.items() if wanted[:2] == asked[:2]):
+            tokens = answers[name]
+            if like[name] == asked and own and read is not None and written is not None:
+                tokens.append((read, written))
+    return {name: _mean(tokens) for name, tokens in answers.items()}
+
+
+def _mean(tokens: Collection[tuple[int, int]]) -> Usage | None:
+    if not tokens:
+        return None
+    read, written = (round(fmean(column)) for column in zip(*tokens, strict=True))
+    return Usage(input_tokens=read, output_tokens=written)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +74,8 @@ class BatchEstimate:
 class Estimate:
     """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
 
-    ``measured`` lists the drivers whose tokens and latency are taken from their earlier answers.
-    ``batch`` is what the same takes in batches, where the run is to use them.
+    ``measured`` lists the drivers whose tokens are those of their earlier answers. ``batch`` is
+    what the same takes in batches, where the run is to use them.
     """
 
     driver: str
@@ -92,19 +86,42 @@ class Estimate:
     cost_usd: float | None
     minutes: float
     free: bool
-    measured: tuple[str, ...]
+    measured: list[str]
     batch: BatchEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Calls:
-    """The calls of a model that one arm lacks, each with its tokens and its latency in s."""
+    """The calls of a model in an arm: what each takes, as measured or as listed in the registry.
+
+    In batches a model costs ``price_factor`` of its price.
+    """
 
     model: str
     entry: ModelEntry
     number: int
     usage: Usage
-    latency_s: float
+    price_factor: float
+
+    @classmethod
+    def of(
+        cls, plan: Plan, arm: Arm, name: str, number: int, facts: Mapping[str, Usage | None]
+    ) -> _Calls:
+        """Return so many calls of a model."""
+        entry = arm.entries[name]
+        usage = facts.get(name) or Usage(
+            # English has about 4 bytes a token.
+            input_tokens=len(typical_prompt(plan, arm).encode()) // 4,
+            output_tokens=entry.typical_output_tokens,
+        )
+        terms = batch_terms(entry)
+        factor = terms.price_factor if terms else 1.0
+        return cls(plan.registered[name], entry, number, usage, factor)
+
+    def cost_usd(self, *, batch: bool = False) -> float | None:
+        """Return what they cost together; None where the price is unknown."""
+        usd = cost_usd(self.entry, self.usage)
+        return usd and usd * self.number * (self.price_factor if batch else 1.0)
 
     def limited_s(self, options: Options) -> float:
         """Return how long the limits stretch the calls, in s.
@@ -113,7 +130,7 @@ class _Calls:
         its actual tokens from then on.
         """
         rpm, tpm = options.rates(self.entry)
-        waiting = min(self.latency_s / 60, 1.0)
+        waiting = min(self.entry.typical_latency_s / 60, 1.0)
         written = waiting * self.entry.max_output_tokens
         written += (1 - waiting) * (self.usage.output_tokens or 0)
         tokens = (self.usage.input_tokens or 0) + written
@@ -128,7 +145,7 @@ def estimate(
     *,
     trials: int,
     calls: Mapping[str, Mapping[str, float]],
-    facts: Mapping[str, CallTotals],
+    facts: Mapping[str, Usage | None],
 ) -> Estimate:
     """Return the estimate for the ``trials`` that a live run of a plan has yet to play.
 
@@ -136,21 +153,28 @@ def estimate(
     knows about each model's earlier answers to similar requests at its endpoint.
     """
     todo = [
-        _calls(plan, arm, name, round(calls[label][name]), facts)
+        _Calls.of(plan, arm, name, round(calls[label][name]), facts)
         for label, arm in plan.by_label().items()
         for name in arm.entries
     ]
+
+    def together_usd(*, batch: bool = False) -> float | None:
+        costs = [each.cost_usd(batch=batch) for each in todo]
+        return None if None in costs else round(sum(filter(None, costs)), 2)
+
     batch = None
     if options.batch:
         batch = BatchEstimate(
-            _cost_usd(todo, batch=True),
+            together_usd(batch=True),
             rounds=max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0),
             most_rounds=max(map(most_prompts, plan.arms), default=0),
         )
     at_once, minutes = min(options.connections, 2 * max(trials, 1)), 0.0
     for model in {each.model for each in todo}:
         own = [each for each in todo if each.model == model]
-        in_turn_s = math.ceil(sum(each.number for each in own) / at_once) * own[0].latency_s
+        in_turn_s = (
+            math.ceil(sum(each.number for each in own) / at_once) * own[0].entry.typical_latency_s
+        )
         limited_s = sum(each.limited_s(options) for each in own)
         minutes = max(minutes, round(max(in_turn_s, limited_s) / 60, 1))
     return Estimate(
@@ -159,49 +183,16 @@ def estimate(
         calls=sum(each.number for each in todo),
         input_tokens=sum(each.number * (each.usage.input_tokens or 0) for each in todo),
         output_tokens=sum(each.number * (each.usage.output_tokens or 0) for each in todo),
-        cost_usd=_cost_usd(todo),
+        cost_usd=together_usd(),
         minutes=minutes,
         free=all(entry.price == "free" for entry in plan.entries.values()),
-        measured=tuple(
-            driver_name(name, plan.endpoints[name])
-            for name in plan.entries
-            if name in facts and facts[name].measured
-        ),
+        measured=[driver_name(n, plan.endpoints[n]) for n in plan.entries if facts.get(n)],
         batch=batch,
     )
 
 
-def _calls(plan: Plan, arm: Arm, name: str, number: int, facts: Mapping[str, CallTotals]) -> _Calls:
-    """Return the calls of a model in an arm, as measured or as listed in the registry."""
-    entry, known = arm.entries[name], facts.get(name, CallTotals())
-    usage = known.mean or Usage(
-        # English has about 4 bytes a token.
-        input_tokens=len(typical_prompt(plan, arm).encode()) // 4,
-        output_tokens=entry.typical_output_tokens,
-    )
-    latency_s = known.latency_s / known.timed if known.timed else entry.typical_latency_s
-    return _Calls(plan.registered[name], entry, number, usage, latency_s)
-
-
-def _cost_usd(calls: Iterable[_Calls], *, batch: bool = False) -> float | None:
-    """Return what calls cost together, to a cent; None where a price is unknown."""
-    sum_usd = 0.0
-    for each in calls:
-        usd = cost_usd(each.entry, each.usage)
-        if usd is None:
-            return None
-        sum_usd += each.number * usd * _part(each.entry, batch=batch)
-    return round(sum_usd, 2)
-
-
-def _part(entry: ModelEntry, *, batch: bool) -> float:
-    """Return the part of its price that a model costs, which is less than 1 in batches."""
-    terms = batch_terms(entry) if batch else None
-    return 1.0 if terms is None else terms.price_factor
-
-
 def trial_costs(
-    plan: Plan, facts: Mapping[str, CallTotals], *, batch: bool = False
+    plan: Plan, facts: Mapping[str, Usage | None], *, batch: bool = False
 ) -> Callable[[int], float]:
     """Return what tells by a trial's order the USD that it is expected to cost, perhaps in batches.
 
@@ -213,11 +204,12 @@ def trial_costs(
         # No tokeniser makes more tokens than bytes.
         read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
         for name in filter(arm.entries.get, arm.asked.values()):
-            entry, calls = arm.entries[name], _calls(plan, arm, name, 1, facts)
-            worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
-            usual_usd, worst_usd = (cost_usd(entry, each) or 0.0 for each in (calls.usage, worst))
-            usd = TRIAL_MARGIN * usual_prompts(arm) * usual_usd + worst_usd
-            by_arm[arm.label] += usd * _part(entry, batch=batch)
+            usual = _Calls.of(plan, arm, name, 1, facts)
+            most = Usage(input_tokens=read, output_tokens=usual.entry.max_output_tokens)
+            usual_usd, worst_usd = (
+                each.cost_usd(batch=batch) or 0.0 for each in (usual, replace(usual, usage=most))
+            )
+            by_arm[arm.label] += TRIAL_MARGIN * usual_prompts(arm) * usual_usd + worst_usd
     return {spec.order: by_arm[spec.arm] for spec in plan.trial_specs()}.__getitem__
 
 

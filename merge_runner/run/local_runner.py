@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import (
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Collection,
+    Iterable,
+    Mapping,
+    Sequence,
+)
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
 
 from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import ProviderDown, TrialSuspended
+from merge_runner.errors import NoValidDecision, ProviderDown, TrialSuspended
+from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient, Wait
-from merge_runner.records import SIDES, ChatReply, Slot, TrialRecord, TrialSpec
+from merge_runner.llm.http_outcome import REGISTRY
+from merge_runner.records import SIDES, ChatReply, Decision, Slot, TrialRecord, TrialSpec
 from merge_runner.run.clients import sealed_clients
-from merge_runner.run.first_decisions import FirstDecisions
 from merge_runner.run.plan import Plan
+from merge_runner.text_safety import one_line
 from merge_runner.trial import play_trial
 
 # Called with each trial that ends, or is suspended for lack of money.
@@ -28,16 +40,99 @@ Room = Callable[[], Awaitable[None]]
 FAILURES_IN_A_ROW = 10
 # Calls that begin in one round of the event loop, so that each round stays short.
 A_FEW = 16
+# After so many without a valid one a live run stops, before much is paid for what is no result.
+MOST_INVALID = 20
+SHOWN = 300
+ADVICE = (
+    "look at what the prompt asks for, and in which output format; some servers hold a small "
+    "model to it by a grammar"
+)
+
+
+class FirstDecisions:
+    """The decisions of each model until one is valid, of which so many may be invalid.
+
+    They are ``one_by_one`` where trials can wait for each other.
+    """
+
+    def __init__(self, most_invalid: float = math.inf, *, one_by_one: bool = False) -> None:
+        self._most_invalid = most_invalid
+        self._one_by_one = one_by_one
+        self._valid: set[str] = set()
+        self._invalid: Counter[str] = Counter()
+        self._described: dict[str, str] = {}
+        self._asked: set[str] = set()  # models that a trial asks alone
+        self._changed = asyncio.Event()
+
+    @asynccontextmanager
+    async def turn(self, models: Collection[str]) -> AsyncIterator[None]:
+        """Play a trial when its models have decided validly, or no other trial asks them."""
+        for model in models:
+            self._check(model)
+        alone = {*models} if self._one_by_one else set()
+        while alone & self._asked - self._valid:
+            self._changed.clear()
+            await self._changed.wait()
+        alone -= self._valid
+        self._asked |= alone
+        try:
+            yield
+        finally:
+            self._asked -= alone
+            self._changed.set()
+
+    def count(self, model: str, decision: Decision) -> None:
+        """Count a decision; raises NoValidDecision where too many are invalid."""
+        if model in self._valid:
+            return
+        text = decision.reply.text if decision.reply else ""
+        self.add(model, decision.valid, not decision.valid, decision.failure, text)
+        self._check(model)
+
+    def add(
+        self, model: str, valid: int, invalid: int, failure: str | None, text: str | None
+    ) -> None:
+        """Count so many decisions; ``failure`` and ``text`` are of an invalid one."""
+        if valid:
+            self._valid.add(model)
+            self._changed.set()
+        if invalid:
+            self._invalid[model] += invalid
+            shown, why = one_line(" ".join((text or "").split()))[:SHOWN], failure or ""
+            is_short = why in ("truncated", "empty")
+            advice = f"set a higher `max_output_tokens` in {REGISTRY}" if is_short else ADVICE
+            line = f'The first reply is "{shown}" ({why.replace("_", " ")}). To mend that {advice}'
+            self._described.setdefault(model, line)
+
+    def without_a_valid_one(self) -> list[str]:
+        """A line for each model none of whose decisions is valid."""
+        return [
+            f"none of the {number} decisions of {model} is valid. {self._described[model]}"
+            for model, number in sorted(self._invalid.items())
+            if model not in self._valid
+        ]
+
+    def _check(self, model: str) -> None:
+        if model not in self._valid and self._invalid[model] >= self._most_invalid:
+            raise NoValidDecision(
+                f"none of the first {self._invalid[model]} decisions of {model} is valid, and "
+                f"nothing else is asked. {self._described[model]}. What was answered is kept; "
+                "--keep-going goes on with such a model"
+            )
 
 
 @dataclass
 class LocalRunner:
-    """Plays at most ``in_flight`` trials at once, of which so many are ``running``."""
+    """Plays at most ``in_flight`` trials at once, of which so many are ``running``.
+
+    What they ask in ``rounds`` is submitted when none of them can go on.
+    """
 
     plan: Plan
     clients: Mapping[str, LlmClient]
     in_flight: int
     first: FirstDecisions = field(default_factory=FirstDecisions)
+    rounds: Rounds | None = None
     running: int = 0
     workers: None = None
     # The open questions of each trial that is running and has asked.
@@ -68,8 +163,7 @@ class LocalRunner:
         """What the calls wait for that are not in flight."""
         return [wait for client in self.clients.values() for wait in client.waits]
 
-    @property
-    def is_idle(self) -> bool:
+    def _is_idle(self) -> bool:
         """Whether no trial goes on by itself: all ask, and wait for the answers to others."""
         idle = sum(client.idle_askers for client in self.clients.values())
         asking = +self._asking  # without the trials that ask nothing now
@@ -101,8 +195,11 @@ class LocalRunner:
 
         try:
             async with asyncio.TaskGroup() as group:
-                for _ in range(self.in_flight):
-                    group.create_task(work())
+                playing = [group.create_task(work()) for _ in range(self.in_flight)]
+                if self.rounds is not None:
+                    watching = group.create_task(self.rounds.watch(self._is_idle))
+                    await asyncio.gather(*playing)
+                    watching.cancel()
         except BaseExceptionGroup as errors:  # the first one has cancelled the others
             raise errors.exceptions[0] from None
 

@@ -57,7 +57,7 @@ async def play(
     options = plan.within_budget(options)
     async with open_sweep(plan, options, say=say) as sweep:
         is_free = all(entry.price == "free" for entry in plan.entries.values())
-        if sweep.trials_to_play and not (options.replay or is_free):
+        if sweep.todo and not (options.replay or is_free):
             expected = await sweep.estimate()
             agree(expected)
         outcome = await sweep.run()
@@ -66,12 +66,14 @@ async def play(
 
 
 def _has_replies(folder: Path, plan: Plan) -> bool:
-    """Whether a cache holds replies of the plan's models."""
+    """Whether a cache holds replies of the plan's models, or any that cannot be read."""
     if not (folder / "cache.db").is_file():
         return False
     ids = {entry.id for entry in plan.entries.values()}
+    damaged: list[str] = []
     with closing(ResponseCache(folder, read_only=True)) as cache:
-        return any(True for _ in cache.recorded(lambda request: request.model in ids))
+        models = (entry.request.model for entry in cache.entries(damaged))
+        return not ids.isdisjoint(models) or bool(damaged)
 
 
 def _recorded(plan: Plan, recordings: Sequence[Path]) -> Plan:

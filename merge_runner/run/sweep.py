@@ -37,15 +37,13 @@ from merge_runner.results.recording import Spilled
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     check_batches,
-    earlier_answers,
     live_clients,
     open_rounds,
 )
 from merge_runner.run.cluster import DaskTasks, connected
-from merge_runner.run.estimate import Estimate, estimate
-from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
+from merge_runner.run.estimate import Estimate, earlier_answers, estimate
 from merge_runner.run.flusher import AGAIN, BATCH, Flusher
-from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions, LocalRunner
 from merge_runner.run.model_names import recorded_name, served_name
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, display_progress, publish_progress
@@ -106,16 +104,11 @@ class Sweep:
     _options: Options
     _cache: ResponseCache
     _stored: list[TrialSpec]
-    _todo: list[TrialSpec]
+    todo: list[TrialSpec]
     _say: Callable[[str], None]
     _ledger: Ledger
     _misses: list[Miss] = field(default_factory=list)
     _rounds: Rounds | None = None
-
-    @property
-    def trials_to_play(self) -> int:
-        """How many trials are not stored yet."""
-        return len(self._todo)
 
     async def run(self) -> Outcome:
         """Play what is missing and store it; what goes wrong is in the outcome."""
@@ -136,7 +129,7 @@ class Sweep:
             flusher = Flusher(store, outcome.sweep_id, self._say)
             progress = Progress(
                 plan=self._plan,
-                planned=len(self._stored) + len(self._todo),
+                planned=len(self._stored) + len(self.todo),
                 stored=len(self._stored),
                 runner=runner,
                 ledger=self._ledger,
@@ -176,7 +169,7 @@ class Sweep:
         arms = self._plan.by_label()
         calls = {label: dict.fromkeys(arm.entries, 0.0) for label, arm in arms.items()}
         runner = LocalRunner.sealed(self._plan, self._cache)
-        for spec in [*self._stored, *self._todo] if whole else self._todo:
+        for spec in [*self._stored, *self.todo] if whole else self.todo:
             arm = arms[spec.arm]
             record = await runner.play_one(spec) if arm.entries and not whole else None
             if record is not None and record.status != "failed":
@@ -197,7 +190,7 @@ class Sweep:
     async def _nothing_is_recorded(self) -> bool:
         """Whether all calls are missing, of which the first of each trial are noted."""
         runner = LocalRunner.sealed(self._plan, self._cache)
-        for spec in self._todo:
+        for spec in self.todo:
             self._note_misses(await runner.play_one(spec))
             if any(meter.calls_cached for meter in runner.meters.values()):
                 return False
@@ -208,8 +201,13 @@ class Sweep:
         self._misses += [Miss(record.spec.trial_id, request) for request in missed]
 
     def _explain(self, outcome: Outcome) -> None:
-        for line in explain(self._misses, self._cache.entries()) if self._misses else ():
+        left_out: list[str] = []
+        for line in explain(self._misses, self._cache.entries(left_out)) if self._misses else ():
             outcome.fail(ReplayMiss.exit_code, line)
+        if left_out:
+            outcome.messages.append(
+                f"{len(left_out)} rows of the cache are left out, the first: {left_out[0]}"
+            )
 
     async def _begin(self, store: Store) -> str:
         started_at = datetime.now(UTC).replace(tzinfo=None)
@@ -253,8 +251,8 @@ class Sweep:
         if rounds is not None:
             stack.push_async_callback(rounds.close)
         # A trial that waits for a round takes up nobody's time.
-        in_flight = len(self._todo) if options.batch else options.in_flight
-        return LocalRunner(plan, clients, in_flight, first)
+        in_flight = len(self.todo) if options.batch else options.in_flight
+        return LocalRunner(plan, clients, in_flight, first, rounds)
 
     async def _play(
         self,
@@ -279,17 +277,9 @@ class Sweep:
             await asyncio.wait([work])
             await runner.drain()
 
-        async def watched() -> None:
-            if self._rounds is None or not isinstance(runner, LocalRunner):
-                await asyncio.Event().wait()
-            else:
-                await self._rounds.watch(lambda: runner.is_idle)
-
         # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
-        work = asyncio.create_task(runner.play(self._todo, ended, room=flusher.room))
+        work = asyncio.create_task(runner.play(self.todo, ended, room=flusher.room))
         drain = asyncio.create_task(drained())
-        watching = asyncio.create_task(watched())
-        watching.add_done_callback(lambda _: work.cancel())  # nobody would close a round
 
         def interrupted() -> None:
             work.cancel()  # before anything is written: the terminal may be closed
@@ -298,10 +288,6 @@ class Sweep:
         with on_interrupt(interrupted, drain.cancel):
             await asyncio.wait([drain])
             await asyncio.wait([work])
-        watching.cancel()
-        await asyncio.wait([watching])
-        if not watching.cancelled():
-            watching.result()
         if work.cancelled():
             outcome.fail(INTERRUPTED, f"Interrupted. {GO_ON}")
         else:
@@ -354,11 +340,8 @@ class Sweep:
             ledgers = (Ledger(self._cache, scope) for scope in scopes(self._cache))
             outcome.cache_cost_usd = sum(ledger.read().spent_usd for ledger in ledgers)
             outcome.spending = self._ledger.read()
-        except MergeRunnerError as exc:
-            if self._options.replay:  # which spends nothing
-                outcome.messages.append(str(exc))
-            else:
-                outcome.fail_by(exc)
+        except MergeRunnerError as exc:  # a run that spends has been refused for that already
+            outcome.messages.append(str(exc))
 
     def _check(self, store: Store, first: FirstDecisions, outcome: Outcome) -> None:
         """Read back what the database holds of the sweep, audit it, and note how it ended."""
@@ -425,19 +408,13 @@ async def _named(
 
 
 def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
-    """The endpoint's identity: in a replay, the one under which the model is recorded."""
-    entry, configured = plan.entries[name], plan.endpoints[name]
-    if not options.replay:
-        return configured
-    recorded = sorted({r.endpoint for r in cache.recorded(lambda r: r.model == entry.id)})
-    if configured in recorded or not recorded:
-        return configured
-    if len(recorded) > 1:
-        raise UsageError(
-            f"replies of {name} are recorded from several endpoints: {', '.join(recorded)}. "
-            "Set the base URL variable of its provider to the one to replay."
-        )
-    return recorded[0]
+    """The endpoint's identity: in a replay, the only one under which the model is recorded."""
+    if options.replay:
+        model = plan.entries[name].id
+        recorded = {request.endpoint for request in cache.recorded(lambda r: r.model == model)}
+        if len(recorded) == 1:
+            return recorded.pop()
+    return plan.endpoints[name]
 
 
 def _less_what_is_spent(

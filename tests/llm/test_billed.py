@@ -26,9 +26,8 @@ from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import FirstCall
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Ledger, cost_usd
 from merge_runner.llm.limiter import Limiter
-from merge_runner.llm.prices import cost_usd
 from merge_runner.records import Slot, Usage
 from tests.emulator.scenarios import SCENARIOS
 from tests.emulator.scenarios.playing import ScenarioPlan, playing

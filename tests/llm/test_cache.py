@@ -21,7 +21,6 @@ from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.text_disk import TextDisk
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage
-from merge_runner.run.estimate import call_totals
 
 
 def entry(number=0, *, model="m", endpoint="openai", reply="{}", **attempt):
@@ -382,49 +381,6 @@ def test_a_folder_of_another_format_is_refused_and_left_alone(
     with pytest.raises(UsageError, match=told):
         ResponseCache(folder, read_only=read_only)
     assert (folder / "cache.db").read_bytes() == before
-
-
-def told(number, *, model="m", endpoint="openai", effort="low", **attempt):
-    """An entry of an answer of 10 tokens to a real request."""
-    prompt = f"What do you do in situation {number}?"
-    request = make_request(
-        provider="openai",
-        endpoint=endpoint,
-        model=model,
-        path="/chat/completions",
-        headers={},
-        body={"model": model, "reasoning_effort": effort, "messages": [{"content": prompt}]},
-        slot=Slot("A1", 1, "left", number, 0),
-    )
-    usage = Usage(input_tokens=100, output_tokens=10)
-    return CachedCall(request, (Attempt(1, "ok", 200, usage=usage, reply="{}", **attempt),))
-
-
-def test_a_line_of_a_batch_tells_its_tokens_and_no_latency():
-    lines = [told(number, latency_s=latency) for number, latency in enumerate((None, 20.0, None))]
-    (totals,) = call_totals(lines).values()
-    assert (totals.measured, totals.timed, totals.latency_s) == (3, 1, 20.0)
-
-
-def test_what_is_measured_is_of_one_endpoint_and_one_way_to_ask(cache):
-    cache.put_now(
-        [
-            *(told(number) for number in range(3)),
-            told(1, effort="high"),
-            told(1, endpoint="http://localhost:8080"),
-            told(7, scripted=True),
-            told(1, model="n"),
-        ]
-    )
-    empty = '{"messages":[{"content":""}],"model":"m","reasoning_effort":"%s"}'
-    low, high = (("/chat/completions", empty % effort) for effort in ("low", "high"))
-    totals = call_totals(cache.entries())
-    of_low = totals["m", "openai", *low]
-    assert (of_low.measured, of_low.output_tokens) == (3, 30)
-    assert totals["m", "openai", *high].measured == 1
-    assert totals["m", "http://localhost:8080", *low].measured == 1
-    assert ("m", "openai", "/responses", empty % "low") not in totals
-    assert endpoints(cache, "m") == ["http://localhost:8080", "openai"]
 
 
 # What SQL can make of a row, and what each says of it.

@@ -2,7 +2,7 @@ import pytest
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.prices import cost_usd
+from merge_runner.llm.ledger import cost_usd
 from merge_runner.records import Usage
 
 PRICE = Price(input=2.0, cached_input=0.5, output=8.0, source="contract")

@@ -8,7 +8,7 @@ import json
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.llm.model_lock import ModelLocks
+from merge_runner.llm.durable import ModelLocks
 from tests.harness import FAST, watched
 from tests.mock_server import FaultPlan
 

@@ -24,9 +24,8 @@ from aiohttp import web
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.run.clients import EarlierAnswers
 from merge_runner.run.cluster import Task, connected, fingerprint, play_task
-from merge_runner.run.first_decisions import FirstDecisions
+from merge_runner.run.local_runner import FirstDecisions
 from merge_runner.run.plan import Options, make_plan
 from tests.gate import HANGS_S, Gate
 from tests.harness import FAST, PROJECT, environment, watched
@@ -109,7 +108,7 @@ async def test_tokens_of_a_workers_tasks_count_together_in_its_share(tmp_path):
     for specs in (plan.trial_specs(), [replace(spec, repetition=2) for spec in plan.trial_specs()]):
         task = Task(
             run="run", name="task", specs=specs, plan=plan, options=options,
-            urls={}, earlier=EarlierAnswers(),
+            urls={}, earlier={},
             share=0.5, first=FirstDecisions(), recorded=(), unanswered={}, overruns=(),
         )  # fmt: skip
         played = await play_task(fingerprint(), pickle.dumps(task), dask_worker=worker)

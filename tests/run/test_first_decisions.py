@@ -6,7 +6,7 @@ import pytest
 
 from merge_runner.errors import NoValidDecision
 from merge_runner.records import Decision
-from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
+from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions
 from tests.harness import watched
 from tests.mock_server import FaultPlan
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.run.estimate import CallTotals, estimate
+from merge_runner.records import Usage
+from merge_runner.run.estimate import estimate
 from merge_runner.run.plan import PROGRAMS, Options, make_plan
 
 
@@ -146,7 +147,7 @@ def test_the_estimate_takes_the_limits_into_account(limited, minutes):
         Options(Path("m.duckdb"), Path("responses"), **limited),
         trials=plan.trials,
         calls={"baseline": {"o3": plan.trials * 21}},
-        facts={"o3": CallTotals()},
+        facts={},
     )
     assert expected.minutes == pytest.approx(minutes, rel=0.08)
     assert expected.calls == 2310
@@ -162,7 +163,7 @@ def test_the_estimate_is_by_what_was_measured():
         options,
         trials=40,
         calls={"baseline": {"o3": 210.0}, "A1": {"o3": 630.0}},
-        facts={"o3": CallTotals(10, 5_000, 15_000)},
+        facts={"o3": Usage(input_tokens=500, output_tokens=1_500)},
     )
     each = (500 * 2 + 1500 * 8) / 1e6
     assert (expected.trials, expected.calls) == (40, 840)

@@ -1,0 +1,140 @@
+"""What makes a cache folder safe: SQLite files, batches of durable writes, and locks.
+
+A durable write waits some milliseconds for the disk however little it writes, so that one for each
+reply would bound a sweep to a few hundred calls a second: what gathers during one transaction goes
+together into the next. A lock is one on an open file, and the kernel frees it when its holder dies:
+none is ever left behind, as a file or a row would be.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import re
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from threading import Lock
+from typing import Any, TypeVar
+
+from merge_runner.errors import UsageError
+
+BUSY_S = 600.0  # another process may be writing long replies to a slow disk
+# Live runs share it, and who releases what is set aside holds it alone.
+LIVE = "live.lock"
+ResultT = TypeVar("ResultT")
+Operation = Callable[[], Any]
+
+
+@contextlib.contextmanager
+def making(folder: Path) -> Iterator[None]:
+    """Keep other processes from making a file in a folder; its name is durable afterwards."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class Connection(sqlite3.Connection):
+    """A connection for all threads; ``rows`` runs one query at a time.
+
+    Threads share prepared statements, and one could read the row that another has asked for.
+    """
+
+    def __init__(self, uri: str) -> None:
+        super().__init__(
+            uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
+        )
+        self._one_at_a_time = Lock()
+
+    def rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
+        """Return the rows of a query."""
+        with self._one_at_a_time:
+            return self.execute(sql, values).fetchall()
+
+
+def connect(file: Path, mode: str = "ro") -> Connection:
+    """Return a connection of our own to an SQLite file; ``mode`` is SQLite's."""
+    return Connection(f"{file.absolute().as_uri()}?mode={mode}")
+
+
+class BatchWriter:
+    """Hands operations to ``run`` in batches, in a thread, one batch at a time."""
+
+    def __init__(self, run: Callable[[list[Operation]], list[Any]]) -> None:
+        self._run = run
+        self._pending: list[Operation] = []
+        self._next_batch: asyncio.Task[list[Any]] | None = None
+        self._one_batch_at_a_time = asyncio.Lock()
+
+    async def write(self, operation: Callable[[], ResultT]) -> ResultT:
+        """Run an operation in the next batch; returns its result once the batch is durable."""
+        # Whoever comes first begins a batch; all who come until its writing begins join it.
+        if self._next_batch is None:
+            self._next_batch = asyncio.create_task(self._write_batch())
+        batch, place = self._next_batch, len(self._pending)
+        self._pending.append(operation)
+        # Shielded: if one gives up waiting, the writes of the others go on.
+        result: ResultT = (await asyncio.shield(batch))[place]
+        return result
+
+    async def _write_batch(self) -> list[Any]:
+        """Write all that has gathered while the previous batch was written."""
+        async with self._one_batch_at_a_time:
+            operations, self._pending, self._next_batch = self._pending, [], None
+            # In a thread, since the event loop must not wait for a disk.
+            return await asyncio.to_thread(self._run, operations)
+
+
+class ModelLocks:
+    """The locks that this run holds on a folder; ``close`` frees them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._files: list[int] = []
+
+    def take(self, models: Iterable[str]) -> None:
+        """Lock models for a live run; raises UsageError where another run asks one of them."""
+        self._lock(LIVE, fcntl.LOCK_SH)
+        for model in sorted(models):
+            name = re.sub(r"[^\w. -]", "_", model)[:200] + ".lock"
+            if not self._lock(name, fcntl.LOCK_EX | fcntl.LOCK_NB):
+                holder = (self._folder / name).read_text(errors="replace")
+                self.close()
+                raise UsageError(
+                    f"another merge-runner ({holder}) asks {model} with the cache {self._folder}: "
+                    "wait until it has ended, or name another folder with --cache; `merge-runner "
+                    "sweep A B` plays several sweeps one after the other"
+                )
+            os.ftruncate(self._files[-1], 0)
+            os.write(self._files[-1], f"PID {os.getpid()} on {os.uname().nodename}".encode())
+
+    def take_all(self) -> bool:
+        """Keep live runs from beginning; False while there is any."""
+        return self._lock(LIVE, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def close(self) -> None:
+        """Free all locks."""
+        while self._files:
+            os.close(self._files.pop())
+
+    def _lock(self, name: str, how: int) -> bool:
+        try:
+            file = os.open(self._folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            self._files.append(file)
+            fcntl.flock(file, how)
+        except BlockingIOError:
+            os.close(self._files.pop())
+            return False
+        except OSError as exc:
+            self.close()
+            raise UsageError(
+                f"the cache {self._folder} cannot be shared safely: {name} cannot be locked "
+                f"({exc.strerror}). Name a folder on a local disk with --cache"
+            ) from exc
+        return True
