@@ -6,13 +6,12 @@ from collections.abc import Mapping
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.records import SIDES, Observation, Side, StateRow, Status
+from merge_runner.records import SIDES, Observation, Side, StateRow, Status, other_side
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import Condition
 from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration, time_to_reach
 
-OTHER: dict[Side, Side] = {"left": "right", "right": "left"}
 Starts = Mapping[Side, tuple[float, float]]
 """Travelled distance in m and speed in m/s by side."""
 
@@ -87,7 +86,7 @@ class World:
 
     def observe(self, side: Side) -> Observation:
         """What the driver of ``side`` sees now, itself as ego."""
-        other = OTHER[side]
+        other = other_side(side)
         position = self._positions[side][-1]
         farthest_back = (
             position
