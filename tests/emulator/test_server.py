@@ -12,7 +12,7 @@ from merge_runner.emulator.server import run
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import read_error
-from merge_runner.llm.formats.delays import server_delay_s
+from merge_runner.llm.http_outcome import server_delay_s
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import ANSWERED_FIELD, SCRIPTED_FIELD, SCRIPTED_HEADER
 from tests.mock_server import FaultPlan, serve
