@@ -562,8 +562,6 @@ def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file as a dict; raises UsageError."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UsageError(f"{path} does not exist") from None
     except OSError as exc:
         raise UsageError(f"{path} cannot be read: {exc.strerror}") from exc
     except (ValueError, RecursionError) as exc:  # also a number of thousands of digits

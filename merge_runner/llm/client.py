@@ -255,9 +255,8 @@ class LlmClient:
         served = reply.attempts[-1].model_served
         if self.strict and served not in self._own_names:
             raise ModelSwapped(
-                f"{self.driver}: {served} answered where {self.entry.id} was asked for, at {slot}; "
-                "the reply is kept. To go on with it, leave --strict-model out, or name it in "
-                "`aliases` in experiments/models.toml"
+                f"{self.driver}: {served} answered where {self.entry.id} was asked for, at {slot}: "
+                "leave --strict-model out, or name it in `aliases` in experiments/models.toml"
             )
         return reply
 
@@ -395,8 +394,8 @@ class LlmClient:
             if self.first.passed:
                 raise self._failed(call, str(exc)) from exc
             raise ProviderDown(
-                f"{self.driver}: the first call of this run: {exc} ({call.last_failure}): nothing "
-                "else is asked. When the service answers again, run the same command"
+                f"{self.driver}: the first call of this run: {exc} ({call.last_failure}): run the "
+                "same command when the service answers again"
             ) from exc
 
     def _failed(self, call: Call, why: str) -> CallFailed:
@@ -508,8 +507,7 @@ class LlmClient:
         else:
             return None
         return QuotaExhausted(
-            f"{self.driver}: {why} ({outcome.message}). Every reply so far is saved; run the same "
-            "command later to go on."
+            f"{self.driver}: {why} ({outcome.message}): run the same command later to go on"
         )
 
     def _record(self, call: Call, outcome: AttemptOutcome) -> Attempt:
