@@ -136,13 +136,6 @@ class Call:
         finally:
             self.wait = None
 
-    def stop(self) -> None:
-        """Give the call up: at once if it waits, otherwise as soon as it would wait again."""
-        self.stopping = True
-        # What is in flight may be charged whether or not anybody takes the answer: it goes on.
-        if self.wait is not None:
-            self.task.cancel()
-
 
 @dataclass(slots=True)
 class Meter:
@@ -185,8 +178,7 @@ class LlmClient:
     that nothing may be asked anew, so that there is no ``transport``; ``strict`` that an answer of
     another model stops the sweep. In ``rounds``, which know it as ``model``, its name in the
     registry, it may be asked at ``batch_price`` as a share of the plain one, or its calls may wait
-    already. ``driver`` is its name, with the endpoint where
-    that is not the provider's own.
+    already. ``driver`` is its name, with the endpoint where that is not the provider's own.
 
     ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
     its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
@@ -265,7 +257,10 @@ class LlmClient:
         self._stopping = True
         calls = self._calls
         for call in calls:
-            call.stop()
+            call.stopping = True
+            # What is in flight may be charged whether or not anybody takes the answer: it goes on.
+            if call.wait is not None:
+                call.task.cancel()
         await asyncio.gather(*(call.task for call in calls), return_exceptions=True)
 
     @property

@@ -382,8 +382,7 @@ def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | 
     elif raw is None or outcome.of_prompt:
         return None
     elif outcome.action == "refused" and outcome.name == "not_allowed":
-        key_envs = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
-        key = " or ".join(key_envs) or f"`key_env` of {place}"
+        key = " or ".join(entry.key_envs) or f"`key_env` of {place}"
         why = f"the endpoint does not accept the key; set {key} to a valid one"
     elif outcome.action == "refused":
         model = f"the endpoint has no model {entry.id!r}"
