@@ -275,6 +275,11 @@ class ModelEntry(Frozen):
     typical_latency_s: Positive = 10.0
     note: str = ""
 
+    @property
+    def key_envs(self) -> tuple[str, ...]:
+        """The variables that may hold the key, the first one first; raises UsageError."""
+        return (self.key_env,) if self.key_env else PROVIDERS.require(self.provider).key_envs
+
 
 @dataclass(frozen=True, slots=True)
 class Provider:
@@ -379,19 +384,14 @@ class Endpoint:
         return self.provider == "emulator" or self.identity == REHEARSAL
 
 
-def _key_envs(entry: ModelEntry) -> tuple[str, ...]:
-    """Return the variables that may hold the key of a model, the first one first."""
-    return (entry.key_env,) if entry.key_env else PROVIDERS.require(entry.provider).key_envs
-
-
 def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.environ) -> Endpoint:
     """The endpoint of a model, from its entry and the environment.
 
     Raises UsageError where a key is needed and none is set, or where one cannot be sent.
     """
     provider = PROVIDERS.require(entry.provider)
-    variables = " or ".join(_key_envs(entry))
-    key = next(filter(None, map(env.get, _key_envs(entry))), "")
+    variables = " or ".join(entry.key_envs)
+    key = next(filter(None, map(env.get, entry.key_envs)), "")
     if not key and provider.key_needed:
         raise UsageError(
             f"{name} needs a key: set {variables}. Without one: `merge-runner sweep baseline` runs "
@@ -491,7 +491,7 @@ def key_status(
     """Whether the environment holds the key that a live run of the model needs."""
     if not PROVIDERS.require(entry.provider).key_needed:
         return "not needed"
-    return "set" if any(map(env.get, _key_envs(entry))) else "missing"
+    return "set" if any(map(env.get, entry.key_envs)) else "missing"
 
 
 def normalised_url(url: str, named: str = "base_url") -> str:
@@ -562,8 +562,6 @@ def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file as a dict; raises UsageError."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UsageError(f"{path} does not exist") from None
     except OSError as exc:
         raise UsageError(f"{path} cannot be read: {exc.strerror}") from exc
     except (ValueError, RecursionError) as exc:  # also a number of thousands of digits

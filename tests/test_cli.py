@@ -163,7 +163,7 @@ async def test_a_mistyped_name_is_answered_with_the_nearest(merge_runner):
         (["sweep", "baseline", "--reps", "x"], "--reps"),
         (["sweep", "baseline", "--reps", "0"], "--reps is a whole number from 1"),
         (["sweep", "nope"], "valid: ablations, baseline"),
-        (["sweep", "none.toml"], "none.toml does not exist"),
+        (["sweep", "none.toml"], "none.toml cannot be read: No such file"),
         (["sweep", "baseline", "--model", "gpt9"], "valid: emulator, random, o3"),
         (["sweep", "baseline", "--model", "o3+gpt9"], "unknown model 'gpt9'"),
         (["sweep", "baseline", "--conditions", "X"], "valid: R_-4_-8"),

@@ -342,5 +342,5 @@ def test_a_registry_that_is_wrong_is_one_line_that_says_where(tmp_path, text, na
 
 
 def test_a_registry_that_is_missing_is_an_error(tmp_path):
-    with pytest.raises(UsageError, match="does not exist"):
+    with pytest.raises(UsageError, match="cannot be read: No such file"):
         read_models(tmp_path / "models.toml")

@@ -134,13 +134,6 @@ class Call:
         finally:
             self.wait = None
 
-    def stop(self) -> None:
-        """Give the call up: at once if it waits, otherwise as soon as it would wait again."""
-        self.stopping = True
-        # What is in flight may be charged whether or not anybody takes the answer: it goes on.
-        if self.wait is not None:
-            self.task.cancel()
-
 
 @dataclass(slots=True)
 class Meter:
@@ -183,8 +176,7 @@ class LlmClient:
     that nothing may be asked anew, so that there is no ``transport``; ``strict`` that an answer of
     another model stops the sweep. In ``rounds``, which know it as ``model``, its name in the
     registry, it may be asked at ``batch_price`` as a share of the plain one, or its calls may wait
-    already. ``driver`` is its name, with the endpoint where
-    that is not the provider's own.
+    already. ``driver`` is its name, with the endpoint where that is not the provider's own.
 
     ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
     its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
@@ -253,9 +245,8 @@ class LlmClient:
         served = reply.attempts[-1].model_served
         if self.strict and served not in self._own_names:
             raise SweepStopped(
-                f"{self.driver}: {served} answered where {self.entry.id} was asked for, at {slot}; "
-                "the reply is kept. To go on with it, leave --strict-model out, or name it in "
-                "`aliases` in experiments/models.toml"
+                f"{self.driver}: {served} answered where {self.entry.id} was asked for, at {slot}: "
+                "leave --strict-model out, or name it in `aliases` in experiments/models.toml"
             )
         return reply
 
@@ -264,7 +255,10 @@ class LlmClient:
         self._stopping = True
         calls = self._calls
         for call in calls:
-            call.stop()
+            call.stopping = True
+            # What is in flight may be charged whether or not anybody takes the answer: it goes on.
+            if call.wait is not None:
+                call.task.cancel()
         await asyncio.gather(*(call.task for call in calls), return_exceptions=True)
 
     @property
@@ -393,8 +387,8 @@ class LlmClient:
             if self.first.passed:
                 raise self._failed(call, str(exc)) from exc
             raise ProviderDown(
-                f"{self.driver}: the first call of this run: {exc} ({call.last_failure}): nothing "
-                "else is asked. When the service answers again, run the same command"
+                f"{self.driver}: the first call of this run: {exc} ({call.last_failure}): run the "
+                "same command when the service answers again"
             ) from exc
 
     def _failed(self, call: Call, why: str) -> CallFailed:
@@ -506,8 +500,7 @@ class LlmClient:
         else:
             return None
         return QuotaExhausted(
-            f"{self.driver}: {why} ({outcome.message}). Every reply so far is saved; run the same "
-            "command later to go on."
+            f"{self.driver}: {why} ({outcome.message}): run the same command later to go on"
         )
 
     def _record(self, call: Call, outcome: AttemptOutcome) -> Attempt:

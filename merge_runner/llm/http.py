@@ -99,7 +99,6 @@ class HttpTransport:
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}
         self._mask = Mask(secret for secret in secrets if len(secret) >= SHORTEST_SECRET)
-        self._tells_slot = endpoint.is_emulator
         self.doubted = False
         self._answers_named = False
         # Each id is a UUID, as some servers demand (llama-cpp-python): a random part, this
@@ -116,7 +115,7 @@ class HttpTransport:
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Post the hashed bytes; raises TransportFailure."""
         headers = request.headers
-        if self._tells_slot:
+        if self._endpoint.is_emulator:
             slot = canonical_json(request.slot.as_dict())
             headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
         body = request.body.encode()

@@ -63,12 +63,8 @@ ACTIONS: dict[str, Action] = {
     "quota_exhausted": "quota",
     "not_allowed": "refused",
     "unknown_model": "refused",
-    "rate_limited": "retry",
-    "request_timeout": "retry",
-    "conflict": "retry",
-    "server_error": "retry",
-    "overloaded": "retry",
-    "server_timeout": "retry",
+    **dict.fromkeys(("rate_limited", "request_timeout", "conflict"), "retry"),
+    **dict.fromkeys(("server_error", "overloaded", "server_timeout"), "retry"),
 }
 
 # The seconds of a unit by its first letter; milliseconds apart.
@@ -211,11 +207,6 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
     told = filter(None, (each.meaning(error) for each in (wire, *PASSED_ON)))
     name = next(told, None) or STATUSES.get(error.status, "bad_request")
     action = ACTIONS.get(name, "fail")
-    wish = error.headers.get("x-should-retry")
-    if wish == "true" and action in ("fail", "refused") and name != "request_too_large":
-        action, name = "retry", f"http_{error.status}"
-    elif wish == "false" and action == "retry":
-        action = "fail"
     of_prompt = name == "bad_prompt"
     return AttemptOutcome(
         action,
@@ -391,8 +382,7 @@ def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | 
     elif raw is None or outcome.of_prompt:
         return None
     elif outcome.action == "refused" and outcome.name == "not_allowed":
-        key_envs = (entry.key_env,) if entry.key_env else PROVIDERS[entry.provider].key_envs
-        key = " or ".join(key_envs) or f"`key_env` of {place}"
+        key = " or ".join(entry.key_envs) or f"`key_env` of {place}"
         why = f"the endpoint does not accept the key; set {key} to a valid one"
     elif outcome.action == "refused":
         model = f"the endpoint has no model {entry.id!r}"

@@ -205,7 +205,7 @@ def test_a_sweep_that_is_wrong(program, tmp_path, content, says):
         (["../mine"], "unknown sweep '../mine'; valid: ablations, baseline, mine"),
         (["a\nb\x1b"], "unknown sweep 'a\\nb\\x1b'; valid: ablations"),
         (["x" * 5000], "valid: ablations"),
-        (["nowhere.toml"], "nowhere.toml does not exist"),
+        (["nowhere.toml"], "nowhere.toml cannot be read: No such file"),
         (["folder.toml"], "folder.toml cannot be read: Is a directory"),
         (["mine", "--model", "gpt9"], "unknown model 'gpt9'; valid: emulator, random, o3, "),
         (["mine", "--model", "m+gpt9"], "unknown model 'gpt9'; valid: emulator, random, o3, "),
