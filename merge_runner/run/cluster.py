@@ -138,8 +138,7 @@ class Task:
 class Played:
     """What a worker returns: ``spent`` and ``opened`` are rows of its ledger."""
 
-    records: list[TrialRecord] = field(default_factory=list)
-    suspended: list[tuple[TrialSpec, str]] = field(default_factory=list)
+    ended: list[tuple[TrialSpec, TrialRecord | TrialSuspended]] = field(default_factory=list)
     replies: list[CachedCall] = field(default_factory=list)
     unanswered: dict[str, tuple[Attempt, ...]] = field(default_factory=dict)
     spent: Rows = field(default_factory=list)
@@ -188,9 +187,8 @@ async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Pla
 
     def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
         if isinstance(record, TrialSuspended):
-            played.suspended.append((spec, str(record)))
-        else:
-            played.records.append(record)
+            record = TrialSuspended(str(record))  # without its frames, which no pickle can hold
+        played.ended.append((spec, record))
 
     async with AsyncExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
@@ -215,7 +213,7 @@ async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Pla
             if not work.cancelled():
                 work.result()
         except MergeRunnerError as exc:
-            played.error = type(exc)(str(exc))  # without its frames, which no pickle can hold
+            played.error = type(exc)(str(exc))
         known = {call.request.key for call in task.recorded}
         played.replies = [call for call in replies.entries() if call.request.key not in known]
         played.unanswered = replies.all_unanswered()
@@ -379,18 +377,17 @@ class DaskTasks:
         for model, meter in played.meters.items():
             self.meters[model].add(meter)
         arms = self._plan.by_label()
-        for record in played.records:
-            self._ended(record.spec, record)
-            asked = arms[record.spec.arm].asked
-            for row in record.decisions:
-                if asked[row.side] in self._plan.entries:
-                    self.first.count(asked[row.side], row.decision)
-        for spec, why in played.suspended:
-            if task.share == 1:
-                self._ended(spec, TrialSuspended(why))
-            else:  # all the money that is left goes to one task at a time
+        for spec, record in played.ended:
+            if isinstance(record, TrialSuspended) and task.share < 1:
+                # All the money that is left goes to one task at a time.
                 self._one_by_one = True
                 self._groups.appendleft([spec])
+                continue
+            self._ended(spec, record)
+            asked = arms[spec.arm].asked
+            for row in record.decisions if isinstance(record, TrialRecord) else ():
+                if asked[row.side] in self._plan.entries:
+                    self.first.count(asked[row.side], row.decision)
 
     def _lose(self, task: Task, address: str, error: Exception) -> None:
         """Give the trials of a lost task out again; its share of the cap stays reserved."""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.audit.findings import Audit
-from merge_runner.config import ModelEntry, model_id
+from merge_runner.config import model_id
 from merge_runner.errors import (
     MergeRunnerError,
     NoValidDecision,
@@ -376,10 +376,14 @@ async def open_sweep(
     check_batches(plan, options)
     recorded = partial(Spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
-        entries = {
-            name: await _named(name, entry, options, cache, say)
-            for name, entry in plan.entries.items()
-        }
+        entries = {}
+        for name, entry in plan.entries.items():
+            found = model_id(entry)
+            if not found and options.sends_nothing:
+                found = recorded_name(entry, cache)
+            elif not found:
+                found = await served_name(name, entry, say=say)
+            entries[name] = entry.model_copy(update={"id": found})
         plan = plan.with_entries(entries)
         endpoints = {name: _endpoint(plan, name, options, cache) for name in entries}
         plan = plan.model_copy(update={"endpoints": endpoints})
@@ -393,18 +397,6 @@ async def open_sweep(
             options = _less_what_is_spent(plan, options, cache, say)
             cache.locks.take({f"{e.id} at {endpoints[name]}" for name, e in entries.items()})
         yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger))
-
-
-async def _named(
-    name: str, entry: ModelEntry, options: Options, cache: ResponseCache, say: Callable[[str], None]
-) -> ModelEntry:
-    """The entry with its model's name: as told, as recorded, or as its server says."""
-    found = model_id(entry)
-    if not found and options.sends_nothing:
-        found = recorded_name(entry, cache)
-    elif not found:
-        found = await served_name(name, entry, say=say)
-    return entry.model_copy(update={"id": found})
 
 
 def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
