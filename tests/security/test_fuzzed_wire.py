@@ -8,13 +8,19 @@ import math
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from merge_runner.llm.formats.delays import MOST_S, server_delay_s
 
 from merge_runner.config import Endpoint
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.formats.base import read_error
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.http_outcome import RawReply, TransportFailure, judge, may_be_charged
+from merge_runner.llm.http_outcome import (
+    MOST_S,
+    RawReply,
+    TransportFailure,
+    judge,
+    may_be_charged,
+    server_delay_s,
+)
 from tests.llm.raw_server import CHAT, a_request, raw_server
 
 DELAYS = (
