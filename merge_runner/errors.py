@@ -86,6 +86,10 @@ class NoValidDecision(SweepStopped):
     """The first decisions of a model are all invalid, and the user has not said to go on."""
 
 
+class CacheFailed(SweepStopped):
+    """The cache can be neither written nor read, so that no reply could be kept."""
+
+
 class TrialSuspended(MergeRunnerError):
     """The next call could exceed ``--max-cost``; the trial's replies so far are kept."""
 

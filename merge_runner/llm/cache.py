@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal
 import diskcache
 from pydantic import Field, TypeAdapter, ValidationError
 
-from merge_runner.errors import RecordingError, SweepStopped, UsageError
+from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.content_hashes import DAMAGED, check_body, check_call
 from merge_runner.llm.durable import BatchWriter, ModelLocks, Operation, ResultT, connect, making
 from merge_runner.llm.ledger import LedgerFile
@@ -194,7 +194,7 @@ class ResponseCache:
         return {key: self._tried(key) for key in keys}
 
     async def write(self, operation: Callable[[], ResultT]) -> ResultT:
-        """Run an operation on this cache in the next durable batch; raises SweepStopped."""
+        """Run an operation on this cache in the next durable batch; raises CacheFailed."""
         return await self._writer.write(operation)
 
     def run_now(self, operations: list[Operation]) -> list[Any]:
@@ -287,7 +287,7 @@ class ResponseCache:
 
     @contextlib.contextmanager
     def _told(self, done: str) -> Iterator[None]:
-        """Raise SweepStopped where the folder is of no use, RecordingError for what is no text."""
+        """Raise CacheFailed where the folder is of no use, RecordingError for what is no text."""
         try:
             yield
         except (diskcache.Timeout, *FAILURES) as exc:
@@ -296,7 +296,7 @@ class ResponseCache:
             why = f"cannot be {done}: {str(exc) or 'another program writes'}"
             if self._file != self._opened:
                 why = "was removed, moved or replaced while it was in use"
-            raise SweepStopped(
+            raise CacheFailed(
                 f"the cache {self.folder} {why}. When that is mended, or a copy of it put back, "
                 "run the same command again: what is in no cache is asked again"
             ) from exc

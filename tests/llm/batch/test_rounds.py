@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import (
+    CacheFailed,
     CallFailed,
     EndpointRefused,
     ProviderDown,
     QuotaExhausted,
-    SweepStopped,
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.service import BatchFailed, BatchStatus
@@ -304,13 +304,13 @@ async def test_where_no_batch_mode_is_at_the_first_creation_the_run_ends(cache):
 @in_virtual_time
 async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache, monkeypatch):
     async def is_full(*_):
-        raise SweepStopped("the disk is full")
+        raise CacheFailed("the disk is full")
 
     service = Memory()
     run = Run(cache, service)
     with monkeypatch.context() as patch:
         patch.setattr(cache, "put", is_full)
-        assert {type(each) for each in await run.ask(2)} == {SweepStopped}
+        assert {type(each) for each in await run.ask(2)} == {CacheFailed}
         await run.end()
     later = Run(cache, service)
     assert texts(await later.ask(2)) == ["batched 1", "batched 2"]
