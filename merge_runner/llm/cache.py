@@ -287,7 +287,7 @@ class ResponseCache:
 
     @contextlib.contextmanager
     def _told(self, done: str) -> Iterator[None]:
-        """Raise CacheFailed where the folder is of no use, RecordingError for what is no text."""
+        """Raise CacheFailed where the folder cannot be used, RecordingError for what is no text."""
         try:
             yield
         except (diskcache.Timeout, *FAILURES) as exc:
