@@ -181,8 +181,9 @@ class Budget:
             return True
         needed_usd, left_usd = self.trial_usd(trial), self._left_usd()
         if left_usd < needed_usd and not self._charged_usd and not self.in_flight:
-            # The first one begins all the same: it may cost less, and each attempt must still fit.
-            if self._spent_before or self._left:
+            # The first one that asks begins all the same: it may cost less, and each attempt must
+            # still fit.
+            if self._spent_before or self._largest_usd:
                 raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD")
         elif left_usd < needed_usd + self._needed_usd(self._charged_usd):
             return False

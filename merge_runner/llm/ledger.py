@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -21,7 +21,7 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 from merge_runner.config import ModelEntry, Price
-from merge_runner.errors import UsageError
+from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.durable import BatchWriter, Connection, Operation, connect, making
 from merge_runner.records import Attempt, Usage
 
@@ -56,6 +56,7 @@ _OPEN = "INSERT INTO open VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _BEGUN = """
 SELECT since FROM open WHERE call = ? AND attempt > ? AND outcome = 'in flight' ORDER BY attempt
 """
+_IN_FLIGHT = "SELECT call, attempt, driver FROM open WHERE scope = ? AND outcome = 'in flight'"
 _PAY = """
 INSERT INTO spent VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET usd = usd + excluded.usd,
 overrun_usd = overrun_usd + excluded.overrun_usd,
@@ -144,7 +145,7 @@ class LedgerFile:
         self.writer = BatchWriter(self.run_now)
 
     def read(self, sql: str, *values: object) -> Rows:
-        """Return the rows of a query; raises UsageError where the file is damaged."""
+        """Return the rows of a query; raises UsageError for a damaged file, and CacheFailed."""
         with self._told():
             # Its first transaction makes all tables: until then it is empty.
             if not self._connections and not (self._file.exists() and self._file.stat().st_size):
@@ -187,7 +188,7 @@ class LedgerFile:
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
         """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
         rows: Rows = []
-        with contextlib.suppress(UsageError):  # which is told before anything is paid
+        with contextlib.suppress(UsageError, CacheFailed):  # told before anything is paid
             rows = self.read(_BEGUN, call, tried)
         for number, (since,) in enumerate(rows, tried + 1):
             why = "the run ended before a reply was seen; it may have been charged"
@@ -201,10 +202,11 @@ class LedgerFile:
     def _connection(self, mode: str) -> Connection:
         """Return a connection of its own to read or write: the event loop reads while one syncs."""
         if mode not in self._connections:
-            self._connections[mode] = connection = connect(self._file, mode)
+            connection = connect(self._file, mode)
             if mode == "rwc":
                 with making(self._file.parent):
                     connection.executescript(TABLES)
+            self._connections[mode] = connection  # not before: the event loop reads meanwhile
         return self._connections[mode]
 
     @contextlib.contextmanager
@@ -212,6 +214,11 @@ class LedgerFile:
         try:
             yield
         except sqlite3.Error as exc:
+            if isinstance(exc, sqlite3.OperationalError) and "no such" not in str(exc):
+                raise CacheFailed(
+                    f"{self._file} cannot be written: {exc}. When that is mended, run the same "
+                    "command again"
+                ) from exc
             raise UsageError(
                 f"the record of what sweeps have spent ({self._file}) cannot be used, so that no "
                 f"cap could hold ({exc}): put a copy of it back, or take the replies with "
@@ -239,7 +246,7 @@ class Ledger:
         self.cache = cache
         self._money = cache.money
         # A damaged record is an error only where money is to be spent: a replay needs none.
-        with contextlib.suppress(UsageError):
+        with contextlib.suppress(UsageError, CacheFailed):
             self.read()
 
     def read(self) -> Spending:
@@ -285,6 +292,19 @@ class Ledger:
                 over = (cost_usd - row[0], cost_usd / max(row[3], TOLERANCE_USD))
         if cost_usd is not None:
             self._money.write(_PAY, self.scope, driver, cost_usd, *over)
+
+    def settle_kept(self, drivers: Collection[str]) -> None:
+        """Settle attempts that were kept right before their run was killed.
+
+        No other run may ask these drivers meanwhile.
+        """
+        rows = self._money.read(_IN_FLIGHT, self.scope)
+        for key, number, driver in (row for row in rows if row[2] in drivers):
+            with contextlib.suppress(RecordingError):
+                entry = self.cache.get(key)
+                for attempt in entry.attempts if entry else self.cache.unanswered(key):
+                    if attempt.number == number and attempt.outcome != "unknown":
+                        self._money.run_now([partial(self._settled, key, attempt, driver)])
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""

@@ -8,6 +8,7 @@ from contextlib import AsyncExitStack, suppress
 from resource import RLIM_INFINITY, RLIMIT_NOFILE, getrlimit, setrlimit
 
 from merge_runner.config import (
+    driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
 )
@@ -79,6 +80,7 @@ def live_clients(
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
+        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
     costs = trial_costs(plan, earlier, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
     # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.

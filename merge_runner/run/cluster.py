@@ -26,7 +26,7 @@ from functools import cache
 from multiprocessing import resource_tracker
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import merge_runner
 from merge_runner.config import base_urls
@@ -239,7 +239,7 @@ class DaskTasks:
     workers: int = 0
     _run: str = field(default_factory=secrets.token_hex)
     _groups: deque[list[TrialSpec]] = field(default_factory=deque)
-    _given: dict[str, tuple[Task, asyncio.Task[Played | Exception]]] = field(default_factory=dict)
+    _given: dict[str, tuple[Task, asyncio.Future[Any]]] = field(default_factory=dict)
     _losses: Counter[int] = field(default_factory=Counter)
     _one_by_one: bool = False
 
@@ -322,7 +322,11 @@ class DaskTasks:
             unanswered=unanswered,
             overruns=[*self._ledger.read().overruns.items()],
         )
-        self._given[address] = task, asyncio.create_task(self._played(address, task))
+        # Out of Dask's scheduling, which would retry it: the share of the cap is spent once.
+        work = self._client.run(
+            play_task, fingerprint(), pickle.dumps(task), workers=[address], on_error="return"
+        )
+        self._given[address] = task, asyncio.ensure_future(work)
 
     async def _recorded(
         self, specs: Sequence[TrialSpec]
@@ -342,17 +346,6 @@ class DaskTasks:
                         unanswered[call.request.key] = attempts
         return list(recorded.values()), unanswered
 
-    async def _played(self, address: str, task: Task) -> Played | Exception:
-        """Have a worker play a task; the error where it died."""
-        # Out of Dask's scheduling, which would retry it: the share of the cap is spent once.
-        answers = await self._client.run(
-            play_task, fingerprint(), pickle.dumps(task), workers=[address], on_error="return"
-        )
-        if isinstance(error := answers[address], ImportError):
-            why = f"it cannot load merge-runner ({error}): install the same one for all"
-            return Played(error=UsageError(why))
-        return answers[address]  # type: ignore[no-any-return] # Dask has no types
-
     async def _collect(self) -> None:
         """Wait a while for tasks, and keep what those that have ended return."""
         if not self._given:
@@ -362,7 +355,10 @@ class DaskTasks:
         await asyncio.wait(works, timeout=LOOK_EVERY_S, return_when=asyncio.FIRST_COMPLETED)
         for address in [address for address, (_, work) in self._given.items() if work.done()]:
             task, work = self._given.pop(address)
-            played = work.result()
+            played = work.result()[address]
+            if isinstance(played, ImportError):
+                why = f"it cannot load merge-runner ({played}): install the same one for all"
+                played = Played(error=UsageError(why))
             if not isinstance(played, Played):
                 self._lose(task, address, played)
                 continue

@@ -340,8 +340,11 @@ class Sweep:
             ledgers = (Ledger(self._cache, scope) for scope in scopes(self._cache))
             outcome.cache_cost_usd = sum(ledger.read().spent_usd for ledger in ledgers)
             outcome.spending = self._ledger.read()
-        except MergeRunnerError as exc:  # a run that spends has been refused for that already
-            outcome.messages.append(str(exc))
+        except MergeRunnerError as exc:
+            if self._options.replay:  # which spends nothing
+                outcome.messages.append(str(exc))
+            else:
+                outcome.fail_by(exc)
 
     def _check(self, store: Store, first: FirstDecisions, outcome: Outcome) -> None:
         """Read back what the database holds of the sweep, audit it, and note how it ended."""

@@ -12,11 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner.errors import TrialSuspended, UsageError
+from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget
-from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.records import Attempt
+from merge_runner.records import Attempt, Slot
 from tests.harness import each
 
 CAP = 100
@@ -236,6 +237,13 @@ async def test_without_money_for_a_whole_trial_the_first_one_alone_begins(ledger
         await other
 
 
+async def test_a_trial_that_ends_without_asking_leaves_the_first_that_asks_its_turn(ledger):
+    budget = Budget(ledger, 3.0, each(4.0))
+    await budget.admit(1)
+    budget.leave(1)  # its replies were all recorded
+    await budget.admit(2)
+
+
 async def test_a_begun_trial_is_paid_before_another_begins(ledger):
     budget = Budget(ledger, 5.0, each(4.0))
     await budget.admit(1)
@@ -340,6 +348,49 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
     assert ledger.read() == task.read()
     assert (ledger.spending.spent_usd, ledger.spending.reserved_usd) == (0.5, 0.25)
     assert ledger.spending.overruns[O3.driver] == 2
+    cache.close()
+
+
+async def test_an_answer_that_was_kept_right_before_a_kill_is_settled_by_the_next_run(
+    ledger, cache
+):
+    slot = Slot("N_0_0", 1, "left", 0, 0)
+    request = make_request(
+        provider="openai", endpoint="e", model="m", path="/p", headers={}, body={}, slot=slot
+    )
+    for key in (request.key, "another"):
+        ledger.reserve(key, 1, 0.25, None, O3)
+    await cache.put(CachedCall(request, (Attempt(1, "ok", 200, cost_usd=0.125, reply="{}"),)))
+    ledger.settle_kept({"another driver"})
+    assert ledger.read().spent_usd == 0
+    ledger.settle_kept({O3.driver})
+    spending = ledger.read()
+    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.125, 0.25, 1)
+
+
+async def test_nobody_reads_the_ledger_s_file_before_its_tables_are_there(tmp_path):
+    cache = ResponseCache(tmp_path)
+    ledger = Ledger(cache, "sweep")
+    reserving = asyncio.create_task(asyncio.to_thread(ledger.reserve, "key", 1, 0.25, None, O3))
+    while not reserving.done():
+        ledger.read()
+        await asyncio.sleep(0)
+    assert ledger.read().reserved_usd == 0.25
+    cache.close()
+
+
+def test_a_ledger_that_cannot_be_written_is_no_damaged_one(tmp_path):
+    cache = ResponseCache(tmp_path)
+    ledger = Ledger(cache, "sweep")
+    ledger.reserve("key", 1, 0.25, None, O3)
+    cache.money.write("PRAGMA max_page_count = 1")
+
+    def fill():
+        for number in range(1_000):
+            ledger.reserve(f"key {number}", 1, 0.25, None, O3)
+
+    with pytest.raises(CacheFailed, match="cannot be written: database or disk is full"):
+        fill()
     cache.close()
 
 
