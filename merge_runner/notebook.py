@@ -24,9 +24,9 @@ from merge_runner.registry import Registry
 from merge_runner.run import summary
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
-from merge_runner.run.progress import say
 from merge_runner.run.sweep import unsent
 from merge_runner.study.crossing import level_text
+from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from merge_runner.cli.options import CacheOption, JsonOption
-from merge_runner.cli.output import agree, print_out
+from merge_runner.cli.options import CacheOption, JsonOption, agree, print_out
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import DEFAULT_CACHE
 

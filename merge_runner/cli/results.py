@@ -1,4 +1,4 @@
-"""The commands on results and recordings that are there, and the list of models."""
+"""The commands on results and recordings that are there, the list of models, and the emulator."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from typing import Annotated, Literal
 import typer
 
 from merge_runner.cli import options as cli
-from merge_runner.cli.output import agree, print_out, say
+from merge_runner.cli.options import agree, print_out
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+from merge_runner.text_safety import say
 
 CACHE = "Also compare every attempt with this cache folder."
 COLUMNS = ("name", "provider", "key", "usd_per_m_in", "usd_per_m_out", "shutdown", "id", "prices")
@@ -208,3 +209,16 @@ def models(as_json: cli.JsonOption = False) -> None:
         print_out("\n".join(["", *(f"{name}: {note}" for name, *_, note in rows if note)]))
     for note in shutdown_notes(entries, datetime.now(UTC).date()):
         say(note)
+
+
+def emulate(
+    port: Annotated[
+        int, typer.Option(metavar="N", help="0: any free port.", min=0, max=65535)
+    ] = 8765,
+) -> None:
+    """Serve the emulator on 127.0.0.1, and print its base URL."""
+    import asyncio
+
+    from merge_runner.emulator.server import run
+
+    asyncio.run(run(port, announce=print_out))

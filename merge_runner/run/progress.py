@@ -15,7 +15,7 @@ from merge_runner.llm.client import Wait
 from merge_runner.llm.ledger import Ledger
 from merge_runner.results.progress_file import ProgressFile, Standing, clear_dead
 from merge_runner.run.plan import Plan
-from merge_runner.text_safety import printable
+from merge_runner.text_safety import printable, say
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -138,25 +138,10 @@ def first_of(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[
 
 
 @asynccontextmanager
-async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
-    """Keep a sweep's progress file up to date while the body runs; remove the file at the end."""
-
-    def publish() -> None:
-        file.write(progress.standing(file.sweep_id))
-
-    clear_dead(file.db)
-    publish()
-    publishing = asyncio.create_task(_repeat(progress, PUBLISHED_EVERY_S, publish))
-    try:
-        yield
-    finally:
-        publishing.cancel()
-        file.remove()
-
-
-@asynccontextmanager
-async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[None]:
-    """Show the progress on stderr while the body runs, and at its end.
+async def show_progress(
+    progress: Progress, file: ProgressFile, *, quiet: bool
+) -> AsyncIterator[None]:
+    """Show the progress on stderr and keep its file up to date while the body runs.
 
     ``quiet``: only the clients' messages.
     """
@@ -177,16 +162,24 @@ async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[
             elif not quiet:
                 say("; ".join(f"{name}: {text}" for name, text in progress.standing("").rows))
 
+    def publish() -> None:
+        file.write(progress.standing(file.sweep_id))
+
+    clear_dead(file.db)
+    publish()
     every_s = PLAIN_EVERY_S if live is None else LIVE_EVERY_S
-    showing = asyncio.create_task(_repeat(progress, every_s, show))
+    times = ((PUBLISHED_EVERY_S, publish), (every_s, show))
+    tasks = [asyncio.create_task(_repeat(progress, *each)) for each in times]
     try:
         yield
     finally:
-        showing.cancel()
+        for task in tasks:
+            task.cancel()
         show()
         with suppress(OSError):
             if live is not None:
                 live.stop()
+        file.remove()
 
 
 async def _repeat(progress: Progress, every_s: float, do: Callable[[], None]) -> None:
@@ -220,8 +213,3 @@ def _notes(progress: Progress) -> list[str]:
         while meter.notes:
             notes[meter.notes.popleft()] = None
     return first_of(list(notes), "more like these", NOTES_SHOWN)
-
-
-def say(line: str) -> None:
-    """Print a message beside the results."""
-    print(printable(line), file=sys.stderr, flush=True)  # noqa: T201 # the display

@@ -14,10 +14,19 @@ from pathlib import Path
 
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.audit.findings import Audit
-from merge_runner.config import ModelEntry, model_id
+from merge_runner.config import (
+    PROVIDERS,
+    UNNAMED,
+    ModelEntry,
+    check_network,
+    driver_name,
+    model_id,
+    resolve_endpoint,
+)
 from merge_runner.errors import (
     MergeRunnerError,
     NoValidDecision,
+    ProviderDown,
     ReplayMiss,
     StoreError,
     TrialSuspended,
@@ -27,6 +36,7 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Meter
 from merge_runner.llm.content_hashes import canonical_json
+from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody
 from merge_runner.llm.ledger import Ledger, Spending, scopes
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
@@ -46,9 +56,8 @@ from merge_runner.run.estimate import Estimate, estimate
 from merge_runner.run.first_decisions import MOST_INVALID, FirstDecisions
 from merge_runner.run.flusher import AGAIN, BATCH, Flusher
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.model_names import recorded_name, served_name
 from merge_runner.run.plan import Options, Plan, usual_prompts
-from merge_runner.run.progress import Progress, display_progress, publish_progress
+from merge_runner.run.progress import Progress, show_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
 from merge_runner.signals import on_interrupt
 
@@ -145,11 +154,11 @@ class Sweep:
                 batches=self._rounds.standing if self._rounds else list,
             )
             file = ProgressFile(self._options.db, outcome.sweep_id)
-            await stack.enter_async_context(publish_progress(progress, file))
+            shown = show_progress(progress, file, quiet=self._options.quiet)
+            await stack.enter_async_context(shown)
             began = time.perf_counter()
             try:
-                async with display_progress(progress, quiet=self._options.quiet):
-                    await self._play(runner, flusher, progress, outcome)
+                await self._play(runner, flusher, progress, outcome)
             finally:
                 outcome.playing_s = time.perf_counter() - began
                 is_stored = await self._store_rest(flusher, outcome)
@@ -418,10 +427,37 @@ async def _named(
     """The entry with its model's name: as told, as recorded, or as its server says."""
     found = model_id(entry)
     if not found and options.sends_nothing:
-        found = recorded_name(entry, cache)
+        # A server of one's own serves one model, or the recorded replies do not tell which.
+        recorded = {r.model for r in cache.recorded(lambda r: r.provider == entry.provider)}
+        found = recorded.pop() if len(recorded) == 1 else UNNAMED
     elif not found:
-        found = await served_name(name, entry, say=say)
+        found = await _served_name(name, entry, say=say)
     return entry.model_copy(update={"id": found})
+
+
+async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
+    """The one model that a server lists; raises ProviderDown where nobody listens, UsageError."""
+    from merge_runner.llm.model_list import listed_models  # imports httpx, which no replay needs
+
+    endpoint = resolve_endpoint(name, entry)
+    driver = driver_name(name, endpoint.identity)
+    check_network(endpoint.base_url)
+    try:
+        listed = await listed_models(endpoint)
+    except TransportFailure as exc:
+        if exc.outcome == "no_connection":
+            raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
+        listed, models = [], f"models that it does not list ({exc})"
+    else:
+        models = ", ".join(listed) or "no model"
+    if len(listed) != 1:
+        variable = PROVIDERS.require(entry.provider).model_env
+        raise UsageError(
+            f"{driver} serves {models}: name one with "
+            f"{variable}, or with `id` of [{name}] in {REGISTRY}, which goes first"
+        )
+    say(f"{driver} serves {listed[0]}, which is asked")
+    return listed[0]
 
 
 def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
