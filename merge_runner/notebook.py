@@ -159,9 +159,8 @@ class Study:
 
     async def adry_run(self, max_cost_usd: float | None = None) -> Estimate:
         """The trials, calls, tokens, cost and time of a run; nothing is sent."""
-        plan = self.plan()
         options = Options(self.db, self.cache, max_cost_usd=max_cost_usd)
-        return await unsent(plan, plan.within_budget(options), say=say)
+        return await unsent(self.plan(), options, say=say)
 
     async def arun(
         self,

@@ -184,7 +184,7 @@ def _play(
         for note in shutdown_notes(asked, datetime.now(UTC).date()):
             say(note)
     if dry_run:
-        expected = asyncio.run(unsent(plan, plan.within_budget(options), say=say))
+        expected = asyncio.run(unsent(plan, options, say=say))
         lines = "\n".join(summary.estimate_lines(expected))
         print_out(json.dumps(asdict(expected)) if as_json else f"{lines}\nNothing was sent.")
         return 0

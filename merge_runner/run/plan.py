@@ -207,12 +207,6 @@ class Plan(BaseModel):
         pairs = (pair_name(arm.names, self.endpoints) for arm in self.arms)
         return ", ".join(dict.fromkeys(pairs))
 
-    def within_budget(self, options: Options) -> Options:
-        """Return the options with the cap of the study's budget; ``--max-cost`` goes before it."""
-        if options.max_cost_usd is not None:
-            return options
-        return replace(options, max_cost_usd=self.study.file.budget.total_usd)
-
     def by_label(self) -> dict[str, Arm]:
         """The arms by the labels that their trials carry."""
         return {arm.label: arm for arm in self.arms}
@@ -271,13 +265,13 @@ class Plan(BaseModel):
             for hashed in (spec_hash(self.spec(arm, condition)),)
             for repetition in range(1, arm.repetitions + 1)
         ]
-        specs.sort(key=self._place)
-        return [replace(spec, order=order) for order, spec in enumerate(specs)]
 
-    def _place(self, spec: TrialSpec) -> tuple[int, str]:
-        """What orders trials randomly within a repetition, the same way on every machine."""
-        drawn_for = f"{self.order_seed}/{spec.repetition}/{spec.arm}/{spec.condition}"
-        return spec.repetition, hashlib.sha256(drawn_for.encode()).hexdigest()
+        def place(spec: TrialSpec) -> tuple[int, str]:
+            # The same way on every machine.
+            drawn_for = f"{self.order_seed}/{spec.repetition}/{spec.arm}/{spec.condition}"
+            return spec.repetition, hashlib.sha256(drawn_for.encode()).hexdigest()
+
+        return [replace(spec, order=order) for order, spec in enumerate(sorted(specs, key=place))]
 
     def trial_id_of(self, arm: Arm, condition: str, repetition: int) -> str:
         """The id of a trial of an arm."""
@@ -347,18 +341,16 @@ def make_plan(
                 "a grid takes the place of the conditions, and goes with --first alone"
             )
         conditions = grid_conditions(grid)
-    asked = (models,) if isinstance(models, str) else tuple(models)
-    study = load_study(sweep, asked, trust=trust)
-    registry = load_models(study.path.parent)
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
-    drivers = chosen_models(study.file, asked)
+    asked = (models,) if isinstance(models, str) else tuple(models)
+    study = load_study(sweep, asked, trust=trust)
+    file, registry = study.file, load_models(study.path.parent)
+    drivers = chosen_models(file, asked)
     pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
     wanted = _repetitions(study, variants, repetitions)
-    names = _conditions(study.file, conditions)
-    arms = cross(
-        study.file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
-    )
+    names = _conditions(file, conditions)
+    arms = cross(file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror)
     _check_arms(arms, names, db, first=first)
     if first:
         arms = list(map(_first_decision, arms))
@@ -367,8 +359,8 @@ def make_plan(
         name=f"{study.name}-first" if first else study.name,
         study=study,
         model=",".join(map("+".join, pairs)),
-        levels=listed_levels(study.file, (arm.model_level for arm in arms), wanted),
-        description=study.file.description,
+        levels=listed_levels(file, (arm.model_level for arm in arms), wanted),
+        description=file.description,
         arms=tuple(arms),
         entries=entries,
         endpoints={name: endpoint_identity(entry) for name, entry in entries.items()},

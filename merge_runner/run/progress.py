@@ -5,13 +5,12 @@ from __future__ import annotations
 import asyncio
 import sys
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Literal
 
-from merge_runner.llm.client import Wait
 from merge_runner.llm.ledger import Ledger
 from merge_runner.results.progress_file import ProgressFile, Standing, clear_dead
 from merge_runner.run.plan import Plan
@@ -66,26 +65,22 @@ class Progress:
         batches = first_of(self.batches(), "others")
         # How long a batch takes nobody knows.
         left_s = None if batches else self._left_s(elapsed_s, ended + failed, live + cached)
-        before = f" (+{self.stored} stored before)" if self.stored else ""
-        workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
-        cap = ""
+        trials = f"{ended + failed}/{self.planned - self.stored} ended"
+        trials += f" (+{self.stored} stored before)" if self.stored else ""
+        trials += f", {self.runner.running} running"
+        trials += "" if self.runner.workers is None else f" on {self.runner.workers} workers"
+        cost = f"{cost_usd:.2f} USD"
         if self.cap_usd is not None:
-            cap = f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+            cost += f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+        left = "" if left_s is None else f", about {left_s:.0f} s left"
         rows = [
-            *(("WARNING", text) for text in self._warnings()),
-            (
-                "trials",
-                f"{ended + failed}/{self.planned - self.stored} ended{before}, "
-                f"{self.runner.running} running{workers}",
-            ),
+            *dict.fromkeys(("WARNING", text) for text in self._warnings()),
+            ("trials", trials),
             ("failed", str(failed)),
             ("calls", f"{live} live, {cached} from recordings"),
-            ("cost", f"{cost_usd:.2f} USD{cap}"),
+            ("cost", cost),
             *(("waiting", text) for text in batches + [CLOSE_IT] * bool(batches) + self._waits()),
-            (
-                "time",
-                f"{elapsed_s:.0f} s" + ("" if left_s is None else f", about {left_s:.0f} s left"),
-            ),
+            ("time", f"{elapsed_s:.0f} s{left}"),
         ]
         return Standing(
             sweep_id=sweep_id,
@@ -109,25 +104,21 @@ class Progress:
         part = max(ended / total, by_calls) if ended < total else 0.0
         return elapsed_s / part - elapsed_s if part else None
 
-    def _warnings(self) -> list[str]:
-        meters = self.runner.meters.items()
-        others = {pair for _, meter in meters for pair in meter.mismatches}
-        return [
-            *filter(None, [self.unstored()]),
-            *(f"another model answers: {pair}" for pair in sorted(others)),
-            *(f"a scripted stand-in answers, not {name}" for name, m in meters if m.stand_ins),
-        ]
+    def _warnings(self) -> Iterator[str]:
+        if problem := self.unstored():
+            yield problem
+        for name, meter in self.runner.meters.items():
+            yield from (f"another model answers: {pair}" for pair in sorted(meter.mismatches))
+            if meter.stand_ins:
+                yield f"a scripted stand-in answers, not {name}"
 
     def _waits(self) -> list[str]:
         """How many calls wait, for what, and the latest time until when, if known."""
-        alike: dict[str, list[Wait]] = {}
-        for wait in self.runner.waits:
-            alike.setdefault(wait.what, []).append(wait)
         texts = []
-        for what, waits in sorted(alike.items(), key=lambda item: -len(item[1])):
-            ends = [wait.until for wait in waits if wait.until is not None]
+        for what, number in Counter(wait.what for wait in self.runner.waits).most_common():
+            ends = [w.until for w in self.runner.waits if w.what == what and w.until is not None]
             until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
-            texts.append(f"{len(waits)} {what}{until}")
+            texts.append(f"{number} {what}{until}")
         return first_of(texts, "other reasons")
 
 

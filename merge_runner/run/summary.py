@@ -54,7 +54,6 @@ async def play(
             say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
         plan = part
     expected = None
-    options = plan.within_budget(options)
     async with open_sweep(plan, options, say=say) as sweep:
         is_free = all(entry.price == "free" for entry in plan.entries.values())
         if sweep.trials_to_play and not (options.replay or is_free):

@@ -400,6 +400,8 @@ async def open_sweep(
     ask. ``say`` shows a line to the user. Raises UsageError.
     """
     check_batches(plan, options)
+    if options.max_cost_usd is None:
+        options = replace(options, max_cost_usd=plan.study.file.budget.total_usd)
     recorded = partial(Spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
         entries = {
