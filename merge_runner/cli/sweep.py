@@ -98,8 +98,6 @@ def sweep(
         raise UsageError("--max-cost is a number of USD")
     if recordings and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
-    if replay and dask:
-        raise UsageError("a replay needs no cluster: leave --dask out")
     known = {each.name for each in fields(Options)} & given.keys() - {"dry_run"}
     options = Options(**{name: given[name] for name in known})
     wanted = {name: given[name] for name in signature(make_plan).parameters if name in given}
@@ -108,8 +106,8 @@ def sweep(
 
     def planned(name: str) -> Plan:
         plan = make_plan(name, **wanted)
-        if dask is not None and plan.replays_humans:
-            raise UsageError("human trials are replayed in this process: leave --dask out")
+        if dask is not None and (replay or plan.replays_humans):
+            raise UsageError("a replay needs no cluster: leave --dask out")
         return plan
 
     if len(studies) > 1:  # all are looked at before the first one is played
@@ -148,9 +146,8 @@ def _rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]
         is_own = endpoint_identity(entry) == entry.provider and entry.path is None
         return is_own and provider.key_needed and provider.base_url_env is not None
 
-    usual = home / DEFAULT_DB, home / DEFAULT_CACHE
-    elsewhere = options.replay or options.dask or options.batch
-    if elsewhere or (options.db, options.cache) != usual:
+    is_usual = (options.db, options.cache) == (home / DEFAULT_DB, home / DEFAULT_CACHE)
+    if not is_usual or options.replay or options.dask or options.batch:
         raise UsageError(
             f"a rehearsal keeps what it makes in {REHEARSALS}, plays in this process and asks "
             "singly: leave --db, --cache, --dask, --replay and --batch out"
@@ -162,9 +159,9 @@ def _rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]
         raise UsageError(
             f"--rehearse takes one model at its provider's own address: --model with one of {valid}"
         )
+    db, cache = home / REHEARSALS / "merge.duckdb", home / REHEARSALS / "responses"
     plan = plan.model_copy(update={"endpoints": dict.fromkeys(plan.entries, REHEARSAL)})
-    folder = home / REHEARSALS
-    return plan, replace(options, db=folder / "merge.duckdb", cache=folder / "responses")
+    return plan, replace(options, db=db, cache=cache)
 
 
 def _play(
