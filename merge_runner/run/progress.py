@@ -1,4 +1,4 @@
-"""What a user sees while a sweep runs: a live table on a terminal, plain lines elsewhere."""
+"""What a user sees while a sweep runs: a live text on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from merge_runner.run.plan import Plan
 from merge_runner.text_safety import printable, say
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.text import Text
 
     from merge_runner.run.cluster import DaskTasks
     from merge_runner.run.local_runner import LocalRunner
@@ -142,14 +142,14 @@ async def show_progress(
         from rich.live import Live
 
         live = Live(console=Console(stderr=True), auto_refresh=False)
-        live.start()  # the table stays below what is printed meanwhile
+        live.start()  # the text stays below what is printed meanwhile
 
     def show() -> None:
         with suppress(OSError):  # the terminal may be closed
             for note in _notes(progress):
                 say(note)
             if live is not None:
-                live.update(table_of(progress), refresh=True)
+                live.update(terminal_text(progress), refresh=True)
             elif not quiet:
                 say("; ".join(f"{name}: {text}" for name, text in progress.standing("").rows))
 
@@ -158,9 +158,9 @@ async def show_progress(
 
     clear_dead(file.db)
     publish()
-    every_s = PLAIN_EVERY_S if live is None else LIVE_EVERY_S
-    times = ((PUBLISHED_EVERY_S, publish), (every_s, show))
-    tasks = [asyncio.create_task(_repeat(progress, *each)) for each in times]
+    shown_every_s = PLAIN_EVERY_S if live is None else LIVE_EVERY_S
+    both = ((PUBLISHED_EVERY_S, publish), (shown_every_s, show))
+    tasks = [asyncio.create_task(_repeat(progress, *each)) for each in both]
     try:
         yield
     finally:
@@ -184,17 +184,15 @@ async def _repeat(progress: Progress, every_s: float, do: Callable[[], None]) ->
         do()
 
 
-def table_of(progress: Progress) -> Table:
-    """What is shown on a terminal."""
-    from rich.table import Table
+def terminal_text(progress: Progress) -> Text:
+    """What is shown on a terminal; text from a server must not be read as markup."""
     from rich.text import Text
 
     mock = " (a mock)" if progress.plan.scripted else ""
-    title = Text(printable(f"{progress.plan.name}: {progress.plan.driver}{mock}"))
-    table = Table(title=title, title_justify="left", show_header=False, box=None)
-    for name, text in progress.standing("").rows:
-        table.add_row(name, Text(text))  # text from a server must not be read as markup
-    return table
+    rows = (f"{name:<8} {text}" for name, text in progress.standing("").rows)
+    return Text(
+        printable("\n".join([f"{progress.plan.name}: {progress.plan.driver}{mock}", *rows]))
+    )
 
 
 def _notes(progress: Progress) -> list[str]:
