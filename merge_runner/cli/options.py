@@ -67,7 +67,7 @@ VariantsOption = Annotated[
     str | None, option("A,B", "Prompt variants, separated by commas.", "--variants")
 ]
 JsonOption = Annotated[bool, flag("--json", "Print the result as JSON.")]
-YesOption = Annotated[bool, flag("--yes", "Do not ask before money is spent or rows are removed.")]
+YesOption = Annotated[bool, flag("--yes", "Do not ask before something is spent or removed.")]
 TrustOption = Annotated[
     bool, flag("--trust", "Run the study's code and send keys where its models.toml says, unasked.")
 ]

@@ -189,7 +189,7 @@ def ledger(
     release: Annotated[
         str | None, cli.option("SWEEP", "Stop counting what is set aside.", "--release")
     ] = None,
-    yes: Annotated[bool, cli.flag("--yes", "Do not ask before releasing.")] = False,
+    yes: cli.YesOption = False,
     as_json: cli.JsonOption = False,
 ) -> None:
     """Show what each sweep has spent, and what is set aside."""
@@ -265,8 +265,7 @@ def models(as_json: cli.JsonOption = False) -> None:
     rows: list[tuple[object, ...]] = []
     for name, entry in entries.items():
         # A thousand tokens each: more may have a price of their own.
-        usage = (Usage(1000, output_tokens=0), Usage(0, output_tokens=1000))
-        costs = [cost_usd(entry, tokens) for tokens in usage]
+        costs = (cost_usd(entry, Usage(n, output_tokens=1000 - n)) for n in (1000, 0))
         usd = ["unknown" if cost is None else round(cost * 1000, 6) for cost in costs]
         source = entry.price.source if isinstance(entry.price, Price) else entry.price
         closes, key = str(entry.shutdown or ""), key_status(entry)

@@ -18,7 +18,8 @@ MOST_INVALID = 20
 SHOWN = 300
 ADVICE = (
     "look at what the prompt asks for, and in which output format; some servers hold a small "
-    "model to it by a grammar"
+    "model to it by a grammar. Where replies are cut off or empty, set a higher "
+    f"`max_output_tokens` in {REGISTRY}"
 )
 
 
@@ -71,7 +72,9 @@ class FirstDecisions:
             self._changed.set()
         if invalid:
             self._invalid[model] += invalid
-            self._described.setdefault(model, _described(failure or "", text or ""))
+            shown = one_line(" ".join((text or "").split()))[:SHOWN]
+            reply = f'"{shown}" ({(failure or "").replace("_", " ")})'
+            self._described.setdefault(model, f"The first reply is {reply}. To mend that {ADVICE}")
 
     def without_a_valid_one(self) -> list[str]:
         """A line for each model none of whose decisions is valid."""
@@ -88,11 +91,3 @@ class FirstDecisions:
                 f"nothing else is asked. {self._described[model]}. What was answered is kept; "
                 "--keep-going goes on with such a model"
             )
-
-
-def _described(failure: str, text: str) -> str:
-    """The reply, why it is invalid, and what to look at."""
-    shown = one_line(" ".join(text.split()))[:SHOWN]
-    is_short = failure in ("truncated", "empty")
-    advice = f"set a higher `max_output_tokens` in {REGISTRY}" if is_short else ADVICE
-    return f'The first reply is "{shown}" ({failure.replace("_", " ")}). To mend that {advice}'
