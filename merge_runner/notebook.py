@@ -157,10 +157,9 @@ class Study:
         """What would be played: all, or only the first decisions; raises UsageError."""
         return make_plan(self.file, db=self.db, first=first, grid=grid, **self._wanted)
 
-    async def adry_run(self, max_cost_usd: float | None = None) -> Estimate:
+    async def adry_run(self) -> Estimate:
         """The trials, calls, tokens, cost and time of a run; nothing is sent."""
-        options = Options(self.db, self.cache, max_cost_usd=max_cost_usd)
-        return await unsent(self.plan(), options, say=say)
+        return await unsent(self.plan(), Options(self.db, self.cache), say=say)
 
     async def arun(
         self,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -43,29 +42,26 @@ class Standing(BaseModel):
         return (datetime.now(UTC) - self.updated_at).total_seconds() < STALE_S[self.doing]
 
 
-@dataclass(frozen=True, slots=True)
-class ProgressFile:
-    """The file of one sweep. A sweep goes on where it cannot be written."""
+def write_standing(db: Path, standing: Standing) -> None:
+    """Replace a sweep's file as a whole: a reader sees the old state or the new one, never a part.
 
-    db: Path
-    sweep_id: str
+    A sweep goes on where it cannot be written.
+    """
+    path = _path(db, standing.sweep_id)
+    made = path.with_suffix(".tmp")
+    with suppress(OSError):
+        path.parent.mkdir(exist_ok=True)
+        made.write_text(standing.model_dump_json(), encoding="utf-8")
+        os.replace(made, path)
 
-    def write(self, standing: Standing) -> None:
-        """Replace the file as a whole: a reader sees the old state or the new one, never a part."""
-        path = _path(self.db, self.sweep_id)
-        made = path.with_suffix(".tmp")
-        with suppress(OSError):
-            path.parent.mkdir(exist_ok=True)
-            made.write_text(standing.model_dump_json(), encoding="utf-8")
-            os.replace(made, path)
 
-    def remove(self) -> None:
-        """Remove the file of a sweep that has ended normally."""
-        path = _path(self.db, self.sweep_id)
-        with suppress(OSError):
-            path.with_suffix(".tmp").unlink(missing_ok=True)
-            path.unlink(missing_ok=True)
-            path.parent.rmdir()
+def remove_standing(db: Path, sweep_id: str) -> None:
+    """Remove the file of a sweep that has ended normally."""
+    path = _path(db, sweep_id)
+    with suppress(OSError):
+        path.with_suffix(".tmp").unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+        path.parent.rmdir()
 
 
 def read_standing(db: Path, sweep_id: str) -> Standing | None:

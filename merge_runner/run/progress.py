@@ -9,10 +9,11 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from merge_runner.llm.ledger import Ledger
-from merge_runner.results.progress_file import ProgressFile, Standing, clear_dead
+from merge_runner.results.progress_file import Standing, clear_dead, remove_standing, write_standing
 from merge_runner.run.plan import Plan
 from merge_runner.text_safety import printable, say
 
@@ -130,9 +131,9 @@ def first_of(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[
 
 @asynccontextmanager
 async def show_progress(
-    progress: Progress, file: ProgressFile, *, quiet: bool
+    progress: Progress, db: Path, sweep_id: str, *, quiet: bool
 ) -> AsyncIterator[None]:
-    """Show the progress on stderr and keep its file up to date while the body runs.
+    """Show the progress on stderr and in a file beside the database while the body runs.
 
     ``quiet``: only the clients' messages.
     """
@@ -154,9 +155,9 @@ async def show_progress(
                 say("; ".join(f"{name}: {text}" for name, text in progress.standing("").rows))
 
     def publish() -> None:
-        file.write(progress.standing(file.sweep_id))
+        write_standing(db, progress.standing(sweep_id))
 
-    clear_dead(file.db)
+    clear_dead(db)
     publish()
     shown_every_s = PLAIN_EVERY_S if live is None else LIVE_EVERY_S
     both = ((PUBLISHED_EVERY_S, publish), (shown_every_s, show))
@@ -170,7 +171,7 @@ async def show_progress(
         with suppress(OSError):
             if live is not None:
                 live.stop()
-        file.remove()
+        remove_standing(db, sweep_id)
 
 
 async def _repeat(progress: Progress, every_s: float, do: Callable[[], None]) -> None:

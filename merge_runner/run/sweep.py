@@ -40,7 +40,7 @@ from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody
 from merge_runner.llm.ledger import Ledger, Spending, scopes
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
-from merge_runner.results.progress_file import ProgressFile
+from merge_runner.results.progress_file import write_standing
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recorded_study import described
 from merge_runner.results.recording import Spilled
@@ -153,9 +153,8 @@ class Sweep:
                 unstored=lambda: flusher.problem,
                 batches=self._rounds.standing if self._rounds else list,
             )
-            file = ProgressFile(self._options.db, outcome.sweep_id)
-            shown = show_progress(progress, file, quiet=self._options.quiet)
-            await stack.enter_async_context(shown)
+            db, sweep_id, quiet = self._options.db, outcome.sweep_id, self._options.quiet
+            await stack.enter_async_context(show_progress(progress, db, sweep_id, quiet=quiet))
             began = time.perf_counter()
             try:
                 await self._play(runner, flusher, progress, outcome)
@@ -171,7 +170,7 @@ class Sweep:
             outcome.batches, outcome.worst_stall_s = progress.batches(), progress.worst_stall_s
             self._add_costs(outcome)
             progress.doing = "checking"
-            file.write(progress.standing(outcome.sweep_id))
+            write_standing(db, progress.standing(sweep_id))
             if is_stored:
                 self._check(store, runner.first, outcome)
         return outcome
