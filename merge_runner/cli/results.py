@@ -117,8 +117,6 @@ def forget(
     """
     from merge_runner.results import forgetting
 
-    if not sweeps:
-        raise UsageError("name a sweep; `merge-runner sql 'from sweeps'` lists them")
     ids, going = forgetting.to_forget(db, sweeps)
     agree(f"these go from {db}: {going}", "Remove them?", otherwise="nothing was removed", yes=yes)
     forgetting.forget(db, ids)
