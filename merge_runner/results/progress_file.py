@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import platform
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -10,11 +12,13 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import quote
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, NonNegativeInt, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
-# While a sweep checks what it stored, the file is silent.
+# While a sweep checks what it stored, the file is silent: only its process shows that it lives.
 STALE_S = {"playing": 10.0, "checking": 600.0}
 MOST_BYTES = 1_000_000
+# Identifies the machine among those that share a folder: process ids mean nothing on another one.
+MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 class Standing(BaseModel):
@@ -28,6 +32,8 @@ class Standing(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     sweep_id: str
+    pid: int = Field(default_factory=os.getpid, ge=1, lt=2**31)
+    machine: str = MACHINE
     updated_at: AwareDatetime
     doing: Literal["playing", "checking"]
     ended: NonNegativeInt
@@ -38,7 +44,14 @@ class Standing(BaseModel):
 
     @property
     def alive(self) -> bool:
-        """Whether the sweep was heard of lately."""
+        """Whether the sweep is still running, by its file and its process."""
+        try:
+            if self.machine == MACHINE:
+                os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:
+            pass  # it is another user's
         return (datetime.now(UTC) - self.updated_at).total_seconds() < STALE_S[self.doing]
 
 

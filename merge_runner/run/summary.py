@@ -12,7 +12,6 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, get_args
 
-from merge_runner.config import resolve_endpoint
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.llm.cache import ResponseCache
@@ -58,9 +57,6 @@ async def play(
     async with open_sweep(plan, options, say=say) as sweep:
         is_free = all(entry.price == "free" for entry in plan.entries.values())
         if sweep.trials_to_play and not (options.replay or is_free):
-            if options.dask is None and not plan.is_rehearsal:
-                for name, entry in plan.entries.items():
-                    resolve_endpoint(name, entry)  # raises where a key is missing
             expected = await sweep.estimate()
             agree(expected)
         outcome = await sweep.run()

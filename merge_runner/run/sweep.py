@@ -417,6 +417,9 @@ async def open_sweep(
         stored = [spec for key, spec in specs.items() if key in ended]
         todo = [spec for key, spec in specs.items() if key not in ended]
         if todo and not options.sends_nothing:
+            if options.dask is None and not plan.is_rehearsal:
+                for name, entry in entries.items():
+                    resolve_endpoint(name, entry)  # raises where its key is missing
             options = _less_what_is_spent(plan, options, cache, say)
             cache.locks.take({f"{e.id} at {endpoints[name]}" for name, e in entries.items()})
         yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger))

@@ -22,6 +22,7 @@ from merge_runner.run.progress import Progress
 from tests.gate import HANGS_S
 from tests.harness import run_sweep
 
+NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
 LONG_AGO = datetime(2026, 1, 1, tzinfo=UTC)
 LEDGER = SimpleNamespace(spending=Spending())
 SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm", 100)
@@ -45,19 +46,23 @@ async def begun(db):
 
 
 @pytest.mark.slow
-async def test_a_sweep_says_where_it_stands_until_it_is_killed(
+async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_tidies_up(
     merge_runner, tmp_path, emulator_url
 ):
     db = tmp_path / "m.duckdb"
     process = await merge_runner.start(*SWEEP, "--db", db, EMULATOR_BASE_URL=emulator_url)
     try:
         found, path = await begun(db)
+        text, alive = path.read_text(), found.alive
     finally:
         process.kill()
         await process.communicate()
+    assert found.pid == process.pid
     assert dict(found.rows)["trials"] == "0/4 ended, 4 running"
-    assert found.alive
-    assert str(tmp_path) not in path.read_text()
+    assert str(tmp_path) not in text
+    assert (alive, read_standing(db, found.sweep_id).alive) == (True, False)
+    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--db", db)).code == 0
+    assert not path.parent.exists()
 
 
 async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, monkeypatch):
@@ -79,9 +84,12 @@ async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, m
         ({}, 11, False),  # frozen
         ({"doing": "checking"}, 11, True),  # it does nothing else meanwhile
         ({"doing": "checking"}, 601, False),
+        ({"doing": "checking", "pid": NO_PROCESS}, 1, False),
+        ({"pid": NO_PROCESS}, 1, False),
+        ({"pid": NO_PROCESS, "machine": "another"}, 1, True),  # its ids mean nothing here
     ],
 )
-def test_a_sweep_is_dead_when_it_is_silent(changes, age_s, alive):
+def test_a_sweep_is_dead_when_its_process_is_gone_or_silent(changes, age_s, alive):
     updated_at = datetime.now(UTC) - timedelta(seconds=age_s)
     assert standing(updated_at=updated_at, **changes).alive == alive
 
