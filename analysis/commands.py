@@ -28,11 +28,13 @@ from merge_runner.cli.options import (
     beside_study,
     levels,
     listed,
+    print_out,
+    terminal_width,
     use_study,
 )
-from merge_runner.cli.output import print_out, say, terminal_width
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB, refuse_another_kind
+from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
     from analysis.data.study import Study

@@ -15,8 +15,8 @@ def main() -> None:
     found = find_spec("analysis")
     place = os.path.realpath((found and found.origin) or "")
     if place != os.path.join(HOME, "analysis", "__init__.py"):
-        from merge_runner.cli.output import say
         from merge_runner.errors import UsageError
+        from merge_runner.text_safety import say
 
         say(
             f"error: {place} hides the package analysis of merge-runner: rename it, or "

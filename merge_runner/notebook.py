@@ -24,9 +24,9 @@ from merge_runner.registry import Registry
 from merge_runner.run import summary
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
-from merge_runner.run.progress import say
 from merge_runner.run.sweep import unsent
 from merge_runner.study.crossing import level_text
+from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,14 +67,10 @@ class StudyOutcome:
 
     def __post_init__(self) -> None:
         self.exit_code: int = self.facts["exit_code"]
+        self.ok = self.exit_code == 0
         self.messages: list[str] = self.facts["messages"]
         self.db = Path(self.facts["db"])
         self.sweep_id: str = self.facts["sweep_id"]
-
-    @property
-    def ok(self) -> bool:
-        """Whether all trials ended, and nothing went wrong."""
-        return self.exit_code == 0
 
     def __repr__(self) -> str:
         """The summary, and what went wrong, for a reader."""
@@ -112,10 +108,9 @@ class Study:
     ``models``, ``repetitions``, ``conditions`` and ``prompts`` take the place of what the file
     says; ``only`` names a level, or a list of levels, by factor; ``mirror`` plays two different
     drivers both ways round; ``db`` and ``cache`` lie beside the file; ``trust`` agrees to the code
-    of the study, and to where its models.toml sends keys. ``arun``, ``aseat_first``, ``areplay``
-    and ``adry_run`` are awaited, as in a notebook; ``run``, ``seat_first``, ``replay`` and
-    ``dry_run`` are for scripts. How a run goes on is said by the fields of ``Options``, as
-    ``in_flight=50, max_cost_usd=20``.
+    of the study, and to where its models.toml sends keys. ``arun``, ``areplay`` and ``adry_run``
+    are awaited, as in a notebook; ``run``, ``replay`` and ``dry_run`` are for scripts. How a run
+    goes on is said by the fields of ``Options``, as ``in_flight=50, max_cost_usd=20``.
 
     All of them raise UsageError for what cannot be run as it is asked for. What goes wrong on the
     way is in the outcome, beside the trials that ended: the same call goes on from there.
@@ -159,14 +154,12 @@ class Study:
         self.register(PROGRAMS, name, Program(driver, meaning, **more))
 
     def plan(self, *, first: bool = False, grid: str | None = None) -> Plan:
-        """What would be played, or only asked ``first``; raises UsageError."""
+        """What would be played: all, or only the first decisions; raises UsageError."""
         return make_plan(self.file, db=self.db, first=first, grid=grid, **self._wanted)
 
-    async def adry_run(self, max_cost_usd: float | None = None) -> Estimate:
+    async def adry_run(self) -> Estimate:
         """The trials, calls, tokens, cost and time of a run; nothing is sent."""
-        plan = self.plan()
-        options = Options(self.db, self.cache, max_cost_usd=max_cost_usd)
-        return await unsent(plan, plan.within_budget(options), say=say)
+        return await unsent(self.plan(), Options(self.db, self.cache), say=say)
 
     async def arun(
         self,
@@ -178,7 +171,8 @@ class Study:
     ) -> StudyOutcome:
         """Play all trials that are not stored yet; ``yes`` lets it spend money.
 
-        ``first`` and ``grid`` are as for ``plan``.
+        ``first`` asks only what drivers do first, in the study's conditions or on a ``grid``, as
+        ``sweep --first`` and its ``--grid``.
         """
 
         def agree(expected: Estimate) -> None:
@@ -198,16 +192,8 @@ class Study:
         finally:
             _playing.release()
 
-    async def aseat_first(self, grid: str | None = None, **how: Any) -> StudyOutcome:  # noqa: ANN401 # as arun
-        """Ask only what drivers do first, as ``sweep --first``; ``grid`` is its --grid.
-
-        Each situation is asked as often as the study has repetitions.
-        """
-        return await self.arun(first=True, grid=grid, **how)
-
     async def areplay(self, *recordings: Path | str) -> StudyOutcome:
         """Play all trials from recorded replies alone, those of the files first; sends nothing."""
         return await self.arun(replay=True, recordings=tuple(map(Path, recordings)))
 
-    dry_run, run = sync(adry_run), sync(arun)
-    seat_first, replay = sync(aseat_first), sync(areplay)
+    dry_run, run, replay = sync(adry_run), sync(arun), sync(areplay)

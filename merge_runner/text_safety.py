@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import re
+import sys
 from types import SimpleNamespace
 from typing import Any, TextIO
 
@@ -14,6 +15,11 @@ def printable(text: str, kept: str = "\n\t") -> str:
     if text.isprintable():
         return text  # as most are, and some are long
     return "".join(c if c.isprintable() or c in kept else "?" for c in text)
+
+
+def say(line: str) -> None:
+    """Print a message beside the results."""
+    print(printable(line), file=sys.stderr, flush=True)  # noqa: T201 # progress and messages
 
 
 def one_line(text: str) -> str:

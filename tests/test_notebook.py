@@ -102,13 +102,13 @@ async def test_an_outcome_holds_the_trials_of_its_own_sweep(folder):
 
 async def test_first_situations_are_asked_alone_in_the_conditions_or_on_a_grid(folder):
     wanted = {"temperature": 0.2, "memory_s": 2.0, "opponent": "self"}
-    outcome = await Study("study.toml", only=wanted).aseat_first()
+    outcome = await Study("study.toml", only=wanted).arun(first=True)
     assert set(outcome.trials()["source"]) == {"seat"}
     assert sum(look["asked"] for look in outcome.facts["first_looks"]) == 4
-    gridded = await Study("study.toml", only=wanted).aseat_first("h=2,dv=0:0.8:0.4")
+    gridded = await Study("study.toml", only=wanted).arun(first=True, grid="h=2,dv=0:0.8:0.4")
     assert set(gridded.trials()["relative_velocity_mps"]) == {0.0, 0.4, 0.8}
     with pytest.raises(UsageError, match="a grid takes the place of the conditions"):
-        await Study("study.toml", conditions=["N_0_0"]).aseat_first("usual")
+        await Study("study.toml", conditions=["N_0_0"]).arun(first=True, grid="usual")
 
 
 async def test_a_replay_gives_the_same_results_without_a_call(folder):

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from merge_runner.cli.options import DbOption, JsonOption
-from merge_runner.cli.output import print_out, say
+from merge_runner.cli.options import DbOption, JsonOption, print_out
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
+from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -22,9 +22,11 @@ from merge_runner.cli.options import (
     VariantsOption,
     levels,
     listed,
+    print_out,
+    terminal_width,
 )
-from merge_runner.cli.output import print_out, say, terminal_width
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+from merge_runner.text_safety import say
 
 
 def power(

@@ -12,13 +12,20 @@ from typing import Annotated
 import typer
 
 from merge_runner import __version__
-from merge_runner.cli.ledger import ledger
-from merge_runner.cli.options import flag
-from merge_runner.cli.output import print_out, say
-from merge_runner.cli.results import audit, digest, forget, models, recording_app, sql
-from merge_runner.cli.stand_in import emulate
+from merge_runner.cli.options import flag, print_out
+from merge_runner.cli.results import (
+    audit,
+    digest,
+    emulate,
+    forget,
+    ledger,
+    models,
+    recording_app,
+    sql,
+)
 from merge_runner.cli.sweep import init, replay, sweep
 from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner.text_safety import say
 
 # A full disk, a limit of file sizes, and a device that fails.
 OUTPUT_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EIO)

@@ -1,7 +1,9 @@
-"""The options that several commands share."""
+"""The options that several commands share, what the command line prints, and what it asks."""
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +12,7 @@ import typer
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import home_of
+from merge_runner.text_safety import printable, say
 
 
 def option(metavar: str, text: str, *names: str, **more: Any) -> Any:  # noqa: ANN401 # as typer's
@@ -64,7 +67,7 @@ VariantsOption = Annotated[
     str | None, option("A,B", "Prompt variants, separated by commas.", "--variants")
 ]
 JsonOption = Annotated[bool, flag("--json", "Print the result as JSON.")]
-YesOption = Annotated[bool, flag("--yes", "Do not ask before money is spent or rows are removed.")]
+YesOption = Annotated[bool, flag("--yes", "Do not ask before something is spent or removed.")]
 TrustOption = Annotated[
     bool, flag("--trust", "Run the study's code and send keys where its models.toml says, unasked.")
 ]
@@ -101,3 +104,24 @@ def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:
 def listed(text: str | None) -> list[str] | None:
     """The parts of an option that takes several names, None where it is not given."""
     return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
+
+
+def print_out(text: str) -> None:
+    """Print a result."""
+    print(printable(text), flush=True)  # noqa: T201 # the command line's output
+
+
+def terminal_width() -> int | None:
+    """How many columns the result may take; None where it goes into a file or a pipe."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+
+
+def agree(what: str, question: str, *, otherwise: str, yes: bool) -> None:
+    """Say what is about to be done, and ask once; ``otherwise`` says that it was not done."""
+    say(what)
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise UsageError(f"there is no terminal to ask at, so {otherwise}: add --yes")
+    if not typer.confirm(question, err=True):
+        raise UsageError(otherwise)

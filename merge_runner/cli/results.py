@@ -1,4 +1,4 @@
-"""The commands on results and recordings that are there, and the list of models."""
+"""The commands on what is there: results, recordings, spending and models; and the emulator."""
 
 from __future__ import annotations
 
@@ -6,17 +6,23 @@ import json
 import shutil
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from merge_runner.cli import options as cli
-from merge_runner.cli.output import agree, print_out, say
-from merge_runner.errors import UsageError
+from merge_runner.cli.options import agree, print_out
+from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
+from merge_runner.text_safety import say
+
+if TYPE_CHECKING:
+    from merge_runner.llm.ledger import Ledger, Spending
 
 CACHE = "Also compare every attempt with this cache folder."
 COLUMNS = ("name", "provider", "key", "usd_per_m_in", "usd_per_m_out", "shutdown", "id", "prices")
@@ -84,9 +90,8 @@ def audit(
         audits = [audit_recording(recording)]
     else:
         audits = audit_database(db, sweep_id, cache)
-        skipped = list(NOT_REPLAYED)
-        if cache is not None:
-            skipped = [name for name in skipped if name == "calls.cached" or "calls" not in name]
+        told = {"calls.cached"} if cache is not None else set(NOT_REPLAYED)
+        skipped = [name for name in NOT_REPLAYED if name in told or "calls" not in name]
     ok = all(found.ok for found in audits)
     if as_json:
         whole = {"ok": ok, "not_replayed": skipped, "audits": [found.as_dict() for found in audits]}
@@ -112,8 +117,6 @@ def forget(
     """
     from merge_runner.results import forgetting
 
-    if not sweeps:
-        raise UsageError("name a sweep; `merge-runner sql 'from sweeps'` lists them")
     ids, going = forgetting.to_forget(db, sweeps)
     agree(f"these go from {db}: {going}", "Remove them?", otherwise="nothing was removed", yes=yes)
     forgetting.forget(db, ids)
@@ -179,6 +182,74 @@ def recording_info(
     print_out(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
 
 
+def ledger(
+    cache: cli.CacheOption = DEFAULT_CACHE,
+    release: Annotated[
+        str | None, cli.option("SWEEP", "Stop counting what is set aside.", "--release")
+    ] = None,
+    yes: cli.YesOption = False,
+    as_json: cli.JsonOption = False,
+) -> None:
+    """Show what each sweep has spent, and what is set aside."""
+    from merge_runner.llm.cache import ResponseCache
+    from merge_runner.llm.ledger import Ledger, scopes
+
+    with closing(ResponseCache(cache, read_only=True)) as opened:
+        names = scopes(opened)
+        if release is not None:
+            if release not in names:
+                raise unknown_name("sweep", release, names, f"with a ledger in {cache}")
+            _release(Ledger(opened, release), yes=yes)
+            names = [release]
+        accounts = {
+            name: (each.read(), each.reasons())
+            for name, each in ((name, Ledger(opened, name)) for name in names)
+        }
+    if as_json:
+        rows = [
+            {"sweep": n, **asdict(s), "reasons": reasons} for n, (s, reasons) in accounts.items()
+        ]
+        print_out(json.dumps(rows, ensure_ascii=False))
+    else:
+        lines = [line for name, each in accounts.items() for line in _account_lines(name, *each)]
+        print_out("\n".join(lines) or "No sweep has spent anything.")
+
+
+def _release(ledger: Ledger, *, yes: bool) -> None:
+    spending = ledger.read()
+    agree(
+        f"{spending.reserved_usd:.4f} USD are set aside for {spending.open_attempts} attempts at "
+        f"{ledger.scope}. If the provider did charge for them, --max-cost may be passed by as much",
+        "Release it?",
+        otherwise="nothing was released",
+        yes=yes,
+    )
+    if not ledger.cache.locks.take_all():
+        raise UsageError(
+            f"another merge-runner works with {ledger.cache.folder}: what it has in flight cannot "
+            "be released; try again when it has ended"
+        )
+    ledger.release()
+
+
+def _account_lines(name: str, spending: Spending, reasons: list[dict[str, Any]]) -> Iterator[str]:
+    yield (
+        f"{name}: {spending.spent_usd:.4f} USD spent, {spending.reserved_usd:.4f} set aside for "
+        f"{spending.open_attempts} attempts whose cost is not known"
+    )
+    for each in reasons:
+        killed = " now, or when a run was killed" if each["outcome"] == "in flight" else ""
+        yield (
+            f"  {each['usd']:.4f} USD for {each['attempts']} attempts of {each['driver']}: "
+            f"{each['outcome']}{killed}, {each['first']} to {each['last']} (as {each['slot']})"
+        )
+    if spending.overrun_usd:
+        yield (
+            f"  {spending.overrun_usd:.4f} of what is spent is what replies cost more than their "
+            f"worst case: {spending.dearest}"
+        )
+
+
 def models(as_json: cli.JsonOption = False) -> None:
     """List the models and programs that can drive."""
     from merge_runner.config import Price, key_status
@@ -192,8 +263,7 @@ def models(as_json: cli.JsonOption = False) -> None:
     rows: list[tuple[object, ...]] = []
     for name, entry in entries.items():
         # A thousand tokens each: more may have a price of their own.
-        usage = (Usage(1000, output_tokens=0), Usage(0, output_tokens=1000))
-        costs = [cost_usd(entry, tokens) for tokens in usage]
+        costs = (cost_usd(entry, Usage(n, output_tokens=1000 - n)) for n in (1000, 0))
         usd = ["unknown" if cost is None else round(cost * 1000, 6) for cost in costs]
         source = entry.price.source if isinstance(entry.price, Price) else entry.price
         closes, key = str(entry.shutdown or ""), key_status(entry)
@@ -208,3 +278,14 @@ def models(as_json: cli.JsonOption = False) -> None:
         print_out("\n".join(["", *(f"{name}: {note}" for name, *_, note in rows if note)]))
     for note in shutdown_notes(entries, datetime.now(UTC).date()):
         say(note)
+
+
+def emulate(
+    port: Annotated[int, cli.option("N", "0: any free port.", min=0, max=65535)] = 8765,
+) -> None:
+    """Serve the emulator on 127.0.0.1, and print its base URL."""
+    import asyncio
+
+    from merge_runner.emulator.server import run
+
+    asyncio.run(run(port, announce=print_out))

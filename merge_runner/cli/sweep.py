@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from merge_runner.cli import options as cli
-from merge_runner.cli.output import agree, print_out, say
+from merge_runner.cli.options import agree, print_out
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
+from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
     from merge_runner.run.estimate import Estimate
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
 GOES_ON = (0, 1, 4)
+REHEARSALS = Path("results/rehearsal")
 GRID = (
     "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
     "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
@@ -96,8 +98,6 @@ def sweep(
         raise UsageError("--max-cost is a number of USD")
     if recordings and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
-    if replay and dask:
-        raise UsageError("a replay needs no cluster: leave --dask out")
     known = {each.name for each in fields(Options)} & given.keys() - {"dry_run"}
     options = Options(**{name: given[name] for name in known})
     wanted = {name: given[name] for name in signature(make_plan).parameters if name in given}
@@ -106,8 +106,8 @@ def sweep(
 
     def planned(name: str) -> Plan:
         plan = make_plan(name, **wanted)
-        if dask is not None and plan.replays_humans:
-            raise UsageError("human trials are replayed in this process: leave --dask out")
+        if dask is not None and (replay or plan.replays_humans):
+            raise UsageError("a replay needs no cluster: leave --dask out")
         return plan
 
     if len(studies) > 1:  # all are looked at before the first one is played
@@ -120,9 +120,7 @@ def sweep(
             say(f"{name}:")
         plan, own = planned(name), options
         if rehearse:
-            from merge_runner.run.rehearsal import rehearsed
-
-            plan, own = rehearsed(plan, options, home_of(name))
+            plan, own = _rehearsed(plan, options, home_of(name))
         codes.append(_play(plan, own, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
         if codes[-1] not in GOES_ON:
             break
@@ -133,6 +131,37 @@ def sweep(
 def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
     """Play a sweep from recorded replies alone: no key, no network."""
     sweep(**{**options, "replay": True})
+
+
+def _rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]:
+    """The sweep as it is, with the emulator in the place of its provider.
+
+    ``home`` is the folder in which the results of the sweep lie. Raises UsageError.
+    """
+    from merge_runner.config import PROVIDERS, REHEARSAL, ModelEntry, endpoint_identity
+    from merge_runner.llm.models import load_models
+
+    def possible(entry: ModelEntry) -> bool:
+        provider = PROVIDERS.require(entry.provider)
+        is_own = endpoint_identity(entry) == entry.provider and entry.path is None
+        return is_own and provider.key_needed and provider.base_url_env is not None
+
+    is_usual = (options.db, options.cache) == (home / DEFAULT_DB, home / DEFAULT_CACHE)
+    if not is_usual or options.replay or options.dask or options.batch:
+        raise UsageError(
+            f"a rehearsal keeps what it makes in {REHEARSALS}, plays in this process and asks "
+            "singly: leave --db, --cache, --dask, --replay and --batch out"
+        )
+    models = {plan.registered[name] for name in plan.entries}
+    if len(models) != 1 or not all(map(possible, plan.entries.values())):
+        registry = load_models(plan.study.path.parent)
+        valid = ", ".join(name for name, entry in registry.items() if possible(entry))
+        raise UsageError(
+            f"--rehearse takes one model at its provider's own address: --model with one of {valid}"
+        )
+    db, cache = home / REHEARSALS / "merge.duckdb", home / REHEARSALS / "responses"
+    plan = plan.model_copy(update={"endpoints": dict.fromkeys(plan.entries, REHEARSAL)})
+    return plan, replace(options, db=db, cache=cache)
 
 
 def _play(
@@ -152,7 +181,7 @@ def _play(
         for note in shutdown_notes(asked, datetime.now(UTC).date()):
             say(note)
     if dry_run:
-        expected = asyncio.run(unsent(plan, plan.within_budget(options), say=say))
+        expected = asyncio.run(unsent(plan, options, say=say))
         lines = "\n".join(summary.estimate_lines(expected))
         print_out(json.dumps(asdict(expected)) if as_json else f"{lines}\nNothing was sent.")
         return 0

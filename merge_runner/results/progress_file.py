@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import platform
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 from urllib.parse import quote
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, NonNegativeInt, ValidationError
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
-# While a sweep checks what it stored, the file is silent.
+# While a sweep checks what it stored, the file is silent: only its process shows that it lives.
 STALE_S = {"playing": 10.0, "checking": 600.0}
 MOST_BYTES = 1_000_000
+# Identifies the machine among those that share a folder: process ids mean nothing on another one.
+MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 class Standing(BaseModel):
@@ -29,6 +32,8 @@ class Standing(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     sweep_id: str
+    pid: int = Field(default_factory=os.getpid, ge=1, lt=2**31)
+    machine: str = MACHINE
     updated_at: AwareDatetime
     doing: Literal["playing", "checking"]
     ended: NonNegativeInt
@@ -39,33 +44,37 @@ class Standing(BaseModel):
 
     @property
     def alive(self) -> bool:
-        """Whether the sweep was heard of lately."""
+        """Whether the sweep is still running, by its file and its process."""
+        try:
+            if self.machine == MACHINE:
+                os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:
+            pass  # it is another user's
         return (datetime.now(UTC) - self.updated_at).total_seconds() < STALE_S[self.doing]
 
 
-@dataclass(frozen=True, slots=True)
-class ProgressFile:
-    """The file of one sweep. A sweep goes on where it cannot be written."""
+def write_standing(db: Path, standing: Standing) -> None:
+    """Replace a sweep's file as a whole: a reader sees the old state or the new one, never a part.
 
-    db: Path
-    sweep_id: str
+    A sweep goes on where it cannot be written.
+    """
+    path = _path(db, standing.sweep_id)
+    made = path.with_suffix(".tmp")
+    with suppress(OSError):
+        path.parent.mkdir(exist_ok=True)
+        made.write_text(standing.model_dump_json(), encoding="utf-8")
+        os.replace(made, path)
 
-    def write(self, standing: Standing) -> None:
-        """Replace the file as a whole: a reader sees the old state or the new one, never a part."""
-        path = _path(self.db, self.sweep_id)
-        made = path.with_suffix(".tmp")
-        with suppress(OSError):
-            path.parent.mkdir(exist_ok=True)
-            made.write_text(standing.model_dump_json(), encoding="utf-8")
-            os.replace(made, path)
 
-    def remove(self) -> None:
-        """Remove the file of a sweep that has ended normally."""
-        path = _path(self.db, self.sweep_id)
-        with suppress(OSError):
-            path.with_suffix(".tmp").unlink(missing_ok=True)
-            path.unlink(missing_ok=True)
-            path.parent.rmdir()
+def remove_standing(db: Path, sweep_id: str) -> None:
+    """Remove the file of a sweep that has ended normally."""
+    path = _path(db, sweep_id)
+    with suppress(OSError):
+        path.with_suffix(".tmp").unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+        path.parent.rmdir()
 
 
 def read_standing(db: Path, sweep_id: str) -> Standing | None:

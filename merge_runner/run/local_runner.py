@@ -45,7 +45,8 @@ MOST_INVALID = 20
 SHOWN = 300
 ADVICE = (
     "look at what the prompt asks for, and in which output format; some servers hold a small "
-    "model to it by a grammar"
+    "model to it by a grammar. Where replies are cut off or empty, set a higher "
+    f"`max_output_tokens` in {REGISTRY}"
 )
 
 
@@ -98,11 +99,9 @@ class FirstDecisions:
             self._changed.set()
         if invalid:
             self._invalid[model] += invalid
-            shown, why = one_line(" ".join((text or "").split()))[:SHOWN], failure or ""
-            is_short = why in ("truncated", "empty")
-            advice = f"set a higher `max_output_tokens` in {REGISTRY}" if is_short else ADVICE
-            line = f'The first reply is "{shown}" ({why.replace("_", " ")}). To mend that {advice}'
-            self._described.setdefault(model, line)
+            shown = one_line(" ".join((text or "").split()))[:SHOWN]
+            reply = f'"{shown}" ({(failure or "").replace("_", " ")})'
+            self._described.setdefault(model, f"The first reply is {reply}. To mend that {ADVICE}")
 
     def without_a_valid_one(self) -> list[str]:
         """A line for each model none of whose decisions is valid."""

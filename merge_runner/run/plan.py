@@ -73,11 +73,10 @@ class Options:
     """How a sweep runs; nothing here changes a result.
 
     ``rpm`` and ``tpm`` override the registry's. ``max_cost_usd`` is a cap over ``ledgers``, too,
-    those of other sweeps.
-    ``dask`` names the cluster that plays the trials; if None, this process plays them.
-    A ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to
-    ``keep_going`` asks a model on that gives no valid decision. In a ``batch`` run all trials ask
-    together, at a lower price.
+    those of other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
+    ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to ``keep_going``
+    asks a model on that gives no valid decision. In a ``batch`` run all trials ask together, at a
+    lower price.
     """
 
     db: Path
@@ -128,11 +127,10 @@ class Plan(BaseModel):
 
     The column ``sweeps.config`` holds it as JSON, from which it is read again. ``model`` says who
     drives but for opponents, as ids of sweeps do, with a comma between models. ``levels`` are those
-    of each factor of its file, a factor's reference first. ``entries`` are the
-    language models of all arms by what an arm's ``asked`` calls them, and ``endpoints`` the
-    identities of their endpoints (see ``config.Endpoint``). ``mirror``: its pairs are played both
-    ways round whatever its file says. ``seat`` is ``first`` where only the first situations are
-    asked (see ``_first_decision``), and empty in a sweep.
+    of each factor of its file, a factor's reference first. ``entries`` are the language models of
+    all arms by what an arm's ``asked`` calls them, and ``endpoints`` the identities of their
+    endpoints (see ``config.Endpoint``). ``mirror``: pairs are played both ways round whatever the
+    file says. ``seat`` is ``first`` where only first decisions are asked, and empty in a sweep.
     """
 
     model_config = ConfigDict(frozen=True, serialize_by_alias=True, validate_by_name=True)
@@ -182,9 +180,8 @@ class Plan(BaseModel):
     @property
     def usual_calls(self) -> float:
         """How many calls all trials usually take."""
-        asked = {arm.label: sum(n in arm.entries for n in arm.asked.values()) for arm in self.arms}
-        calls = (a.repetitions * usual_prompts(a) * asked[a.label] for a in self.arms)
-        return sum(calls) * len(self.conditions)
+        asked = (arm for arm in self.arms for side in SIDES if arm.asked[side] in arm.entries)
+        return sum(a.repetitions * usual_prompts(a) for a in asked) * len(self.conditions)
 
     @property
     def scripted(self) -> bool:
@@ -206,12 +203,6 @@ class Plan(BaseModel):
         """The drivers with their endpoints; see ``pair_name``."""
         pairs = (pair_name(arm.names, self.endpoints) for arm in self.arms)
         return ", ".join(dict.fromkeys(pairs))
-
-    def within_budget(self, options: Options) -> Options:
-        """Return the options with the cap of the study's budget; ``--max-cost`` goes before it."""
-        if options.max_cost_usd is not None:
-            return options
-        return replace(options, max_cost_usd=self.study.file.budget.total_usd)
 
     def by_label(self) -> dict[str, Arm]:
         """The arms by the labels that their trials carry."""
@@ -271,13 +262,13 @@ class Plan(BaseModel):
             for hashed in (spec_hash(self.spec(arm, condition)),)
             for repetition in range(1, arm.repetitions + 1)
         ]
-        specs.sort(key=self._place)
-        return [replace(spec, order=order) for order, spec in enumerate(specs)]
 
-    def _place(self, spec: TrialSpec) -> tuple[int, str]:
-        """What orders trials randomly within a repetition, the same way on every machine."""
-        drawn_for = f"{self.order_seed}/{spec.repetition}/{spec.arm}/{spec.condition}"
-        return spec.repetition, hashlib.sha256(drawn_for.encode()).hexdigest()
+        def place(spec: TrialSpec) -> tuple[int, str]:
+            # The same way on every machine.
+            drawn_for = f"{self.order_seed}/{spec.repetition}/{spec.arm}/{spec.condition}"
+            return spec.repetition, hashlib.sha256(drawn_for.encode()).hexdigest()
+
+        return [replace(spec, order=order) for order, spec in enumerate(sorted(specs, key=place))]
 
     def trial_id_of(self, arm: Arm, condition: str, repetition: int) -> str:
         """The id of a trial of an arm."""
@@ -343,22 +334,18 @@ def make_plan(
     """
     if grid is not None:
         if conditions is not None or not first:
-            raise UsageError(
-                "a grid takes the place of the conditions, and goes with --first alone"
-            )
+            raise UsageError("a grid takes the place of the conditions, with --first alone")
         conditions = grid_conditions(grid)
-    asked = (models,) if isinstance(models, str) else tuple(models)
-    study = load_study(sweep, asked, trust=trust)
-    registry = load_models(study.path.parent)
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
-    drivers = chosen_models(study.file, asked)
+    asked = (models,) if isinstance(models, str) else tuple(models)
+    study = load_study(sweep, asked, trust=trust)
+    file, registry = study.file, load_models(study.path.parent)
+    drivers = chosen_models(file, asked)
     pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
     wanted = _repetitions(study, variants, repetitions)
-    names = _conditions(study.file, conditions)
-    arms = cross(
-        study.file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
-    )
+    names = _conditions(file, conditions)
+    arms = cross(file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror)
     _check_arms(arms, names, db, first=first)
     if first:
         arms = list(map(_first_decision, arms))
@@ -367,8 +354,8 @@ def make_plan(
         name=f"{study.name}-first" if first else study.name,
         study=study,
         model=",".join(map("+".join, pairs)),
-        levels=listed_levels(study.file, (arm.model_level for arm in arms), wanted),
-        description=study.file.description,
+        levels=listed_levels(file, (arm.model_level for arm in arms), wanted),
+        description=file.description,
         arms=tuple(arms),
         entries=entries,
         endpoints={name: endpoint_identity(entry) for name, entry in entries.items()},
@@ -398,8 +385,7 @@ def grid_conditions(text: str) -> list[str]:
     ``h`` or ``dv`` may be one number, or be left out for that of the usual grid. Raises UsageError.
     """
     parts = USUAL_GRID if text == "usual" else f"{USUAL_GRID},{text}"
-    axes = dict(map(_axis, parts.split(",")))
-    points = list(product(*axes.values()))
+    points = list(product(*dict(map(_axis, parts.split(","))).values()))
     for point in points:
         Condition(*point)  # raises where a vehicle would not drive forwards
     return [condition_name(*point) for point in points]
@@ -452,10 +438,9 @@ def _check_arms(
 def _conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:
     wanted = next(c for c in (chosen, file.conditions, HUMAN_CONDITIONS) if c is not None)
     names = (HUMAN_CONDITIONS if each == EVERY_CONDITION else (each,) for each in wanted)
-    conditions = tuple(dict.fromkeys(chain.from_iterable(names)))
-    if not conditions:
-        raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
-    return conditions
+    if conditions := tuple(dict.fromkeys(chain.from_iterable(names))):
+        return conditions
+    raise UsageError(f"no condition is left; valid: {', '.join(CONDITIONS)}")
 
 
 def _repetitions(
@@ -464,15 +449,14 @@ def _repetitions(
     """The wanted prompts with their repetitions per condition; raises UsageError."""
     if chosen is not None and not 1 <= chosen <= MOST_REPETITIONS:
         raise UsageError(f"--reps is a whole number from 1 to {MOST_REPETITIONS}")
-    given = study.file.repetitions
-    wanted = {}
+    given, wanted = study.file.repetitions, {}
     for variant in file_prompts(study.file) if variants is None else variants:
         blocks_of(variant)  # raises where there is none
         wanted[variant] = chosen or given.get(variant, given.get(EVERY_PROMPT, 0))
-    lacking = [variant for variant, repetitions in wanted.items() if not repetitions]
-    if lacking or not wanted:
-        raise UsageError(
-            f"the sweep {study.name} has no variant{' '.join(['', *lacking])}; valid: "
-            f"{', '.join(VARIANTS)}. With --reps N any variant can be run."
-        )
-    return wanted
+    if wanted and all(wanted.values()):
+        return wanted
+    lacking = "".join(f" {variant}" for variant, repetitions in wanted.items() if not repetitions)
+    raise UsageError(
+        f"the sweep {study.name} has no variant{lacking}; valid: {', '.join(VARIANTS)}. With "
+        "--reps N any variant can be run."
+    )

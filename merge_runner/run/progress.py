@@ -1,24 +1,24 @@
-"""What a user sees while a sweep runs: a live table on a terminal, plain lines elsewhere."""
+"""What a user sees while a sweep runs: a live text on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
 import asyncio
 import sys
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from merge_runner.llm.client import Wait
 from merge_runner.llm.ledger import Ledger
-from merge_runner.results.progress_file import ProgressFile, Standing, clear_dead
+from merge_runner.results.progress_file import Standing, clear_dead, remove_standing, write_standing
 from merge_runner.run.plan import Plan
-from merge_runner.text_safety import printable
+from merge_runner.text_safety import printable, say
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.text import Text
 
     from merge_runner.run.cluster import DaskTasks
     from merge_runner.run.local_runner import LocalRunner
@@ -66,26 +66,22 @@ class Progress:
         batches = first_of(self.batches(), "others")
         # How long a batch takes nobody knows.
         left_s = None if batches else self._left_s(elapsed_s, ended + failed, live + cached)
-        before = f" (+{self.stored} stored before)" if self.stored else ""
-        workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
-        cap = ""
+        trials = f"{ended + failed}/{self.planned - self.stored} ended"
+        trials += f" (+{self.stored} stored before)" if self.stored else ""
+        trials += f", {self.runner.running} running"
+        trials += "" if self.runner.workers is None else f" on {self.runner.workers} workers"
+        cost = f"{cost_usd:.2f} USD"
         if self.cap_usd is not None:
-            cap = f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+            cost += f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+        left = "" if left_s is None else f", about {left_s:.0f} s left"
         rows = [
-            *(("WARNING", text) for text in self._warnings()),
-            (
-                "trials",
-                f"{ended + failed}/{self.planned - self.stored} ended{before}, "
-                f"{self.runner.running} running{workers}",
-            ),
+            *dict.fromkeys(("WARNING", text) for text in self._warnings()),
+            ("trials", trials),
             ("failed", str(failed)),
             ("calls", f"{live} live, {cached} from recordings"),
-            ("cost", f"{cost_usd:.2f} USD{cap}"),
+            ("cost", cost),
             *(("waiting", text) for text in batches + [CLOSE_IT] * bool(batches) + self._waits()),
-            (
-                "time",
-                f"{elapsed_s:.0f} s" + ("" if left_s is None else f", about {left_s:.0f} s left"),
-            ),
+            ("time", f"{elapsed_s:.0f} s{left}"),
         ]
         return Standing(
             sweep_id=sweep_id,
@@ -109,25 +105,21 @@ class Progress:
         part = max(ended / total, by_calls) if ended < total else 0.0
         return elapsed_s / part - elapsed_s if part else None
 
-    def _warnings(self) -> list[str]:
-        meters = self.runner.meters.items()
-        others = {pair for _, meter in meters for pair in meter.mismatches}
-        return [
-            *filter(None, [self.unstored()]),
-            *(f"another model answers: {pair}" for pair in sorted(others)),
-            *(f"a scripted stand-in answers, not {name}" for name, m in meters if m.stand_ins),
-        ]
+    def _warnings(self) -> Iterator[str]:
+        if problem := self.unstored():
+            yield problem
+        for name, meter in self.runner.meters.items():
+            yield from (f"another model answers: {pair}" for pair in sorted(meter.mismatches))
+            if meter.stand_ins:
+                yield f"a scripted stand-in answers, not {name}"
 
     def _waits(self) -> list[str]:
         """How many calls wait, for what, and the latest time until when, if known."""
-        alike: dict[str, list[Wait]] = {}
-        for wait in self.runner.waits:
-            alike.setdefault(wait.what, []).append(wait)
         texts = []
-        for what, waits in sorted(alike.items(), key=lambda item: -len(item[1])):
-            ends = [wait.until for wait in waits if wait.until is not None]
+        for what, number in Counter(wait.what for wait in self.runner.waits).most_common():
+            ends = [w.until for w in self.runner.waits if w.what == what and w.until is not None]
             until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
-            texts.append(f"{len(waits)} {what}{until}")
+            texts.append(f"{number} {what}{until}")
         return first_of(texts, "other reasons")
 
 
@@ -138,25 +130,10 @@ def first_of(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[
 
 
 @asynccontextmanager
-async def publish_progress(progress: Progress, file: ProgressFile) -> AsyncIterator[None]:
-    """Keep a sweep's progress file up to date while the body runs; remove the file at the end."""
-
-    def publish() -> None:
-        file.write(progress.standing(file.sweep_id))
-
-    clear_dead(file.db)
-    publish()
-    publishing = asyncio.create_task(_repeat(progress, PUBLISHED_EVERY_S, publish))
-    try:
-        yield
-    finally:
-        publishing.cancel()
-        file.remove()
-
-
-@asynccontextmanager
-async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[None]:
-    """Show the progress on stderr while the body runs, and at its end.
+async def show_progress(
+    progress: Progress, db: Path, sweep_id: str, *, quiet: bool
+) -> AsyncIterator[None]:
+    """Show the progress on stderr and in a file beside the database while the body runs.
 
     ``quiet``: only the clients' messages.
     """
@@ -166,27 +143,35 @@ async def display_progress(progress: Progress, *, quiet: bool) -> AsyncIterator[
         from rich.live import Live
 
         live = Live(console=Console(stderr=True), auto_refresh=False)
-        live.start()  # the table stays below what is printed meanwhile
+        live.start()  # the text stays below what is printed meanwhile
 
     def show() -> None:
         with suppress(OSError):  # the terminal may be closed
             for note in _notes(progress):
                 say(note)
             if live is not None:
-                live.update(table_of(progress), refresh=True)
+                live.update(terminal_text(progress), refresh=True)
             elif not quiet:
                 say("; ".join(f"{name}: {text}" for name, text in progress.standing("").rows))
 
-    every_s = PLAIN_EVERY_S if live is None else LIVE_EVERY_S
-    showing = asyncio.create_task(_repeat(progress, every_s, show))
+    def publish() -> None:
+        write_standing(db, progress.standing(sweep_id))
+
+    clear_dead(db)
+    publish()
+    shown_every_s = PLAIN_EVERY_S if live is None else LIVE_EVERY_S
+    both = ((PUBLISHED_EVERY_S, publish), (shown_every_s, show))
+    tasks = [asyncio.create_task(_repeat(progress, *each)) for each in both]
     try:
         yield
     finally:
-        showing.cancel()
+        for task in tasks:
+            task.cancel()
         show()
         with suppress(OSError):
             if live is not None:
                 live.stop()
+        remove_standing(db, sweep_id)
 
 
 async def _repeat(progress: Progress, every_s: float, do: Callable[[], None]) -> None:
@@ -200,17 +185,15 @@ async def _repeat(progress: Progress, every_s: float, do: Callable[[], None]) ->
         do()
 
 
-def table_of(progress: Progress) -> Table:
-    """What is shown on a terminal."""
-    from rich.table import Table
+def terminal_text(progress: Progress) -> Text:
+    """What is shown on a terminal; text from a server must not be read as markup."""
     from rich.text import Text
 
     mock = " (a mock)" if progress.plan.scripted else ""
-    title = Text(printable(f"{progress.plan.name}: {progress.plan.driver}{mock}"))
-    table = Table(title=title, title_justify="left", show_header=False, box=None)
-    for name, text in progress.standing("").rows:
-        table.add_row(name, Text(text))  # text from a server must not be read as markup
-    return table
+    rows = (f"{name:<8} {text}" for name, text in progress.standing("").rows)
+    return Text(
+        printable("\n".join([f"{progress.plan.name}: {progress.plan.driver}{mock}", *rows]))
+    )
 
 
 def _notes(progress: Progress) -> list[str]:
@@ -220,8 +203,3 @@ def _notes(progress: Progress) -> list[str]:
         while meter.notes:
             notes[meter.notes.popleft()] = None
     return first_of(list(notes), "more like these", NOTES_SHOWN)
-
-
-def say(line: str) -> None:
-    """Print a message beside the results."""
-    print(printable(line), file=sys.stderr, flush=True)  # noqa: T201 # the display

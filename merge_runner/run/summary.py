@@ -54,7 +54,6 @@ async def play(
             say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
         plan = part
     expected = None
-    options = plan.within_budget(options)
     async with open_sweep(plan, options, say=say) as sweep:
         is_free = all(entry.price == "free" for entry in plan.entries.values())
         if sweep.todo and not (options.replay or is_free):
@@ -101,12 +100,7 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
     The last ones, from ``decisions`` on, are there where anything is stored.
     """
     plan, facts, meter, spending = outcome.plan, outcome.facts, outcome.meter, outcome.spending
-    trials = {
-        "planned": plan.trials,
-        "stored_before": outcome.stored_before,
-        "suspended": outcome.suspended,
-    }
-    summary = {
+    summary: dict[str, Any] = {
         "sweep_id": outcome.sweep_id,
         "name": plan.name,
         "model": plan.model,
@@ -115,7 +109,11 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
         "exit_code": outcome.exit_code,
         "messages": outcome.messages,
         "db": str(options.db),
-        "trials": trials,
+        "trials": {
+            "planned": plan.trials,
+            "stored_before": outcome.stored_before,
+            "suspended": outcome.suspended,
+        },
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
         "attempts": meter.outcomes,
         "cost_usd": round(meter.cost_usd, 6),
@@ -136,7 +134,7 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
     statuses: Counter[str] = Counter()
     for _, _, status, _, _, number in facts.outcomes:
         statuses[status] += number
-    trials.update({status: statuses[status] for status in get_args(Status)})
+    summary["trials"] |= {status: statuses[status] for status in get_args(Status)}
     return {
         **summary,
         "decisions": facts.decisions,
@@ -171,45 +169,33 @@ def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
     """The summary for a reader; ``summary`` is the same by ``as_dict``."""
     facts = outcome.facts
     if facts is not None:
-        if looks := facts.first_looks:
-            as_text = StringIO()
-            write_table([*looks[0]], (tuple(map(_short, look.values())) for look in looks), as_text)
-            yield as_text.getvalue()
-        for factor, group in groupby(summary["outcomes_by_level"], key=itemgetter("factor")):
-            rows = [list(row.values())[1:] for row in group]
-            if len(rows) > 1 and not outcome.plan.seat:
-                yield from _grid([factor, *COLUMNS], rows)
-        share = f" ({facts.invalid / facts.decisions:.1%})" if facts.invalid else ""
-        yield (
-            f"decisions: {facts.decisions}, {facts.invalid} invalid{share}, "
-            f"{facts.fallbacks} fallbacks to an earlier plan"
-        )
-        yield from (
-            f"attempts without a plan, {model}, {variant}: {attempts} {fate} after {cause}"
-            for model, variant, fate, cause, attempts in facts.ledger
-            if fate != "driven"
-        )
+        yield from _results(outcome.plan, facts, summary)
     yield from _costs(outcome, summary)
     yield from (f"open batch: {text}" for text in outcome.batches)
     for key in outcome.meter.damaged:
         yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
     if facts is not None:
-        yield from (
-            f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
-            for pair, answers in summary["model_mismatches"].items()
-        )
-        yield from _who_answered(outcome, facts)
-        if (audit := outcome.audit) is not None:
-            checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
-            yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
-            notes = [f"note: {each}" for each in audit.notes]
-            yield from first_of(notes, "more notes: `merge-runner audit`", SHOWN)
-        failed = [f"failed: {trial_id}: {error}" for trial_id, error in facts.failed]
-        yield from first_of(failed, "more, in the table trials", SHOWN)
-        if failed and outcome.exit_code != ReplayMiss.exit_code:
-            yield "Run the same command again to play the failed trials anew."
+        yield from _faults(outcome, facts, summary)
     if outcome.sweep_id:
         yield f"database: {summary['db']}"
+
+
+def _results(plan: Plan, facts: SweepFacts, summary: dict[str, Any]) -> Iterator[str]:
+    """How the trials ended, or what drivers do first."""
+    if looks := facts.first_looks:
+        as_text = StringIO()
+        rows = ([f"{v:.3g}" if isinstance(v, float) else v for v in r.values()] for r in looks)
+        write_table([*looks[0]], map(tuple, rows), as_text)
+        yield as_text.getvalue()
+    for factor, group in groupby(summary["outcomes_by_level"], key=itemgetter("factor")):
+        levels = [list(row.values())[1:] for row in group]
+        if len(levels) > 1 and not plan.seat:
+            yield from _grid([factor, *COLUMNS], levels)
+    share = f" ({facts.invalid / facts.decisions:.1%})" if facts.invalid else ""
+    yield (
+        f"decisions: {facts.decisions}, {facts.invalid} invalid{share}, "
+        f"{facts.fallbacks} fallbacks to an earlier plan"
+    )
 
 
 def _grid(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
@@ -222,29 +208,21 @@ def _grid(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator
     yield ""
 
 
-def _short(value: object) -> object:
-    return f"{value:.3g}" if isinstance(value, float) else value
-
-
 def _costs(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
-    spending, unknown = outcome.spending, outcome.meter.cost_unknown
+    meter, spending = outcome.meter, outcome.spending
+    unknown = f" and {meter.cost_unknown} calls of unknown cost" if meter.cost_unknown else ""
     yield (
-        "calls: {live} live, {cached} from recordings; ".format(**summary["calls"])
-        + f"cost {outcome.meter.cost_usd:.4f} USD"
-        + (f" and {unknown} calls of unknown cost" if unknown else "")
+        f"calls: {meter.calls_live} live, {meter.calls_cached} from recordings; "
+        f"cost {meter.cost_usd:.4f} USD{unknown}"
     )
     if (expected := summary["estimate"]) is not None:
         cost = (expected["batch"] or expected)["cost_usd"]
         usd = "an unknown price" if cost is None else f"{cost:.2f} USD"
         yield f"estimated before: {expected['calls']} calls, {usd}"
     if spending.committed_usd:
-        reserved = (
-            f", and {spending.reserved_usd:.4f} set aside (`merge-runner ledger` says why)"
-            if spending.open_attempts
-            else ""
-        )
         yield (
-            f"this sweep over all its runs: {spending.spent_usd:.4f} USD{reserved}; "
+            f"this sweep over all its runs: {spending.spent_usd:.4f} USD, and "
+            f"{spending.reserved_usd:.4f} set aside (`merge-runner ledger` says why); "
             f"all sweeps on this cache: {outcome.cache_cost_usd:.4f} USD"
         )
     if spending.overrun_usd:
@@ -254,8 +232,10 @@ def _costs(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
         )
 
 
-def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
-    """Stand-ins, and what the registry notes of models."""
+def _faults(outcome: Outcome, facts: SweepFacts, summary: dict[str, Any]) -> Iterator[str]:
+    """Who answered in whose place, what the audit says, and which trials failed."""
+    for pair, answers in summary["model_mismatches"].items():
+        yield (f"WARNING: another model answered than was asked for: {pair} ({answers} answers)")
     for driver, model, provider, _, _ in facts.stand_ins:
         if provider == EMULATOR:
             yield f"The model `{model}` is a scripted stand-in, no language model."
@@ -264,6 +244,15 @@ def _who_answered(outcome: Outcome, facts: SweepFacts) -> Iterator[str]:
     for name, entry in outcome.plan.entries.items():
         if entry.note and entry.provider != EMULATOR:
             yield f"{name}: {entry.note}"
+    if (audit := outcome.audit) is not None:
+        checked = ", ".join(f"{n} {what}" for what, n in audit.counts.items() if n)
+        yield f"audited: {checked}: {len(audit.findings) or 'no'} findings"
+        notes = [f"note: {each}" for each in audit.notes]
+        yield from first_of(notes, "more notes: `merge-runner audit`", SHOWN)
+    failed = [f"failed: {trial_id}: {error}" for trial_id, error in facts.failed]
+    yield from first_of(failed, "more, in the table trials", SHOWN)
+    if failed and outcome.exit_code != ReplayMiss.exit_code:
+        yield "Run the same command again to play the failed trials anew."
 
 
 def estimate_lines(expected: Estimate) -> Iterator[str]:

@@ -14,10 +14,18 @@ from pathlib import Path
 
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.audit.findings import Audit
-from merge_runner.config import model_id
+from merge_runner.config import (
+    PROVIDERS,
+    UNNAMED,
+    ModelEntry,
+    driver_name,
+    model_id,
+    resolve_endpoint,
+)
 from merge_runner.errors import (
     MergeRunnerError,
     NoValidDecision,
+    ProviderDown,
     ReplayMiss,
     StoreError,
     TrialSuspended,
@@ -27,10 +35,11 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Meter
 from merge_runner.llm.content_hashes import canonical_json
+from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody
 from merge_runner.llm.ledger import Ledger, Spending, scopes
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
-from merge_runner.results.progress_file import ProgressFile
+from merge_runner.results.progress_file import write_standing
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recorded_study import described
 from merge_runner.results.recording import Spilled
@@ -44,9 +53,8 @@ from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate
 from merge_runner.run.flusher import AGAIN, BATCH, Flusher
 from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions, LocalRunner
-from merge_runner.run.model_names import recorded_name, served_name
 from merge_runner.run.plan import Options, Plan, usual_prompts
-from merge_runner.run.progress import Progress, display_progress, publish_progress
+from merge_runner.run.progress import Progress, show_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
 from merge_runner.signals import on_interrupt
 
@@ -137,12 +145,11 @@ class Sweep:
                 unstored=lambda: flusher.problem,
                 batches=self._rounds.standing if self._rounds else list,
             )
-            file = ProgressFile(self._options.db, outcome.sweep_id)
-            await stack.enter_async_context(publish_progress(progress, file))
+            db, sweep_id, quiet = self._options.db, outcome.sweep_id, self._options.quiet
+            await stack.enter_async_context(show_progress(progress, db, sweep_id, quiet=quiet))
             began = time.perf_counter()
             try:
-                async with display_progress(progress, quiet=self._options.quiet):
-                    await self._play(runner, flusher, progress, outcome)
+                await self._play(runner, flusher, progress, outcome)
             finally:
                 outcome.playing_s = time.perf_counter() - began
                 is_stored = await self._store_rest(flusher, outcome)
@@ -155,7 +162,7 @@ class Sweep:
             outcome.batches, outcome.worst_stall_s = progress.batches(), progress.worst_stall_s
             self._add_costs(outcome)
             progress.doing = "checking"
-            file.write(progress.standing(outcome.sweep_id))
+            write_standing(db, progress.standing(sweep_id))
             if is_stored:
                 self._check(store, runner.first, outcome)
         return outcome
@@ -377,16 +384,14 @@ async def open_sweep(
     ask. ``say`` shows a line to the user. Raises UsageError.
     """
     check_batches(plan, options)
+    if options.max_cost_usd is None:
+        options = replace(options, max_cost_usd=plan.study.file.budget.total_usd)
     recorded = partial(Spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
-        entries = {}
-        for name, entry in plan.entries.items():
-            found = model_id(entry)
-            if not found and options.sends_nothing:
-                found = recorded_name(entry, cache)
-            elif not found:
-                found = await served_name(name, entry, say=say)
-            entries[name] = entry.model_copy(update={"id": found})
+        entries = {
+            name: await _named(name, entry, options, cache, say)
+            for name, entry in plan.entries.items()
+        }
         plan = plan.with_entries(entries)
         endpoints = {name: _endpoint(plan, name, options, cache) for name in entries}
         plan = plan.model_copy(update={"endpoints": endpoints})
@@ -397,9 +402,50 @@ async def open_sweep(
         stored = [spec for key, spec in specs.items() if key in ended]
         todo = [spec for key, spec in specs.items() if key not in ended]
         if todo and not options.sends_nothing:
+            if options.dask is None and not plan.is_rehearsal:
+                for name, entry in entries.items():
+                    resolve_endpoint(name, entry)  # raises where its key is missing
             options = _less_what_is_spent(plan, options, cache, say)
             cache.locks.take({f"{e.id} at {endpoints[name]}" for name, e in entries.items()})
         yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger))
+
+
+async def _named(
+    name: str, entry: ModelEntry, options: Options, cache: ResponseCache, say: Callable[[str], None]
+) -> ModelEntry:
+    """The entry with its model's name: as told, as recorded, or as its server says."""
+    found = model_id(entry)
+    if not found and options.sends_nothing:
+        # A server of one's own serves one model, or the recorded replies do not tell which.
+        recorded = {r.model for r in cache.recorded(lambda r: r.provider == entry.provider)}
+        found = recorded.pop() if len(recorded) == 1 else UNNAMED
+    elif not found:
+        found = await _served_name(name, entry, say=say)
+    return entry.model_copy(update={"id": found})
+
+
+async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
+    """The one model that a server lists; raises ProviderDown where nobody listens, UsageError."""
+    from merge_runner.llm.http import listed_models  # imports httpx, which no replay needs
+
+    endpoint = resolve_endpoint(name, entry)
+    driver = driver_name(name, endpoint.identity)
+    try:
+        listed = await listed_models(endpoint)
+    except TransportFailure as exc:
+        if exc.outcome == "no_connection":
+            raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
+        listed, models = [], f"models that it does not list ({exc})"
+    else:
+        models = ", ".join(listed) or "no model"
+    if len(listed) != 1:
+        variable = PROVIDERS.require(entry.provider).model_env
+        raise UsageError(
+            f"{driver} serves {models}: name one with "
+            f"{variable}, or with `id` of [{name}] in {REGISTRY}, which goes first"
+        )
+    say(f"{driver} serves {listed[0]}, which is asked")
+    return listed[0]
 
 
 def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:

@@ -10,13 +10,19 @@ from types import SimpleNamespace
 import pytest
 
 from merge_runner.llm.ledger import Spending
-from merge_runner.results.progress_file import ProgressFile, clear_dead, read_standing
+from merge_runner.results.progress_file import (
+    clear_dead,
+    read_standing,
+    remove_standing,
+    write_standing,
+)
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.progress import Progress
 from tests.gate import HANGS_S
 from tests.harness import run_sweep
 
+NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
 LONG_AGO = datetime(2026, 1, 1, tzinfo=UTC)
 LEDGER = SimpleNamespace(spending=Spending())
 SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm", 100)
@@ -40,24 +46,30 @@ async def begun(db):
 
 
 @pytest.mark.slow
-async def test_a_sweep_says_where_it_stands_until_it_is_killed(
+async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_tidies_up(
     merge_runner, tmp_path, emulator_url
 ):
     db = tmp_path / "m.duckdb"
     process = await merge_runner.start(*SWEEP, "--db", db, EMULATOR_BASE_URL=emulator_url)
     try:
         found, path = await begun(db)
+        text, alive = path.read_text(), found.alive
     finally:
         process.kill()
         await process.communicate()
+    assert found.pid == process.pid
     assert dict(found.rows)["trials"] == "0/4 ended, 4 running"
-    assert found.alive
-    assert str(tmp_path) not in path.read_text()
+    assert str(tmp_path) not in text
+    assert (alive, read_standing(db, found.sweep_id).alive) == (True, False)
+    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--db", db)).code == 0
+    assert not path.parent.exists()
 
 
 async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, monkeypatch):
     said = []
-    monkeypatch.setattr(ProgressFile, "write", lambda _, standing: said.append(standing))
+    for module in ("progress", "sweep"):
+        name = f"merge_runner.run.{module}.write_standing"
+        monkeypatch.setattr(name, lambda _, standing: said.append(standing))
     plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0", "L_4_0"])
     await run_sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print)
     first, last = said[0], said[-1]
@@ -72,17 +84,20 @@ async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, m
         ({}, 11, False),  # frozen
         ({"doing": "checking"}, 11, True),  # it does nothing else meanwhile
         ({"doing": "checking"}, 601, False),
+        ({"doing": "checking", "pid": NO_PROCESS}, 1, False),
+        ({"pid": NO_PROCESS}, 1, False),
+        ({"pid": NO_PROCESS, "machine": "another"}, 1, True),  # its ids mean nothing here
     ],
 )
-def test_a_sweep_is_dead_when_it_is_silent(changes, age_s, alive):
+def test_a_sweep_is_dead_when_its_process_is_gone_or_silent(changes, age_s, alive):
     updated_at = datetime.now(UTC) - timedelta(seconds=age_s)
     assert standing(updated_at=updated_at, **changes).alive == alive
 
 
 def test_a_living_sweep_of_the_same_database_keeps_its_file(tmp_path):
     db = tmp_path / "m.duckdb"
-    ProgressFile(db, "a").write(standing("a"))
-    ProgressFile(db, "b").write(standing("b", updated_at=LONG_AGO))
+    write_standing(db, standing("a"))
+    write_standing(db, standing("b", updated_at=LONG_AGO))
     clear_dead(db)
     assert (read_standing(db, "a").alive, read_standing(db, "b")) == (True, None)
 
@@ -90,7 +105,7 @@ def test_a_living_sweep_of_the_same_database_keeps_its_file(tmp_path):
 def test_only_what_a_killed_sweep_wrote_is_tidied_up(tmp_path):
     """A folder from elsewhere may lead to one of the user's, or hold files of other programs."""
     db, documents = tmp_path / "m.duckdb", tmp_path / "documents"
-    ProgressFile(db, "a").write(standing("a", updated_at=LONG_AGO))
+    write_standing(db, standing("a", updated_at=LONG_AGO))
     (tmp_path / "m.duckdb.progress").rename(documents)
     for name in ("notes.json", "thesis.tmp"):
         (documents / name).write_text("{}")
@@ -108,19 +123,17 @@ def test_only_what_a_killed_sweep_wrote_is_tidied_up(tmp_path):
 
 def test_the_name_of_a_sweep_leads_out_of_no_folder(tmp_path):
     db, name = tmp_path / "m.duckdb", "../outside"
-    ProgressFile(db, "a").write(standing("a"))
-    ProgressFile(tmp_path / "x", "y").write(standing(name))
-    (tmp_path / "x.progress/y.json").rename(tmp_path / "outside.json")
+    write_standing(db, standing("a"))
+    (tmp_path / "outside.json").write_text(standing(name).model_dump_json())
     assert read_standing(db, name) is None
-    ProgressFile(db, name).remove()
+    remove_standing(db, name)
     assert (tmp_path / "outside.json").exists()
 
 
 def test_a_disk_that_takes_no_file_fails_nothing(tmp_path):
     (tmp_path / "m.duckdb.progress").write_text("a file where the folder should be")
-    file = ProgressFile(tmp_path / "m.duckdb", "s")
-    file.write(standing())
-    file.remove()
+    write_standing(tmp_path / "m.duckdb", standing())
+    remove_standing(tmp_path / "m.duckdb", "s")
     clear_dead(tmp_path / "m.duckdb")
 
 

@@ -19,7 +19,7 @@ from analysis.explorer.pages import sweep as page
 from analysis.explorer.pages.trials import filter_of
 from analysis.explorer.site import Site
 from analysis.explorer.sweeps import Config, ListedSweep, Model, assessment_of, config_of
-from merge_runner.results.progress_file import ProgressFile
+from merge_runner.results.progress_file import remove_standing, write_standing
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.analysis.studies import Said, write_study, yielding
@@ -87,9 +87,7 @@ def running(db, **changes):
     shown = progress(runner(), planned=3 * len(CONDITIONS))
     shown.outcome_counts = Counter(changes.pop("ended", {"finished": 2}))
     standing = shown.standing("sweep-1").model_copy(update={"left_s": 20.0, **changes})
-    file = ProgressFile(db, "sweep-1")
-    file.write(standing)
-    return file
+    write_standing(db, standing)
 
 
 def test_a_sweep_says_what_the_registry_says_of_its_model(written):
@@ -253,7 +251,7 @@ def test_a_finished_sweep_that_another_model_answered_is_doubtful():
 
 
 def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(study):
-    file = running(study)
+    running(study)
     client = browser(study)
     look = news_of(client.get(URL).text)
     assert client.get(look).status_code == 204
@@ -262,7 +260,7 @@ def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(stud
     # Who listens finds the same state, which is not read out again.
     assert '<span aria-live="off">Running: 3 of 33' in told
     Store(study).end_sweep("sweep-1", END, 130)
-    file.remove()
+    remove_standing(study, "sweep-1")
     assert "<span>Stopped: it was interrupted" in client.get(news_of(told)).text
 
 
@@ -277,11 +275,11 @@ def test_a_sweep_that_slept_goes_on_on_the_same_page(study):
 
 @pytest.mark.slow
 def test_a_sweep_is_not_said_to_be_lost_while_its_end_cannot_be_read(study):
-    file = running(study)
+    running(study)
     client = browser(study)
     look = news_of(client.get(URL).text)
     with held(study):
-        file.remove()
+        remove_standing(study, "sweep-1")
         assert client.get(look).status_code == 204
     assert "Stopped without a word" in client.get(look).text
 

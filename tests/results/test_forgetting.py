@@ -94,3 +94,4 @@ async def test_nothing_is_forgotten_while_a_sweep_is_running(merge_runner, tmp_p
     finally:
         running.kill()
         await running.wait()
+    assert (await merge_runner("forget", two_sweeps[0], "--yes")).code == 0, "it is dead"

@@ -10,7 +10,7 @@ from aiohttp import web
 from rich.console import Console
 
 from merge_runner.llm.client import Meter, Wait
-from merge_runner.run.progress import table_of
+from merge_runner.run.progress import terminal_text
 from tests.harness import watched
 from tests.run.standings import progress, runner
 
@@ -67,6 +67,6 @@ def test_a_servers_words_are_no_markup_in_the_display():
     wait = Wait("m: L_4_0", f"after HTTP 503: [/nope] {ESCAPE}")
     shown = io.StringIO()
     waiting = progress(runner(Meter(), running=1, waits=[wait]))
-    Console(file=shown, width=200).print(table_of(waiting))
+    Console(file=shown, width=200).print(terminal_text(waiting))
     assert "[/nope]" in shown.getvalue()
     assert "\x1b" not in shown.getvalue()

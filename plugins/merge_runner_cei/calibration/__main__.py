@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from merge_runner.cli.options import DbOption
-from merge_runner.cli.output import print_out, say
+from merge_runner.cli.options import DbOption, print_out
 from merge_runner.config import Resistance
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
+from merge_runner.text_safety import say
 from merge_runner_cei.parameters import SETS, ThresholdSet
 
 if TYPE_CHECKING:
