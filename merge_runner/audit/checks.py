@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from importlib.resources import files
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import duckdb
 
-from merge_runner.audit.findings import Audit, Finding
 from merge_runner.errors import RecordingError, StoreError
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import canonical_json, spec_hash, without_prompt
@@ -51,8 +53,66 @@ JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
-SHOWN = 3
+MOST_PAIRS = 3  # that the end of a sweep names
+SHOWN = 10
+"""Findings of each kind."""
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that does not hold, and where; docs/reference/audit.md lists the kinds."""
+
+    kind: str
+    text: str
+    sweep: str | None = None
+    trial: str | None = None
+    side: str | None = None
+    decision: int | None = None
+
+    def __str__(self) -> str:
+        number = None if self.decision is None else f"decision {self.decision}"
+        where = ", ".join(filter(None, (self.sweep, self.trial, self.side, number)))
+        return f"{self.kind}: {where}: {self.text}" if where else f"{self.kind}: {self.text}"
+
+
+@dataclass(slots=True)
+class Audit:
+    """What was checked of ``subject``: a sweep, a database, a recording or a cache.
+
+    The checks add to it. ``counts`` say how much was checked, in the order of checking; of a sweep
+    among them ``missing`` and ``failed`` trials. All holds where there is no finding.
+    """
+
+    subject: str
+    counts: dict[str, int] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """Whether all holds."""
+        return not self.findings
+
+    def as_dict(self) -> dict[str, Any]:
+        """The audit as JSON values."""
+        return {**asdict(self), "ok": self.ok}
+
+    def lines(self) -> Iterator[str]:
+        """The audit for a reader; of each kind the first findings."""
+        number = len(self.findings)
+        yield f"{self.subject}: " + (f"{number} findings" if number else "all holds")
+        yield "  checked: " + ", ".join(f"{n} {name}" for name, n in self.counts.items())
+        for text in self.notes:
+            yield f"  note: {text}"
+        shown: Counter[str] = Counter()
+        for finding in self.findings:
+            shown[finding.kind] += 1
+            if shown[finding.kind] <= SHOWN:
+                yield f"  {finding}"
+        for kind, count in shown.items():
+            if count > SHOWN:
+                yield f"  {kind}: and {count - SHOWN} more, all of them with --json"
 
 
 @contextmanager
@@ -106,7 +166,7 @@ def audit_sweep(path: Path, sweep_id: str, planned: Sequence[TrialKey], *, finis
         audit = check_sweep(connection, sweep_id, planned, finished=finished)
         shared = connection.execute("SELECT count(*), sum(calls) FROM calls_in_common").fetchall()
         ((pairs, calls),) = shared
-        if pairs > SHOWN:
+        if pairs > MOST_PAIRS:
             audit.notes.append(
                 f"{pairs} pairs of arms share {calls} calls, where they asked the same in the "
                 "same slots: `merge-runner audit` names them"

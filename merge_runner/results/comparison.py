@@ -16,9 +16,6 @@ from merge_runner.results.rows import Row
 TrialKey = tuple[str, str]
 """(trial_id, spec_hash)"""
 
-Span = tuple[int, int]
-"""The first and the last row number."""
-NOWHERE: Span = (2**62, -1)
 AT_ONCE = 16
 """Trials whose rows are in memory together, without their long texts."""
 
@@ -112,15 +109,12 @@ class Stored:
 
 
 def stored_rows(
-    connection: duckdb.DuckDBPyConnection,
-    table: str,
-    keys: Sequence[TrialKey],
-    span: Span | None = None,
+    connection: duckdb.DuckDBPyConnection, table: str, keys: Sequence[TrialKey]
 ) -> Stored:
     """The rows of these trials, with hashes in place of long texts."""
     hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in LONG.get(table, ()))
     columns = f"* REPLACE ({hashes})" if hashes else "*"
-    result = rows_of_trials(connection, columns, table, keys, span)
+    result = rows_of_trials(connection, columns, table, keys)
     stored = Stored(table, names_of(result))
     key = itemgetter(*map(stored.names.index, ("trial_id", "spec_hash")))
     for row in result.fetchall():
@@ -129,21 +123,16 @@ def stored_rows(
 
 
 def rows_of_trials(
-    connection: duckdb.DuckDBPyConnection,
-    columns: str,
-    table: str,
-    keys: Sequence[TrialKey],
-    span: Span | None = None,
+    connection: duckdb.DuckDBPyConnection, columns: str, table: str, keys: Sequence[TrialKey]
 ) -> duckdb.DuckDBPyConnection:
     """A query for the rows of these trials, to be fetched.
 
-    A trial's rows lie together in the table. Their place is looked up first, unless it is given, so
-    that no other rows are read.
+    A trial's rows lie together in the table. Their place is looked up first, so that no other rows
+    are read.
     """
     names = [[key[0] for key in keys], [key[1] for key in keys]]
-    if span is None:
-        sql = f"SELECT min(rowid), max(rowid) FROM {table} {_OF_THESE}"  # noqa: S608 # constants
-        (span,) = connection.execute(sql, names).fetchall()
+    sql = f"SELECT min(rowid), max(rowid) FROM {table} {_OF_THESE}"  # noqa: S608 # constants
+    (span,) = connection.execute(sql, names).fetchall()
     return connection.execute(
         f"SELECT {columns} FROM {table} {_OF_THESE} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # constants
         [*names, *span],
@@ -151,28 +140,18 @@ def rows_of_trials(
 
 
 def in_order(
-    connection: duckdb.DuckDBPyConnection, keys: Iterable[TrialKey]
+    connection: duckdb.DuckDBPyConnection, keys: Collection[TrialKey]
 ) -> Iterator[tuple[TrialKey, dict[str, Stored]]]:
     """Yield trials with their rows of each table, in the order in which they are stored.
 
     The rows of a few are read at once, which are one stretch of each table.
     """
-    where = {table: spans(connection, table) for table in PLACES}
-    ordered = sorted(keys, key=where["trials"].__getitem__)
-    for first in range(0, len(ordered), AT_ONCE):
-        some, tables = ordered[first : first + AT_ONCE], {}
-        for table, spans_of in where.items():
-            begin, end = zip(*(spans_of.get(key, NOWHERE) for key in some), strict=True)
-            tables[table] = stored_rows(connection, table, some, (min(begin), max(end)))
+    rows = connection.execute("SELECT trial_id, spec_hash FROM trials ORDER BY rowid").fetchall()
+    stored = [key for key in rows if key in keys]
+    for first in range(0, len(stored), AT_ONCE):
+        some = stored[first : first + AT_ONCE]
+        tables = {table: stored_rows(connection, table, some) for table in PLACES}
         yield from ((key, tables) for key in some)
-
-
-def spans(connection: duckdb.DuckDBPyConnection, table: str) -> dict[TrialKey, Span]:
-    """The first and the last row number of each trial in a table."""
-    rows = connection.execute(
-        f"SELECT trial_id, spec_hash, min(rowid), max(rowid) FROM {table} GROUP BY ALL"  # noqa: S608 # constants
-    ).fetchall()
-    return {(trial_id, spec_hash): (first, last) for trial_id, spec_hash, first, last in rows}
 
 
 def same_value(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table

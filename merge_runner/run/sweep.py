@@ -12,8 +12,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from merge_runner.audit.checks import audit_sweep
-from merge_runner.audit.findings import Audit
+from merge_runner.audit.checks import Audit, audit_sweep
 from merge_runner.config import ModelEntry, model_id
 from merge_runner.errors import (
     MergeRunnerError,
