@@ -212,7 +212,7 @@ def export(
     from merge_runner.results.export import export_tables
 
     deque(export_tables(db, folder, [outcomes_table()]), maxlen=0)
-    print_out(f"wrote every table into {folder}: begin with {folder / 'README.md'}")
+    print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")
 
 
 @app.command()

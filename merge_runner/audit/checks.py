@@ -33,7 +33,6 @@ from merge_runner.results.database import (
 from merge_runner.results.recorded_study import described_sweeps
 from merge_runner.results.recording import read_provenance, read_recording
 from merge_runner.results.rows import Row, call_row
-from merge_runner.results.validity import ASKED_DECISIONS, not_judged
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
 
@@ -44,6 +43,14 @@ ANTI JOIN done USING (trial_id, spec_hash)
 """
 # Where the formats have the answer.
 ANSWERS = ("choices", "output", "candidates", "content")
+MOST_INVALID_SHARE = 0.2
+# One row a trial that ended and a model that was asked in it. An invalid decision is a fallback.
+ASKED_DECISIONS = """
+SELECT trial_id, spec_hash, if(side = 'left', model_left, model_right) AS model,
+    count(*) AS asked, count(*) FILTER (NOT valid) AS invalid
+FROM decisions JOIN trials USING (trial_id, spec_hash)
+WHERE call_key IS NOT NULL AND status <> 'failed' GROUP BY ALL
+"""
 # How many decisions of each driver, prompt and model that was asked are invalid.
 DECIDED = f"""
 SELECT driver || '/' || variant, model, sum(invalid)::BIGINT, sum(asked)::BIGINT
@@ -53,7 +60,6 @@ JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
-MOST_PAIRS = 3  # that the end of a sweep names
 SHOWN = 10
 """Findings of each kind."""
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
@@ -163,17 +169,7 @@ def make_views(connection: duckdb.DuckDBPyConnection) -> None:
 def audit_sweep(path: Path, sweep_id: str, planned: Sequence[TrialKey], *, finished: bool) -> Audit:
     """Audit a sweep that has just been played; see ``check_sweep``."""
     with audited_database(path) as connection:
-        audit = check_sweep(connection, sweep_id, planned, finished=finished)
-        shared = connection.execute("SELECT count(*), sum(calls) FROM calls_in_common").fetchall()
-        ((pairs, calls),) = shared
-        if pairs > MOST_PAIRS:
-            audit.notes.append(
-                f"{pairs} pairs of arms share {calls} calls, where they asked the same in the "
-                "same slots: `merge-runner audit` names them"
-            )
-        else:
-            audit.notes += _in_common(connection)
-        return audit
+        return check_sweep(connection, sweep_id, planned, finished=finished)
 
 
 def check_sweep(
@@ -214,14 +210,13 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
         str(path),
         counts,
         list(_findings(connection, orphans)),
-        _in_common(connection) if counts["sweeps"] else ["there is no sweep in this database"],
+        [
+            f"{first} and {second} share {calls} calls"
+            for first, second, calls in connection.execute("FROM calls_in_common").fetchall()
+        ]
+        if counts["sweeps"]
+        else ["there is no sweep in this database"],
     )
-
-
-def _in_common(connection: duckdb.DuckDBPyConnection) -> list[str]:
-    """Return notes on calls that several specs share, since their requests were identical."""
-    rows = connection.execute("FROM calls_in_common").fetchall()
-    return [f"{first} and {second} share {calls} calls" for first, second, calls in rows]
 
 
 def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:
@@ -246,6 +241,16 @@ def _notes(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
     for group, model, invalid, asked in connection.execute(DECIDED).fetchall():
         if why := not_judged(model, invalid, asked):
             yield f"{group}: {why}"
+
+
+def not_judged(model: str, invalid: int, asked: int) -> str:
+    """Why nothing is concluded from a model's trials; empty where few enough are invalid."""
+    if invalid <= MOST_INVALID_SHARE * asked:
+        return ""
+    return (
+        f"not judged: {invalid} of the {asked} decisions of {model} are invalid "
+        f"({100 * invalid / asked:.1f} %, more than {100 * MOST_INVALID_SHARE:.0f} %)"
+    )
 
 
 def audit_recording(file: Path) -> Audit:

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 
 from merge_runner.results.comparison import PLACES
+from merge_runner.results.export import FACTORS, only, wide_trials
 from merge_runner.results.store import answer
-from merge_runner.results.wide_trials import FACTORS, only, wide_trials
 
 WHOLE_NUMBERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT")
 TEXT = pd.StringDtype(na_value=np.nan)  # what pandas calls str since its version 3
