@@ -211,7 +211,7 @@ def export(
     from analysis.data.human_counts import outcomes_table
     from merge_runner.results.export import export_tables
 
-    deque(export_tables(db, folder, [outcomes_table()]), maxlen=0)
+    export_tables(db, folder, [outcomes_table()])
     print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")
 
 

@@ -219,15 +219,6 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
     )
 
 
-def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:
-    """Return how many answers to prompts asked before are word for word as before, if all are.
-
-    0 where some differ, or where only a few prompts were asked again.
-    """
-    ((answers,),) = connection.execute("FROM alike").fetchall()
-    return int(answers)
-
-
 def _findings(
     connection: duckdb.DuckDBPyConnection, view: str, sweep_id: str | None = None
 ) -> Iterator[Finding]:

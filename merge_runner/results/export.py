@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -68,10 +68,8 @@ def wide_trials(factors: Iterable[tuple[str, str]], sweep_id: str | None = None)
     return WIDE.format(levels=levels, only=only(sweep_id))
 
 
-def export_tables(
-    db: Path, folder: Path, also: Sequence[tuple[SchemaTable, Path]] = ()
-) -> Iterator[Path]:
-    """Write the folder, with tables ``also`` that are CSV files; yields each path once written.
+def export_tables(db: Path, folder: Path, also: Sequence[tuple[SchemaTable, Path]] = ()) -> None:
+    """Write the folder, with tables ``also`` that are CSV files.
 
     Its dictionary says what each column means and, in a row without a column, each table. Raises
     UsageError where the folder holds anything but an earlier export.
@@ -93,16 +91,16 @@ def export_tables(
                     (table.name, column.name, column.kind, column.unit, column.comment or otherwise)
                     for column in table.columns
                 ]
-            yield _write_csv(folder / DICTIONARY, HEADINGS, meanings)
+            _write_csv(folder / DICTIONARY, HEADINGS, meanings)
             for table in stored:
                 query = f"FROM {table.name}"
-                yield _write_parquet(connection, folder / f"{table.name}.parquet", query)
+                _write_parquet(connection, folder / f"{table.name}.parquet", query)
                 result = connection.execute(query)
-                yield _write_csv(folder / f"{table.name}.csv", names_of(result), fetched(result))
+                _write_csv(folder / f"{table.name}.csv", names_of(result), fetched(result))
             for table, file in also:
-                yield shutil.copyfile(file, copy := folder / f"{table.name}.csv")
+                copy = shutil.copyfile(file, folder / f"{table.name}.csv")
                 query = f"FROM read_csv({quoted(copy.resolve())})"
-                yield _write_parquet(connection, folder / f"{table.name}.parquet", query)
+                _write_parquet(connection, folder / f"{table.name}.parquet", query)
     except OSError as exc:
         raise UsageError(f"{folder} cannot be written: {exc}") from exc
     except duckdb.Error as exc:
@@ -116,13 +114,11 @@ def _refuse_other_content(folder: Path) -> None:
         raise UsageError(f"{folder} is there and no earlier export: name another folder")
 
 
-def _write_csv(path: Path, names: list[str], rows: Rows) -> Path:
+def _write_csv(path: Path, names: list[str], rows: Rows) -> None:
     with path.open("w", encoding="utf-8", newline="") as out:
         write_csv(names, rows, out)
-    return path
 
 
-def _write_parquet(connection: duckdb.DuckDBPyConnection, path: Path, query: str) -> Path:
+def _write_parquet(connection: duckdb.DuckDBPyConnection, path: Path, query: str) -> None:
     options = "FORMAT parquet, COMPRESSION zstd"
     connection.execute(f"COPY ({query}) TO {quoted(path.resolve())} ({options})")
-    return path

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
@@ -30,9 +29,7 @@ class RecordedSweep(BaseModel):
     """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition.
 
     It is read from the configuration of any version that wrote a recording. ``arms`` has the
-    labels of the arms of a study; recordings of plain sweeps may have none. ``mirror`` says that
-    two different drivers were played both ways round. ``seat`` is ``first`` where only the first
-    situations were asked.
+    labels of the arms of a study; recordings of plain sweeps may have none.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -43,8 +40,6 @@ class RecordedSweep(BaseModel):
     conditions: tuple[str, ...]
     sample_set: int
     arms: frozenset[str] = frozenset()
-    seat: str = ""
-    mirror: bool = False
     models: dict[str, JsonValue] = {}
 
     @field_validator("arms", mode="before")
@@ -61,19 +56,6 @@ class RecordedSweep(BaseModel):
             f"{self.name} with {self.model}: {variants} in {len(self.conditions)} conditions "
             f"({', '.join(self.conditions)}), sample set {self.sample_set}"
         )
-
-    def command(self, files: Sequence[Path]) -> str:
-        """What replays it; its names may be anybody's, and are quoted for a shell."""
-        words = ["merge-runner", "replay", self.name]
-        if self.seat:
-            study = self.name.removesuffix(f"-{self.seat}")
-            words = ["merge-runner", "sweep", study, "--first", "--replay"]
-            words += ["--conditions", ",".join(self.conditions)]
-        words += [word for model in self.model.split(",") for word in ("--model", model)]
-        words += ["--mirror"] * self.mirror
-        words += ["--sample-set", str(self.sample_set)] * bool(self.sample_set)
-        words += [word for file in files for word in ("--recording", str(file))]
-        return one_line(shlex.join(words))
 
 
 def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
@@ -131,14 +113,13 @@ def recorded_part(
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
-    """What recordings hold, and what to type to replay it; without files, what a cache holds.
+    """What recordings hold; without files, what a cache holds.
 
     ``entries`` are all their calls, which are counted where no recording says its sweep.
     """
     named = ", ".join(map(str, files)) or "the cache"
     if sweeps := recorded_sweeps(files):
-        said = "; ".join(map(str, sweeps))
-        return f"{named} holds {said}. To replay it: {sweeps[0].command(files)}"
+        return f"{named} holds {'; '.join(map(str, sweeps))}"
     models = Counter(entry.request.model for entry in entries)
     counts = ", ".join(f"{calls} calls of {model}" for model, calls in sorted(models.items()))
     return one_line(f"{named} holds {counts or 'no call at all'}")

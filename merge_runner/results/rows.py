@@ -35,36 +35,27 @@ _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
 def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
     """All rows of a trial, by table."""
-    return {
-        "trials": [trial_row(record)],
-        "trial_factors": list(factor_rows(record.spec)),
-        "states": list(state_rows(record)),
-        "decisions": list(_decision_rows(record)),
-        "calls": list(_call_rows(record)),
-    }
-
-
-def trial_row(record: TrialRecord) -> Row:
-    """The row of ``trials``."""
     spec, condition = record.spec, CONDITIONS[record.spec.condition]
-    return (
-        *(spec.trial_id, spec.spec_hash, spec.pair, spec.source),
+    key = (spec.trial_id, spec.spec_hash)
+    trial = (
+        *(*key, spec.pair, spec.source),
         *(spec.model_left, spec.model_right, spec.variant, spec.condition),
         *(condition.projected_headway_m, condition.relative_velocity_mps),
         *(spec.repetition, spec.sample_set, record.status, record.merged_first),
         *(record.end_time_s, record.error, record.scripted),
     )
+    return {
+        "trials": [trial],
+        "trial_factors": list(factor_rows(spec)),
+        "states": [(*key, *_state(row)) for row in record.states],
+        "decisions": list(_decision_rows(record)),
+        "calls": list(_call_rows(record)),
+    }
 
 
 def factor_rows(spec: TrialSpec) -> Iterator[Row]:
     """Rows of ``trial_factors``."""
     return ((spec.trial_id, spec.spec_hash, *level) for level in spec.factors)
-
-
-def state_rows(record: TrialRecord) -> Iterator[Row]:
-    """Rows of ``states``."""
-    key = (record.spec.trial_id, record.spec.spec_hash)
-    return ((*key, *_state(row)) for row in record.states)
 
 
 def _decision_rows(record: TrialRecord) -> Iterator[Row]:
