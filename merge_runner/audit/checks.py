@@ -30,8 +30,7 @@ from merge_runner.results.database import (
     read_database,
     schema_sql,
 )
-from merge_runner.results.recorded_study import described_sweeps
-from merge_runner.results.recording import read_provenance, read_recording
+from merge_runner.results.recording import described_sweeps, read_provenance, read_recording
 from merge_runner.results.rows import Row, call_row
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line

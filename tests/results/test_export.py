@@ -7,8 +7,7 @@ import csv
 import duckdb
 import pytest
 
-from merge_runner.results.data_dictionary import tables
-from merge_runner.results.export import FACTORS
+from merge_runner.results.export import FACTORS, tables
 from merge_runner.results.recording import COLUMNS
 from tests.harness import PROJECT
 
