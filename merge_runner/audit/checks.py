@@ -20,7 +20,6 @@ from merge_runner.errors import RecordingError, StoreError
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import canonical_json, spec_hash, without_prompt
 from merge_runner.records import ANSWERED_FIELD
-from merge_runner.results.comparison import TrialKey
 from merge_runner.results.database import (
     SETTINGS,
     append,
@@ -31,7 +30,7 @@ from merge_runner.results.database import (
     schema_sql,
 )
 from merge_runner.results.recording import described_sweeps, read_provenance, read_recording
-from merge_runner.results.rows import Row, call_row
+from merge_runner.results.rows import Row, TrialKey, call_row
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
 

@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -44,7 +44,7 @@ from merge_runner.llm.content_hashes import (
 )
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
-from merge_runner.results.database import Settings, fetched, in_memory
+from merge_runner.results.database import Settings, append, fetched, in_memory
 from merge_runner.results.rows import Row
 from merge_runner.text_safety import first_line, one_line, quoted
 
@@ -76,8 +76,7 @@ ROWS = TypeAdapter(list[dict[str, str]])
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """DuckDB hands out this many rows at once, and their texts may have this many bytes."""
-PART_BYTES = 2**25
-"""What is written at once."""
+WRITTEN_AT_ONCE = 16
 SETTINGS: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
@@ -158,21 +157,16 @@ def export_recording(
             connection.execute(f"ATTACH {quoted(f'{folder}/calls.duckdb')} AS file; USE file")
             columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
             connection.execute(f"CREATE TABLE calls ({columns})")
-            appender = connection.appender("calls")
-            content, calls, size = hashlib.sha256(), 0, 0
-            for row in _exported_rows(cache, keys, damaged):
-                appender.append_rows([row])
-                content.update(_fingerprint(row[0], row[-1]))
-                calls, size = calls + 1, size + len(row[-1]) + len(row[-2])
-                if size > PART_BYTES:
-                    appender.flush()
-                    size = 0
-            appender.flush()
+            content, rows = hashlib.sha256(), _exported_rows(cache, keys, damaged)
+            while batch := list(islice(rows, WRITTEN_AT_ONCE)):
+                append(connection, "calls", batch)
+                for row in batch:
+                    content.update(_fingerprint(row[0], row[-1]))
             metadata = {
                 **provenance,
                 "format": FORMAT,
                 "key_version": str(KEY_VERSION),
-                "calls": str(calls),
+                "calls": str(len(keys) - len(damaged)),
                 "content_sha256": content.hexdigest(),
             }
             metadata[PROVENANCE_HASH] = _provenance_hash(metadata)

@@ -19,7 +19,6 @@ import duckdb
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.registry import require
-from merge_runner.results.comparison import FACTORS, PLACES, TrialKey, rows_of_trials, stored_rows
 from merge_runner.results.database import (
     SCHEMA_VERSION,
     SETTINGS,
@@ -37,7 +36,16 @@ from merge_runner.results.database import (
     write_database,
 )
 from merge_runner.results.progress_file import running
-from merge_runner.results.rows import Row, factor_rows, rows_of
+from merge_runner.results.rows import (
+    FACTORS,
+    PLACES,
+    Row,
+    TrialKey,
+    factor_rows,
+    rows_of,
+    rows_of_trials,
+    stored_rows,
+)
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.measures import measures_sql
 from merge_runner.served_model import other_models

@@ -29,16 +29,16 @@ from merge_runner.llm.http_outcome import RawReply, judge
 from merge_runner.prompts.blocks import blocks_of
 from merge_runner.records import ANSWERS, SIDES, Attempt, Slot, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import in_use, require, use
-from merge_runner.results.comparison import (
+from merge_runner.results.database import by_name
+from merge_runner.results.rows import (
     FACTORS,
     LONG,
     Difference,
     Stored,
     in_order,
+    rows_of,
     rows_of_trials,
 )
-from merge_runner.results.database import by_name
-from merge_runner.results.rows import rows_of
 from merge_runner.run.clients import sealed_clients
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Plan
