@@ -33,6 +33,8 @@ Row = tuple[Any, ...]
 TrialKey = tuple[str, str]
 """(trial_id, spec_hash)"""
 
+SHOWN = 60
+"""Characters of a value that differs."""
 AT_ONCE = 16
 """Trials whose rows are in memory together, without their long texts."""
 
@@ -183,6 +185,17 @@ class Difference:
     def name(self) -> str:
         """The column's name with its table's."""
         return f"{self.table}.{self.column}" if self.column else f"rows of {self.table}"
+
+    def __str__(self) -> str:
+        at = f" at step {self.place['step']}" if "step" in self.place else ""
+        more = f", and {self.rows - 1} more in the trial" if self.rows > 1 else ""
+        if self.column is None:
+            return f"{self.name} are missing or too many{at}{more}"
+        if self.column in LONG.get(self.table, ()):
+            return f"{self.name} is not what it is replayed{more}"
+        values = ("NULL" if value is None else str(value) for value in (self.stored, self.wanted))
+        stored, wanted = (text[:SHOWN] for text in values)
+        return f"{self.name}{at} is {stored}, and {wanted} replayed{more}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,8 +32,6 @@ from merge_runner.registry import in_use, require, use
 from merge_runner.results.database import by_name
 from merge_runner.results.rows import (
     FACTORS,
-    LONG,
-    Difference,
     Stored,
     in_order,
     rows_of,
@@ -49,7 +47,6 @@ from merge_runner.text_safety import one_line
 
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
-SHOWN = 60
 # The columns that no replay gives; docs/reference/audit.md says why. A cache has those of
 # ``calls``, except ``cached``.
 NOT_REPLAYED = (
@@ -346,23 +343,8 @@ def _findings(
             for difference in tables[table].differences(
                 key, rows, ignored=ignored, tolerance=TOLERANCE, part=part
             ):
-                yield _finding(kind, difference, key[0], sweep_id)
+                where = (difference.place.get(name) for name in ("side", "decision"))
+                yield Finding(kind, str(difference), sweep_id, key[0], *where)
     if missing is not None:
         text = f"it cannot be replayed: {record.error}"
         yield Finding(kind, text, sweep_id, key[0], missing.side, missing.number)
-
-
-def _finding(kind: str, difference: Difference, trial_id: str, sweep_id: str) -> Finding:
-    place = difference.place
-    at = f" at step {place['step']}" if "step" in place else ""
-    if difference.column is None:
-        text = f"{difference.name} are missing or too many{at}"
-    elif difference.column in LONG.get(difference.table, ()):
-        text = f"{difference.name} is not what it is replayed"
-    else:
-        values = (difference.stored, difference.wanted)
-        stored, wanted = ("NULL" if value is None else str(value)[:SHOWN] for value in values)
-        text = f"{difference.name}{at} is {stored}, and {wanted} replayed"
-    if difference.rows > 1:
-        text += f", and {difference.rows - 1} more in the trial"
-    return Finding(kind, text, sweep_id, trial_id, place.get("side"), place.get("decision"))
