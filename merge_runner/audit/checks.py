@@ -204,17 +204,9 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
     """
     counts = next(by_name(connection.execute(sql)))
     orphans = "(SELECT kind, trial_id, NULL AS side, NULL AS decision, text FROM orphans)"
-    return Audit(
-        str(path),
-        counts,
-        list(_findings(connection, orphans)),
-        [
-            f"{first} and {second} share {calls} calls"
-            for first, second, calls in connection.execute("FROM calls_in_common").fetchall()
-        ]
-        if counts["sweeps"]
-        else ["there is no sweep in this database"],
-    )
+    shared = connection.execute("FROM calls_in_common").fetchall()
+    notes = [f"{first} and {second} share {calls} calls" for first, second, calls in shared]
+    return Audit(str(path), counts, list(_findings(connection, orphans)), notes)
 
 
 def _findings(
