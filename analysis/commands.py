@@ -213,8 +213,8 @@ def export(
     from analysis.data.human_counts import outcomes_table
     from merge_runner.results.export import export_tables
 
-    deque(export_tables(db, folder, [outcomes_table()]), maxlen=0)
-    print_out(f"wrote every table into {folder}: begin with {folder / 'README.md'}")
+    export_tables(db, folder, [outcomes_table()])
+    print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")
 
 
 @app.command()

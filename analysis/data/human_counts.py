@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from merge_runner.results.data_dictionary import SchemaColumn, SchemaTable
+from merge_runner.results.export import SchemaColumn, SchemaTable
 
 DATA = Path(__file__).parent
 OUTCOMES = "human_outcomes.csv"

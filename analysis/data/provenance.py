@@ -14,7 +14,7 @@ import pandas as pd
 
 from analysis.data.load import ANSWERED, load_each, load_specs, rows
 from analysis.data.study import Group, Study, of_group
-from merge_runner.audit.checks import answers_alike, make_views
+from merge_runner.audit.checks import make_views
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.results.database import read_database
@@ -230,7 +230,7 @@ def _alike(db: Path) -> dict[str, int]:
         found = {}
         for (driver,) in connection.execute(DRIVERS).fetchall():
             connection.execute(OF_DRIVER, [driver])
-            found[driver] = answers_alike(connection)
+            ((found[driver],),) = connection.execute("FROM alike").fetchall()
     return {driver: repeated for driver, repeated in found.items() if repeated}
 
 

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from importlib.resources import files
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import duckdb
 
-from merge_runner.audit.findings import Audit, Finding
 from merge_runner.errors import RecordingError, StoreError
 from merge_runner.llm.cache import CachedCall
 from merge_runner.llm.content_hashes import canonical_json, spec_hash, without_prompt
 from merge_runner.records import ANSWERED_FIELD
-from merge_runner.results.comparison import TrialKey
 from merge_runner.results.database import (
     SETTINGS,
     append,
@@ -28,10 +29,8 @@ from merge_runner.results.database import (
     read_database,
     schema_sql,
 )
-from merge_runner.results.recorded_study import described_sweeps
-from merge_runner.results.recording import read_provenance, read_recording
-from merge_runner.results.rows import Row, call_row
-from merge_runner.results.validity import ASKED_DECISIONS, not_judged
+from merge_runner.results.recording import described_sweeps, read_provenance, read_recording
+from merge_runner.results.rows import Row, TrialKey, call_row
 from merge_runner.served_model import other_models
 from merge_runner.text_safety import first_line
 
@@ -42,6 +41,14 @@ ANTI JOIN done USING (trial_id, spec_hash)
 """
 # Where the formats have the answer.
 ANSWERS = ("choices", "output", "candidates", "content")
+MOST_INVALID_SHARE = 0.2
+# One row a trial that ended and a model that was asked in it. An invalid decision is a fallback.
+ASKED_DECISIONS = """
+SELECT trial_id, spec_hash, if(side = 'left', model_left, model_right) AS model,
+    count(*) AS asked, count(*) FILTER (NOT valid) AS invalid
+FROM decisions JOIN trials USING (trial_id, spec_hash)
+WHERE call_key IS NOT NULL AND status <> 'failed' GROUP BY ALL
+"""
 # How many decisions of each driver, prompt and model that was asked are invalid.
 DECIDED = f"""
 SELECT driver || '/' || variant, model, sum(invalid)::BIGINT, sum(asked)::BIGINT
@@ -51,8 +58,65 @@ JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
-SHOWN = 3
+SHOWN = 10
+"""Findings of each kind."""
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that does not hold, and where; docs/reference/audit.md lists the kinds."""
+
+    kind: str
+    text: str
+    sweep: str | None = None
+    trial: str | None = None
+    side: str | None = None
+    decision: int | None = None
+
+    def __str__(self) -> str:
+        number = None if self.decision is None else f"decision {self.decision}"
+        where = ", ".join(filter(None, (self.sweep, self.trial, self.side, number)))
+        return f"{self.kind}: {where}: {self.text}" if where else f"{self.kind}: {self.text}"
+
+
+@dataclass(slots=True)
+class Audit:
+    """What was checked of ``subject``: a sweep, a database, a recording or a cache.
+
+    The checks add to it. ``counts`` say how much was checked, in the order of checking; of a sweep
+    among them ``missing`` and ``failed`` trials. All holds where there is no finding.
+    """
+
+    subject: str
+    counts: dict[str, int] = field(default_factory=dict)
+    findings: list[Finding] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """Whether all holds."""
+        return not self.findings
+
+    def as_dict(self) -> dict[str, Any]:
+        """The audit as JSON values."""
+        return {**asdict(self), "ok": self.ok}
+
+    def lines(self) -> Iterator[str]:
+        """The audit for a reader; of each kind the first findings."""
+        number = len(self.findings)
+        yield f"{self.subject}: " + (f"{number} findings" if number else "all holds")
+        yield "  checked: " + ", ".join(f"{n} {name}" for name, n in self.counts.items())
+        for text in self.notes:
+            yield f"  note: {text}"
+        shown: Counter[str] = Counter()
+        for finding in self.findings:
+            shown[finding.kind] += 1
+            if shown[finding.kind] <= SHOWN:
+                yield f"  {finding}"
+        for kind, count in shown.items():
+            if count > SHOWN:
+                yield f"  {kind}: and {count - SHOWN} more, all of them with --json"
 
 
 @contextmanager
@@ -103,17 +167,7 @@ def make_views(connection: duckdb.DuckDBPyConnection) -> None:
 def audit_sweep(path: Path, sweep_id: str, planned: Sequence[TrialKey], *, finished: bool) -> Audit:
     """Audit a sweep that has just been played; see ``check_sweep``."""
     with audited_database(path) as connection:
-        audit = check_sweep(connection, sweep_id, planned, finished=finished)
-        shared = connection.execute("SELECT count(*), sum(calls) FROM calls_in_common").fetchall()
-        ((pairs, calls),) = shared
-        if pairs > SHOWN:
-            audit.notes.append(
-                f"{pairs} pairs of arms share {calls} calls, where they asked the same in the "
-                "same slots: `merge-runner audit` names them"
-            )
-        else:
-            audit.notes += _in_common(connection)
-        return audit
+        return check_sweep(connection, sweep_id, planned, finished=finished)
 
 
 def check_sweep(
@@ -150,27 +204,9 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
     """
     counts = next(by_name(connection.execute(sql)))
     orphans = "(SELECT kind, trial_id, NULL AS side, NULL AS decision, text FROM orphans)"
-    return Audit(
-        str(path),
-        counts,
-        list(_findings(connection, orphans)),
-        _in_common(connection) if counts["sweeps"] else ["there is no sweep in this database"],
-    )
-
-
-def _in_common(connection: duckdb.DuckDBPyConnection) -> list[str]:
-    """Return notes on calls that several specs share, since their requests were identical."""
-    rows = connection.execute("FROM calls_in_common").fetchall()
-    return [f"{first} and {second} share {calls} calls" for first, second, calls in rows]
-
-
-def answers_alike(connection: duckdb.DuckDBPyConnection) -> int:
-    """Return how many answers to prompts asked before are word for word as before, if all are.
-
-    0 where some differ, or where only a few prompts were asked again.
-    """
-    ((answers,),) = connection.execute("FROM alike").fetchall()
-    return int(answers)
+    shared = connection.execute("FROM calls_in_common").fetchall()
+    notes = [f"{first} and {second} share {calls} calls" for first, second, calls in shared]
+    return Audit(str(path), counts, list(_findings(connection, orphans)), notes)
 
 
 def _findings(
@@ -186,6 +222,16 @@ def _notes(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
     for group, model, invalid, asked in connection.execute(DECIDED).fetchall():
         if why := not_judged(model, invalid, asked):
             yield f"{group}: {why}"
+
+
+def not_judged(model: str, invalid: int, asked: int) -> str:
+    """Why nothing is concluded from a model's trials; empty where few enough are invalid."""
+    if invalid <= MOST_INVALID_SHARE * asked:
+        return ""
+    return (
+        f"not judged: {invalid} of the {asked} decisions of {model} are invalid "
+        f"({100 * invalid / asked:.1f} %, more than {100 * MOST_INVALID_SHARE:.0f} %)"
+    )
 
 
 def audit_recording(file: Path) -> Audit:

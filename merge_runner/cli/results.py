@@ -115,11 +115,11 @@ def forget(
 
     Their replies stay in the cache.
     """
-    from merge_runner.results import forgetting
+    from merge_runner.results import store
 
-    ids, going = forgetting.to_forget(db, sweeps)
+    ids, going = store.to_forget(db, sweeps)
     agree(f"these go from {db}: {going}", "Remove them?", otherwise="nothing was removed", yes=yes)
-    forgetting.forget(db, ids)
+    store.forget(db, ids)
     say(
         f"removed: {going}. Their replies stay in the cache: the same `merge-runner sweep` plays "
         "the trials again without a call"

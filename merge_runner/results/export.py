@@ -1,41 +1,151 @@
-"""Every table and view as Parquet and CSV, in a folder that explains itself."""
+"""Every table and view as Parquet and CSV, among them one row a trial with its factors."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import chain
 from pathlib import Path
 
 import duckdb
 
 from merge_runner.errors import StoreError, UsageError
-from merge_runner.results.data_dictionary import SchemaTable, described, units
-from merge_runner.results.database import fetched, names_of, read_database
-from merge_runner.results.provenance import program
+from merge_runner.results.database import fetched, names_of, read_database, schema_sql
 from merge_runner.results.query_output import Rows, write_csv
-from merge_runner.results.wide_trials import COMMENT, FACTORS, NAME, wide_trials
 from merge_runner.text_safety import first_line, quoted
 
-TITLE = "# Results of merge-runner"
-README, DICTIONARY = "README.md", "dictionary.csv"
+_UNITS = {
+    "mps2": "m/s²",
+    "mps": "m/s",
+    "m": "m",
+    "s": "s",
+    "usd": "USD",
+    "tokens": "tokens",
+    "at": "UTC",
+}
+# A column without a comment means what the first of its name does.
+_DESCRIBED = """
+WITH relations AS (
+    SELECT table_oid AS oid, table_name AS name, comment, false AS is_view, database_name
+    FROM duckdb_tables()
+    UNION ALL
+    SELECT view_oid, view_name, comment, true, database_name FROM duckdb_views() WHERE NOT internal
+), columns AS (
+    SELECT *, coalesce(comment, arg_min(comment, table_oid) OVER (PARTITION BY column_name), '')
+        AS meaning
+    FROM duckdb_columns()
+    WHERE NOT internal AND database_name IN (current_database(), 'temp')
+)
+SELECT name, is_view, relations.comment,
+    list((column_name, data_type, meaning) ORDER BY column_index)
+FROM relations JOIN columns ON oid = table_oid AND relations.database_name = columns.database_name
+GROUP BY oid, name, is_view, relations.comment ORDER BY is_view, oid
+"""
+# Each factor with the type that all its levels have; they are written as ``level_text`` does.
+FACTORS = """
+SELECT factor, CASE
+    WHEN bool_and(kind = 'BOOLEAN') THEN 'BOOLEAN'
+    WHEN bool_and(kind LIKE '%BIGINT' AND try_cast(value AS BIGINT) IS NOT NULL) THEN 'BIGINT'
+    WHEN bool_and(kind LIKE '%BIGINT' OR kind = 'DOUBLE') THEN 'DOUBLE'
+    ELSE 'VARCHAR' END AS type
+FROM (
+    SELECT factor, value, CASE WHEN json_valid(value) THEN json_type(value) ELSE '' END AS kind
+    FROM trial_factors {only}
+)
+GROUP BY factor ORDER BY factor
+"""
+WIDE = """
+SELECT trials.*, trial_drivers.* EXCLUDE (trial_id, spec_hash),
+    trial_metrics.* EXCLUDE (trial_id, spec_hash), levels.* EXCLUDE (trial_id, spec_hash)
+FROM trials {only}
+LEFT JOIN trial_drivers USING (trial_id, spec_hash)
+LEFT JOIN trial_metrics USING (trial_id, spec_hash)
+LEFT JOIN (SELECT trial_id, spec_hash{levels} FROM trial_factors GROUP BY ALL) AS levels
+    USING (trial_id, spec_hash)
+ORDER BY trial_id, spec_hash
+"""
+NAME = "trials_wide"
+COMMENT = "One row a trial: trials, trial_drivers, trial_metrics, and a column for each factor."
+DICTIONARY = "dictionary.csv"
 OF_A_FACTOR = "the level of a factor of the study"  # what no other table has
 HEADINGS = ["table", "column", "type", "unit", "meaning"]
-EXPLAINED = """
-The tables and views of `{name}`, each as Parquet and as CSV, written by {program}.
-`dictionary.csv` explains each column. {units} In CSV, a text that a
-spreadsheet would take for a formula has an apostrophe before it; in Parquet it is as it was.
-
-| table | what it holds |
-|---|---|
-"""
 
 
-def export_tables(
-    db: Path, folder: Path, also: Sequence[tuple[SchemaTable, Path]] = ()
-) -> Iterator[Path]:
-    """Write the folder, with tables ``also`` that are CSV files; yields each path once written.
+@dataclass(frozen=True, slots=True)
+class SchemaColumn:
+    """A column, its type, and what is said of it."""
 
-    Raises UsageError where the folder holds anything but an earlier export.
+    name: str
+    kind: str
+    comment: str
+
+    @property
+    def unit(self) -> str:
+        """As the end of its name says it; empty: it has none."""
+        return _UNITS.get(self.name.rpartition("_")[2], "") if "_" in self.name else ""
+
+
+@dataclass(frozen=True, slots=True)
+class SchemaTable:
+    """A table or a view."""
+
+    name: str
+    is_view: bool
+    comment: str
+    columns: list[SchemaColumn]
+
+
+@cache
+def tables() -> list[SchemaTable]:
+    """Tables, then views, in the order of their definitions."""
+    with duckdb.connect() as connection:
+        connection.execute(schema_sql())
+        return described(connection)
+
+
+def described(connection: duckdb.DuckDBPyConnection) -> list[SchemaTable]:
+    """The tables and views of an open database, and the temporary ones of the connection."""
+    return [
+        SchemaTable(name, is_view, comment, [SchemaColumn(*column) for column in columns])
+        for name, is_view, comment, columns in connection.execute(_DESCRIBED).fetchall()
+    ]
+
+
+def units() -> str:
+    """What holds for all columns: the definitions' first line."""
+    return schema_sql().partition("\n")[0].removeprefix("-- ")
+
+
+def only(sweep_id: str | None) -> str:
+    """What keeps the rows of one sweep's trials; nothing is left out where none is named."""
+    if sweep_id is None:
+        return ""
+    wanted = f"FROM sweep_trials WHERE sweep_id = {quoted(sweep_id)}"
+    return f"SEMI JOIN ({wanted}) USING (trial_id, spec_hash)"
+
+
+def wide_trials(factors: Iterable[tuple[str, str]], sweep_id: str | None = None) -> str:
+    """Return the query of all trials, or of a sweep's, with their FACTORS.
+
+    A factor that is called like a column of the trials has ``factor_`` before its name.
+    """
+    relations = ("trials", "trial_drivers", "trial_metrics")
+    fixed = (table.columns for table in tables() if table.name in relations)
+    taken, levels = {column.name for column in chain.from_iterable(fixed)}, ""
+    for factor, kind in factors:
+        name = f"factor_{factor}" if factor.lower() in taken else factor
+        column = '"' + name.replace('"', '""') + '"'
+        levels += f", max(value) FILTER (factor = {quoted(factor)})::{kind} AS {column}"
+    return WIDE.format(levels=levels, only=only(sweep_id))
+
+
+def export_tables(db: Path, folder: Path, also: Sequence[tuple[SchemaTable, Path]] = ()) -> None:
+    """Write the folder, with tables ``also`` that are CSV files.
+
+    Its dictionary says what each column means and, in a row without a column, each table. Raises
+    UsageError where the folder holds anything but an earlier export.
     """
     _refuse_other_content(folder)
     try:
@@ -46,27 +156,24 @@ def export_tables(
             stored = described(connection)
             known = [*stored, *(table for table, _ in also)]
             folder.mkdir(parents=True, exist_ok=True)
-            rows = [f"| `{t.name}`{' (view)' * t.is_view} | {t.comment} |" for t in known]
-            said = EXPLAINED.format(name=db.name, program=program(), units=units())
-            text = "\n".join([TITLE, said.rstrip("\n"), *rows, ""])
-            (folder / README).write_text(text, encoding="utf-8")
-            yield folder / README
-            meanings = (
-                (table.name, column.name, column.kind, column.unit, column.comment or otherwise)
-                for table in known
-                for otherwise in [OF_A_FACTOR if table.name == NAME else ""]
-                for column in table.columns
-            )
-            yield _write_csv(folder / DICTIONARY, HEADINGS, meanings)
+            meanings = []
+            for table in known:
+                otherwise = OF_A_FACTOR if table.name == NAME else ""
+                meanings.append((table.name, "", "", "", table.comment))
+                meanings += [
+                    (table.name, column.name, column.kind, column.unit, column.comment or otherwise)
+                    for column in table.columns
+                ]
+            _write_csv(folder / DICTIONARY, HEADINGS, meanings)
             for table in stored:
                 query = f"FROM {table.name}"
-                yield _write_parquet(connection, folder / f"{table.name}.parquet", query)
+                _write_parquet(connection, folder / f"{table.name}.parquet", query)
                 result = connection.execute(query)
-                yield _write_csv(folder / f"{table.name}.csv", names_of(result), fetched(result))
+                _write_csv(folder / f"{table.name}.csv", names_of(result), fetched(result))
             for table, file in also:
-                yield shutil.copyfile(file, copy := folder / f"{table.name}.csv")
+                copy = shutil.copyfile(file, folder / f"{table.name}.csv")
                 query = f"FROM read_csv({quoted(copy.resolve())})"
-                yield _write_parquet(connection, folder / f"{table.name}.parquet", query)
+                _write_parquet(connection, folder / f"{table.name}.parquet", query)
     except OSError as exc:
         raise UsageError(f"{folder} cannot be written: {exc}") from exc
     except duckdb.Error as exc:
@@ -75,18 +182,16 @@ def export_tables(
 
 def _refuse_other_content(folder: Path) -> None:
     there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-    readme = folder / README
-    if there and not (readme.is_file() and readme.read_bytes().startswith(TITLE.encode())):
+    dictionary, first = folder / DICTIONARY, ",".join(HEADINGS).encode()
+    if there and not (dictionary.is_file() and dictionary.read_bytes().startswith(first)):
         raise UsageError(f"{folder} is there and no earlier export: name another folder")
 
 
-def _write_csv(path: Path, names: list[str], rows: Rows) -> Path:
+def _write_csv(path: Path, names: list[str], rows: Rows) -> None:
     with path.open("w", encoding="utf-8", newline="") as out:
         write_csv(names, rows, out)
-    return path
 
 
-def _write_parquet(connection: duckdb.DuckDBPyConnection, path: Path, query: str) -> Path:
+def _write_parquet(connection: duckdb.DuckDBPyConnection, path: Path, query: str) -> None:
     options = "FORMAT parquet, COMPRESSION zstd"
     connection.execute(f"COPY ({query}) TO {quoted(path.resolve())} ({options})")
-    return path

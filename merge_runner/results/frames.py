@@ -9,19 +9,20 @@ import duckdb
 import numpy as np
 import pandas as pd
 
-from merge_runner.results.comparison import PLACES
+from merge_runner.results.export import FACTORS, only, wide_trials
+from merge_runner.results.rows import PLACES
 from merge_runner.results.store import answer
-from merge_runner.results.wide_trials import FACTORS, only, wide_trials
 
-WHOLE_NUMBERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT")
 TEXT = pd.StringDtype(na_value=np.nan)  # what pandas calls str since its version 3
-DTYPES = {
-    "VARCHAR": TEXT,
-    "JSON": TEXT,
-    "DOUBLE": "float64",
-    "FLOAT": "float64",
-    "DECIMAL": "float64",  # a number that a query writes with a point
-    "TIMESTAMP": "datetime64[us]",
+# By the SQL type, without and with missing values; None: as pandas finds it.
+DTYPES: dict[str, tuple[Any, Any]] = {
+    **dict.fromkeys(("VARCHAR", "JSON"), (TEXT, TEXT)),
+    # A number that a query writes with a point is a DECIMAL.
+    **dict.fromkeys(("DOUBLE", "FLOAT", "DECIMAL"), ("float64", "float64")),
+    **dict.fromkeys(("TINYINT", "SMALLINT", "INTEGER", "BIGINT"), ("int64", "Int64")),
+    "HUGEINT": (None, "float64"),  # a sum of whole numbers
+    "BOOLEAN": (bool, "boolean"),
+    "TIMESTAMP": ("datetime64[us]", "datetime64[us]"),
 }
 
 
@@ -52,18 +53,9 @@ def frame(result: duckdb.DuckDBPyConnection) -> pd.DataFrame:
     columns = [(name, str(kind)) for name, kind, *_ in result.description or ()]
     # By place, since two columns may have one name.
     made = pd.DataFrame(result.fetchall(), columns=range(len(columns)))
-    types = {place: _dtype(kind, made[place]) for place, (_, kind) in enumerate(columns)}
-    made = made.astype({place: dtype for place, dtype in types.items() if dtype is not None})
+    for place, (_, kind) in enumerate(columns):
+        dtype = DTYPES.get(kind.partition("(")[0], (None, None))[made[place].hasnans]
+        if dtype is not None:
+            made[place] = made[place].astype(dtype)
     made.columns = pd.Index([name for name, _ in columns])
     return made
-
-
-def _dtype(kind: str, values: pd.Series) -> Any:  # noqa: ANN401 # pandas knows many
-    """The dtype of a column of this SQL type; None: as pandas finds it."""
-    if kind == "BOOLEAN":
-        return "boolean" if values.hasnans else bool
-    if kind == "HUGEINT":  # a sum of whole numbers
-        return "float64" if values.hasnans else None
-    if kind in WHOLE_NUMBERS:
-        return "Int64" if values.hasnans else "int64"
-    return DTYPES.get(kind.partition("(")[0])

@@ -14,15 +14,24 @@ import json
 import os
 import re
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from itertools import chain, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import duckdb
-from pydantic import TypeAdapter
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    JsonValue,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+)
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
@@ -35,9 +44,9 @@ from merge_runner.llm.content_hashes import (
 )
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
-from merge_runner.results.database import Settings, fetched, in_memory
+from merge_runner.results.database import Settings, append, fetched, in_memory
 from merge_runner.results.rows import Row
-from merge_runner.text_safety import first_line, quoted
+from merge_runner.text_safety import first_line, one_line, quoted
 
 FORMAT = "merge-runner recording 2"
 """Read for ever: a model that is shut down cannot be asked again."""
@@ -62,12 +71,12 @@ COLUMNS = {
 """docs/reference/recordings.md says what they mean."""
 SLOT = ("condition", "repetition", "side", "decision", "sample_set")
 HEADERS = TypeAdapter(dict[str, str])
+ROWS = TypeAdapter(list[dict[str, str]])
 # Far beyond any sweep; a file that claims more was made to do harm.
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """DuckDB hands out this many rows at once, and their texts may have this many bytes."""
-PART_BYTES = 2**25
-"""What is written at once."""
+WRITTEN_AT_ONCE = 16
 SETTINGS: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
@@ -94,6 +103,39 @@ class Summary:
     provenance: dict[str, str] = field(default_factory=dict)
 
 
+class RecordedSweep(BaseModel):
+    """A sweep in a recording; ``repetitions`` of each prompt variant, in each condition.
+
+    It is read from the configuration of any version that wrote a recording. ``arms`` has the
+    labels of the arms of a study; recordings of plain sweeps may have none.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    name: str
+    model: str
+    repetitions: dict[str, int]
+    conditions: tuple[str, ...]
+    sample_set: int
+    arms: frozenset[str] = frozenset()
+    models: dict[str, JsonValue] = {}
+
+    @field_validator("arms", mode="before")
+    @classmethod
+    def _labels(cls, stored: object) -> object:
+        if not isinstance(stored, list):
+            return stored
+        return [arm.get("label") if isinstance(arm, dict) else arm for arm in stored]
+
+    def __str__(self) -> str:
+        """As a part of a sentence."""
+        variants = ", ".join(f"{n} x {variant}" for variant, n in self.repetitions.items())
+        return one_line(
+            f"{self.name} with {self.model}: {variants} in {len(self.conditions)} conditions "
+            f"({', '.join(self.conditions)}), sample set {self.sample_set}"
+        )
+
+
 def export_recording(
     file: Path, cache: ResponseCache, keys: list[str], provenance: dict[str, str]
 ) -> int:
@@ -115,21 +157,16 @@ def export_recording(
             connection.execute(f"ATTACH {quoted(f'{folder}/calls.duckdb')} AS file; USE file")
             columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
             connection.execute(f"CREATE TABLE calls ({columns})")
-            appender = connection.appender("calls")
-            content, calls, size = hashlib.sha256(), 0, 0
-            for row in _exported_rows(cache, keys, damaged):
-                appender.append_rows([row])
-                content.update(_fingerprint(row[0], row[-1]))
-                calls, size = calls + 1, size + len(row[-1]) + len(row[-2])
-                if size > PART_BYTES:
-                    appender.flush()
-                    size = 0
-            appender.flush()
+            content, rows = hashlib.sha256(), _exported_rows(cache, keys, damaged)
+            while batch := list(islice(rows, WRITTEN_AT_ONCE)):
+                append(connection, "calls", batch)
+                for row in batch:
+                    content.update(_fingerprint(row[0], row[-1]))
             metadata = {
                 **provenance,
                 "format": FORMAT,
                 "key_version": str(KEY_VERSION),
-                "calls": str(calls),
+                "calls": str(len(keys) - len(damaged)),
                 "content_sha256": content.hexdigest(),
             }
             metadata[PROVENANCE_HASH] = _provenance_hash(metadata)
@@ -364,3 +401,70 @@ def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
         {name: str(value) for name, value in row.items() if value is not None} for row in sweeps
     ]
     return rows[0] if len(rows) == 1 else {SWEEPS: canonical_json(rows)}
+
+
+def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
+    """Return the sweeps as a recording says itself, without those whose configuration is odd."""
+    rows, sweeps = [provenance], []
+    with suppress(KeyError, ValidationError):
+        rows = ROWS.validate_json(provenance[SWEEPS])
+    for row in rows:
+        with suppress(KeyError, TypeError, ValueError, RecursionError):
+            told = {**json.loads(row["config"]), "name": row.get("name", "")}
+            sweeps.append(RecordedSweep(**told))
+    return sweeps
+
+
+def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
+    """The sweeps in recordings, less the repetitions and conditions of which no call is there.
+
+    A recording that does not say of what sweep it is has none. Raises RecordingError.
+    """
+    sweeps = []
+    for file in files:
+        with opened(file) as (connection, provenance):
+            counts = "SELECT condition, max(repetition) FROM recording GROUP BY ALL"
+            recorded = dict(connection.execute(counts).fetchall())
+        for sweep in described_sweeps(provenance):
+            conditions = tuple(name for name in sweep.conditions if name in recorded)
+            most = max((recorded[name] for name in conditions), default=0)
+            repetitions = {name: min(n, most) for name, n in sweep.repetitions.items()}
+            changes = {"conditions": conditions, "repetitions": repetitions}
+            sweeps.append(sweep.model_copy(update=changes))
+    return sweeps
+
+
+def recorded_part(
+    files: Iterable[Path], names: Collection[str], model: str, sample_set: int
+) -> RecordedSweep | None:
+    """What recordings hold of one sweep: all that several of them, or several runs, hold of it.
+
+    It may have several ``names``.
+    """
+    parts = [
+        sweep
+        for sweep in recorded_sweeps(files)
+        if sweep.name in names and (sweep.model, sweep.sample_set) == (model, sample_set)
+    ]
+    if not parts:
+        return None
+    repetitions: Counter[str] = Counter()
+    for part in parts:
+        repetitions |= Counter(part.repetitions)  # the larger number of each
+    conditions = tuple(dict.fromkeys(chain.from_iterable(part.conditions for part in parts)))
+    arms = frozenset(chain.from_iterable(part.arms for part in parts))
+    changes = {"repetitions": dict(repetitions), "conditions": conditions, "arms": arms}
+    return parts[0].model_copy(update=changes)
+
+
+def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
+    """What recordings hold; without files, what a cache holds.
+
+    ``entries`` are all their calls, which are counted where no recording says its sweep.
+    """
+    named = ", ".join(map(str, files)) or "the cache"
+    if sweeps := recorded_sweeps(files):
+        return f"{named} holds {'; '.join(map(str, sweeps))}"
+    models = Counter(entry.request.model for entry in entries)
+    counts = ", ".join(f"{calls} calls of {model}" for model, calls in sorted(models.items()))
+    return one_line(f"{named} holds {counts or 'no call at all'}")

@@ -12,13 +12,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import fields, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
 
 import duckdb
 
-from merge_runner.audit.checks import audited_database, check_rest, check_sweep
-from merge_runner.audit.findings import Audit, Finding
+from merge_runner.audit.checks import Audit, Finding, audited_database, check_rest, check_sweep
 from merge_runner.config import ModelEntry
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed, MergeRunnerError, RecordingError
@@ -29,16 +29,14 @@ from merge_runner.llm.http_outcome import RawReply, judge
 from merge_runner.prompts.blocks import blocks_of
 from merge_runner.records import ANSWERS, SIDES, Attempt, Slot, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import in_use, require, use
-from merge_runner.results.comparison import (
+from merge_runner.results.database import by_name
+from merge_runner.results.rows import (
     FACTORS,
-    LONG,
-    Difference,
     Stored,
     in_order,
-    spans,
+    rows_of,
+    rows_of_trials,
 )
-from merge_runner.results.database import by_name
-from merge_runner.results.rows import rows_of
 from merge_runner.run.clients import sealed_clients
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Plan
@@ -49,7 +47,6 @@ from merge_runner.text_safety import one_line
 
 TOLERANCE = 1e-9
 """Numbers may differ by this much, as between the arithmetic of two machines."""
-SHOWN = 60
 # The columns that no replay gives; docs/reference/audit.md says why. A cache has those of
 # ``calls``, except ``cached``.
 NOT_REPLAYED = (
@@ -73,9 +70,6 @@ HINT = "install the package that registers it, or name the study: --study FILE"
 SWEEPS = """
 SELECT sweep_id, config::VARCHAR, coalesce(exit_code = 0, false) FROM sweeps
 ORDER BY started_at DESC, sweep_id DESC
-"""
-CALLS = """
-SELECT * FROM calls WHERE rowid BETWEEN ? AND ? AND trial_id = ? AND spec_hash = ? ORDER BY attempt
 """
 
 
@@ -134,14 +128,12 @@ def _audit(
             for condition in plan.conditions
             for repetition in range(1, arm.repetitions + 1)
         }
-        specs = _installed_specs(connection, plan)
+        plan = _installed_part(connection, plan, notes)
+        specs = plan.trial_specs()
         planned |= {spec.trial_id: spec.spec_hash for spec in specs}
     except (*DAMAGED, AttributeError, MergeRunnerError) as exc:
-        if planned and isinstance(exc, MergeRunnerError):
-            notes[str(exc)] += len(planned)
-        else:
-            why = f"its configuration cannot be read, so that its trials are not known: {exc}"
-            problems.append(Finding("config", one_line(why), sweep_id))
+        why = f"its configuration cannot be read, so that its trials are not known: {exc}"
+        problems.append(Finding("config", one_line(why), sweep_id))
     audit = check_sweep(connection, sweep_id, list(planned.items()), finished=finished)
     audit.findings += problems
     if specs:
@@ -157,20 +149,26 @@ def _audit(
     return audit
 
 
-def _installed_specs(connection: duckdb.DuckDBPyConnection, plan: Plan) -> list[TrialSpec]:
-    """Return the specs of a plan whose parts are all installed, else raise UsageError.
+def _installed_part(connection: duckdb.DuckDBPyConnection, plan: Plan, notes: Counter[str]) -> Plan:
+    """Return the arms of a plan that are installed; the notes count the trials of the others.
 
-    Reads the human trials that it replays.
+    Reads the human trials that the arms replay.
     """
-    for name in plan.conditions:
-        CONDITIONS.require(name, HINT)
+    arms = []
     for arm in plan.arms:
-        if arm.entries:
-            blocks_of(arm.variant)
-        for name in {*arm.asked.values()} - {*arm.entries}:
-            if (humans := PROGRAMS.require(name, HINT).data) is not None:
-                humans.read(connection)
-    return plan.trial_specs()
+        try:
+            for name in plan.conditions:
+                CONDITIONS.require(name, HINT)
+            if arm.entries:
+                blocks_of(arm.variant)
+            for name in {*arm.asked.values()} - {*arm.entries}:
+                if (humans := PROGRAMS.require(name, HINT).data) is not None:
+                    humans.read(connection)
+        except MergeRunnerError as exc:
+            notes[str(exc)] += arm.repetitions * len(plan.conditions)
+        else:
+            arms.append(arm)
+    return plan.model_copy(update={"arms": tuple(arms)})
 
 
 def _replayable(
@@ -246,7 +244,6 @@ class StoredReplies:
         self.money = None  # the ledger of a sealed client keeps nothing
         self._connection = connection
         self._plan = plan
-        self._spans = spans(connection, "calls")
         self._spec: TrialSpec
         self._arm: Arm
         self._calls: dict[str, list[dict[str, Any]]] = {}
@@ -255,8 +252,8 @@ class StoredReplies:
         """Read the calls of a trial."""
         key = (spec.trial_id, spec.spec_hash)
         self._spec, self._arm, self._calls = spec, self._plan.by_label()[spec.arm], {}
-        place = self._spans.get(key, (0, -1))
-        for row in by_name(self._connection.execute(CALLS, [*place, *key])):
+        rows = by_name(rows_of_trials(self._connection, "*", "calls", [key]))
+        for row in sorted(rows, key=itemgetter("attempt")):
             if self._arm.asked.get(row["side"]) in self._arm.entries:
                 self._calls.setdefault(row["call_key"], []).append(row)
 
@@ -346,23 +343,8 @@ def _findings(
             for difference in tables[table].differences(
                 key, rows, ignored=ignored, tolerance=TOLERANCE, part=part
             ):
-                yield _finding(kind, difference, key[0], sweep_id)
+                where = (difference.place.get(name) for name in ("side", "decision"))
+                yield Finding(kind, str(difference), sweep_id, key[0], *where)
     if missing is not None:
         text = f"it cannot be replayed: {record.error}"
         yield Finding(kind, text, sweep_id, key[0], missing.side, missing.number)
-
-
-def _finding(kind: str, difference: Difference, trial_id: str, sweep_id: str) -> Finding:
-    place = difference.place
-    at = f" at step {place['step']}" if "step" in place else ""
-    if difference.column is None:
-        text = f"{difference.name} are missing or too many{at}"
-    elif difference.column in LONG.get(difference.table, ()):
-        text = f"{difference.name} is not what it is replayed"
-    else:
-        values = (difference.stored, difference.wanted)
-        stored, wanted = ("NULL" if value is None else str(value)[:SHOWN] for value in values)
-        text = f"{difference.name}{at} is {stored}, and {wanted} replayed"
-    if difference.rows > 1:
-        text += f", and {difference.rows - 1} more in the trial"
-    return Finding(kind, text, sweep_id, trial_id, place.get("side"), place.get("decision"))

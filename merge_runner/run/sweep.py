@@ -12,8 +12,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from merge_runner.audit.checks import audit_sweep
-from merge_runner.audit.findings import Audit
+from merge_runner.audit.checks import Audit, audit_sweep
 from merge_runner.config import (
     PROVIDERS,
     UNNAMED,
@@ -41,8 +40,7 @@ from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.progress_file import write_standing
 from merge_runner.results.provenance import git_state, versions
-from merge_runner.results.recorded_study import described
-from merge_runner.results.recording import Spilled
+from merge_runner.results.recording import Spilled, described
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     check_batches,

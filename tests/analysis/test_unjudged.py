@@ -12,7 +12,7 @@ from analysis.explorer.pages.ablations import ablations
 from analysis.report.alarms import alarms
 from analysis.report.conclusions import not_shown, nothing, shown
 from analysis.tables import make_tables
-from merge_runner.results.validity import not_judged
+from merge_runner.audit.checks import not_judged
 from merge_runner.run.stored_replay import audit_database
 from tests.analysis.studies import Said, changed, write_study, yielding
 

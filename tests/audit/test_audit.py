@@ -708,7 +708,7 @@ def test_a_database_of_humans_alone_passes_and_says_that_there_is_no_sweep(prepa
     assert prepare(tmp_path, "human", "import", "recordings").code == 0
     found = audit("--db", tmp_path / "results/merge.duckdb")
     assert found.code == 0
-    assert found.notes == "there is no sweep in this database"
+    assert [told["counts"]["sweeps"] for told in found.audits] == [0]
     assert found.audits[0]["counts"]["human trials"] == 11
 
 

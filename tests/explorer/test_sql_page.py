@@ -18,7 +18,7 @@ from analysis.explorer.pages.sql import EXAMPLES
 from analysis.explorer.queries import Limits, QueryResult
 from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
-from merge_runner.results.data_dictionary import tables
+from merge_runner.results.export import tables
 from merge_runner.results.store import query
 from tests.analysis.studies import write_study, yielding
 from tests.harness import PROJECT

@@ -123,9 +123,9 @@ def test_a_recording_of_any_size_is_exported_in_the_same_order_and_with_the_same
     cache = ResponseCache(tmp_path / "cache")
     cache.put_now(entries)
     contents = []
-    for part_bytes in (2**25, 10_000):
-        monkeypatch.setattr("merge_runner.results.recording.PART_BYTES", part_bytes)
-        file = tmp_path / f"{part_bytes}.parquet"
+    for at_once in (16, 7):
+        monkeypatch.setattr("merge_runner.results.recording.WRITTEN_AT_ONCE", at_once)
+        file = tmp_path / f"{at_once}.parquet"
         export_recording(file, cache, [e.request.key for e in entries], {})
         contents.append(list(read_recording(file)))
     assert contents[0] == contents[1] == entries

@@ -10,9 +10,8 @@ from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.llm.content_hashes import make_request
 from merge_runner.records import Attempt, ChatReply, Slot, TrialRecord, TrialSpec, Usage
-from merge_runner.results.comparison import PLACES, stored_rows
 from merge_runner.results.database import in_memory, schema_sql
-from merge_runner.results.rows import rows_of
+from merge_runner.results.rows import PLACES, rows_of, stored_rows
 from merge_runner.results.store import OF_A_RUN
 from merge_runner.trial import play_trial
 

@@ -7,9 +7,8 @@ import csv
 import duckdb
 import pytest
 
-from merge_runner.results.data_dictionary import tables
+from merge_runner.results.export import FACTORS, tables
 from merge_runner.results.recording import COLUMNS
-from merge_runner.results.wide_trials import FACTORS
 from tests.harness import PROJECT
 
 
@@ -25,7 +24,8 @@ async def test_every_table_and_view_is_written_as_parquet_and_csv(merge_runner, 
     for _ in range(2):  # an earlier export is replaced
         run = await merge_runner("export", "out")
         assert run.code == 0, run.err
-        assert (run.out, run.err) == ("wrote every table into out: begin with out/README.md\n", "")
+        said = "wrote every table into out: begin with out/dictionary.csv\n"
+        assert (run.out, run.err) == (said, "")
     folder, db = tmp_path / "out", str(tmp_path / "results/merge.duckdb")
     dictionary = rows(folder / "dictionary.csv")
     with duckdb.connect(db, read_only=True) as connection:
@@ -35,8 +35,7 @@ async def test_every_table_and_view_is_written_as_parquet_and_csv(merge_runner, 
             assert parquet.shape == (there, len(table.columns))
             assert len(rows(folder / f"{table.name}.csv")) == there
             told = [row["column"] for row in dictionary if row["table"] == table.name]
-            assert told == parquet.columns
-            assert f"| `{table.name}`" in (folder / "README.md").read_text()
+            assert told == ["", *parquet.columns]
     (gap,) = [
         row for row in dictionary if (row["table"], row["column"]) == ("trial_metrics", "gap_m")
     ]
@@ -74,7 +73,11 @@ async def test_the_wide_trials_have_metrics_and_typed_factors_and_humans_stand_b
     humans = duckdb.read_parquet(str(tmp_path / "out/human_outcomes.parquet"))
     ended = humans.aggregate("sum(left_first + right_first + collided), sum(collided)").fetchall()
     assert ended == [(990, 28)]
-    told = {row["column"]: row["type"] for row in described if row["table"] == "human_outcomes"}
+    told = {
+        row["column"]: row["type"]
+        for row in described
+        if row["table"] == "human_outcomes" and row["column"]
+    }
     assert told == dict(zip(humans.columns, map(str, humans.types), strict=True))
     with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
         trials = connection.execute("SELECT trial_id, gap_m FROM trial_metrics ORDER BY ALL")
@@ -103,7 +106,11 @@ def test_a_factor_has_the_type_that_all_its_levels_have(levels, kind):
 async def test_a_folder_with_anything_else_is_left_as_it_is(merge_runner, tmp_path):
     part = ("sweep", "baseline", "--model", "constant", "--reps", 1, "--conditions", "N_0_0")
     assert (await merge_runner(*part)).code == 0
-    for name, content in (("notes.txt", "mine"), ("README.md", "# mine"), ("trials.csv", "mine")):
+    for name, content in (
+        ("notes.txt", "mine"),
+        ("dictionary.csv", "# mine"),
+        ("trials.csv", "mine"),
+    ):
         folder = tmp_path / name.partition(".")[0]
         folder.mkdir()
         (folder / name).write_text(content)

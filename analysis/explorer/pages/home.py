@@ -22,7 +22,7 @@ from analysis.metrics import GAP, LEFT_FIRST
 from analysis.names import HUMAN
 from analysis.tables.formats import notes_of, printed
 from analysis.tables.model import Table, from_text
-from merge_runner.results.validity import not_judged
+from merge_runner.audit.checks import not_judged
 from merge_runner.study.crossing import PROMPT
 
 # More groups than these cannot be told apart in a picture.

@@ -9,7 +9,7 @@ from analysis.explorer.display_text import visible
 from analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST, QueryResult
 from analysis.explorer.site import Site
 from merge_runner.errors import MergeRunnerError
-from merge_runner.results.data_dictionary import tables, units
+from merge_runner.results.export import tables, units
 
 NUMBERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
            "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE", "DECIMAL", "BIGNUM")  # fmt: skip

@@ -11,7 +11,7 @@ from analysis.human.load import import_trials, sort_files
 from analysis.human.record import SPEC, SPEC_HASH, trial_record
 from analysis.human.trace import parse_csv
 from merge_runner.errors import UsageError
-from merge_runner.results.rows import state_rows, trial_row
+from merge_runner.results.rows import rows_of
 from merge_runner.results.store import Store, query, results_digest
 from tests.analysis.recordings import Recording, drive, file
 
@@ -42,8 +42,8 @@ def test_a_trial_is_stored_as_its_record_says_and_its_spec_too(path):
     report = imported(path, {"d/experiment_6_iter_1.csv": LEFT.csv()})
     assert (report.added, report.there, report.differing) == (1, 0, [])
     record = trial_record(parse_csv(LEFT.csv()), 6, 1)
-    assert rows(path, "from trials") == [trial_row(record)]
-    assert rows(path, "from states order by step, side") == list(state_rows(record))
+    assert rows(path, "from trials") == rows_of(record)["trials"]
+    assert rows(path, "from states order by step, side") == rows_of(record)["states"]
     assert rows(path, "from specs") == [(SPEC_HASH, SPEC)]
     assert rows(path, "select pair, source, variant, time_to_merge_s > 0 from trials "
                 "join trial_metrics using (trial_id, spec_hash)") == [
