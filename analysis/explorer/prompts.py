@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from functools import lru_cache
-from itertools import compress, count
-from operator import ne
 from typing import Literal
 
 from merge_runner.prompts.blocks import BLOCKS
@@ -95,59 +93,14 @@ def _like(paragraph: str) -> list[tuple[str, list[str]]]:
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
-    """Line by line where there are as many: the values change, and hardly the words."""
-    old, new = before.splitlines(keepends=True), now.splitlines(keepends=True)
-    if len(old) != len(new):
-        old, new = [before], [now]
+    """The text of a block, word by word, with what is gone from the one before."""
+    if before == now:
+        return (("same", now),)
+    old, new = _WORDS.findall(before), _WORDS.findall(now)
     pieces: list[tuple[Change, str]] = []
-    for line_before, line in zip(old, new, strict=True):
-        if line_before == line:
-            pieces.append(("same", line))
-            continue
-        words_before, words = _words(line_before), _words(line)
-        for i1, i2, j1, j2, changed in _runs(words_before, words):
-            if changed and i1 < i2:
-                pieces.append(("gone", "".join(words_before[i1:i2]).strip()))
-            if j1 < j2:
-                pieces.append(("new" if changed else "same", "".join(words[j1:j2])))
+    for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
+        if kind != "equal" and i1 < i2:
+            pieces.append(("gone", "".join(old[i1:i2]).strip()))
+        if j1 < j2:
+            pieces.append(("same" if kind == "equal" else "new", "".join(new[j1:j2])))
     return tuple(pieces)
-
-
-@lru_cache(KEPT)
-def _words(line: str) -> list[str]:
-    return _WORDS.findall(line)
-
-
-def _runs(old: list[str], new: list[str]) -> list[tuple[int, int, int, int, bool]]:
-    """Where two lines are equal and where not; a comma between two changes is changed as well."""
-    runs: list[tuple[int, int, int, int, bool]] = []
-    for i1, i2, j1, j2, changed in _matched(old, new):
-        if changed and len(runs) > 1 and "".join(new[slice(*runs[-1][2:4])]).strip() in {"", ","}:
-            start = runs[-2]
-            runs[-2:] = [(start[0], i2, start[2], j2, True)]
-        else:
-            runs.append((i1, i2, j1, j2, changed))
-    return runs
-
-
-def _matched(old: list[str], new: list[str]) -> Iterator[tuple[int, int, int, int, bool]]:
-    """How a line becomes another; matching takes long, and most lines begin and end alike."""
-    begin = _alike(old, new)
-    end = _alike(old[begin:][::-1], new[begin:][::-1])
-    last_old, last_new = len(old) - end, len(new) - end
-    if begin:
-        yield 0, begin, 0, begin, False
-    gone, come = old[begin:last_old], new[begin:last_new]
-    if not set(gone).isdisjoint(come):
-        for kind, i1, i2, j1, j2 in SequenceMatcher(None, gone, come, autojunk=False).get_opcodes():
-            yield begin + i1, begin + i2, begin + j1, begin + j2, kind != "equal"
-    elif gone or come:
-        yield begin, last_old, begin, last_new, True
-    if end:
-        yield last_old, len(old), last_new, len(new), False
-
-
-def _alike(old: Sequence[str], new: Sequence[str]) -> int:
-    """How many words both begin with."""
-    differing = compress(count(), map(ne, old, new))
-    return next(differing, min(len(old), len(new)))

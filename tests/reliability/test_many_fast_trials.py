@@ -82,11 +82,6 @@ def multiplied(db, times):
     return many
 
 
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="4.3: rows of decisions that no model was asked for wait in memory to be stored",
-)
 def test_a_sweep_of_them_takes_less_than_400_mb(few):
     code, errors, used = run(few, "sweep", "study.toml", "--reps", 100, "--db", "sweep.duckdb")
     if code:
