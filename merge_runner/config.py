@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import json
 import os
 import re
 import tomllib
@@ -18,7 +17,6 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -44,14 +42,6 @@ REHEARSAL = "rehearsal://localhost"
 MOST_STEPS = MOST_REPETITIONS = 100_000
 
 
-def _finite(value: JsonValue) -> JsonValue:
-    try:
-        json.dumps(value, allow_nan=False)
-    except ValueError as exc:
-        raise ValueError("numbers must be finite") from exc
-    return value
-
-
 # Strict, or else "4" and true would be numbers.
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
@@ -59,15 +49,14 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
 Rate = Annotated[Positive, Field(le=1e6)]
 Deviation = Annotated[NotNegative, Field(le=1e6)]
 Count = Annotated[int, Field(gt=0, strict=True)]
-Json = Annotated[JsonValue, AfterValidator(_finite)]
 Resistance = Literal["none", "human"]
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class Frozen(BaseModel):
-    """A configuration object: frozen, and an unknown key is an error."""
+    """A configuration object: frozen, finite, and an unknown key is an error."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 def whole_steps(name: str, seconds: float, step_s: float) -> int:
@@ -252,10 +241,10 @@ class ModelEntry(Frozen):
     format: str
     id: str = UNNAMED
     aliases: tuple[str, ...] = ()
-    parameters: dict[str, Json] = {}
-    applied_defaults: dict[str, Json] = {}
+    parameters: dict[str, JsonValue] = {}
+    applied_defaults: dict[str, JsonValue] = {}
     rejects: tuple[str, ...] = ()
-    efforts: dict[str, dict[str, Json]] = {}
+    efforts: dict[str, dict[str, JsonValue]] = {}
     max_output_tokens: Count
     cap_field: Literal["max_completion_tokens", "max_tokens"] = "max_completion_tokens"
     rpm: Count | None = None

@@ -7,7 +7,8 @@ import itertools
 import re
 import select
 import ssl
-from collections.abc import Iterable, Mapping
+from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 from urllib.request import getproxies, proxy_bypass
 from uuid import uuid4
@@ -95,7 +96,7 @@ class HttpTransport:
         self._endpoint = endpoint
         self._base = httpx.URL(endpoint.base_url)
         self._urls: dict[str, httpx.URL] = {}
-        self.most_bytes = most_bytes
+        self._most_bytes = most_bytes
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}
         self._mask = Mask(secret for secret in secrets if len(secret) >= SHORTEST_SECRET)
@@ -131,18 +132,52 @@ class HttpTransport:
         timeout_s: float,
         most_bytes: int | None = None,
     ) -> RawReply:
-        """Ask for anything; turns every error of the libraries into a TransportFailure."""
+        """Ask for anything; raises TransportFailure."""
+        async with self._exchange(method, path, headers, body, timeout_s) as (reply, _):
+            return await self._read(reply, most_bytes or self._most_bytes)
+
+    async def lines(
+        self, path: str, headers: Mapping[str, str], *, timeout_s: float
+    ) -> AsyncGenerator[str | RawReply]:
+        """Get a body of lines; where the status is not 200, the whole reply instead.
+
+        No part of it may take longer than ``timeout_s``. A line of more than ``most_bytes`` is cut.
+        Raises TransportFailure.
+        """
+        loop, line = asyncio.get_running_loop(), bytearray()
+        async with self._exchange("GET", path, headers, b"", timeout_s) as (reply, limit):
+            if reply.status_code != 200:
+                yield await self._read(reply, self._most_bytes)
+                return
+            async for chunk in reply.aiter_bytes():
+                limit.reschedule(loop.time() + timeout_s)
+                *ended, last = chunk.split(b"\n")
+                for part in ended:
+                    line += part[: self._most_bytes - len(line)]
+                    yield self._text(line)
+                    line.clear()
+                line += last[: self._most_bytes - len(line)]
+            yield self._text(line)
+
+    @asynccontextmanager
+    async def _exchange(
+        self, method: str, path: str, headers: Mapping[str, str], body: bytes, timeout_s: float
+    ) -> AsyncIterator[tuple[httpx.Response, asyncio.Timeout]]:
+        """Yield the reply to a request, with its body unread, and the time limit of both.
+
+        Turns every error of the libraries into a TransportFailure.
+        """
         own_id = self._own + next(self._ids)
         sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
         sent |= dict.fromkeys(ID_HEADERS, own_id)
         sent["connection"] = "close" if self.one_each else "keep-alive"
         request = httpx.Request(method, self._url(path), headers=sent, content=body)
         try:
-            async with asyncio.timeout(timeout_s):
+            async with asyncio.timeout(timeout_s) as limit:
                 reply = await self._carrier.handle_async_request(request)
                 try:
                     self._refuse_others(reply, own_id)
-                    return await self._read(reply, most_bytes or self.most_bytes)
+                    yield reply, limit
                 finally:
                     await reply.aclose()
         except TransportFailure:
@@ -176,11 +211,13 @@ class HttpTransport:
                     "reply_refused", f"the reply is refused: {why}", action="fail"
                 )
             pieces.append(piece)
-        # UTF-8 is the encoding of JSON, whatever a header says. A provider may echo the key in an
-        # error; it must not get into a log or a database.
-        body = self._mask(b"".join(pieces).decode("utf-8-sig", errors="replace"))
         headers = {name.lower(): value for name, value in reply.headers.items()}
-        return RawReply(reply.status_code, headers, body)
+        return RawReply(reply.status_code, headers, self._text(b"".join(pieces)))
+
+    def _text(self, body: bytes | bytearray) -> str:
+        """Decode as UTF-8, the encoding of JSON, whatever a header says, without secrets."""
+        # A provider may echo the key in an error; it must not get into a log or a database.
+        return self._mask(body.decode("utf-8-sig", errors="replace"))
 
     def _failure(self, error: Exception) -> TransportFailure:
         """Return the TransportFailure for an error of the libraries."""

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, JsonValue, model_validator
 
 from merge_runner.config import (
     MOST_REPETITIONS,
     Count,
     Frozen,
-    Json,
     NotNegative,
     Perception,
     Positive,
@@ -149,9 +148,9 @@ class StudyFile(Frozen):
     ]
     conditions: Annotated[dict[str, Condition | None], BeforeValidator(_by_name)] | None = None
     scenario: ScenarioConfig = ScenarioConfig()
-    factors: dict[str, tuple[Json, ...]] = Field(default_factory=dict)
-    skip: tuple[dict[str, Json], ...] = ()
-    reference: dict[str, Json] = Field(default_factory=dict)
+    factors: dict[str, tuple[JsonValue, ...]] = Field(default_factory=dict)
+    skip: tuple[dict[str, JsonValue], ...] = ()
+    reference: dict[str, JsonValue] = Field(default_factory=dict)
     mirror: bool = False
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)

@@ -96,11 +96,14 @@ def refused(program, *arguments):
         (model(price='{ input = inf, output = 1, source = "s" }'), "a finite number"),
         (
             model(parameters="{ temperature = nan }"),
-            "parameters.temperature: numbers must be finite",
+            "parameters.temperature.float: Input should be a finite number",
         ),
-        (model(parameters="{ a = [{ b = inf }] }"), "parameters.a: numbers must be finite"),
+        (model(parameters="{ a = [{ b = inf }] }"), "b.float: Input should be a finite number"),
         (model(parameters="{ a = 2026-01-01 }"), "parameters.a: input was not a valid JSON value"),
-        (model(applied_defaults="{ a = -inf }"), "applied_defaults.a: numbers must be finite"),
+        (
+            model(applied_defaults="{ a = -inf }"),
+            "applied_defaults.a.float: Input should be a finite number",
+        ),
         (model(cap_field='"x"'), "'max_completion_tokens' or 'max_tokens'"),
         (model(auth='"x"'), "'bearer' or 'api-key'"),
         (model(shutdown='"soon"'), "shutdown: Input should be a valid date"),

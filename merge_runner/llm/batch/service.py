@@ -6,6 +6,7 @@ import json
 import re
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import aclosing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from urllib.parse import quote
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 # A batch, or a page of a list, may have many megabytes.
 TIMEOUT_S = 300.0
-MOST_BYTES, MOST_RESULTS_BYTES = 256_000_000, 1_000_000_000
+MOST_BYTES = 256_000_000
 LONGEST_MESSAGE = 500
 ID = re.compile(r"(?!.*\.\.)[A-Za-z0-9_-][A-Za-z0-9_./-]{0,999}")
 FailureKind = Literal["again", "smaller", "quota", "refused", "lost"]
@@ -157,10 +158,19 @@ class BatchService(ABC):
         Raises BatchFailed with the kind ``again`` where they can be read from the beginning.
         """
         for path in paths:
-            # What is not there belongs to a batch that is.
-            raw = await self.ask("GET", path, most_bytes=MOST_RESULTS_BYTES, missing="again")
-            for line in filter(None, map(str.strip, raw.body.split("\n"))):
-                yield self._result(line)
+            try:
+                body = self.transport.lines(path, self.wire.headers, timeout_s=TIMEOUT_S)
+                async with aclosing(body) as lines:
+                    async for line in lines:
+                        if isinstance(line, RawReply):
+                            failure = self.failure_of(line.error, exists=True)
+                            if line.status == 404:  # it belongs to a batch that is there
+                                failure.kind = "again"
+                            raise failure
+                        if line.strip():
+                            yield self._result(line)
+            except TransportFailure as exc:
+                raise _unanswered(exc) from exc
 
     def failure_of(self, error: ServerError, *, exists: bool = False) -> BatchFailed:
         """Return the failure of a batch that is not created, fails as a whole, or ``exists``."""
@@ -176,31 +186,19 @@ class BatchService(ABC):
         return BatchFailed(kind, message, delay_s=outcome.delay_s)
 
     async def ask(
-        self,
-        method: str,
-        path: str,
-        body: bytes = b"",
-        headers: Mapping[str, str] | None = None,
-        *,
-        most_bytes: int = MOST_BYTES,
-        missing: FailureKind = "lost",
+        self, method: str, path: str, body: bytes = b"", headers: Mapping[str, str] | None = None
     ) -> RawReply:
-        """Return the reply to a step of a creation (POST), or to a look at what exists (GET).
-
-        ``missing`` is the kind of failure where that is not found.
-        """
+        """Return the reply to a step of a creation (POST), or to a look at what exists (GET)."""
         sent = {**self.wire.headers, **(headers or {})}
         try:
             raw = await self.transport.ask(
-                method, path, sent, body, timeout_s=TIMEOUT_S, most_bytes=most_bytes
+                method, path, sent, body, timeout_s=TIMEOUT_S, most_bytes=MOST_BYTES
             )
         except TransportFailure as exc:
             raise _unanswered(exc) from exc
         if 200 <= raw.status < 300:
             return raw
         failure = self.failure_of(raw.error, exists=method == "GET")
-        if method == "GET" and raw.status == 404:
-            failure.kind = missing
         # Without a mark it cannot be looked for: what the provider says of itself decides.
         own = is_own_host(self.endpoint.provider, self.endpoint.identity)
         failure.sent = may_be_charged(raw, self.endpoint.provider if own else None)
@@ -212,7 +210,7 @@ class BatchService(ABC):
 
     def _result(self, line: str) -> tuple[str, RawReply | None]:
         try:
-            value = as_dict(json.loads(line) if len(line) <= self.transport.most_bytes else None)
+            value = as_dict(json.loads(line))
             key = value.get("custom_id", value.get("key"))
             return as_text(key) or "", self.read(value)
         except ValueError:

@@ -185,6 +185,23 @@ async def test_a_lone_surrogate_in_a_result_can_be_kept(server, service_at):
     assert result.body.encode() == rb'{"x": "\ud83d"}'
 
 
+async def test_results_may_take_long_as_long_as_each_part_comes_in_time(
+    server, service_at, monkeypatch
+):
+    monkeypatch.setattr("merge_runner.llm.batch.service.TIMEOUT_S", 0.4)
+
+    async def slow(request):
+        response = web.StreamResponse()
+        await response.prepare(request)
+        for key in "abcd":
+            await asyncio.sleep(0.2)
+            await response.write(jsonl(succeeded(key), b""))
+        return response
+
+    results_at(server, slow)
+    assert await read(service_at(server.url, "anthropic")) == (["a", "b", "c", "d"], None)
+
+
 async def test_results_that_break_off_can_be_read_again(server, service_at):
     async def cut(request):
         whole = jsonl(succeeded("a"), succeeded("b"), b"")
@@ -199,7 +216,7 @@ async def test_results_that_break_off_can_be_read_again(server, service_at):
     results_at(server, cut)
     service = service_at(server.url, "anthropic")
     keys, failed = await read(service)
-    assert (keys, failed.kind) == ([], "again")
+    assert (keys, failed.kind) == (["a"], "again")
     results_at(server, (200, jsonl(succeeded("a"), succeeded("b"))))
     assert await read(service) == (["a", "b"], None)
 
