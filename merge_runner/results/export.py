@@ -145,7 +145,7 @@ def export_tables(db: Path, folder: Path, also: Sequence[tuple[SchemaTable, Path
     """Write the folder, with tables ``also`` that are CSV files.
 
     Its dictionary says what each column means and, in a row without a column, each table. Raises
-    UsageError where the folder holds anything but an earlier export.
+    UsageError where the folder is neither empty nor an earlier export's.
     """
     _refuse_other_content(folder)
     try:
