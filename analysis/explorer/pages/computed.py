@@ -11,7 +11,7 @@ from analysis.explorer.site import NotThere, Site
 from analysis.explorer.urls import query_of, seconds
 from merge_runner.errors import MergeRunnerError
 
-# What is kept in the database comes within this time; what takes longer is asked for again.
+# What is kept comes within this time; what takes longer is asked for again.
 AT_ONCE_S = 0.3
 # CPU time of a first table in a new process, with its imports: 4 s of 110 trials, and of 11,000
 # between 6 s (who merged first) and 10 s (the contrasts).
