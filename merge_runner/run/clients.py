@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from contextlib import AsyncExitStack, suppress
+from contextlib import AsyncExitStack
 from resource import RLIM_INFINITY, RLIMIT_NOFILE, getrlimit, setrlimit
 
 from merge_runner.config import (
@@ -88,9 +88,14 @@ def live_clients(
     budget = Budget(ledger, options.max_cost_usd, costs)
     # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.
     wanted, (soft, hard) = options.connections + SPARE_FILES, getrlimit(RLIMIT_NOFILE)
-    with suppress(ValueError):  # more than this system allows
+    try:
         if wanted > soft != RLIM_INFINITY:
             setrlimit(RLIMIT_NOFILE, (wanted, hard))
+    except ValueError as exc:
+        raise UsageError(
+            f"{wanted} connections exceed this system's limit of {hard} open files: choose a lower "
+            "--in-flight or raise `ulimit -n`"
+        ) from exc
     env = {**os.environ, **(urls or {})}
     in_process = None
     if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):

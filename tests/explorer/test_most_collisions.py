@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 
+import duckdb
 import httpx
 import pytest
-from aiohttp import web
 
 from tests.explorer.serving import served
-from tests.harness import watched
 
 CONDITIONS = ("L_4_0", "N_0_0", "R_0_8")
 pytestmark = pytest.mark.slow
@@ -62,13 +61,9 @@ async def test_where_all_conditions_collide_alike_none_is_named_before_the_other
     reason="1.11: where no trial ended, none is said to have collided",
 )
 async def test_where_no_trial_ended_nothing_is_said_of_collisions(sweep, tmp_path):
-    async def with_a_reply_that_is_refused(request, handler):
-        return web.Response(body=b"{}", headers={"content-encoding": "br"})
-
-    async with watched(with_a_reply_that_is_refused) as server:
-        run = await sweep("emulator", "L_4_0", EMULATOR_BASE_URL=f"{server.url}/v1")
-    if "failed: 1" not in run.err:
-        pytest.fail(run.err)
+    assert (await sweep("constant", "L_4_0")).code == 0
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb")) as connection:
+        connection.execute("UPDATE trials SET status = 'failed', merged_first = NULL")
     text = which_collides_most(tmp_path)
     assert not re.search(r"No trial[^.]* collided", text)
     assert "ended" in text

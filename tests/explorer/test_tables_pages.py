@@ -38,13 +38,13 @@ class InProcess(Worker):
     """Computes in a thread of this process."""
 
     def __init__(self, db):
-        self._numbers = Numbers(db)
         self.begun = 0
         self._answering = Answering(db, self._begin)
         self._pool = ThreadPoolExecutor(1)
 
     def _begin(self, db):
         self.begun += 1
+        self._numbers = Numbers(db)
         return self
 
     def answer(self, request):

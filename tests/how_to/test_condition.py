@@ -44,7 +44,7 @@ async def test_conditions_from_outside_go_through_every_command(merge_runner, tm
     rows = [line.split()[:2] for line in read["tables"].out.splitlines()]
     assert ["far", "projected-order"] in rows
     assert ["far", "human"] not in rows
-    assert "not replayed: 2 trials" in read["audit"].out
+    assert "not replayed: 3 trials" in read["audit"].out
     assert "no human drove" in (tmp_path / "report.html").read_text()
     assert "no human drove it" in (tmp_path / "pages/index.html").read_text()
 
