@@ -447,13 +447,19 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
 
 
 def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
-    """The endpoint's identity: in a replay, the only one under which the model is recorded."""
-    if options.replay:
-        model = plan.entries[name].id
-        recorded = {request.endpoint for request in cache.recorded(lambda r: r.model == model)}
-        if len(recorded) == 1:
-            return recorded.pop()
-    return plan.endpoints[name]
+    """The endpoint's identity: in a replay, the one under which the model is recorded."""
+    entry, configured = plan.entries[name], plan.endpoints[name]
+    if not options.replay:
+        return configured
+    recorded = sorted({r.endpoint for r in cache.recorded(lambda r: r.model == entry.id)})
+    if configured in recorded or not recorded:
+        return configured
+    if len(recorded) > 1:
+        raise UsageError(
+            f"replies of {name} are recorded from several endpoints: {', '.join(recorded)}. "
+            "Set the base URL variable of its provider to the one to replay."
+        )
+    return recorded[0]
 
 
 def _less_what_is_spent(
