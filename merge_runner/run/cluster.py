@@ -110,6 +110,8 @@ async def connected(where: str) -> AsyncIterator[Client]:
                 f"no Dask scheduler answers at {where} within {CONNECT_TIMEOUT_S} s; {VALID}"
             ) from exc
         stack.push_async_callback(client.close, timeout=CONNECT_TIMEOUT_S)
+        if named["workers"]:  # the first of them would get the share of all
+            await client.wait_for_workers(int(named["workers"]))
         yield client
 
 
