@@ -12,21 +12,11 @@ SELECT *, driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver
 FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash);
 
 CREATE OR REPLACE TEMP VIEW outcomes AS
-SELECT variant, condition, status, merged_first, coalesce(fallen_back, false) AS fallen_back,
-    count(*) AS trials
-FROM played LEFT JOIN (
-    SELECT trial_id, spec_hash, bool_or(fallback) AS fallen_back FROM decisions GROUP BY ALL
-) USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL;
+SELECT condition, status, merged_first, count(*) AS trials FROM played GROUP BY ALL ORDER BY ALL;
 
 CREATE OR REPLACE TEMP VIEW levels AS
 SELECT factor, value, status, merged_first, count(*) AS trials
 FROM played JOIN trial_levels USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL;
-
--- Attempts by their fate, as the view of attempts names it.
-CREATE OR REPLACE TEMP VIEW ledger AS
-SELECT driver, variant, fate, if(outcome = 'ok', coalesce(failure, outcome), outcome) AS outcome,
-    count(*) AS attempts
-FROM tried GROUP BY ALL ORDER BY ALL;
 
 CREATE OR REPLACE TEMP VIEW failed AS
 SELECT trial_id, error FROM played WHERE status = 'failed' ORDER BY ALL;

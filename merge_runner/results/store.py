@@ -294,9 +294,8 @@ def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str
 class SweepFacts:
     """What the database says of one sweep: each list is the view of its name in facts.sql."""
 
-    outcomes: list[tuple[str, str, str, str | None, bool, int]]
+    outcomes: list[tuple[str, str, str | None, int]]
     levels: list[tuple[str, str, str, str | None, int]]
-    ledger: list[tuple[str, str, str, str, int]]
     failed: list[tuple[str, str]]
     others: list[tuple[str, str, int]]
     stand_ins: list[tuple[str, str, str, int, int]]
@@ -313,7 +312,7 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
         connection.execute(FACTS.read_text(encoding="utf-8"))
         append(connection, "other_models", other_models(connection))
         facts = next(by_name(connection.execute("FROM decided")))
-        for name in ("outcomes", "levels", "ledger", "failed", "others", "stand_ins"):
+        for name in ("outcomes", "levels", "failed", "others", "stand_ins"):
             facts[name] = connection.execute(f"FROM {name}").fetchall()
         return SweepFacts(
             **facts, first_looks=list(by_name(connection.execute("FROM first_looks")))

@@ -132,7 +132,7 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
     if facts is None:
         return summary
     statuses: Counter[str] = Counter()
-    for _, _, status, _, _, number in facts.outcomes:
+    for _, status, _, number in facts.outcomes:
         statuses[status] += number
     summary["trials"] |= {status: statuses[status] for status in get_args(Status)}
     return {
@@ -153,7 +153,7 @@ def _tallies(plan: Plan, facts: SweepFacts) -> Iterator[dict[str, Any]]:
     tallies = {(name, level): Counter[str]() for name in shown for level in shown[name]}
     rows = [
         ("condition", level, status, merged_first, trials)
-        for _, condition, status, merged_first, _, trials in facts.outcomes
+        for condition, status, merged_first, trials in facts.outcomes
         for level in (condition, "all")
     ]
     for factor, level, status, merged_first, trials in [*rows, *facts.levels]:

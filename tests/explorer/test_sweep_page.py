@@ -107,8 +107,8 @@ def test_the_page_has_the_numbers_of_the_database(written):
         (answers,) = connection.execute(
             "SELECT count(*) FROM calls WHERE http_status = 200"
         ).fetchone()
-    attempts = sum(row[-1] for row in facts.ledger)
-    collided = sum(row[-1] for row in facts.outcomes if row[2] == "collided")
+        (attempts,) = connection.execute("SELECT count(*) FROM attempts").fetchone()
+    collided = sum(row[-1] for row in facts.outcomes if row[1] == "collided")
     for said in (
         f"collisions {collided} of 29 ended trials",
         f"failed trials {len(facts.failed)} of 30 stored trials",
