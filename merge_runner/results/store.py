@@ -55,11 +55,11 @@ from merge_runner.served_model import other_models
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
 FACTS = Path(__file__).with_name("facts.sql")
 SWEEPS = "FROM sweeps ORDER BY started_at"
-# The trials of some sweeps; those that other sweeps have, too, stay.
+# The trials of some sweeps that no other one has.
 GOING = """
 CREATE OR REPLACE TEMP TABLE going AS
-SELECT trial_id, spec_hash, bool_and(list_contains($ids, sweep_id)) AS goes FROM sweep_trials
-GROUP BY ALL HAVING bool_or(list_contains($ids, sweep_id))
+SELECT trial_id, spec_hash FROM sweep_trials
+GROUP BY ALL HAVING bool_and(list_contains(?, sweep_id))
 """
 # By their slots.
 CALLS_OF = """
@@ -235,9 +235,12 @@ def answering(
         "SET temp_directory = ''; SET enable_external_access = false; "
         "SET disabled_filesystems = 'LocalFileSystem'; SET lock_configuration = true"
     )
+    kinds = duckdb.StatementType
     try:
         statements = connection.extract_statements(sql)
-        if len(statements) != 1 or not _reads(statements[0]):
+        # A PIVOT consists of several.
+        reading = (kinds.SELECT, kinds.EXPLAIN, kinds.MULTI)
+        if [each.type in reading for each in statements] != [True]:
             raise UsageError(
                 "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
                 "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
@@ -251,18 +254,8 @@ def answering(
             f"the query needs more than the {SETTINGS['memory_limit']} of memory that it may use: "
             "ask for fewer rows or columns at once; requests and replies are long"
         ) from exc
-    except duckdb.Error as exc:
-        hint = "; cast times with a zone, as in now()::TIMESTAMP" if "pytz" in str(exc) else ""
-        raise UsageError(f"the query failed: {exc}{hint}") from exc
-
-
-def _reads(statement: duckdb.Statement) -> bool:
-    """Whether a statement is a query; a PIVOT consists of several."""
-    kinds = duckdb.StatementType
-    try:
-        return statement.type in (kinds.SELECT, kinds.EXPLAIN, kinds.MULTI)
-    except ValueError:  # a kind that the client library does not know
-        return False
+    except (duckdb.Error, ValueError) as exc:  # or a kind of statement that the client knows not
+        raise UsageError(f"the query failed: {exc}") from exc
 
 
 def results_digest(path: Path) -> tuple[str, int]:
@@ -343,21 +336,18 @@ def to_forget(db: Path, patterns: Sequence[str]) -> tuple[list[str], str]:
             if not matching:
                 raise unknown_name("sweep", pattern, known, f"in {db}; * stands for anything")
             ids += [sweep_id for sweep_id in matching if sweep_id not in ids]
-        connection.execute(GOING, {"ids": ids})
-        counts = "SELECT count(*) FILTER (goes), count(*) FILTER (NOT goes) FROM going"
-        ((trials, staying),) = connection.execute(counts).fetchall()
-    also = f"; {staying} trials that other sweeps have, too, stay" if staying else ""
-    return ids, f"{len(ids)} sweeps ({', '.join(ids)}) and {trials} trials{also}"
+        connection.execute(GOING, [ids])
+        ((trials,),) = connection.execute("SELECT count(*) FROM going").fetchall()
+    return ids, f"{len(ids)} sweeps ({', '.join(ids)}) and the {trials} trials of no other one"
 
 
 def forget(db: Path, ids: Sequence[str]) -> None:
     """Remove sweeps, their trials, and the specs that no trial is left of; see ``to_forget``."""
     with write_database(db) as connection:
-        connection.execute(GOING, {"ids": ids})
+        connection.execute(GOING, [ids])
         for table in PLACES:
             connection.execute(
-                f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN "  # noqa: S608 # our tables
-                "(SELECT trial_id, spec_hash FROM going WHERE goes)"
+                f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM going)"  # noqa: S608 # our tables
             )
         for table in ("sweep_trials", "sweeps"):
             connection.execute(f"DELETE FROM {table} WHERE list_contains(?, sweep_id)", [ids])  # noqa: S608 # our tables
