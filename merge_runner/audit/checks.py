@@ -21,9 +21,11 @@ from merge_runner.llm.content_hashes import canonical_json, spec_hash, without_p
 from merge_runner.records import ANSWERED_FIELD
 from merge_runner.results.database import (
     SETTINGS,
+    Instance,
     append,
     by_name,
     fetched,
+    has_long_texts,
     in_memory,
     read_database,
     schema_sql,
@@ -58,6 +60,8 @@ GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
 SHOWN = 20
+ENOUGH = "200MB"
+"""Of memory for DuckDB where replies are short: more would only cache the file."""
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 
@@ -115,7 +119,9 @@ class Audit:
 def audited_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open a database with the views of checks.sql; raises UsageError or StoreError."""
     try:
-        with read_database(path) as connection:
+        with read_database(path, Instance()) as connection:
+            if not has_long_texts(connection):
+                connection.execute(f"SET memory_limit = '{ENOUGH}'")
             prepare(connection)
             yield connection
     except duckdb.Error as exc:

@@ -43,6 +43,7 @@ from merge_runner.llm.content_hashes import (
 )
 from merge_runner.paths import refuse_another_kind
 from merge_runner.records import ChatRequest, is_scripted
+from merge_runner.results import database
 from merge_runner.results.database import Settings, append, fetched, in_memory
 from merge_runner.results.rows import Row
 from merge_runner.text_safety import first_line, one_line, quoted
@@ -78,9 +79,9 @@ SHOWN = 70
 # Misses that differ in numbers alone have one cause.
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 SETTINGS: Settings = {
+    **database.SETTINGS,
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
-    "memory_limit": "1GB",  # unpacked bytes count, too
     "threads": 1,
 }
 

@@ -10,7 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import fields, replace
 from operator import itemgetter
 from pathlib import Path
@@ -73,14 +73,12 @@ def audit_database(
     A trial that several sweeps have is audited with the newest of them. The replies are those of
     the folder ``cache``, if it is named, and are compared with the stored ones. Raises UsageError.
     """
-    with audited_database(path) as connection, ExitStack() as stack:
+    opened = nullcontext() if cache is None else closing(ResponseCache(cache, read_only=True))
+    with audited_database(path) as connection, opened as recorded:
         sweeps = {row[0]: row for row in connection.execute(SWEEPS).fetchall()}
         if sweep_id is not None:
             oldest_first = dict(reversed(sweeps.items()))
             sweeps = {sweep_id: require(oldest_first, "sweep", sweep_id, f"in {path}")}
-        recorded = None
-        if cache is not None:
-            recorded = stack.enter_context(closing(ResponseCache(cache, read_only=True)))
         audits = [
             _audit(connection, name, config, recorded, finished=finished)
             for name, config, finished in sweeps.values()
