@@ -56,7 +56,7 @@ class RoadTexts(Frozen):
     """The templates of a paragraph before and after the merge point; where one is left out, none.
 
     In a file a text, or the key ``text``, stands for both. What they may name in braces:
-    ``prompts.fields``.
+    ``prompts.blocks``.
     """
 
     merge: str | None = None
