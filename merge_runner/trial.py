@@ -36,12 +36,10 @@ async def play_trial(
     Drivers are asked at once, or ``in_turn`` where their answers are there already. Raises
     UsageError for a decision that cannot be driven.
     """
-    world = World(scenario, CONDITIONS.require(spec.condition), TRACK)
     # Each side starts as its own driver says, or else as the other's does.
     given = {side: d.starts for side, d in drivers.items() if hasattr(d, "starts")}
-    if given:
-        some = next(iter(given.values()))
-        world.start_at({side: given.get(side, some)[side] for side in SIDES})
+    starts = {side: given.get(side, other)[side] for other in given.values() for side in SIDES}
+    world = World(scenario, CONDITIONS.require(spec.condition), TRACK, starts)
     seats = [_Seated(drivers[side], side, scenario, world) for side in SIDES]
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}

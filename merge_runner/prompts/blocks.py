@@ -291,17 +291,17 @@ def title_of(variant: str) -> str:
 
 def blocks_of(variant: str) -> dict[str, Block]:
     """The blocks of a variant by name, in the order of its prompt; raises UsageError."""
-    chosen = VARIANTS.require(variant)
+    chosen, known = VARIANTS.require(variant), dict(BLOCKS.items())
     if chosen.blocks:
         return dict(chosen.blocks)
     for name in sorted(chosen.removes | chosen.adds):
-        BLOCKS.require(name, f"the variant {variant} names it")
-    paper = {name: block for name, block in BLOCKS.items() if block.before is None}
+        require(known, BLOCKS.kind, name, f"the variant {variant} names it")
+    paper = {name: block for name, block in known.items() if block.before is None}
     blocks = {name: block for name, block in paper.items() if name not in chosen.removes}
     # In the order of names, which is that of no import.
     for name in sorted(chosen.adds - blocks.keys()):
-        blocks = with_block(blocks, name, BLOCKS[name])
-    return {name: BLOCKS[name] for name in blocks}
+        blocks = with_block(blocks, name, known[name])
+    return {name: known[name] for name in blocks}
 
 
 def with_block(
