@@ -53,9 +53,7 @@ class World:
             for side, (position, speed) in (starts or dict(places)).items()
         }
         if max(positions) >= track.merge_point_m:
-            raise UsageError(
-                f"{condition.described}: a vehicle is at the merge point before both are driven"
-            )
+            raise UsageError(f"{condition}: a vehicle is at the merge point before both are driven")
         self.status: Status | None = "collided" if self._collided() else None
 
     @property
