@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
+from functools import partial
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
@@ -62,9 +63,6 @@ async def play_trial(
                 decisions.append(DecisionRow(number, world.time_s, side, answer, seat.told))
         if not failures:
             world.advance({seat.side: seat.action() for seat in seats})
-            for seat in seats:
-                if seat.eyes:
-                    seat.eyes.look(world.observe(seat.side))
     return TrialRecord(
         spec=spec,
         status=world.status or "failed",
@@ -89,8 +87,8 @@ class _Seated:
         self.interval = self._pace.interval_steps
         perception, self.eyes = scenario.perception(side), None
         if not perception.is_perfect:
-            start = world.observe(side)
-            self.eyes = Eyes(perception, driver.seat.seed, scenario.step_s, start)
+            observe = partial(world.observe, side)
+            self.eyes = Eyes(perception, driver.seat.seed, scenario.step_s, observe)
         self.told: Observation | None = None
         self._applied: tuple[float, ...] | None = None
         self._decided_at = 0
@@ -101,7 +99,7 @@ class _Seated:
 
     async def ask(self) -> Decision | CallFailed:
         """Ask the driver; where its call fails, the other's answer is still awaited."""
-        self.told = self.eyes.told() if self.eyes else None
+        self.told = self.eyes.told(self._world.step) if self.eyes else None
         observation = self.told or self._world.observe(self.side)
         try:
             return await self.driver.decide(observation, self._world.step // self.interval)

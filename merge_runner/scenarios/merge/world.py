@@ -98,23 +98,24 @@ class World:
             return None
         return min(times, key=times.__getitem__)
 
-    def observe(self, side: Side) -> Observation:
-        """What the driver of ``side`` sees now, itself as ego."""
+    def observe(self, side: Side, step: int | None = None) -> Observation:
+        """What the driver of ``side`` sees, itself as ego, now or at an earlier step."""
         own, other = self._vehicles[side], self._vehicles[other_side(side)]
-        position, other_position = own.positions[-1], other.positions[-1]
+        now = self.step if step is None else step
+        position, other_position = own.positions[now], other.positions[now]
         by_own = self._config.straight_after == "own"
         farthest_back = position if by_own else min(position, other_position)
         straight = farthest_back >= self._track.merge_point_m
         return Observation(
             road="straight" if straight else "merge",
-            own_speed_mps=own.velocities[-1],
-            other_speed_mps=other.velocities[-1],
+            own_speed_mps=own.velocities[now],
+            other_speed_mps=other.velocities[now],
             relative_distance_m=other_position - position,
             distance_to_merge_m=None if straight else self._track.merge_point_m - position,
-            own_accelerations_mps2=self._history(own.accelerations[1:], 0.0),
-            other_speeds_mps=self._history(other.velocities[:-1], other.velocities[0]),
+            own_accelerations_mps2=self._history(own.accelerations[1 : now + 1], 0.0),
+            other_speeds_mps=self._history(other.velocities[:now], other.velocities[0]),
             own_position_m=position,
-            other_acceleration_mps2=other.accelerations[-1],
+            other_acceleration_mps2=other.accelerations[now],
         )
 
     def states(self) -> tuple[StateRow, ...]:
