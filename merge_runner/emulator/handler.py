@@ -33,6 +33,8 @@ from merge_runner.records import (
 MODEL, RANDOM_MODEL = "scripted-driver", "random-driver"
 # What anything but a chat request can raise: refused with 400.
 UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
+# How OpenAI, Gemini and Anthropic name it.
+REFUSAL = {"type": "invalid_request_error", "code": 400, "status": "INVALID_ARGUMENT"}
 CREATED = 1_760_000_000
 Body = dict[str, Any]
 
@@ -58,15 +60,13 @@ class ServedFormat:
 
     ``path`` is a regular expression. A request has its messages in the member ``turns``, or is one
     text there, and the text of a message in ``content``; ``parameters_in`` names the member with
-    its parameters, if they do not stand at the top. ``error`` makes the body that refuses a
-    request, by a message.
+    its parameters, if they do not stand at the top.
     """
 
     path: str
     turns: str
     content: str
     answer: Callable[[Completion], Body]
-    error: Callable[[str], Body]
     parameters_in: str | None = None
 
     def prompt(self, body: Body) -> str:
@@ -156,32 +156,16 @@ def _message(said: Completion) -> Body:
     }
 
 
-def _openai_error(message: str) -> Body:
-    name = "invalid_request_error"
-    return {"error": {"message": message, "type": name, "param": None, "code": name}}
-
-
-def _gemini_error(message: str) -> Body:
-    status = "INVALID_ARGUMENT"
-    return {"error": {"code": 400, "message": message, "status": status, "details": []}}
-
-
-def _anthropic_error(message: str) -> Body:
-    error = {"type": "invalid_request_error", "message": message}
-    return {"type": "error", "error": error, "request_id": "req_emulated"}
-
-
-CHAT = ServedFormat("/v1/chat/completions", "messages", "content", _chat, _openai_error)
-RESPONSES = ServedFormat("/v1/responses", "input", "content", _response, _openai_error)
+CHAT = ServedFormat("/v1/chat/completions", "messages", "content", _chat)
+RESPONSES = ServedFormat("/v1/responses", "input", "content", _response)
 GEMINI = ServedFormat(
     r"/v1\w*/models/(?P<model>[^/]+?):generateContent",
     "contents",
     "parts",
     _content,
-    _gemini_error,
     parameters_in="generationConfig",
 )
-MESSAGES = ServedFormat("/v1/messages", "messages", "content", _message, _anthropic_error)
+MESSAGES = ServedFormat("/v1/messages", "messages", "content", _message)
 SERVED = (CHAT, RESPONSES, GEMINI, MESSAGES)
 
 
@@ -244,7 +228,8 @@ class Emulator:
                 try:
                     return await self.reply(asked, self.attempt(asked))
                 except UsageError as exc:
-                    return as_json({**wire.error(str(exc)), SCRIPTED_FIELD: True}, 400)
+                    error = {**REFUSAL, "message": str(exc)}
+                    return as_json({"type": "error", "error": error, SCRIPTED_FIELD: True}, 400)
         return as_response(b"404: Not Found", 404, {"content-type": "text/plain"})
 
     def attempt(self, asked: Asked) -> int:
