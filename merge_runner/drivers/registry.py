@@ -96,11 +96,6 @@ class Program:
         """
         if changes and not self.settable:
             raise UsageError(f"the parameters of {name} stand in its source and cannot be set")
-        if clock_s is not None and self.rate_hz is not None and clock_s < 1 / self.rate_hz:
-            raise UsageError(
-                f"clock = {clock_s:g} is too fast: {name} decides every {1 / self.rate_hz:g} s, "
-                "and a clock can only slow it down"
-            )
         values, given = self.values, dict(self.parameters)
         # Which other parameters there are depends on the set, so that it comes first.
         for each in sorted(changes, key=lambda each: each != SET):

@@ -169,31 +169,26 @@ def named(template: str) -> list[str]:
 _APPROACHING = """\
 You drive a car towards a merge. Two roads join at a merge point and go on as a single lane. You \
 are on one of the two roads and another car is on the other one. Neither of you has the right of \
-way. You cannot steer and you cannot communicate with the other driver: you control only the \
+way. """
+_MERGED = """\
+You drive a car on a straight road: you have passed a merge point where two roads join to a \
+single lane. Another car comes from the other road and is ahead of you or behind you. """
+_SITUATION = """\
+You cannot steer and you cannot communicate with the other driver: you control only the \
 acceleration of your own car. You are asked for a new plan every {prompt_interval_s} s.
 
 Situation now:
-- Road type: merge
-- Length of each car: {vehicle_length} m
-- Your speed: {own_speed} m/s
-- Speed of the other car: {other_speed} m/s
-- Relative distance (how far the other car is ahead of you along the road; negative if it is \
-behind): {relative_distance} m
-- Your distance to the merge point: {distance_to_merge} m"""
-
-_MERGED = """\
-You drive a car on a straight road: you have passed a merge point where two roads join to a \
-single lane. Another car comes from the other road and is ahead of you or behind you. You cannot \
-steer and you cannot communicate with the other driver: you control only the acceleration of your \
-own car. You are asked for a new plan every {prompt_interval_s} s.
-
-Situation now:
-- Road type: straight
+- Road type: ROAD
 - Length of each car: {vehicle_length} m
 - Your speed: {own_speed} m/s
 - Speed of the other car: {other_speed} m/s
 - Relative distance (how far the other car is ahead of you along the road; negative if it is \
 behind): {relative_distance} m"""
+_DISTANCE_LEFT = "\n- Your distance to the merge point: {distance_to_merge} m"
+_SITUATIONS = (
+    _APPROACHING + _SITUATION.replace("ROAD", "merge") + _DISTANCE_LEFT,
+    _MERGED + _SITUATION.replace("ROAD", "straight"),
+)
 
 
 def _tabled(situation: str) -> str:
@@ -244,7 +239,7 @@ _KMH = "In km/h: your speed is {own_speed_kmh}, the speed of the other car {othe
 _MPH = "In mph: your speed is {own_speed_mph}, the speed of the other car {other_speed_mph}"
 
 _PAPER = (
-    ("C0", "situation", _APPROACHING, _MERGED),
+    ("C0", "situation", *_SITUATIONS),
     ("C1", "history", _HISTORY, _HISTORY),
     ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
     ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
@@ -254,7 +249,6 @@ _PAPER = (
     ("C4", "tactical decision", _TACTICAL, None),
     (OUTPUT_FORMAT, "output format", _SCHEMA, _SCHEMA),
 )
-_TABLES = _tabled(_APPROACHING), _tabled(_MERGED)
 _READY = (
     ("state.projected_headway", "projected headway", _HEADWAY, None),
     ("state.time_to_merge", "times to the merge point", _TIMES, None),
@@ -262,7 +256,7 @@ _READY = (
     ("state.relative_speed", "relative speed in words", _FASTER, _FASTER),
     ("state.kmh", "speeds in km/h", _KMH, _KMH),
     ("state.mph", "speeds in mph", _MPH, _MPH),
-    ("state.table", "situation as a table, in place of C0", *_TABLES),
+    ("state.table", "situation as a table, in place of C0", *map(_tabled, _SITUATIONS)),
 )
 BLOCKS = Registry[Block]("prompt block")
 for _before, _blocks in ((None, _PAPER), ("C1", _READY)):

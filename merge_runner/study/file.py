@@ -110,7 +110,7 @@ class BudgetTerms(Frozen):
 
 
 class StudyDriver(Frozen):
-    """A driver that a study makes of a ``program``: with other parameters, or with a slower clock.
+    """A driver that a study makes of a ``program``: with other parameters, or another clock.
 
     It holds each action for ``clock`` seconds. Every other key is a parameter of the program.
     """
