@@ -12,7 +12,6 @@ from merge_runner.config import (
     rehearsal_endpoint,
     resolve_endpoint,
 )
-from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
 from merge_runner.llm.batch.rounds import Rounds
@@ -30,8 +29,6 @@ from merge_runner.run.plan import Options, Plan
 
 # Time in a rehearsal: answers come so much sooner, and the limits of a minute hold within less.
 SPEED = 10
-# The share of attempts in which something goes wrong, as with providers.
-RATES = {"rate_limit": 0.01, "server_error": 0.005, "overloaded": 0.005, "malformed": 0.005}
 # For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
 
@@ -101,7 +98,11 @@ def live_clients(
     if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
         from merge_runner.emulator.handler import Emulator
 
-        in_process = Emulator(_behaviour(plan)).transport()
+        emulator = Emulator()
+        if plan.is_rehearsal:  # of one model, whose entries differ in parameters alone
+            entry = next(iter(plan.entries.values()))
+            emulator = Emulator(entry.typical_latency_s / SPEED, entry.typical_output_tokens)
+        in_process = emulator.transport()
     limiters = {} if limiters is None else limiters
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
@@ -154,19 +155,6 @@ def live_clients(
             under_way=under_way,
         )
     return clients
-
-
-def _behaviour(plan: Plan) -> Behaviour:
-    """How the emulator answers, in a rehearsal in the place of a plan's one model."""
-    if not plan.is_rehearsal:
-        return Behaviour()
-    entry = next(iter(plan.entries.values()))  # the others differ in parameters alone
-    return Behaviour(
-        rates=RATES,
-        latency_s=entry.typical_latency_s / SPEED,
-        delay_s=1.0,
-        output_tokens=entry.typical_output_tokens,
-    )
 
 
 def open_rounds(
