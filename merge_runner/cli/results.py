@@ -24,7 +24,7 @@ from merge_runner.text_safety import say
 if TYPE_CHECKING:
     from merge_runner.llm.ledger import Ledger, Spending
 
-CACHE = "Also compare every attempt with this cache folder."
+CACHE = "Replay from this cache folder, not from the stored replies."
 COLUMNS = ("name", "provider", "key", "usd_per_m_in", "usd_per_m_out", "shutdown", "id", "prices")
 
 SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
@@ -44,7 +44,7 @@ def sql(
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
     from merge_runner.results.database import fetched, names_of
-    from merge_runner.results.query_output import write_csv, write_json, write_table
+    from merge_runner.results.export import write_csv, write_json, write_table
     from merge_runner.results.store import answer
 
     writers = {"text": write_table, "csv": write_csv, "json": write_json}
@@ -168,7 +168,7 @@ def recording_verify(file: RecordingFile) -> None:
     from merge_runner.results.recording import summarise
 
     found = summarise(file)
-    say(f"{file} is whole: {found.calls} calls, as they were exported")
+    say(f"{file} is whole: {found['calls']} calls, as they were exported")
 
 
 @recording_app.command("info")
@@ -179,7 +179,7 @@ def recording_info(
     """Verify a recording and print what it holds, as JSON."""
     from merge_runner.results.recording import summarise
 
-    print_out(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
+    print_out(json.dumps(summarise(file), indent=2, ensure_ascii=False))
 
 
 def ledger(
@@ -257,7 +257,7 @@ def models(as_json: cli.JsonOption = False) -> None:
     from merge_runner.llm.ledger import cost_usd
     from merge_runner.llm.models import load_models, shutdown_notes
     from merge_runner.records import Usage
-    from merge_runner.results.query_output import write_json, write_table
+    from merge_runner.results.export import write_json, write_table
 
     entries = load_models()
     rows: list[tuple[object, ...]] = []

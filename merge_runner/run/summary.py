@@ -17,7 +17,7 @@ from merge_runner.errors import ReplayMiss
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.records import Status
-from merge_runner.results.query_output import write_table
+from merge_runner.results.export import write_table
 from merge_runner.results.recording import recorded_part
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
