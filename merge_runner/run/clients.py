@@ -8,7 +8,6 @@ from contextlib import AsyncExitStack
 from resource import RLIM_INFINITY, RLIMIT_NOFILE, getrlimit, setrlimit
 
 from merge_runner.config import (
-    driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
 )
@@ -16,12 +15,11 @@ from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import FirstCall
-from merge_runner.llm.ledger import Ledger, cost_usd
+from merge_runner.llm.ledger import Budget, Ledger, cost_usd
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.records import Usage
@@ -83,7 +81,6 @@ def live_clients(
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
         ledger.read()  # raises where it is damaged, before anything is spent
-        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
     costs = trial_costs(plan, earlier, batch=options.batch)
     budget = Budget(ledger, options.max_cost_usd, costs)
     # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.

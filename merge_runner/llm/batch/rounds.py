@@ -35,9 +35,9 @@ from merge_runner.errors import (
     TrialSuspended,
 )
 from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus
-from merge_runner.llm.budget import PaidAttempt
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
+from merge_runner.llm.ledger import PaidAttempt
 from merge_runner.records import ChatRequest
 
 if TYPE_CHECKING:

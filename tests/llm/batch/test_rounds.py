@@ -26,12 +26,11 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.batch.service import BatchFailed, BatchStatus
-from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Budget, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot
 from tests.virtual_time import in_virtual_time, now_s
