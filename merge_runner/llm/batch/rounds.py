@@ -34,7 +34,7 @@ from merge_runner.errors import (
     RecordingError,
     TrialSuspended,
 )
-from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus
+from merge_runner.llm.batch.providers import BatchFailed, BatchService, BatchStatus
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
 from merge_runner.llm.ledger import PaidAttempt
@@ -84,21 +84,14 @@ class Batch:
 
     Then ``ends`` has what became of the lines with a result, by key, until it is taken, and
     ``rest`` what became of all others; None: they go with the next round. An ``error`` ends the
-    sweep. While its work ``sleeps`` nothing of it is on its way.
+    sweep.
     """
 
     note: OpenBatch
     ends: dict[str, AttemptOutcome] = field(default_factory=dict)
     rest: AttemptOutcome | None = None
     error: MergeRunnerError | None = None
-    sleeps: bool = False
     work: asyncio.Task[None] | None = None
-
-    async def sleep(self, seconds: float) -> None:
-        """Wait, while others may go on."""
-        self.sleeps = True
-        await asyncio.sleep(seconds)
-        self.sleeps = False
 
 
 @dataclass(slots=True, eq=False)
@@ -176,8 +169,7 @@ class Rounds:
             await asyncio.sleep(LOOK_S)
             for _ in range(LOOKS):
                 await asyncio.sleep(0)
-                sleep = all(batch.sleeps for batch in self._open())
-                if not (self._forming and sleep and is_idle()):
+                if not (self._forming and is_idle()):
                     break
             else:
                 self._close_round()
@@ -321,7 +313,7 @@ class Rounds:
             raise BatchFailed("lost", "whether it was created is not known")
         find = partial(service.find, batch.note.mark)
         for pause_s in (0.0, *ARRIVAL_S):
-            await batch.sleep(pause_s)
+            await asyncio.sleep(pause_s)
             if (batch_id := await self._patiently(batch, find)) is not None:
                 await self._note(batch, batch_id)
                 return True
@@ -340,12 +332,12 @@ class Rounds:
         ask = partial(self.services[note.model].status, note.batch_id)
         while (status := await self._patiently(batch, ask)) == BatchStatus():
             age_s = (datetime.now(UTC) - note.submitted_at).total_seconds()
-            await batch.sleep(max(SHORTEST_POLL_S, min(LONGEST_POLL_S, POLL_SHARE * age_s)))
+            await asyncio.sleep(max(SHORTEST_POLL_S, min(LONGEST_POLL_S, POLL_SHARE * age_s)))
         if status.failure:
             await self._not_asked(batch, status.failure, "batch_failed")
             return
         try:
-            await self._patiently(batch, partial(self._read, batch), ENDING_S)
+            await self._patiently(batch, partial(self._read, batch, status), ENDING_S)
         except BatchFailed as exc:
             if exc.kind != "again":
                 raise
@@ -354,14 +346,10 @@ class Rounds:
         if note.model in self._most:
             self._most[note.model] = max(self._most[note.model], 2 * len(note.lines))
 
-    async def _read(self, batch: Batch) -> None:
+    async def _read(self, batch: Batch, status: BatchStatus) -> None:
         """Take the results of a batch; raises BatchFailed where there should be others."""
-        note, service = batch.note, self.services[batch.note.model]
-        status = await service.status(note.batch_id)
-        if status.paths is None:
-            raise BatchFailed("again", "a batch that has ended is said to go on")
-        broken = 0
-        async for key, raw in service.results(status.paths):
+        note, service, broken = batch.note, self.services[batch.note.model], 0
+        async for key, raw in service.results(status.paths or []):
             end = _no_answer("expired", "it was not asked in time", charged=False)
             if raw:  # no limit of single calls is meant, and no call waits for one
                 end = replace(judge(raw, service.wire), pause=False, delay_s=None)
@@ -397,7 +385,7 @@ class Rounds:
                 self._say(f"{model}: {calls} calls go in smaller batches: {exc}")
             self._most[model] = max(1, calls // 2) if is_alone else calls
             # It counts as open, so that no other one is submitted meanwhile.
-            await batch.sleep(exc.delay_s or 1.0)
+            await asyncio.sleep(exc.delay_s or 1.0)
             return
         batch.rest = _no_answer(outcome, str(exc), charged=False)
 
@@ -433,7 +421,7 @@ class Rounds:
                 if not tries:
                     self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
                 tries += 1
-                await batch.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
+                await asyncio.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
 
 
 def _no_answer(name: str, why: str, *, charged: bool = True) -> AttemptOutcome:

@@ -24,8 +24,8 @@ from merge_runner.errors import (
     ProviderDown,
     QuotaExhausted,
 )
+from merge_runner.llm.batch.providers import BatchFailed, BatchStatus
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.batch.service import BatchFailed, BatchStatus
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
