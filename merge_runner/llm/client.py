@@ -545,7 +545,7 @@ class LlmClient:
             with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
                 paid = await self.money.set_aside(*who)
         else:
-            paid = self.money.going_on(*who, call.open.note.ledger)
+            paid = self.money.going_on(*who)
         with closing(paid):
             with call.waiting(f"for batches of {self.model}", idle=True):
                 outcome, batch = await rounds.ask(call, paid, self.model)

@@ -81,8 +81,8 @@ most_overrun = max(most_overrun, excluded.most_overrun)
 """
 _CLOSE = """
 DELETE FROM open WHERE rowid =
-(SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
-RETURNING usd, driver, slot, worst_usd, since
+(SELECT max(rowid) FROM open WHERE call = ? AND attempt = ?)
+RETURNING scope, usd, driver, slot, worst_usd, since
 """
 _REASONS = """
 SELECT driver, outcome, count(*), sum(usd), min(since), max(since), min(slot) FROM open
@@ -292,15 +292,17 @@ class Ledger:
             self.read()
 
     def _settled(self, key: str, attempt: Attempt, driver: str) -> None:
-        place, cost_usd, over = (self.scope, key, attempt.number), attempt.cost_usd, (0.0, 0.0)
-        # It may be gone: a batch may end after its money was released.
-        for row in self._money.write(_CLOSE, *place):
+        # Its reservation may be gone: a batch may end after its money was released.
+        scope, cost_usd, over = self.scope, attempt.cost_usd, (0.0, 0.0)
+        # That of a line in a batch is paid by the sweep that has submitted it.
+        for scope, usd, *asked in self._money.write(_CLOSE, key, attempt.number):
             if cost_usd is None:  # it may have been charged
-                self._money.write(_OPEN, *place, *row, attempt.outcome)
-            elif cost_usd > row[0] + TOLERANCE_USD:
-                over = (cost_usd - row[0], cost_usd / max(row[3], TOLERANCE_USD))
+                place = (scope, key, attempt.number, usd)
+                self._money.write(_OPEN, *place, *asked, attempt.outcome)
+            elif cost_usd > usd + TOLERANCE_USD:
+                over = (cost_usd - usd, cost_usd / max(asked[2], TOLERANCE_USD))
         if cost_usd is not None:
-            self._money.write(_PAY, self.scope, driver, cost_usd, *over)
+            self._money.write(_PAY, scope, driver, cost_usd, *over)
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""
@@ -339,7 +341,6 @@ class PaidAttempt:
     """
 
     budget: Budget
-    ledger: Ledger
     trial: int
     key: str
     asked: Asked
@@ -354,15 +355,15 @@ class PaidAttempt:
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
         """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
-        reserve = partial(self.set_aside, attempts)
-        if self.ledger.scope and not await self.ledger.cache.money.writer.write(reserve):
+        ledger, reserve = self.budget.ledger, partial(self.set_aside, attempts)
+        if ledger.scope and not await ledger.cache.money.writer.write(reserve):
             raise TrialSuspended("another run spends from the same cap, and has used it up")
         self.begun()
 
     def set_aside(self, attempts: Sequence[Attempt]) -> bool:
         """Do the durable part of ``begin`` in this thread; False if the cap is used up."""
         number, cap_usd = len(attempts) + 1, self.budget.cap_usd
-        return self.ledger.reserve(self.key, number, self.aside_usd, cap_usd, self.asked)
+        return self.budget.ledger.reserve(self.key, number, self.aside_usd, cap_usd, self.asked)
 
     def begun(self) -> None:
         """Count the reservation no longer here: ``set_aside`` has made it durable."""
@@ -371,17 +372,17 @@ class PaidAttempt:
 
     async def settle(self, attempts: Sequence[Attempt]) -> None:
         """Settle the attempt, the last of these, which brought no answer."""
-        await self.ledger.cache.put_unanswered(self.key, tuple(attempts))
+        await self.budget.ledger.cache.put_unanswered(self.key, tuple(attempts))
         await self._pay(attempts[-1])
 
     async def keep(self, entry: CachedCall) -> CachedCall:
         """Keep the answer that the attempt brought, then settle what it cost."""
-        kept = await self.ledger.cache.put(entry)
+        kept = await self.budget.ledger.cache.put(entry)
         await self._pay(entry.attempts[-1])
         return kept
 
     async def _pay(self, attempt: Attempt) -> None:
-        await self.ledger.settle(self.key, attempt, self.asked.driver)
+        await self.budget.ledger.settle(self.key, attempt, self.asked.driver)
         self.cost_usd = attempt.cost_usd
 
     def close(self) -> None:
@@ -448,15 +449,14 @@ class Budget:
             await self._in_turn((False, trial), partial(self._pays, trial, asked))
         usd = self._worst_usd(asked)
         self._largest_usd = max(self._largest_usd, usd)
-        return PaidAttempt(self, self.ledger, trial, key, asked, usd)
+        return PaidAttempt(self, trial, key, asked, usd)
 
-    def going_on(self, trial: int, key: str, asked: Asked, scope: str) -> PaidAttempt:
-        """Return the money of an attempt that an earlier run has begun under a ledger's name."""
-        ledger = Ledger(self.ledger.cache, scope) if self.ledger.scope else self.ledger
-        sql = "SELECT usd FROM open WHERE scope = ? AND call = ? ORDER BY attempt"
-        reserved = ledger.cache.money.read(sql, scope, key)
+    def going_on(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
+        """Return the money of an attempt that an earlier run, perhaps another sweep, has begun."""
+        sql = "SELECT usd FROM open WHERE call = ? ORDER BY attempt"
+        reserved = self.ledger.cache.money.read(sql, key)
         aside_usd = reserved[-1][0] if reserved else 0.0  # 0: a user has released it
-        return PaidAttempt(self, ledger, trial, key, asked, aside_usd, queued=False)
+        return PaidAttempt(self, trial, key, asked, aside_usd, queued=False)
 
     def charge(self, trial: int, usd: float) -> None:
         """Count what a trial that has begun spends or sets aside, or gives back."""

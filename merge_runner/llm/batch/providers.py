@@ -126,7 +126,6 @@ class BatchService(ABC):
         self.transport = transport
         self.endpoint = endpoint
         self.wire = wire
-        self.forgets = endpoint.is_emulator  # what waits there ends with the emulator
 
     def line(self, request: ChatRequest) -> bytes:
         """Return a line as it is sent, with the body as it is hashed."""

@@ -67,12 +67,11 @@ class OpenBatch(BaseModel, frozen=True):
 
     ``mark`` is its name at the provider, ``batch_id`` its id, empty until the provider has told it.
     ``lines`` has the number of the attempt by the key of each call. ``model`` is its name in the
-    registry, ``ledger`` that of the money. ``submitted_at`` is UTC.
+    registry. ``submitted_at`` is UTC.
     """
 
     mark: str
     model: str
-    ledger: str
     submitted_at: AwareDatetime
     lines: dict[str, int]
     batch_id: str = ""
@@ -132,22 +131,19 @@ class Rounds:
                 noted.append(OpenBatch.model_validate_json(cache.read(name) or ""))
         noted.sort(key=lambda note: note.submitted_at)
         self.batches = {note.mark: Batch(note) for note in noted if note.model in models}
-        ended = [mark for mark, batch in self.batches.items() if not self._waits(batch)]
+        # Where earlier runs have submitted calls last whose attempts there have not ended.
+        self._waiting: dict[str, Batch] = {}
+        for batch in self.batches.values():
+            self._waiting |= dict.fromkeys(batch.note.lines, batch)
+        self._waiting = {key: b for key, b in self._waiting.items() if not self._ended(key, b)}
+        ended = self.batches.keys() - {batch.note.mark for batch in self._waiting.values()}
         cache.run_now([partial(cache.remove, _BATCH + mark) for mark in ended])
         for mark in ended:
             del self.batches[mark]
 
     def open_batch(self, key: str) -> Batch | None:
-        """Return where a call was submitted last, unless its attempt there has ended."""
-        every = reversed(self.batches.values())
-        batch = next((batch for batch in every if key in batch.note.lines), None)
-        if batch is None:
-            return None
-        with contextlib.suppress(RecordingError):  # damaged: nothing is known of its attempts
-            tried = {each.number: each.outcome for each in self._cache.unanswered(key)}
-            if tried.get(batch.note.lines[key], "unknown") != "unknown":
-                return None
-        return batch
+        """Return where an earlier run has submitted a call, unless its attempt there has ended."""
+        return self._waiting.get(key)
 
     async def ask(self, call: Call, paid: PaidAttempt, model: str) -> tuple[AttemptOutcome, Batch]:
         """Return what became of a call's next attempt, in the next round or where it waits."""
@@ -160,6 +156,7 @@ class Rounds:
             if end is None and not self.submits:
                 end = _no_answer("not_created", "the run ended before", charged=False)
             if end is not None:
+                self._waiting.pop(call.request.key, None)
                 return end, batch
             batch = await self._next_round(call, paid, model)
 
@@ -197,14 +194,11 @@ class Rounds:
             if batch.work and not batch.work.done() and model in (None, batch.note.model)
         ]
 
-    def _waits(self, batch: Batch) -> bool:
-        """Whether a call of a batch waits there yet, and in no later one."""
-        for key in batch.note.lines:
-            with contextlib.suppress(RecordingError):  # damaged: it is asked anew
-                if self._cache.get(key) is not None:
-                    continue
-            if self.open_batch(key) is batch:
-                return True
+    def _ended(self, key: str, batch: Batch) -> bool:
+        with contextlib.suppress(RecordingError):  # damaged: nothing is known of its attempts
+            tried = {each.number: each.outcome for each in self._cache.unanswered(key)}
+            outcome = tried.get(batch.note.lines[key], "unknown")
+            return outcome != "unknown" or self._cache.get(key) is not None
         return False
 
     async def _next_round(self, call: Call, paid: PaidAttempt, model: str) -> Batch:
@@ -213,12 +207,12 @@ class Rounds:
         return await line.batch
 
     def _close_round(self) -> None:
-        groups: defaultdict[tuple[str, str], list[Line]] = defaultdict(list)
+        groups: defaultdict[str, list[Line]] = defaultdict(list)
         for line in self._forming:
             if not line.batch.done():  # somebody waits for it yet
-                groups[line.model, line.paid.ledger.scope].append(line)
+                groups[line.model].append(line)
         self._forming = []
-        for (model, ledger), lines in groups.items():
+        for model, lines in groups.items():
             most = self._most.get(model, MOST_CALLS)
             if model in self._most:
                 now = 0 if self._open(model) else most
@@ -228,7 +222,6 @@ class Rounds:
                 note = OpenBatch(
                     mark=secrets.token_hex(16),
                     model=model,
-                    ledger=ledger,
                     submitted_at=datetime.now(UTC),
                     lines={each.call.request.key: len(each.call.attempts) + 1 for each in part},
                 )
@@ -394,7 +387,7 @@ class Rounds:
         note, service = batch.note, self.services[batch.note.model]
         is_unknown = not (note.batch_id or service.takes_mark)
         # A key that is refused is another account's, perhaps: there the batch goes on.
-        if is_unknown or service.forgets or (not self.submits and exc.kind == "lost"):
+        if is_unknown or (not self.submits and exc.kind == "lost"):
             batch.rest = _no_answer("batch_lost", str(exc))
             return
         raise EndpointRefused(

@@ -60,7 +60,6 @@ class Memory:
     """
 
     takes_mark = True
-    forgets = False
     wire = FORMATS["openai-chat"]
 
     def __init__(self):
@@ -631,18 +630,6 @@ async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind)
         await run.end()
     (reply,) = await Run(cache, service).ask()
     assert outcomes(reply) == [("ok", "batch-0")]
-
-
-@in_virtual_time
-async def test_a_batch_that_ended_with_its_emulator_is_asked_anew(cache):
-    service = Memory()
-    service.forgets = True
-    await left_behind(cache, service, price="free")
-    service.batches.clear()
-    again = Run(cache, service, price="free")
-    (reply,) = await again.ask()
-    assert [attempt.outcome for attempt in reply.attempts] == ["batch_lost", "ok"]
-    assert again.ledger.read().open_attempts == 0
 
 
 @in_virtual_time
