@@ -79,10 +79,14 @@ INSERT INTO spent VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET usd = usd + e
 overrun_usd = overrun_usd + excluded.overrun_usd,
 most_overrun = max(most_overrun, excluded.most_overrun)
 """
+_KEEP = """
+UPDATE open SET outcome = ? WHERE rowid =
+(SELECT max(rowid) FROM open WHERE call = ? AND attempt = ?)
+"""
 _CLOSE = """
 DELETE FROM open WHERE rowid =
 (SELECT max(rowid) FROM open WHERE call = ? AND attempt = ?)
-RETURNING scope, usd, driver, slot, worst_usd, since
+RETURNING scope, usd, worst_usd
 """
 _REASONS = """
 SELECT driver, outcome, count(*), sum(usd), min(since), max(since), min(slot) FROM open
@@ -292,17 +296,16 @@ class Ledger:
             self.read()
 
     def _settled(self, key: str, attempt: Attempt, driver: str) -> None:
-        # Its reservation may be gone: a batch may end after its money was released.
-        scope, cost_usd, over = self.scope, attempt.cost_usd, (0.0, 0.0)
-        # That of a line in a batch is paid by the sweep that has submitted it.
-        for scope, usd, *asked in self._money.write(_CLOSE, key, attempt.number):
-            if cost_usd is None:  # it may have been charged
-                place = (scope, key, attempt.number, usd)
-                self._money.write(_OPEN, *place, *asked, attempt.outcome)
-            elif cost_usd > usd + TOLERANCE_USD:
-                over = (cost_usd - usd, cost_usd / max(asked[2], TOLERANCE_USD))
-        if cost_usd is not None:
-            self._money.write(_PAY, scope, driver, cost_usd, *over)
+        usd, over = attempt.cost_usd, (0.0, 0.0)
+        if usd is None:  # it may have been charged
+            self._money.write(_KEEP, attempt.outcome, key, attempt.number)
+            return
+        closed = self._money.write(_CLOSE, key, attempt.number)
+        # None: a user has released it. That of a line is of the sweep that has submitted its batch.
+        scope, aside_usd, honest_usd = closed[0] if closed else (self.scope, usd, usd)
+        if usd > aside_usd + TOLERANCE_USD:
+            over = (usd - aside_usd, usd / max(honest_usd, TOLERANCE_USD))
+        self._money.write(_PAY, scope, driver, usd, *over)
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""

@@ -212,9 +212,6 @@ def check_batches(plan: Plan, options: Options) -> None:
         return
     if options.replay or options.dask is not None or not plan.entries:
         raise UsageError("--batch asks models from this process: leave it, --replay or --dask out")
-    runs = os.environ.get("EMULATOR_BASE_URL")
-    if not runs and any(entry.provider == "emulator" for entry in plan.entries.values()):
-        raise UsageError("the emulator has no batch mode: leave --batch out")
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         require_batch(plan.registered[name], entry, registry)
