@@ -27,7 +27,6 @@ from merge_runner.errors import (
     ReplayMiss,
     SweepStopped,
 )
-from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request, reply_object
 from merge_runner.llm.formats import FORMATS
@@ -47,7 +46,7 @@ from merge_runner.llm.http_outcome import (
     may_be_charged,
     why_refused,
 )
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger, cost_usd
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Budget, Ledger, PaidAttempt, cost_usd
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -546,7 +545,7 @@ class LlmClient:
             with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
                 paid = await self.money.set_aside(*who)
         else:
-            paid = self.money.going_on(*who, call.open.note.ledger)
+            paid = self.money.going_on(*who)
         with closing(paid):
             with call.waiting(f"for batches of {self.model}", idle=True):
                 outcome, batch = await rounds.ask(call, paid, self.model)

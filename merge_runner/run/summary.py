@@ -216,7 +216,7 @@ def _costs(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
         f"cost {meter.cost_usd:.4f} USD{unknown}"
     )
     if (expected := summary["estimate"]) is not None:
-        cost = (expected["batch"] or expected)["cost_usd"]
+        cost = expected["cost_usd"]
         usd = "an unknown price" if cost is None else f"{cost:.2f} USD"
         yield f"estimated before: {expected['calls']} calls, {usd}"
     if spending.committed_usd:
@@ -262,17 +262,18 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
         return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
 
     measured = ", as measured before" if expected.measured else ""
-    singly = ", asked singly" if expected.batch is not None else ""
     tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
     yield f"driver  {expected.driver}"
     yield f"trials  {expected.trials} that have not ended yet"
     yield f"calls   about {expected.calls} that are not recorded yet"
     yield f"tokens  {tokens}"
-    yield f"cost    {about(expected.cost_usd)}{singly}"
-    yield f"time    about {expected.minutes} minutes{singly}"
-    if (batch := expected.batch) is not None:
-        yield (
-            f"batch   {about(batch.cost_usd)} in about {batch.rounds} rounds, at most "
-            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour, "
-            "a day at most"
-        )
+    if not expected.rounds:
+        yield f"cost    {about(expected.cost_usd)}"
+        yield f"time    about {expected.minutes} minutes"
+        return
+    singly = f"{about(expected.singly_usd)} and {expected.minutes} minutes if asked singly"
+    yield f"cost    {about(expected.cost_usd)} in batches; {singly}"
+    yield (
+        f"time    about {expected.rounds} rounds; each takes as long as its slowest batch: "
+        "minutes, an hour, a day at most"
+    )
