@@ -30,8 +30,7 @@ from merge_runner.errors import (
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request, reply_object
-from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.base import WireFormat
+from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.http_outcome import (
     NOBODY_S,
     AttemptOutcome,

@@ -20,7 +20,7 @@ from merge_runner.llm.batch.service import (
     json_object,
 )
 from merge_runner.llm.content_hashes import LARGEST_STATUS, canonical_json
-from merge_runner.llm.formats.base import (
+from merge_runner.llm.formats import (
     as_count,
     as_dict,
     as_text,

@@ -14,7 +14,7 @@ from urllib.parse import quote
 from merge_runner.config import Endpoint, is_own_host
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.llm.formats.base import ServerError, WireFormat, as_dict, as_dicts, as_text
+from merge_runner.llm.formats import ServerError, WireFormat, as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import (
     RawReply,
     TransportFailure,
