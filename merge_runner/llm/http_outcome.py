@@ -1,8 +1,6 @@
 """What a raw HTTP reply means: an answer, something to try again, or a reason to stop.
 
 ``judge`` says what a reply is by itself; what follows for its call and its run, the client decides.
-The loop of attempts is tenacity's. Ours are the wait, which no server can shorten, and the
-deadline.
 """
 
 from __future__ import annotations
@@ -11,14 +9,14 @@ import asyncio
 import json
 import random
 import re
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from functools import cached_property
 from math import inf
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal
 from urllib.parse import urlsplit
 
 from merge_runner.config import PROVIDERS, ModelEntry
@@ -36,12 +34,9 @@ from merge_runner.llm.formats import (
 if TYPE_CHECKING:
     from tenacity import RetryCallState
 
-T = TypeVar("T")
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
 REGISTRY = "experiments/models.toml"
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
-# For how long connections may be refused at the first call of a run.
-NOBODY_S = 5.0
 # The statuses of a refusal that names the request.
 REQUEST_ITSELF = (200, 400, 413, 422, 429)
 # Azure charges for a prompt that it has looked at, also where it then refuses it.
@@ -255,83 +250,13 @@ class TryAgain(MergeRunnerError):
         self.delay_s = delay_s
 
 
-class OutOfTime(MergeRunnerError):
-    """A call's deadline would pass before the next attempt."""
-
-
 def backoff_s(attempts: int) -> float:
     """Return the wait in s after so many failed attempts, without jitter."""
     # The exponent is bounded: after a thousand attempts the power would fit in no float.
     return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
 
 
-class Deadline:
-    """How long a call may take: its attempts and the waits between them.
-
-    The wait for a turn does not count: standing in the limiter's queue is no fault of the provider.
-    """
-
-    def __init__(self, seconds: float) -> None:
-        self._seconds = self._left_s = seconds
-
-    @contextmanager
-    def attempt(self) -> Iterator[float]:
-        """Count the time within this; yields the seconds that are left for it."""
-        loop = asyncio.get_running_loop()
-        began = loop.time()
-        try:
-            yield self._left_s
-        finally:
-            self._left_s -= loop.time() - began
-
-    async def keep(
-        self,
-        attempt: Callable[[], Awaitable[T]],
-        *,
-        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
-    ) -> T:
-        """Return the result of the first attempt that does not raise TryAgain.
-
-        The wait before the next one is the backoff, or longer where the server asks for it. Raises
-        OutOfTime where it would pass the deadline.
-        """
-        failed: list[TryAgain] = []
-        try:
-            return await attempt()
-        except TryAgain as exc:
-            failed.append(exc)
-        # Only now, since it costs time and memory that most calls need not spend.
-        from tenacity import AsyncRetrying, retry_if_exception_type
-
-        async def next_attempt() -> T:
-            if failed:
-                raise failed.pop()
-            return await attempt()
-
-        async def wait(seconds: float) -> None:
-            self._left_s -= seconds
-            await sleep(seconds)
-
-        again = AsyncRetrying(
-            retry=retry_if_exception_type(TryAgain),
-            wait=_wait_s,
-            stop=lambda state: state.upcoming_sleep >= self._left_s,
-            sleep=wait,
-            reraise=True,
-        )
-        try:
-            return await again(next_attempt)
-        except TryAgain as exc:
-            why = f"no answer within {self._seconds:.0f} s"
-            if (exc.delay_s or 0.0) >= self._seconds:  # then that is what to tell
-                why = (
-                    f"the server asks to wait {exc.delay_s:.0f} s, longer than a call's deadline "
-                    f"of {self._seconds:.0f} s: run the same command again after that"
-                )
-            raise OutOfTime(why) from exc
-
-
-def _wait_s(state: RetryCallState) -> float:
+def next_wait_s(state: RetryCallState) -> float:
     """Return the wait in s after a failed attempt: the backoff, or the server's longer one."""
     error = state.outcome.exception() if state.outcome else None
     assert isinstance(error, TryAgain)

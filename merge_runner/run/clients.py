@@ -46,7 +46,6 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
             cache=cache,
             transport=None,
             limiter=Limiter(),
-            sealed=True,
         )
         for name, entry in plan.entries.items()
     }
