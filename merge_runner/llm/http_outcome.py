@@ -74,8 +74,6 @@ _PART = r"(\d+(?:\.\d+)?) ?(ms|[smhd])(?:ec|econd|in|inute|our|ay)?s?(?![a-z])"
 _IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ((?:{_PART} ?)+)", re.I)
 # A header that is sent several times has all its values in one, and a date has a comma of its own.
 _LISTED = re.compile("[A-Z][a-z]{2}, [^,]+|[^,]+")
-# A server that asks for longer means for ever, and dates end somewhere.
-MOST_S = 366 * 86400.0
 
 
 @dataclass(frozen=True)
@@ -215,7 +213,7 @@ def server_delay_s(
 
     Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), a member of the
     error, and "try again in 1.574s" or "retry after 5 minutes" in the message. Of several values of
-    a header the longest counts, and of a delay a year at most.
+    a header the longest counts.
     """
     told = _IN_TEXT.search(error.message)
     parts = re.findall(_PART, told[1], re.I) if told else []
@@ -225,7 +223,7 @@ def server_delay_s(
         wire.delay_s(error) or known_delay_s(error) or 0.0,
         sum(float(number) * _UNIT_S[unit.lower()] for number, unit in parts),
     )
-    return next((min(delay, MOST_S) for delay in candidates if 0 < delay < inf), None)
+    return next((delay for delay in candidates if 0 < delay < inf), None)
 
 
 def _longest_s(header: str, now: datetime | None) -> float:

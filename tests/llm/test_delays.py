@@ -3,7 +3,7 @@ from datetime import UTC, datetime
 import pytest
 
 from merge_runner.llm.formats import FORMATS, read_error
-from merge_runner.llm.http_outcome import MOST_S, server_delay_s
+from merge_runner.llm.http_outcome import server_delay_s
 
 NOW = datetime(2026, 10, 21, 7, 28, 0, tzinfo=UTC)
 
@@ -125,8 +125,7 @@ def test_a_source_that_says_nothing_usable_gives_way_to_the_next(name, useless):
         ("soon, 7, nan, -1, inf", 7),
         ("Wed, 21 Oct 2026 07:28:30 GMT, 7", 30),
         ("7, Wed, 21 Oct 2026 07:28:30 GMT", 30),
-        ("99999999999", MOST_S),
-        ("Fri, 31 Dec 9999 23:59:59 GMT", MOST_S),
+        ("99999999999", 99999999999),
         ("Wed, 21 Oct 2026 07:28:30 +99999999999999999999", None),
         ("Wed, 21 Oct 2026 07:28:30 +9999, 7", 7),
     ],
