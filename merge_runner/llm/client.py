@@ -32,7 +32,6 @@ from merge_runner.llm.content_hashes import make_request, reply_object
 from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.http_outcome import (
     AttemptOutcome,
-    FirstCall,
     TransportFailure,
     TryAgain,
     backoff_s,
@@ -152,14 +151,15 @@ class Meter:
 
 @dataclass(slots=True)
 class LlmClient:
-    """Answers prompts of one model.
+    """Answers prompts of one model, called ``driver``; see ``driver_name``.
 
     ``endpoint`` is the identity that enters the keys. ``budget`` is None for a model that costs
-    nothing. ``first`` is the run's first call to the endpoint, which goes alone. Without a
-    ``transport`` nothing may be asked anew; ``strict`` says that an answer of another model stops
-    the sweep. In ``rounds``, which know it as ``model``, its name in the
-    registry, it may be asked at ``batch_price`` as a share of the plain one, or its calls may wait
-    already. ``driver`` is its name, with the endpoint where that is not the provider's own.
+    nothing. Until the endpoint has ``passed``, by an answer in its format, the calls of a run go
+    alone: a wrong key, URL or parameter costs one call. It is ``known`` where it ever has answered,
+    and ``_refused`` counts the requests that it has refused before. Without a ``transport`` nothing
+    may be asked anew. ``strict`` says that an answer of another model stops the sweep. In
+    ``rounds``, which know it as ``model``, its name in the registry, it may be asked at
+    ``batch_price`` as a share of the plain one, or its calls may wait already.
 
     ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
     its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
@@ -174,7 +174,8 @@ class LlmClient:
     limiter: Limiter
     budget: Budget | None = None
     strict: bool = False
-    first: FirstCall = field(default_factory=lambda: FirstCall(passed=True))
+    passed: bool = True
+    known: bool = False
     rounds: Rounds | None = None
     model: str = ""
     batch_price: float = 1.0
@@ -184,6 +185,8 @@ class LlmClient:
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
     money: Budget = field(init=False)
+    _refused: int = 0
+    _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
     _stopping: bool = False
 
     def __post_init__(self) -> None:
@@ -331,13 +334,12 @@ class LlmClient:
             self.money.begin_anew(call.order)
         with self._waiting(call, "for trials before it to end, under --max-cost", idle=True):
             await self.money.admit(call.order)
-        first = self.first
-        alone = not first.passed and not opened  # nobody waits for an answer that may take hours
+        alone = not self.passed and not opened  # nobody waits for an answer that may take hours
         if alone:
             with self._waiting(call, f"for the first answer of {self.driver}"):
-                await first.alone.acquire()
-            if first.passed:  # answered meanwhile: nobody goes alone any more
-                first.alone.release()
+                await self._alone.acquire()
+            if self.passed:  # answered meanwhile: nobody goes alone any more
+                self._alone.release()
                 alone = False
         try:
             self._resume(call)
@@ -347,7 +349,7 @@ class LlmClient:
             raise
         finally:
             if alone:
-                first.alone.release()
+                self._alone.release()
 
     def _resume(self, call: Call) -> None:
         """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
@@ -413,7 +415,7 @@ class LlmClient:
                 f"the server asks to wait {delay_s:.0f} s, longer than a call's deadline of "
                 f"{self.entry.deadline_s:.0f} s: run the same command again after that"
             )
-        if self.first.passed:
+        if self.passed:
             return self._failed(call, why)
         return ProviderDown(
             f"{self.driver}: the first call of this run: {why} ({call.last_failure}): run the same "
@@ -506,17 +508,17 @@ class LlmClient:
 
     def _error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
-        first, driver, message = self.first, self.driver, outcome.message or outcome.name
-        if outcome.action == "refused" or not first.passed:
+        driver, message = self.driver, outcome.message or outcome.name
+        if outcome.action == "refused" or not self.passed:
             why = why_refused(self.name, self.entry, outcome)
-            first.refused += why is not None and outcome.action == "fail"
+            self._refused += why is not None and outcome.action == "fail"
             # An endpoint that has answered before may mean this prompt alone.
-            sure = outcome.action == "refused" or not first.known or first.refused >= SEVERAL
+            sure = outcome.action == "refused" or not self.known or self._refused >= SEVERAL
             if why is not None and sure:
                 return EndpointRefused(f"{driver}: {why}")
         # A server that is just starting is waited for, but only for seconds.
         is_late = self.entry.deadline_s - call.left_s >= NOBODY_S
-        if outcome.name == "no_connection" and not first.passed and is_late:
+        if outcome.name == "no_connection" and not self.passed and is_late:
             return ProviderDown(f"{driver}: {message}: {if_nobody(self.name, self.entry)}")
         why, delay_s = None, outcome.delay_s or 0.0
         if outcome.action == "quota":
@@ -530,7 +532,7 @@ class LlmClient:
             return TryAgain(message, outcome.delay_s)
         if outcome.action == "fail":
             return self._failed(call, "nothing that is asked again would help")
-        first.passed = first.known = True
+        self.passed = self.known = True
         empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
         if outcome.name == "empty" and self._wire.retries_empty and empty <= EMPTY_RETRIES:
             return TryAgain("empty answer")
@@ -571,7 +573,7 @@ class LlmClient:
             return cost_usd(self.entry, usage)
         if (usage.output_tokens or 0) > self.entry.max_output_tokens:
             return cost_usd(self.entry, replace(worst, output_tokens=usage.output_tokens))
-        stray = raw.status == 200 and raw.is_web_page and not self.first.known
+        stray = raw.status == 200 and raw.is_web_page and not self.known
         own = is_own_host(self.entry.provider, self.endpoint)
         charged = may_be_charged(raw, self.entry.provider if own else None)
         return None if charged and not stray else 0.0

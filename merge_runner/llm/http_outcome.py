@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import random
 import re
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from functools import cached_property
@@ -263,20 +262,6 @@ def next_wait_s(state: RetryCallState) -> float:
     return max(
         error.delay_s or 0, min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
     )
-
-
-@dataclass(slots=True)
-class FirstCall:
-    """The first live call of a run goes ``alone``: a wrong key, URL or parameter costs one call.
-
-    ``passed`` says that the endpoint has answered in this run, in its format, ``known`` that it
-    ever has; ``refused`` counts the requests that it has refused before.
-    """
-
-    passed: bool = False
-    known: bool = False
-    refused: int = 0
-    alone: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
 def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | None:

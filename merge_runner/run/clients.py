@@ -20,7 +20,6 @@ from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Ledger, cost_usd
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
@@ -142,11 +141,9 @@ def live_clients(
             limiter=limiters[model],
             budget=None if entry.price == "free" else budget,
             strict=options.strict_model,
-            first=FirstCall(
-                # A round is asked at once: no call of it waits for another one's answer.
-                passed=rounds is not None and rounds.submits,
-                known=name in earlier,
-            ),
+            # A round is asked at once: no call of it waits for another one's answer.
+            passed=rounds is not None and rounds.submits,
+            known=name in earlier,
             rounds=rounds if terms else None,
             model=model,
             batch_price=terms.price_factor if terms else 1.0,

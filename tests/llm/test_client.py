@@ -18,7 +18,7 @@ from merge_runner.errors import (
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient, Meter
-from merge_runner.llm.http_outcome import FirstCall, RawReply, TransportFailure
+from merge_runner.llm.http_outcome import RawReply, TransportFailure
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.records import Slot
@@ -101,7 +101,16 @@ def cache(opened):
 def make(cache):
     """A client whose server gives these replies."""
 
-    def make(*replies, limiter=None, cap=None, cache=cache, first=None, under_way=None, **changes):
+    def make(
+        *replies,
+        limiter=None,
+        cap=None,
+        cache=cache,
+        passed=True,
+        known=False,
+        under_way=None,
+        **changes,
+    ):
         fields = {
             "provider": "openai",
             "format": "openai-chat",
@@ -118,7 +127,8 @@ def make(cache):
             transport=Server(*replies),
             limiter=limiter or Limiter(),
             budget=None if entry.price == "free" else Budget(Ledger(cache, "test"), cap),
-            first=first or FirstCall(passed=True),
+            passed=passed,
+            known=known,
             under_way={} if under_way is None else under_way,
         )
 
