@@ -119,7 +119,7 @@ class Call:
 
 @dataclass(slots=True)
 class Meter:
-    """Counts of calls, attempts, tokens and cost.
+    """Counts of calls, attempts and cost.
 
     ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name; ``damaged``
     are the keys of recorded replies that could not be read.
@@ -127,7 +127,6 @@ class Meter:
 
     calls_live: int = 0
     calls_cached: int = 0
-    tokens: int = 0
     cost_usd: float = 0.0
     cost_unknown: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
@@ -141,7 +140,6 @@ class Meter:
         self.outcomes[attempt.outcome] += 1
         self.cost_usd += attempt.cost_usd or 0.0
         self.cost_unknown += attempt.cost_usd is None
-        self.tokens += (attempt.usage.input_tokens or 0) + (attempt.usage.output_tokens or 0)
 
     def add(self, other: Meter) -> None:
         """Add what another meter has counted."""
