@@ -18,7 +18,6 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Budget, Ledger, cost_usd
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
@@ -45,7 +44,6 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
             cache=cache,
             transport=None,
             limiter=Limiter(),
-            sealed=True,
         )
         for name, entry in plan.entries.items()
     }
@@ -101,11 +99,9 @@ def live_clients(
             limiter=limiters[model],
             budget=None if entry.price == "free" else budget,
             strict=options.strict_model,
-            first=FirstCall(
-                # A round is asked at once: no call of it waits for another one's answer.
-                passed=rounds is not None and rounds.submits,
-                known=name in earlier,
-            ),
+            # A round is asked at once: no call of it waits for another one's answer.
+            passed=rounds is not None and rounds.submits,
+            known=name in earlier,
             rounds=rounds if terms else None,
             model=model,
             batch_price=terms.price_factor if terms else 1.0,
@@ -177,19 +173,6 @@ def _allow_files(number: int) -> None:
             f"{number} connections exceed this system's limit of {hard} open files: choose a lower "
             "--in-flight or raise `ulimit -n`"
         ) from exc
-
-
-def _behaviour(plan: Plan) -> Behaviour:
-    """How the emulator answers, in a rehearsal in the place of a plan's one model."""
-    if not plan.is_rehearsal:
-        return Behaviour()
-    entry = next(iter(plan.entries.values()))  # the others differ in parameters alone
-    return Behaviour(
-        rates=RATES,
-        latency_s=entry.typical_latency_s / SPEED,
-        delay_s=1.0,
-        output_tokens=entry.typical_output_tokens,
-    )
 
 
 def open_rounds(
