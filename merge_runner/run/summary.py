@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
-from io import StringIO
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -17,7 +16,7 @@ from merge_runner.errors import ReplayMiss
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.records import Status
-from merge_runner.results.query_output import write_table
+from merge_runner.results.query_output import as_table
 from merge_runner.results.recording import recorded_part
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
@@ -122,29 +121,27 @@ def as_dict(outcome: Outcome, options: Options, expected: Estimate | None) -> di
         "sweep_cost_usd": round(spending.spent_usd, 6),
         "set_aside_usd": round(spending.reserved_usd, 6),
         "attempts_of_unknown_cost": spending.open_attempts,
-        "cache_cost_usd": round(outcome.cache_cost_usd, 6),
         "damaged_entries": meter.damaged,
         "open_batches": outcome.batches,
         "playing_s": round(outcome.playing_s, 3),
         "worst_stall_s": round(outcome.worst_stall_s, 3),
         "audit": None if outcome.audit is None else outcome.audit.as_dict(),
     }
-    if facts is None:
-        return summary
-    statuses: Counter[str] = Counter()
-    for _, status, _, number in facts.outcomes:
-        statuses[status] += number
-    summary["trials"] |= {status: statuses[status] for status in get_args(Status)}
-    return {
-        **summary,
-        "decisions": facts.decisions,
-        "invalid_decisions": facts.invalid,
-        "fallbacks": facts.fallbacks,
-        "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts.others},
-        "failed": dict(facts.failed),
-        "outcomes_by_level": [*_tallies(plan, facts)],
-        "first_looks": facts.first_looks,
-    }
+    if facts is not None:
+        statuses = Counter(dict.fromkeys(get_args(Status), 0))
+        for _, status, _, number in facts.outcomes:
+            statuses[status] += number
+        summary["trials"] |= statuses
+        summary |= {
+            "decisions": facts.decisions,
+            "invalid_decisions": facts.invalid,
+            "fallbacks": facts.fallbacks,
+            "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts.others},
+            "failed": dict(facts.failed),
+            "outcomes_by_level": [*_tallies(plan, facts)],
+            "first_looks": facts.first_looks,
+        }
+    return summary
 
 
 def _tallies(plan: Plan, facts: SweepFacts) -> Iterator[dict[str, Any]]:
@@ -176,36 +173,22 @@ def as_lines(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
         yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
     if facts is not None:
         yield from _faults(outcome, facts, summary)
-    if outcome.sweep_id:
         yield f"database: {summary['db']}"
 
 
 def _results(plan: Plan, facts: SweepFacts, summary: dict[str, Any]) -> Iterator[str]:
     """How the trials ended, or what drivers do first."""
-    if looks := facts.first_looks:
-        as_text = StringIO()
-        rows = ([f"{v:.3g}" if isinstance(v, float) else v for v in r.values()] for r in looks)
-        write_table([*looks[0]], map(tuple, rows), as_text)
-        yield as_text.getvalue()
+    if facts.first_looks:
+        yield as_table(facts.first_looks)
     for factor, group in groupby(summary["outcomes_by_level"], key=itemgetter("factor")):
-        levels = [list(row.values())[1:] for row in group]
+        levels = [{factor: row["level"], **{name: row[name] for name in COLUMNS}} for row in group]
         if len(levels) > 1 and not plan.seat:
-            yield from _grid([factor, *COLUMNS], levels)
+            yield as_table(levels)
     share = f" ({facts.invalid / facts.decisions:.1%})" if facts.invalid else ""
     yield (
         f"decisions: {facts.decisions}, {facts.invalid} invalid{share}, "
         f"{facts.fallbacks} fallbacks to an earlier plan"
     )
-
-
-def _grid(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
-    # The widths do not depend on the counts, so that two runs can be compared side by side; rich
-    # would fit them to the content.
-    texts = [[str(cell) for cell in row] for row in (headings, *rows)]
-    width = max(10, *(len(row[0]) + 1 for row in texts))
-    for first, second, *others in texts:
-        yield f"{first:<{width}}{second:>9}" + "".join(f"{text:>12}" for text in others)
-    yield ""
 
 
 def _costs(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
@@ -216,14 +199,12 @@ def _costs(outcome: Outcome, summary: dict[str, Any]) -> Iterator[str]:
         f"cost {meter.cost_usd:.4f} USD{unknown}"
     )
     if (expected := summary["estimate"]) is not None:
-        cost = (expected["batch"] or expected)["cost_usd"]
-        usd = "an unknown price" if cost is None else f"{cost:.2f} USD"
+        usd = _about((expected["batch"] or expected)["cost_usd"])
         yield f"estimated before: {expected['calls']} calls, {usd}"
     if spending.committed_usd:
         yield (
             f"this sweep over all its runs: {spending.spent_usd:.4f} USD, and "
-            f"{spending.reserved_usd:.4f} set aside (`merge-runner ledger` says why); "
-            f"all sweeps on this cache: {outcome.cache_cost_usd:.4f} USD"
+            f"{spending.reserved_usd:.4f} set aside (`merge-runner ledger` says why)"
         )
     if spending.overrun_usd:
         yield (
@@ -255,12 +236,12 @@ def _faults(outcome: Outcome, facts: SweepFacts, summary: dict[str, Any]) -> Ite
         yield "Run the same command again to play the failed trials anew."
 
 
+def _about(cost_usd: float | None) -> str:
+    return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
+
+
 def estimate_lines(expected: Estimate) -> Iterator[str]:
     """What a run will take, for a reader."""
-
-    def about(cost_usd: float | None) -> str:
-        return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
-
     measured = ", as measured before" if expected.measured else ""
     singly = ", asked singly" if expected.batch is not None else ""
     tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
@@ -268,11 +249,11 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     yield f"trials  {expected.trials} that have not ended yet"
     yield f"calls   about {expected.calls} that are not recorded yet"
     yield f"tokens  {tokens}"
-    yield f"cost    {about(expected.cost_usd)}{singly}"
+    yield f"cost    {_about(expected.cost_usd)}{singly}"
     yield f"time    about {expected.minutes} minutes{singly}"
     if (batch := expected.batch) is not None:
         yield (
-            f"batch   {about(batch.cost_usd)} in about {batch.rounds} rounds, at most "
+            f"batch   {_about(batch.cost_usd)} in about {batch.rounds} rounds, at most "
             f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour, "
             "a day at most"
         )

@@ -67,11 +67,10 @@ class Outcome:
     """What a run of a plan did.
 
     ``stored_before`` trials were stored already; ``suspended`` ones wait for money. ``meter``
-    counts the calls of this run, ``spending`` is that of the sweep over all its runs, and
-    ``cache_cost_usd`` that of all sweeps on the cache. ``facts`` and ``audit`` are of what the
-    database holds of the sweep; None where nothing is stored, or its user gave up waiting for it.
-    ``batches`` go on without this run. ``playing_s`` is how long the trials took,
-    ``worst_stall_s`` the longest delay of the event loop.
+    counts the calls of this run, ``spending`` is that of the sweep over all its runs. ``facts`` and
+    ``audit`` are of what the database holds of the sweep; None where nothing is stored, or its user
+    gave up waiting for it. ``batches`` go on without this run. ``playing_s`` is how long the trials
+    took, ``worst_stall_s`` the longest delay of the event loop.
     """
 
     plan: Plan
@@ -82,7 +81,6 @@ class Outcome:
     meter: Meter = field(default_factory=Meter)
     suspended: int = 0
     spending: Spending = field(default_factory=Spending)
-    cache_cost_usd: float = 0.0
     facts: SweepFacts | None = None
     audit: Audit | None = None
     batches: list[str] = field(default_factory=list)
@@ -120,11 +118,9 @@ class Sweep:
         """Play what is missing and store it; what goes wrong is in the outcome."""
         outcome = Outcome(self._plan, stored_before=len(self._stored))
         if self._options.replay and await self._nothing_is_recorded():
-            self._explain(outcome)
             held = described(self._options.recordings, self._cache.entries())
-            outcome.messages.append(
-                f"nothing of this replay is recorded, and nothing is stored: {held}"
-            )
+            nothing = f"nothing of this replay is recorded, and nothing is stored: {held}"
+            self._explain(outcome, nothing)
             return outcome
         self._misses.clear()
         async with AsyncExitStack() as stack:
@@ -143,8 +139,9 @@ class Sweep:
                 unstored=lambda: flusher.problem,
                 batches=self._rounds.standing if self._rounds else list,
             )
-            db, sweep_id, quiet = self._options.db, outcome.sweep_id, self._options.quiet
-            await stack.enter_async_context(show_progress(progress, db, sweep_id, quiet=quiet))
+            db, sweep_id = self._options.db, outcome.sweep_id
+            shown = show_progress(progress, db, sweep_id, quiet=self._options.quiet)
+            await stack.enter_async_context(shown)
             began = time.perf_counter()
             try:
                 await self._play(runner, flusher, progress, outcome)
@@ -158,7 +155,6 @@ class Sweep:
             for meter in runner.meters.values():
                 outcome.meter.add(meter)
             outcome.batches, outcome.worst_stall_s = progress.batches(), progress.worst_stall_s
-            self._add_costs(outcome)
             progress.doing = "checking"
             write_standing(db, progress.standing(sweep_id))
             if is_stored:
@@ -205,14 +201,10 @@ class Sweep:
         missed = [call.request for call in record.failed_calls if call.missed]
         self._misses += [Miss(record.spec.trial_id, request) for request in missed]
 
-    def _explain(self, outcome: Outcome) -> None:
-        left_out: list[str] = []
-        for line in explain(self._misses, self._cache.entries(left_out)) if self._misses else ():
-            outcome.fail(ReplayMiss.exit_code, line)
-        if left_out:
-            outcome.messages.append(
-                f"{len(left_out)} rows of the cache are left out, the first: {left_out[0]}"
-            )
+    def _explain(self, outcome: Outcome, *more: str) -> None:
+        if self._misses:
+            for line in (*explain(self._misses, self._cache.entries()), *more):
+                outcome.fail(ReplayMiss.exit_code, line)
 
     async def _begin(self, store: Store) -> str:
         started_at = datetime.now(UTC).replace(tzinfo=None)
@@ -340,22 +332,13 @@ class Sweep:
                 flusher.add(await runner.play_one(spec))
             await flusher.close()
 
-    def _add_costs(self, outcome: Outcome) -> None:
-        try:
-            ledgers = (Ledger(self._cache, scope) for scope in scopes(self._cache))
-            outcome.cache_cost_usd = sum(ledger.read().spent_usd for ledger in ledgers)
-            outcome.spending = self._ledger.read()
-        except MergeRunnerError as exc:
-            if self._options.replay:  # which spends nothing
-                outcome.messages.append(str(exc))
-            else:
-                outcome.fail_by(exc)
-
     def _check(self, store: Store, first: FirstDecisions, outcome: Outcome) -> None:
         """Read back what the database holds of the sweep, audit it, and note how it ended."""
         db, sweep_id = self._options.db, outcome.sweep_id
-        keys = [(spec.trial_id, spec.spec_hash) for spec in self._plan.trial_specs()]
+        keys = [(spec.trial_id, spec.spec_hash) for spec in (*self._stored, *self.todo)]
         try:
+            if not self._options.replay:  # which spends nothing
+                outcome.spending = self._ledger.read()
             outcome.facts = sweep_facts(db, sweep_id)
             outcome.audit = audit_sweep(db, sweep_id, keys, finished=outcome.exit_code == 0)
             if not (outcome.exit_code or self._options.sends_nothing or self._options.keep_going):
@@ -368,7 +351,7 @@ class Sweep:
             outcome.messages += map(str, findings[:SHOWN])
             ended_at = datetime.now(UTC).replace(tzinfo=None)
             store.end_sweep(sweep_id, ended_at, outcome.exit_code)
-        except (StoreError, UsageError) as exc:
+        except MergeRunnerError as exc:
             outcome.fail_by(exc)
 
 
@@ -386,13 +369,7 @@ async def open_sweep(
         options = replace(options, max_cost_usd=plan.study.file.budget.total_usd)
     recorded = partial(Spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
-        entries = {
-            name: await _named(name, entry, options, cache, say)
-            for name, entry in plan.entries.items()
-        }
-        plan = plan.with_entries(entries)
-        endpoints = {name: _endpoint(plan, name, options, cache) for name in entries}
-        plan = plan.model_copy(update={"endpoints": endpoints})
+        plan = await _with_names(plan, options, cache, say)
         specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
         with unreadable_is_usage():
@@ -401,25 +378,43 @@ async def open_sweep(
         todo = [spec for key, spec in specs.items() if key not in ended]
         if todo and not options.sends_nothing:
             if options.dask is None and not plan.is_rehearsal:
-                for name, entry in entries.items():
+                for name, entry in plan.entries.items():
                     resolve_endpoint(name, entry)  # raises where its key is missing
             options = _less_what_is_spent(plan, options, cache, say)
-            cache.locks.take({f"{e.id} at {endpoints[name]}" for name, e in entries.items()})
+            asked = plan.entries.items()
+            cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in asked})
         yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger))
 
 
-async def _named(
-    name: str, entry: ModelEntry, options: Options, cache: ResponseCache, say: Callable[[str], None]
-) -> ModelEntry:
-    """The entry with its model's name: as told, as recorded, or as its server says."""
-    found = model_id(entry)
-    if not found and options.sends_nothing:
-        # A server of one's own serves one model, or the recorded replies do not tell which.
-        recorded = {r.model for r in cache.recorded(lambda r: r.provider == entry.provider)}
-        found = recorded.pop() if len(recorded) == 1 else UNNAMED
-    elif not found:
-        found = await _served_name(name, entry, say=say)
-    return entry.model_copy(update={"id": found})
+async def _with_names(
+    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
+) -> Plan:
+    """The plan with its models' names, and in a replay the endpoints where they are recorded.
+
+    A model's name is as told, as recorded, or as its server says. Raises UsageError.
+    """
+    entries, endpoints = dict(plan.entries), dict(plan.endpoints)
+    for name, entry in entries.items():
+        named = model_id(entry)
+        if not named and options.sends_nothing:
+            # A server of one's own serves one model, or the recorded replies do not tell which.
+            models = {request.model for request in cache.recorded(provider=entry.provider)}
+            named = models.pop() if len(models) == 1 else UNNAMED
+        entries[name] = entry.model_copy(
+            update={"id": named or await _served_name(name, entry, say=say)}
+        )
+        recorded: set[str] = set()
+        if options.replay:
+            recorded = {request.endpoint for request in cache.recorded(model=entries[name].id)}
+        if recorded and endpoints[name] not in recorded:
+            endpoints[name], *others = sorted(recorded)
+            if others:
+                raise UsageError(
+                    f"replies of {name} are recorded from several endpoints: "
+                    f"{', '.join(sorted(recorded))}. Set the base URL variable of its provider to "
+                    "the one to replay."
+                )
+    return plan.with_entries(entries).model_copy(update={"endpoints": endpoints})
 
 
 async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
@@ -430,12 +425,11 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
     driver = driver_name(name, endpoint.identity)
     try:
         listed = await listed_models(endpoint)
+        models = ", ".join(listed) or "no model"
     except TransportFailure as exc:
         if exc.outcome == "no_connection":
             raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
         listed, models = [], f"models that it does not list ({exc})"
-    else:
-        models = ", ".join(listed) or "no model"
     if len(listed) != 1:
         variable = PROVIDERS.require(entry.provider).model_env
         raise UsageError(
@@ -444,22 +438,6 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
         )
     say(f"{driver} serves {listed[0]}, which is asked")
     return listed[0]
-
-
-def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
-    """The endpoint's identity: in a replay, the one under which the model is recorded."""
-    entry, configured = plan.entries[name], plan.endpoints[name]
-    if not options.replay:
-        return configured
-    recorded = sorted({r.endpoint for r in cache.recorded(lambda r: r.model == entry.id)})
-    if configured in recorded or not recorded:
-        return configured
-    if len(recorded) > 1:
-        raise UsageError(
-            f"replies of {name} are recorded from several endpoints: {', '.join(recorded)}. "
-            "Set the base URL variable of its provider to the one to replay."
-        )
-    return recorded[0]
 
 
 def _less_what_is_spent(
