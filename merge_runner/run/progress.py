@@ -49,6 +49,7 @@ class Progress:
     cap_usd: float | None = None
     outcome_counts: Counter[str] = field(default_factory=Counter)
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+    ended_at: datetime | None = None
     worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
     unstored: Callable[[], str] = str  # says why trials are not stored; empty: nothing is wrong
