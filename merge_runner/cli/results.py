@@ -190,7 +190,7 @@ def ledger(
     """Show what each sweep has spent, and what is set aside."""
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.ledger import Ledger, scopes
-    from merge_runner.results.query_output import as_table
+    from merge_runner.run.summary import as_table
 
     with closing(ResponseCache(cache, read_only=True)) as opened:
         names = scopes(opened)
@@ -237,7 +237,7 @@ def models(as_json: cli.JsonOption = False) -> None:
     from merge_runner.llm.ledger import cost_usd
     from merge_runner.llm.models import load_models, shutdown_notes
     from merge_runner.records import Usage
-    from merge_runner.results.query_output import as_table
+    from merge_runner.run.summary import as_table
 
     entries = load_models()
     rows: list[dict[str, Any]] = []

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
-from io import StringIO
+from collections.abc import Iterable
 from itertools import chain
 from tempfile import TemporaryFile
 from typing import Any, TextIO
@@ -46,12 +45,3 @@ def write_table(names: list[str], rows: Rows, out: TextIO) -> None:
         for line in kept:
             padded = map(str.ljust, json.loads(line), widths)
             out.write(printable("  ".join(padded).rstrip()) + "\n")
-
-
-def as_table(rows: Sequence[dict[str, Any]]) -> str:
-    """The table of a few rows, numbers shortened; empty without a row."""
-    out = StringIO()
-    if rows:
-        cells = ([f"{v:g}" if isinstance(v, float) else v for v in r.values()] for r in rows)
-        write_table([*rows[0]], map(tuple, cells), out)
-    return out.getvalue()

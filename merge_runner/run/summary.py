@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from io import StringIO
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, get_args
@@ -14,7 +15,7 @@ from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.llm.client import Meter
 from merge_runner.records import Status
-from merge_runner.results.query_output import as_table
+from merge_runner.results.query_output import write_table
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
@@ -181,6 +182,15 @@ def _faults(summary: dict[str, Any]) -> Iterator[str]:
     yield from first_of(failed, "more, in the table trials", SHOWN)
     if failed and summary["exit_code"] != ReplayMiss.exit_code:
         yield "Run the same command again to play the failed trials anew."
+
+
+def as_table(rows: Sequence[dict[str, Any]]) -> str:
+    """The table of a few rows, numbers shortened; empty without a row."""
+    text = StringIO()
+    if rows:
+        cells = ([f"{v:g}" if isinstance(v, float) else v for v in r.values()] for r in rows)
+        write_table([*rows[0]], map(tuple, cells), text)
+    return text.getvalue()
 
 
 def _about(cost_usd: float | None) -> str:

@@ -60,7 +60,6 @@ from merge_runner.signals import on_interrupt
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
 SHOWN = 5
-FROM_PROGRAMS = 16
 
 
 async def play(
@@ -263,7 +262,7 @@ class Sweep:
         """What plays the trials: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if options.sends_nothing or not plan.entries:
-            in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
+            in_flight = 1 if plan.entries else options.in_flight
             return LocalRunner.sealed(plan, self._cache, in_flight)
         earlier = earlier_answers(plan, self._cache)
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
