@@ -189,6 +189,11 @@ class Plan(BaseModel):
         return any(map(_is_scripted, self.arms))
 
     @property
+    def is_free(self) -> bool:
+        """Whether no model costs anything."""
+        return all(entry.price == "free" for entry in self.entries.values())
+
+    @property
     def is_rehearsal(self) -> bool:
         """Whether the emulator takes the place of the providers."""
         return REHEARSAL in self.endpoints.values()
