@@ -10,9 +10,9 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.site import Site
 from merge_runner.results.store import query, results_digest
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.site import Site
 from tests.harness import FAST, watched
 from tests.mock_server import FaultPlan
 
