@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Literal
 
@@ -28,11 +29,8 @@ SCRIPTED_FIELD = "merge_runner_scripted"
 ANSWERED_FIELD = "merge_runner_request"
 
 # What an attempt can have: a recorded one with other values is damaged, or made up.
-Number = Annotated[int, Field(ge=1, le=2**31 - 1)]
 Amount = Annotated[float, Field(ge=0, le=2**31 - 1)]
 Tokens = Annotated[int, Field(ge=0, le=2**33)]
-HttpStatus = Annotated[int, Field(ge=0, le=999)]
-Outcome = Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,39}$")]
 
 FAR_BEHIND_M = 1000.0
 """Where the other vehicle is put while it is not seen; see Observation."""
@@ -114,9 +112,9 @@ class Attempt:
     A line has no latency.
     """
 
-    number: Number
-    outcome: Outcome
-    http_status: HttpStatus | None = None
+    number: Annotated[int, Field(ge=1, le=2**31 - 1)]
+    outcome: Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,39}$")]
+    http_status: Annotated[int | None, Field(ge=0, le=999)] = None
     model_served: str | None = None
     finish_reason: str | None = None
     usage: Usage = field(default_factory=Usage)
@@ -128,11 +126,6 @@ class Attempt:
     scripted: bool = False
     # Left out where there is none, so that what is kept of other attempts stays as it was.
     batch_id: Annotated[str | None, Field(exclude_if=lambda value: value is None)] = None
-
-    @property
-    def answered(self) -> bool:
-        """Whether a body of status 200 was read as an answer, which is a JSON object."""
-        return self.http_status == 200 and self.outcome in ANSWERS
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,11 +295,9 @@ def is_scripted(request: ChatRequest, attempt: Attempt) -> bool:
 
 def says_scripted(body: str) -> bool:
     """Whether a body has the field at its top; what a model writes in its answer is no field."""
-    if SCRIPTED_FIELD not in body:
-        return False
-    try:
-        payload = json.loads(body)
-    except (ValueError, RecursionError):
-        return False
-    parts = payload if isinstance(payload, list) else [payload]
-    return any(isinstance(part, dict) and SCRIPTED_FIELD in part for part in parts)
+    if SCRIPTED_FIELD in body:
+        with suppress(ValueError, RecursionError):
+            payload = json.loads(body)
+            parts = payload if isinstance(payload, list) else [payload]
+            return any(isinstance(part, dict) and SCRIPTED_FIELD in part for part in parts)
+    return False

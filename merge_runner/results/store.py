@@ -138,9 +138,20 @@ class Store:
         Raises UsageError where one of their conditions had other numbers when they were stored:
         the spec's hash does not cover these.
         """
+        named, columns = (
+            list(keys),
+            "DISTINCT condition, projected_headway_m, relative_velocity_mps",
+        )
         with write_database(self.path) as connection:
-            _refuse_other_conditions(connection, list(keys))
-            return {key for key, ended in _ended(connection, list(keys)).items() if ended}
+            there = rows_of_trials(connection, columns, "trials", named).fetchall()
+            for name, *numbers in there:
+                condition = CONDITIONS[name]
+                if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
+                    raise UsageError(
+                        f"the condition {name} is stored with a headway of {numbers[0]:g} m and a "
+                        f"relative velocity of {numbers[1]:g} m/s: give the changed one a new name"
+                    )
+            return {key for key, ended in _ended(connection, named).items() if ended}
 
     def decisions_by_spec(self, spec_hashes: Collection[str]) -> list[tuple[Any, ...]]:
         """Of the trials that did not fail, by spec and side, how many decisions are (in)valid.
@@ -365,17 +376,6 @@ def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> 
 def _add_specs(connection: duckdb.DuckDBPyConnection, specs: Mapping[str, str]) -> None:
     sql = "INSERT OR IGNORE INTO specs SELECT unnest(?), unnest(?)"
     connection.execute(sql, [list(specs), list(specs.values())])
-
-
-def _refuse_other_conditions(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:
-    columns = "DISTINCT condition, projected_headway_m, relative_velocity_mps"
-    for name, *numbers in rows_of_trials(connection, columns, "trials", keys).fetchall():
-        condition = CONDITIONS[name]
-        if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
-            raise UsageError(
-                f"the condition {name} is stored with a headway of {numbers[0]:g} m and a relative "
-                f"velocity of {numbers[1]:g} m/s: give the changed one a new name"
-            )
 
 
 def _key(record: TrialRecord) -> TrialKey:

@@ -46,10 +46,8 @@ class Flusher:
 
     def add(self, record: TrialRecord) -> None:
         """Store this trial with the next batch, or drop it while storing fails."""
-        replies = (row.decision.reply for row in record.decisions)
-        calls = [reply.attempts for reply in replies if reply]
-        calls += [call.attempts for call in record.failed_calls]
-        size = sum(sys.getsizeof(attempt.reply) for attempt in chain.from_iterable(calls))
+        attempts = chain.from_iterable(call.attempts for call in record.calls)
+        size = sum(sys.getsizeof(attempt.reply) for attempt in attempts)
         self._pending.append((record, size))
         if self._problem is not None:
             self._drop_excess()

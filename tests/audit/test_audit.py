@@ -236,7 +236,7 @@ WIDER = {
     ),
     "the sweep says another model": (
         ["UPDATE sweeps SET config = replace(config::VARCHAR, 'scripted-driver', 'other')"],
-        {"spec": "is not what the sweep says in left.body, right.body"},
+        {"spec": "is not what the sweep says in left.body.model, right.body.model"},
     ),
     "the sweep is gone": (
         ["DELETE FROM sweeps WHERE sweep_id = (SELECT sweep_id FROM sweep_trials "

@@ -105,7 +105,8 @@ def test_rows_that_lack_or_are_too_many_are_counted(stored):
     stored.execute("INSERT INTO decisions FROM decisions WHERE spec_hash = 'h' AND decision = 1")
     states = stored_rows(stored, "states", [KEY])
     (difference,) = states.differences(KEY, rows_of(RECORD)["states"])
-    assert (difference.rows, difference.place) == (2, {"step": 3, "side": "left"})
+    assert difference.place == {"step": 3, "side": "left"}
+    assert difference.text.endswith("at step 3 are missing or too many, and 1 more in the trial")
     assert differing(stored) == ["rows of states", "rows of decisions"]
 
 

@@ -183,7 +183,7 @@ async def test_missing_replies_are_counted_with_what_differs_and_the_rest_finish
     part = ("--reps", 1, "--conditions", "N_0_0")
     ablated = await merge_runner(*lacking, *part, "--variants", "A1")
     assert ablated.code == 4
-    assert "body.messages[0].content (recorded 'History of the last 2 s" in ablated.err
+    assert "body.messages.0.content (recorded 'History of the last 2 s" in ablated.err
     other = await merge_runner(*lacking, *part, "--sample-set", 2)
     assert "sample_set (recorded 0, wanted 2)" in other.err
 
