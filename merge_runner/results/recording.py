@@ -311,16 +311,11 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
                 f"read_parquet({pattern}, file_row_number = true, hive_partitioning = false)"
             )
             columns = connection.execute("DESCRIBE recording").fetchall()
-        except duckdb.Error as exc:
-            raise RecordingError(
-                f"{file} is not a readable Parquet file: {first_line(exc)}"
-            ) from exc
-        if {name: kind for name, kind, *_ in columns if name != "file_row_number"} != COLUMNS:
-            raise RecordingError(
-                f"{file} is not one of our recordings: it has other columns than "
-                f"{', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())}"
-            )
-        try:
+            if {name: kind for name, kind, *_ in columns if name != "file_row_number"} != COLUMNS:
+                raise RecordingError(
+                    f"{file} is not one of our recordings: it has other columns than "
+                    f"{', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())}"
+                )
             pairs = connection.execute(
                 f"SELECT key, value FROM parquet_kv_metadata({pattern})"  # noqa: S608 # quoted
             ).fetchall()
@@ -334,7 +329,9 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
             _refuse_bombs(file, connection)
             yield connection, metadata
         except (duckdb.Error, UnicodeDecodeError) as exc:
-            raise RecordingError(f"{file} is damaged: {first_line(exc)}") from exc
+            raise RecordingError(
+                f"{file} is damaged, or no Parquet file: {first_line(exc)}"
+            ) from exc
 
 
 def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:

@@ -138,13 +138,10 @@ class Store:
         Raises UsageError where one of their conditions had other numbers when they were stored:
         the spec's hash does not cover these.
         """
-        named, columns = (
-            list(keys),
-            "DISTINCT condition, projected_headway_m, relative_velocity_mps",
-        )
+        named = list(keys)
+        columns = "DISTINCT condition, projected_headway_m, relative_velocity_mps"
         with write_database(self.path) as connection:
-            there = rows_of_trials(connection, columns, "trials", named).fetchall()
-            for name, *numbers in there:
+            for name, *numbers in rows_of_trials(connection, columns, "trials", named).fetchall():
                 condition = CONDITIONS[name]
                 if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
                     raise UsageError(
