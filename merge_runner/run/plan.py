@@ -189,6 +189,11 @@ class Plan(BaseModel):
         return any(map(_is_scripted, self.arms))
 
     @property
+    def is_free(self) -> bool:
+        """Whether no model costs anything."""
+        return all(entry.price == "free" for entry in self.entries.values())
+
+    @property
     def is_rehearsal(self) -> bool:
         """Whether the emulator takes the place of the providers."""
         return REHEARSAL in self.endpoints.values()
@@ -372,7 +377,8 @@ def _first_decision(arm: Arm) -> Arm:
 
     Such a trial is planned, played, kept and checked as any other; its calls have the texts and the
     slots, and so the keys, of the first decisions of the study's sweep. Its source is ``seat``,
-    which tables of trials that were driven to their end leave out (``analysis.data.load.TRIALS``).
+    which tables of trials that were driven to their end leave out
+    (``merge_runner_analysis.data.load.TRIALS``).
     """
     given = arm.scenario.model_dump(exclude_unset=True)
     given["timeout_s"] = 1 / arm.scenario.prompt_rate_hz

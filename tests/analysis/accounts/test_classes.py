@@ -6,14 +6,14 @@ from collections import Counter
 
 import pytest
 
-from analysis.accounts.classes import COLLISIONS, collision_class, judged_at
-from analysis.accounts.course import BRAKING, SPEEDING_UP
-from analysis.data.reference_data import human_outcomes, published
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES, other_side
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner_analysis.accounts.classes import COLLISIONS, collision_class, judged_at
+from merge_runner_analysis.accounts.course import BRAKING, SPEEDING_UP
+from merge_runner_analysis.data.reference_data import human_outcomes, published
 from tests.analysis.accounts.crashes import EXAMPLES, NO_PLAN, crash
 
 INSISTING = ("N_0_0", (0.5,) * 5, (0.4,) * 5)
