@@ -27,7 +27,6 @@ from merge_runner.registry import Catalogue, Registry, require
 
 OUTPUT_FORMAT = "C5"
 LAST = "the end"
-TO_MERGE = "distance_to_merge"
 _UNIT_OF_NOTHING = re.compile(rf"({NOT_SEEN}) (?:m/s\^2|m/s|km/h|mph|m|s)(?![\w/^])")
 KMH_OF_MPS = 3.6
 MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
@@ -126,7 +125,8 @@ class Block:
 
     def __post_init__(self) -> None:
         for road, template in (("merge", self.merge), ("straight", self.straight)):
-            fields = {n: f for n, f in FIELDS.items() if (road, n) != ("straight", TO_MERGE)}
+            absent = "distance_to_merge" if road == "straight" else ""
+            fields = {name: field for name, field in FIELDS.items() if name != absent}
             for name in named(template or ""):
                 require(fields, f"field on the road {road} of the block {self.meaning!r}:", name)
 
