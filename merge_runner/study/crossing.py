@@ -39,12 +39,13 @@ Levels = Mapping[str, JsonValue]
 class Arm:
     """One crossing of a study's levels, which is played in all its conditions.
 
-    ``sides`` says who drives, by their names in the registry, and ``asked`` the same, but by the
-    names in ``entries`` of language models with these parameters. ``factors`` are the levels as
-    texts; ``label`` names what sets this arm apart from the others. ``ego`` is the side of the
-    driver whose odds are told (see ``config.ego_side``).
+    ``model`` is what ids of trials say, ``sides`` who drives, by their names in the registry, and
+    ``asked`` the same, but by the names in ``entries`` of language models with these parameters.
+    ``factors`` are the levels as texts; ``label`` names what sets this arm apart from the others.
+    ``ego`` is the side of the driver whose odds are told (see ``config.ego_side``).
     """
 
+    model: str
     sides: dict[Side, str]
     asked: dict[Side, str]
     entries: dict[str, ModelEntry]
@@ -54,11 +55,6 @@ class Arm:
     factors: dict[str, str] = field(default_factory=dict)
     label: str = ""
     ego: Side = "left"
-
-    @property
-    def model(self) -> str:
-        """Who drives, as ids of trials say."""
-        return "+".join(dict.fromkeys(self.sides.values()))
 
     @property
     def is_mixed(self) -> bool:
@@ -81,6 +77,7 @@ class Arm:
         """The same with the drivers' sides changed."""
         return replace(
             self,
+            model="+".join([self.sides["right"], self.sides["left"]]),
             sides={side: self.sides[other_side(side)] for side in SIDES},
             asked={side: self.asked[other_side(side)] for side in SIDES},
             label=f"{self.label} mirrored",
@@ -251,6 +248,7 @@ def _arm(
     labels = (texts[n] if n in (MODEL, PROMPT) else f"{n}={texts[n]}" for n in varying)
     programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
     return Arm(
+        model="+".join(dict.fromkeys(sides.values())),
         sides=sides,
         asked=asked,
         entries=entries,
