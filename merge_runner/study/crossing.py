@@ -117,21 +117,16 @@ def cross(
             f"these are {trials:,} trials, and at most {MOST_TRIALS:,} can be played: leave out "
             "levels, conditions or repetitions, in the file or by --only, --conditions or --reps"
         )
-    mirrored = mirror or file.mirror
+    varying = [name for name, levels in axes.items() if len(levels) > 1]
     arms: dict[tuple[str, ...], Arm] = {}
     for chosen in product(*wanted.values()):
         texts = dict(zip(wanted, chosen, strict=True))
         if any(all(texts[name] in levels for name, levels in row.items()) for row in skip):
             continue
-        arm = _arm(
-            file,
-            {name: axes[name][text] for name, text in texts.items()},
-            texts,
-            repetitions[texts[PROMPT]],
-            registry,
-            [name for name, levels in axes.items() if len(levels) > 1],
-        )
-        for each in (arm, arm.turned()) if mirrored and arm.is_mixed else (arm,):
+        levels = {name: axes[name][text] for name, text in texts.items()}
+        arm = _arm(file, levels, texts, repetitions[texts[PROMPT]], registry, varying)
+        turned = (mirror or file.mirror) and arm.is_mixed
+        for each in (arm, arm.turned()) if turned else (arm,):
             apart = (f"{n}={t}" for n, t in each.factors.items() if n not in (PROMPT, OPPONENT))
             # What comes to the same trials, as a pair that is named both ways, is played once.
             twin = arms.setdefault((each.model, each.variant, *apart), each)
