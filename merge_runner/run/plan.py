@@ -155,7 +155,7 @@ class Plan(BaseModel):
 
         A study with a budget of its own has one ledger over all its models and samples.
         """
-        if self.study.file.budget.total_usd is not None:
+        if self.study.file.budget:
             return self.study.name
         models = ",".join(sorted(self.model.split(",")))
         seat = f"/{self.seat}" if self.seat else ""

@@ -409,7 +409,7 @@ async def open_sweep(
     """
     check_batches(plan, options)
     if options.max_cost_usd is None:
-        options = replace(options, max_cost_usd=plan.study.file.budget.total_usd)
+        options = replace(options, max_cost_usd=plan.study.file.budget.get("total_usd"))
     recorded = partial(Spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
         plan = await _with_names(plan, options, cache, say)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, JsonValue, model_validator
 
@@ -103,12 +103,6 @@ class StudyPrompt(Frozen):
     title: str = ""
 
 
-class BudgetTerms(Frozen):
-    """What a study may cost, in USD over all models, runs and days."""
-
-    total_usd: NotNegative | None = None
-
-
 class StudyDriver(Frozen):
     """A driver that a study makes of a ``program``: with other parameters, or another clock.
 
@@ -121,12 +115,6 @@ class StudyDriver(Frozen):
     clock: Positive | None = None
 
 
-class Plugins(Frozen):
-    """Python files that register drivers, prompt blocks, metrics and so on, beside the study."""
-
-    files: tuple[str, ...] = ()
-
-
 class StudyFile(Frozen):
     """One study. ``repetitions`` are per condition, for each prompt or for all of them.
 
@@ -135,7 +123,9 @@ class StudyFile(Frozen):
     leaves crossings out: each row names levels, or lists of them. Tables compare the levels of a
     factor with its first one, or with that which ``reference`` names. With ``mirror`` two different
     drivers are played both ways round. ``perception`` holds by name what the levels of the factors
-    perception, perception_left and perception_right stand for.
+    perception, perception_left and perception_right stand for. ``budget`` is what it may cost, in
+    USD over all models, runs and days, ``plugins`` are Python files that register drivers, prompt
+    blocks, metrics and so on, beside the study.
     """
 
     description: str = ""
@@ -152,8 +142,8 @@ class StudyFile(Frozen):
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)
     perception: dict[str, Perception] = Field(default_factory=dict)
-    budget: BudgetTerms = BudgetTerms()
-    plugins: Plugins = Plugins()
+    budget: dict[Literal["total_usd"], NotNegative] = Field(default_factory=dict)
+    plugins: dict[Literal["files"], tuple[str, ...]] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +173,7 @@ def read_study(name: str) -> StudySource:
         path = files[name]
     file = validated(StudyFile, read_toml(path), str(path))
     sources = {}
-    for each in file.plugins.files:
+    for each in file.plugins.get("files", ()):
         plugin = path.parent / each
         if not plugin.resolve().is_relative_to(path.parent.resolve()):
             raise UsageError(f"{path}: the plug-in {each} lies outside of the study's folder")
