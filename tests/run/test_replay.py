@@ -200,8 +200,7 @@ async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, s
     )  # fmt: skip
     out, _ = await run.communicate()
     assert run.returncode == 4
-    told, held = json.loads(out)["messages"]
-    assert "small.parquet holds 206 calls of scripted-driver" in held
+    (told,) = json.loads(out)["messages"]
     assert "recorded '- Your speed: 1" in told
     assert "wanted '- Your spead: 1" in told
     assert told.endswith("; 22 calls of 11 trials differ like this")
