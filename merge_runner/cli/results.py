@@ -23,7 +23,7 @@ from merge_runner.text_safety import say
 if TYPE_CHECKING:
     from merge_runner.llm.ledger import Ledger
 
-CACHE = "Also compare every attempt with this cache folder."
+CACHE = "Replay from this cache folder, not from the stored replies."
 SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
 Form = Literal["text", "csv", "json"]
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
@@ -41,7 +41,7 @@ def sql(
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
     from merge_runner.results.database import fetched, names_of
-    from merge_runner.results.query_output import write_csv, write_json, write_table
+    from merge_runner.results.export import write_csv, write_json, write_table
     from merge_runner.results.store import answer
 
     writers = {"text": write_table, "csv": write_csv, "json": write_json}
@@ -165,7 +165,7 @@ def recording_verify(file: RecordingFile) -> None:
     from merge_runner.results.recording import summarise
 
     found = summarise(file)
-    say(f"{file} is whole: {found.calls} calls, as they were exported")
+    say(f"{file} is whole: {found['calls']} calls, as they were exported")
 
 
 @recording_app.command("info")
@@ -176,7 +176,7 @@ def recording_info(
     """Verify a recording and print what it holds, as JSON."""
     from merge_runner.results.recording import summarise
 
-    print_out(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
+    print_out(json.dumps(summarise(file), indent=2, ensure_ascii=False))
 
 
 def ledger(

@@ -15,7 +15,7 @@ from merge_runner.drivers.registry import EMULATOR
 from merge_runner.errors import ReplayMiss
 from merge_runner.llm.client import Meter
 from merge_runner.records import Status
-from merge_runner.results.query_output import write_table
+from merge_runner.results.export import write_table
 from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
@@ -148,7 +148,7 @@ def _costs(summary: dict[str, Any]) -> Iterator[str]:
         f"cost {summary['cost_usd']:.4f} USD{unknown}"
     )
     if (expected := summary["estimate"]) is not None:
-        usd = _about((expected["batch"] or expected)["cost_usd"])
+        usd = _about(expected["cost_usd"])
         yield f"estimated before: {expected['calls']} calls, {usd}"
     spent_usd, aside_usd = summary["sweep_cost_usd"], summary["set_aside_usd"]
     if spent_usd + aside_usd:
@@ -200,17 +200,18 @@ def _about(cost_usd: float | None) -> str:
 def estimate_lines(expected: Estimate) -> Iterator[str]:
     """What a run will take, for a reader."""
     measured = ", as measured before" if expected.measured else ""
-    singly = ", asked singly" if expected.batch is not None else ""
     tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
     yield f"driver  {expected.driver}"
     yield f"trials  {expected.trials} that have not ended yet"
     yield f"calls   about {expected.calls} that are not recorded yet"
     yield f"tokens  {tokens}"
-    yield f"cost    {_about(expected.cost_usd)}{singly}"
-    yield f"time    about {expected.minutes} minutes{singly}"
-    if (batch := expected.batch) is not None:
-        yield (
-            f"batch   {_about(batch.cost_usd)} in about {batch.rounds} rounds, at most "
-            f"{batch.most_rounds}; a round takes as long as its slowest batch: minutes, an hour, "
-            "a day at most"
-        )
+    if not expected.rounds:
+        yield f"cost    {_about(expected.cost_usd)}"
+        yield f"time    about {expected.minutes} minutes"
+        return
+    singly = f"{_about(expected.singly_usd)} and {expected.minutes} minutes if asked singly"
+    yield f"cost    {_about(expected.cost_usd)} in batches; {singly}"
+    yield (
+        f"time    about {expected.rounds} rounds; each takes as long as its slowest batch: "
+        "minutes, an hour, a day at most"
+    )
