@@ -38,7 +38,6 @@ from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
-from merge_runner.results.progress_file import write_standing
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Miss, Spilled, described, explain, recorded_part
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
@@ -52,8 +51,7 @@ from merge_runner.run.estimate import Estimate, earlier_answers, estimate
 from merge_runner.run.flusher import AGAIN, BATCH, Flusher
 from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions, LocalRunner
 from merge_runner.run.plan import Options, Plan, usual_prompts
-from merge_runner.run.progress import Progress, show_progress
-from merge_runner.run.summary import as_dict
+from merge_runner.run.progress import Progress, as_dict, show_progress, write_standing
 from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130

@@ -157,7 +157,7 @@ async def test_a_replay_opens_no_network_socket_and_needs_no_key(tmp_path):
 
 def test_a_replay_imports_no_library_that_it_does_not_use():
     code = (
-        "import sys, merge_runner.cli, merge_runner.run.sweep, merge_runner.run.summary;"
+        "import sys, merge_runner.cli, merge_runner.run.sweep;"
         "unused = ('httpx', 'aiohttp', 'pandas', 'statsmodels', 'tenacity', 'numpy', 'rich');"
         "print([m for m in unused if m in sys.modules])"
     )
