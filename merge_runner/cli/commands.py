@@ -183,8 +183,8 @@ def _play(
     import asyncio
 
     from merge_runner.llm.models import shutdown_notes
+    from merge_runner.run import progress
     from merge_runner.run import sweep as running
-    from merge_runner.run.progress import as_lines, estimate_lines
 
     if plan.is_rehearsal:
         say(f"REHEARSAL: the emulator answers as {plan.driver}; nobody else is asked, or charges")
@@ -194,12 +194,12 @@ def _play(
             say(note)
     if dry_run:
         expected = asyncio.run(running.unsent(plan, options, say=say))
-        lines = "\n".join(estimate_lines(expected))
+        lines = "\n".join(progress.estimate_lines(expected))
         print_out(json.dumps(asdict(expected)) if as_json else f"{lines}\nNothing was sent.")
         return 0
 
     def leave(expected: Estimate) -> None:
-        lines = "\n".join(estimate_lines(expected))
+        lines = "\n".join(progress.estimate_lines(expected))
         by_asyncio = signal.signal(signal.SIGINT, signal.default_int_handler)
         try:  # Ctrl-C is an answer, too
             agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
@@ -211,7 +211,9 @@ def _play(
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
         return running.INTERRUPTED
-    as_text = json.dumps(facts, ensure_ascii=False) if as_json else "\n".join(as_lines(facts))
+    as_text = (
+        json.dumps(facts, ensure_ascii=False) if as_json else "\n".join(progress.as_lines(facts))
+    )
     print_out(as_text)
     for message in facts["messages"]:
         say(f"error: {message}")
@@ -225,15 +227,15 @@ def sql(
     as_json: cli.JsonOption = False,
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
-    from merge_runner.results.database import fetched, names_of
-    from merge_runner.results.export import write_csv, write_json, write_table
-    from merge_runner.results.store import answer
+    from merge_runner.results import database, export, store
 
-    writers = {"text": write_table, "csv": write_csv, "json": write_json}
+    writers = {"text": export.write_table, "csv": export.write_csv, "json": export.write_json}
     # A slow reader of a pipe would otherwise keep every sweep from writing meanwhile.
     with tempfile.TemporaryFile("w+", encoding="utf-8", newline="") as spooled:
-        with answer(db, query) as result:
-            writers["json" if as_json else output](names_of(result), fetched(result), spooled)
+        with store.answer(db, query) as result:
+            writers["json" if as_json else output](
+                database.names_of(result), database.fetched(result), spooled
+            )
         spooled.seek(0)
         shutil.copyfileobj(spooled, sys.stdout)
 
