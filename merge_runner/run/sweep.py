@@ -96,7 +96,7 @@ async def play(
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
     """Whether a model of a plan is recorded, or it has none."""
     models = {entry.id or UNNAMED for entry in plan.entries.values()}
-    return not models or any(True for model in models for _ in cache.recorded(model=model))
+    return not models or any(entry.request.model in models for entry in cache.entries())
 
 
 def _recorded(plan: Plan, recordings: Sequence[Path]) -> Plan:
