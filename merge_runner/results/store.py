@@ -36,7 +36,6 @@ from merge_runner.results.database import (
     unreadable_is_usage,
     write_database,
 )
-from merge_runner.results.progress_file import running
 from merge_runner.results.rows import (
     FACTORS,
     PLACES,
@@ -328,12 +327,8 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
 def to_forget(db: Path, patterns: Sequence[str]) -> tuple[list[str], str]:
     """Return the ids of the sweeps to forget, in which * stands for anything, and all that goes.
 
-    Raises UsageError where a pattern names nothing, or a sweep into the database is running.
+    Raises UsageError where a pattern names nothing.
     """
-    for busy in running(db):
-        raise UsageError(
-            f"the sweep {busy.sweep_id} is running into {db}: stop it, or wait for its end"
-        )
     with read_database(db) as connection:
         rows = connection.execute("SELECT sweep_id FROM sweeps ORDER BY ALL").fetchall()
         known, ids = [sweep_id for (sweep_id,) in rows], []

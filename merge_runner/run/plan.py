@@ -129,8 +129,8 @@ class Plan(BaseModel):
     drives but for opponents, as ids of sweeps do, with a comma between models. ``levels`` are those
     of each factor of its file, a factor's reference first. ``entries`` are the language models of
     all arms by what an arm's ``asked`` calls them, and ``endpoints`` the identities of their
-    endpoints (see ``config.Endpoint``). ``mirror``: pairs are played both ways round whatever the
-    file says. ``seat`` is ``first`` where only first decisions are asked, and empty in a sweep.
+    endpoints (see ``config.Endpoint``). ``seat`` is ``first`` where only first decisions are asked,
+    and empty in a sweep.
     """
 
     model_config = ConfigDict(frozen=True, serialize_by_alias=True, validate_by_name=True)
@@ -147,7 +147,6 @@ class Plan(BaseModel):
     sample_set: int
     order_seed: int
     seat: Literal["", "first"] = ""
-    mirror: bool = False
 
     @property
     def ledger(self) -> str:
@@ -368,7 +367,6 @@ def make_plan(
         sample_set=sample_set,
         order_seed=order_seed,
         seat="first" if first else "",
-        mirror=mirror,
     )
 
 

@@ -383,7 +383,6 @@ async def test_a_damaged_record_of_spending_stops_no_replay(merge_runner, tmp_pa
     assert (await merge_runner("sweep", *part, "--dry-run", "--db", "new")).code == 0
     replay = await merge_runner("replay", *part, "--db", "new")
     assert replay.code == 0, replay.err
-    assert "no cap could hold" in replay.err
     for command in (("sweep", *part), ("ledger",)):
         refused = await merge_runner(*command)
         assert refused.code == 2
