@@ -31,12 +31,12 @@ from decimal import Decimal
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
-from threading import RLock
+from threading import Lock, RLock
 from typing import TYPE_CHECKING, Any
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
-from merge_runner.llm.durable import BatchWriter, Connection, Operation, connect, making
+from merge_runner.llm.durable import BatchWriter, Operation, connect, making
 from merge_runner.records import Attempt, Usage
 
 if TYPE_CHECKING:
@@ -161,17 +161,17 @@ class LedgerFile:
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / FILE
-        self._connections: dict[str, Connection] = {}
-        self._one_at_a_time = RLock()
+        self._connections: dict[str, sqlite3.Connection] = {}
+        self._one_query, self._one_transaction = Lock(), RLock()
         self.writer = BatchWriter(self.run_now)
 
     def read(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises UsageError for a damaged file, and CacheFailed."""
-        with self._told():
+        with self._told(), self._one_query:
             # Its first transaction makes all tables: until then it is empty.
             if not self._connections and not (self._file.exists() and self._file.stat().st_size):
                 return []
-            return self._connection("ro").rows(sql, *values)
+            return self._connection("ro").execute(sql, values).fetchall()
 
     def spending(self, scope: str, ask: Callable[..., Rows]) -> Spending:
         """Return the sums of a sweep, by ``read`` or ``write``; raises UsageError for odd ones."""
@@ -185,12 +185,12 @@ class LedgerFile:
 
     def write(self, sql: str, *values: object) -> Rows:
         """Execute a statement within a transaction, and return its rows."""
-        return self._connection("rwc").rows(sql, *values)
+        return self._connection("rwc").execute(sql, values).fetchall()
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[None]:
         """Make what is written within it, in this thread, one durable transaction."""
-        with self._told(), self._one_at_a_time:
+        with self._told(), self._one_transaction:
             connection = self._connection("rwc")
             if connection.in_transaction:  # a part of the one around it
                 yield
@@ -218,7 +218,7 @@ class LedgerFile:
         while self._connections:
             self._connections.popitem()[1].close()
 
-    def _connection(self, mode: str) -> Connection:
+    def _connection(self, mode: str) -> sqlite3.Connection:
         """Return a connection of its own to read or write: the event loop reads while one syncs."""
         if mode not in self._connections:
             connection = connect(self._file, mode)
