@@ -49,8 +49,14 @@ from merge_runner.run.clients import (
 )
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate
-from merge_runner.run.flusher import AGAIN, BATCH, Flusher
-from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions, LocalRunner
+from merge_runner.run.local_runner import (
+    AGAIN,
+    BATCH,
+    MOST_INVALID,
+    FirstDecisions,
+    Flusher,
+    LocalRunner,
+)
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, show_progress
 from merge_runner.run.replay_diagnosis import Miss, explain
