@@ -316,13 +316,14 @@ class ResponseCache:
                         left_out.append(str(exc))
         yield from self._overlay.values()
 
-    def recorded(self, fits: Callable[[ChatRequest], bool]) -> Iterator[ChatRequest]:
-        """Yield the requests that fit and have a reply: the recording's, else the folder's."""
+    def recorded(self, **fields: str) -> Iterator[ChatRequest]:
+        """Yield the requests with these values and a reply: the recording's, else the folder's."""
         for entries in (self._overlay.values(), self.entries()):
             found = False
-            for request in filter(fits, (each.request for each in entries)):
-                found = True
-                yield request
+            for request in (entry.request for entry in entries):
+                if all(getattr(request, name) == value for name, value in fields.items()):
+                    found = True
+                    yield request
             if found:
                 return
 

@@ -12,14 +12,12 @@ from merge_runner.config import (
     rehearsal_endpoint,
     resolve_endpoint,
 )
-from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http_outcome import FirstCall
 from merge_runner.llm.ledger import Budget, Ledger, cost_usd
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
@@ -32,8 +30,6 @@ if TYPE_CHECKING:
 
 # Time in a rehearsal: answers come so much sooner, and the limits of a minute hold within less.
 SPEED = 10
-# The share of attempts in which something goes wrong, as with providers.
-RATES = {"rate_limit": 0.01, "server_error": 0.005, "overloaded": 0.005, "malformed": 0.005}
 # For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
 
@@ -48,7 +44,6 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
             cache=cache,
             transport=None,
             limiter=Limiter(),
-            sealed=True,
         )
         for name, entry in plan.entries.items()
     }
@@ -104,11 +99,9 @@ def live_clients(
             limiter=limiters[model],
             budget=None if entry.price == "free" else budget,
             strict=options.strict_model,
-            first=FirstCall(
-                # A round is asked at once: no call of it waits for another one's answer.
-                passed=rounds is not None and rounds.submits,
-                known=name in earlier,
-            ),
+            # A round is asked at once: no call of it waits for another one's answer.
+            passed=rounds is not None and rounds.submits,
+            known=name in earlier,
             rounds=rounds if terms else None,
             model=model,
             batch_price=terms.price_factor if terms else 1.0,
@@ -130,7 +123,11 @@ def _connections(
     if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
         from merge_runner.emulator.handler import Emulator
 
-        in_process = Emulator(_behaviour(plan)).transport()
+        emulator = Emulator()
+        if plan.is_rehearsal:  # of one model, whose entries differ in parameters alone
+            entry = next(iter(plan.entries.values()))
+            emulator = Emulator(entry.typical_latency_s / SPEED, entry.typical_output_tokens)
+        in_process = emulator.transport()
 
     def connect(name: str) -> HttpTransport:
         entry = plan.entries[name]
@@ -176,19 +173,6 @@ def _allow_files(number: int) -> None:
             f"{number} connections exceed this system's limit of {hard} open files: choose a lower "
             "--in-flight or raise `ulimit -n`"
         ) from exc
-
-
-def _behaviour(plan: Plan) -> Behaviour:
-    """How the emulator answers, in a rehearsal in the place of a plan's one model."""
-    if not plan.is_rehearsal:
-        return Behaviour()
-    entry = next(iter(plan.entries.values()))  # the others differ in parameters alone
-    return Behaviour(
-        rates=RATES,
-        latency_s=entry.typical_latency_s / SPEED,
-        delay_s=1.0,
-        output_tokens=entry.typical_output_tokens,
-    )
 
 
 def open_rounds(

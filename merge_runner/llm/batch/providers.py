@@ -21,7 +21,7 @@ from merge_runner.config import (
 )
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.llm.content_hashes import LARGEST_STATUS, canonical_json
-from merge_runner.llm.formats.base import (
+from merge_runner.llm.formats import (
     ServerError,
     WireFormat,
     as_count,
