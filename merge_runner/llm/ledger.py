@@ -206,12 +206,10 @@ class LedgerFile:
 
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
         """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
-        rows: Rows = []
+        why = "the run ended before a reply was seen; it may have been charged"
         with contextlib.suppress(UsageError, CacheFailed):  # told before anything is paid
-            rows = self.read(_BEGUN, call, tried)
-        for number, (since,) in enumerate(rows, tried + 1):
-            why = "the run ended before a reply was seen; it may have been charged"
-            yield Attempt(number, "unknown", started_at=since, error=why)
+            for number, (since,) in enumerate(self.read(_BEGUN, call, tried), tried + 1):
+                yield Attempt(number, "unknown", started_at=since, error=why)
 
     def close(self) -> None:
         """Close the file."""
@@ -358,18 +356,12 @@ class PaidAttempt:
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
         """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
-        ledger, reserve = self.budget.ledger, partial(self.set_aside, attempts)
-        if ledger.scope and not await ledger.cache.money.writer.write(reserve):
+        if not self.queued:  # in a smaller batch than before, or in one of an earlier run
+            return
+        ledger, cap_usd, number = self.budget.ledger, self.budget.cap_usd, len(attempts) + 1
+        worst = partial(ledger.reserve, self.key, number, self.aside_usd, cap_usd, self.asked)
+        if ledger.scope and not await ledger.cache.money.writer.write(worst):
             raise TrialSuspended("another run spends from the same cap, and has used it up")
-        self.begun()
-
-    def set_aside(self, attempts: Sequence[Attempt]) -> bool:
-        """Do the durable part of ``begin`` in this thread; False if the cap is used up."""
-        number, cap_usd = len(attempts) + 1, self.budget.cap_usd
-        return self.budget.ledger.reserve(self.key, number, self.aside_usd, cap_usd, self.asked)
-
-    def begun(self) -> None:
-        """Count the reservation no longer here: ``set_aside`` has made it durable."""
         self.queued = False
         self.budget.queued_usd -= self.aside_usd
 

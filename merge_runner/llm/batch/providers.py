@@ -329,8 +329,6 @@ class AnthropicBatches(BatchService):
     def _status_of(self, batch: dict[str, Any]) -> BatchStatus:
         if (as_text(batch.get("processing_status")) or "").upper() != "ENDED":
             return BatchStatus()
-        if batch.get("archived_at"):
-            raise BatchFailed("lost", "the results of the batch are no longer kept")
         counts = as_dict(batch.get("request_counts")).values()
         # Not at the URL that the batch names: the key goes to the configured host alone.
         path = f"{self.path}/{id_of(batch)}/results"
