@@ -316,16 +316,20 @@ class ResponseCache:
                         left_out.append(str(exc))
         yield from self._overlay.values()
 
-    def recorded(self, **fields: str) -> Iterator[ChatRequest]:
-        """Yield the requests with these values and a reply: the recording's, else the folder's."""
-        for entries in (self._overlay.values(), self.entries()):
-            found = False
-            for request in (entry.request for entry in entries):
-                if all(getattr(request, name) == value for name, value in fields.items()):
-                    found = True
-                    yield request
-            if found:
-                return
+    def recorded(self, name: str, **fields: str) -> set[str]:
+        """Return what ``name`` is in requests with a reply and these ``fields``.
+
+        They are those of the recording, else of the folder.
+        """
+
+        def values(entries: Iterable[CachedCall]) -> set[str]:
+            return {
+                getattr(entry.request, name)
+                for entry in entries
+                if all(getattr(entry.request, key) == value for key, value in fields.items())
+            }
+
+        return values(self._overlay.values()) or values(self.entries())
 
     def close(self) -> None:
         """Close the folder, and free its locks."""

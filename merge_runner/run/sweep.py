@@ -447,14 +447,14 @@ async def _with_names(
         named = model_id(entry)
         if not named and options.sends_nothing:
             # A server of one's own serves one model, or the recorded replies do not tell which.
-            models = {request.model for request in cache.recorded(provider=entry.provider)}
+            models = cache.recorded("model", provider=entry.provider)
             named = models.pop() if len(models) == 1 else UNNAMED
         entries[name] = entry.model_copy(
             update={"id": named or await _served_name(name, entry, say=say)}
         )
         recorded: set[str] = set()
         if options.replay:
-            recorded = {request.endpoint for request in cache.recorded(model=entries[name].id)}
+            recorded = cache.recorded("endpoint", model=entries[name].id)
         if recorded and endpoints[name] not in recorded:
             endpoints[name], *others = sorted(recorded)
             if others:
