@@ -515,11 +515,12 @@ class GeminiMode(BatchMode):
         """A resumable upload: it is announced, and then sent whole."""
         if request.headers.get("x-goog-upload-command") == "start":
             url = f"http://{request.headers['host']}{request.url.path}?upload_id=1"
-            headers = {"x-goog-upload-url": url, "x-goog-upload-status": "active"}
-            return as_json(_marked({}), headers=headers)
+            begun = as_json(_marked({}))
+            begun.headers.update({"x-goog-upload-url": url, "x-goog-upload-status": "active"})
+            return begun
         content = request.content
         file = {"name": f"files/{self._file(content)}", "sizeBytes": str(len(content))}
-        return as_json(_marked({"file": file}), headers={"x-goog-upload-status": "final"})
+        return as_json(_marked({"file": file}))
 
     def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
         if result.kind == "not asked":
