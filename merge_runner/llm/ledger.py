@@ -162,7 +162,7 @@ class LedgerFile:
     def __init__(self, folder: Path) -> None:
         self._file = folder / FILE
         self._connections: dict[str, sqlite3.Connection] = {}
-        self._one_query, self._one_transaction = Lock(), RLock()
+        self._one_query, self._one_writer = Lock(), RLock()
         self.writer = BatchWriter(self.run_now)
 
     def read(self, sql: str, *values: object) -> Rows:
@@ -184,24 +184,14 @@ class LedgerFile:
         return Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
 
     def write(self, sql: str, *values: object) -> Rows:
-        """Execute a statement within a transaction, and return its rows."""
-        return self._connection("rwc").execute(sql, values).fetchall()
-
-    @contextlib.contextmanager
-    def transaction(self) -> Iterator[None]:
-        """Make what is written within it, in this thread, one durable transaction."""
-        with self._told(), self._one_transaction:
-            connection = self._connection("rwc")
-            if connection.in_transaction:  # a part of the one around it
-                yield
-                return
-            with connection:
-                connection.execute("BEGIN IMMEDIATE")
-                yield
+        """Execute a statement, and return its rows; an operation."""
+        with self._told(), self._one_writer:
+            return self._connection("rwc").execute(sql, values).fetchall()
 
     def run_now(self, operations: list[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread; raises UsageError."""
-        with self.transaction():
+        with self._told(), self._one_writer, self._connection("rwc") as connection:
+            connection.execute("BEGIN IMMEDIATE")
             return [operation() for operation in operations]
 
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
@@ -275,16 +265,15 @@ class Ledger:
     def reserve(
         self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
     ) -> bool:
-        """Reserve the worst case of an attempt at a call; False if that exceeds the cap."""
+        """Reserve the worst case of an attempt; False if that exceeds the cap; an operation."""
         if not self.scope:
             return True
-        with self._money.transaction():
-            committed_usd = self._money.spending(self.scope, self._money.write).committed_usd
-            if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
-                return False
-            since = datetime.now(UTC).isoformat(timespec="milliseconds")
-            place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
-            self._money.write(_OPEN, self.scope, key, number, usd, *place)
+        committed_usd = self._money.spending(self.scope, self._money.write).committed_usd
+        if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
+            return False
+        since = datetime.now(UTC).isoformat(timespec="milliseconds")
+        place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
+        self._money.write(_OPEN, self.scope, key, number, usd, *place)
         return True
 
     async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
@@ -312,11 +301,11 @@ class Ledger:
 
     def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
         """Put what a task has spent, and has open, in the place of the share reserved for it."""
-        with self._money.transaction():
-            self._money.write("DELETE FROM open WHERE scope = ? AND call = ?", self.scope, name)
-            for sql, rows in ((_PAY, spent), (_OPEN, opened)):
-                for row in rows:
-                    self._money.write(sql, self.scope, *row)
+        sql = "DELETE FROM open WHERE scope = ? AND call = ?"
+        operations = [partial(self._money.write, sql, self.scope, name)]
+        operations += [partial(self._money.write, _PAY, self.scope, *row) for row in spent]
+        operations += [partial(self._money.write, _OPEN, self.scope, *row) for row in opened]
+        self._money.run_now(operations)
 
     def reasons(self) -> list[dict[str, Any]]:
         """Return the reservations by driver and outcome, with times in UTC and one of the slots."""
@@ -325,8 +314,7 @@ class Ledger:
 
     def release(self) -> None:
         """Count no longer what is reserved; nobody may be asking meanwhile."""
-        with self._money.transaction():
-            self._money.write("DELETE FROM open WHERE scope = ?", self.scope)
+        self._money.write("DELETE FROM open WHERE scope = ?", self.scope)
         self.read()
 
 
