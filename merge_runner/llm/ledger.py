@@ -302,7 +302,7 @@ class Ledger:
     def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
         """Put what a task has spent, and has open, in the place of the share reserved for it."""
         sql = "DELETE FROM open WHERE scope = ? AND call = ?"
-        operations = [partial(self._money.write, sql, self.scope, name)]
+        operations: list[Operation] = [partial(self._money.write, sql, self.scope, name)]
         operations += [partial(self._money.write, _PAY, self.scope, *row) for row in spent]
         operations += [partial(self._money.write, _OPEN, self.scope, *row) for row in opened]
         self._money.run_now(operations)
