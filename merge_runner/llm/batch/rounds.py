@@ -191,7 +191,9 @@ class Rounds:
         return [
             batch
             for batch in self.batches.values()
-            if batch.work and not batch.work.done() and model in (None, batch.note.model)
+            if (work := batch.work) and model in (None, batch.note.model)
+            # One whose work was cancelled goes on without this run.
+            if work.cancelled() or not work.done()
         ]
 
     def _ended(self, key: str, batch: Batch) -> bool:
