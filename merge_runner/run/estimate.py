@@ -95,8 +95,7 @@ def estimate(
     """
     number = read = written = 0
     usd = singly_usd = 0.0
-    in_turn_s: defaultdict[str, float] = defaultdict(float)
-    limited_s: defaultdict[str, float] = defaultdict(float)
+    busy_s: defaultdict[str, float] = defaultdict(float)
     at_once = min(options.connections, 2 * max(trials, 1))
     for label, arm in plan.by_label().items():
         for name, entry in arm.entries.items():
@@ -109,10 +108,8 @@ def estimate(
             singly_usd += asked * call_usd
             usd += asked * call_usd * _price_factor(entry, options.batch)
             # An account's limits are those of a model, with whatever parameters it is asked.
-            model = plan.registered[name]
-            in_turn_s[model] += asked / at_once * entry.typical_latency_s
-            limited_s[model] += asked * _limited_s(options, entry, usage)
-    longest_s = max([*in_turn_s.values(), *limited_s.values()], default=0.0)
+            call_s = max(entry.typical_latency_s / at_once, _limited_s(options, entry, usage))
+            busy_s[plan.registered[name]] += asked * call_s
     rounds = max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0)
     return Estimate(
         plan.driver,
@@ -122,7 +119,7 @@ def estimate(
         output_tokens=written,
         cost_usd=None if math.isnan(usd) else round(usd, 2),
         singly_usd=None if math.isnan(usd) else round(singly_usd, 2),
-        minutes=round(longest_s / 60, 1),
+        minutes=round(max(busy_s.values(), default=0.0) / 60, 1),
         rounds=rounds if options.batch else 0,
         free=all(entry.price == "free" for entry in plan.entries.values()),
         measured=any(map(facts.get, plan.entries)),

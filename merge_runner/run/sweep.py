@@ -48,8 +48,14 @@ from merge_runner.run.clients import (
 )
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate
-from merge_runner.run.flusher import AGAIN, BATCH, Flusher
-from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions, LocalRunner
+from merge_runner.run.local_runner import (
+    AGAIN,
+    BATCH,
+    MOST_INVALID,
+    FirstDecisions,
+    Flusher,
+    LocalRunner,
+)
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, as_dict, show_progress, write_standing
 from merge_runner.signals import on_interrupt
@@ -418,14 +424,14 @@ async def _with_names(
         named = model_id(entry)
         if not named and options.sends_nothing:
             # A server of one's own serves one model, or the recorded replies do not tell which.
-            models = {request.model for request in cache.recorded(provider=entry.provider)}
+            models = cache.recorded("model", provider=entry.provider)
             named = models.pop() if len(models) == 1 else UNNAMED
         entries[name] = entry.model_copy(
             update={"id": named or await _served_name(name, entry, say=say)}
         )
         recorded: set[str] = set()
         if options.replay:
-            recorded = {request.endpoint for request in cache.recorded(model=entries[name].id)}
+            recorded = cache.recorded("endpoint", model=entries[name].id)
         if recorded and endpoints[name] not in recorded:
             endpoints[name], *others = sorted(recorded)
             if others:

@@ -63,7 +63,7 @@ def cache(folder):
 
 
 def endpoints(cache, model):
-    return sorted({each.endpoint for each in cache.recorded(model=model)})
+    return sorted(cache.recorded("endpoint", model=model))
 
 
 def left_out(cache):
