@@ -26,7 +26,7 @@ from pydantic import (
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import SHIPPED_EXPERIMENTS
 from merge_runner.planted_effect import PARAMETERS as PLANTED
-from merge_runner.records import SIDES, Side
+from merge_runner.records import MOST_STEPS, SIDES, Side
 from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
 
@@ -36,7 +36,6 @@ SHORTEST_SECRET = 8
 UNNAMED = "default"
 # What stands for the emulator where it takes the place of a provider.
 REHEARSAL = "rehearsal://localhost"
-MOST_STEPS = MOST_REPETITIONS = 100_000
 
 
 # Strict, or else "4" and true would be numbers.

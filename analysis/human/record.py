@@ -8,8 +8,16 @@ from analysis.data.imported_humans import VELOCITY_PAGES
 from analysis.data.reference_data import HUMAN_DOI, PAIRS
 from analysis.human.archive import Unreadable
 from analysis.human.trace import Trace
-from merge_runner.llm.content_hashes import canonical_json, spec_hash
-from merge_runner.records import SIDES, Side, StateRow, Status, TrialRecord, TrialSpec
+from merge_runner.records import (
+    SIDES,
+    Side,
+    StateRow,
+    Status,
+    TrialRecord,
+    TrialSpec,
+    canonical_json,
+    spec_hash,
+)
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
 from merge_runner.scenarios.merge.geometry import TRACK
 

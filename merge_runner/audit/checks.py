@@ -18,8 +18,7 @@ import duckdb
 
 from merge_runner.errors import RecordingError, StoreError
 from merge_runner.llm.cache import CachedCall
-from merge_runner.llm.content_hashes import canonical_json, spec_hash, without_prompt
-from merge_runner.records import ANSWERED_FIELD
+from merge_runner.records import ANSWERED_FIELD, canonical_json, spec_hash, without_prompt
 from merge_runner.results.database import (
     SETTINGS,
     append,

@@ -26,7 +26,6 @@ import diskcache
 from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
-from merge_runner.llm.content_hashes import DAMAGED, check_body, check_call
 from merge_runner.llm.durable import BatchWriter, ModelLocks, Operation, ResultT, connect, making
 from merge_runner.llm.ledger import LedgerFile
 from merge_runner.llm.text_disk import (
@@ -38,7 +37,7 @@ from merge_runner.llm.text_disk import (
     open_texts,
     refuse_others,
 )
-from merge_runner.records import Attempt, ChatRequest
+from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
 
 CHECKSUM_LENGTH = 32
 BATCH = 1_000

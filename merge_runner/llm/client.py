@@ -28,7 +28,6 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request, reply_object
 from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.http_outcome import (
     AttemptOutcome,
@@ -51,6 +50,8 @@ from merge_runner.records import (
     Slot,
     Usage,
     is_scripted,
+    make_request,
+    reply_object,
     says_scripted,
 )
 

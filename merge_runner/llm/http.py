@@ -22,10 +22,9 @@ from httpx_aiohttp import AiohttpTransport
 
 from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url
 from merge_runner.errors import UsageError
-from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import RawReply, TransportFailure
-from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
+from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest, canonical_json
 
 if TYPE_CHECKING:
     from aiohttp.client_proto import ResponseHandler

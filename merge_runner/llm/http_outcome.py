@@ -173,8 +173,7 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if reading.outcome == "error":
         error = replace(raw.error, status=status_within(raw.error))
         return replace(judge_error(error, wire), reading=reading, raw=raw)
-    nothing = (None, [], {})
-    if reading.outcome == "empty" and all(body.get(name) in nothing for name in wire.members):
+    if reading.outcome == "empty" and not any(body.get(name) for name in wire.members):
         why = "the body has nothing of an answer"
         return AttemptOutcome("retry", "bad_body", why, reading, raw=raw)
     return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
 from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.records import Attempt, Slot
+from merge_runner.records import Attempt, Slot, make_request
 from tests.harness import each
 
 CAP = 100

@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.text_disk import TextDisk
-from merge_runner.records import Attempt, ChatRequest, Slot, Usage
+from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 
 
 def entry(number=0, *, model="m", endpoint="openai", reply="{}", **attempt):

@@ -30,8 +30,7 @@ from merge_runner.emulator.handler import (
     as_response,
 )
 from merge_runner.errors import UsageError
-from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_FIELD, SLOT_HEADER
+from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_FIELD, SLOT_HEADER, canonical_json
 
 if TYPE_CHECKING:
     from tests.mock_server.emulator import FaultyEmulator

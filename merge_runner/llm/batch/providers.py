@@ -19,7 +19,6 @@ from merge_runner.llm.batch.service import (
     id_of,
     json_object,
 )
-from merge_runner.llm.content_hashes import LARGEST_STATUS, canonical_json
 from merge_runner.llm.formats import (
     as_count,
     as_dict,
@@ -28,7 +27,7 @@ from merge_runner.llm.formats import (
     read_error,
 )
 from merge_runner.llm.http_outcome import RawReply, status_within
-from merge_runner.records import ChatRequest
+from merge_runner.records import LARGEST_STATUS, ChatRequest, canonical_json
 
 # Where a provider's addresses stand, whatever the base URL of the server is.
 OPENAI, GEMINI = "/v1", "/v1beta"

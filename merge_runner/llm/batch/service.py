@@ -13,7 +13,6 @@ from urllib.parse import quote
 
 from merge_runner.config import Endpoint, is_own_host
 from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import ServerError, WireFormat, as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import (
     RawReply,
@@ -21,7 +20,7 @@ from merge_runner.llm.http_outcome import (
     judge_error,
     may_be_charged,
 )
-from merge_runner.records import SLOT_HEADER, ChatRequest
+from merge_runner.records import SLOT_HEADER, ChatRequest, canonical_json
 
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
