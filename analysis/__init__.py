@@ -1,6 +1,6 @@
 """Analyses of what lies in the results database, for a notebook as for the command line.
 
->>> from analysis import table
+>>> from merge_runner_analysis import table
 >>> table("results/merge.duckdb", "gap")
 
 ``Study`` holds what such a database has of its trials, to make several tables of it; a study that
@@ -13,17 +13,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from analysis.data.load import load, load_trials
-    from analysis.data.study import Study
-    from analysis.tables import TABLES, table
+    from merge_runner_analysis.data.load import load, load_trials
+    from merge_runner_analysis.data.study import Study
+    from merge_runner_analysis.tables import TABLES, table
 
 # Names are loaded when they are used: the command line must not wait for pandas.
 _PLACES = {
-    "Study": "analysis.data.study",
-    "load": "analysis.data.load",
-    "load_trials": "analysis.data.load",
-    "table": "analysis.tables",
-    "TABLES": "analysis.tables",
+    "Study": "merge_runner_analysis.data.study",
+    "load": "merge_runner_analysis.data.load",
+    "load_trials": "merge_runner_analysis.data.load",
+    "table": "merge_runner_analysis.tables",
+    "TABLES": "merge_runner_analysis.tables",
 }
 __all__ = ["TABLES", "Study", "load", "load_trials", "table"]
 
@@ -31,4 +31,4 @@ __all__ = ["TABLES", "Study", "load", "load_trials", "table"]
 def __getattr__(name: str) -> object:
     if name in _PLACES:
         return getattr(import_module(_PLACES[name]), name)
-    raise AttributeError(f"module 'analysis' has no attribute {name!r}")
+    raise AttributeError(f"module 'merge_runner_analysis' has no attribute {name!r}")

@@ -16,9 +16,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from analysis.human.commands import INTERRUPTED, human_app
-from analysis.power.commands import power
-from analysis.table_format import TableFormat
 from merge_runner.cli import app, main
 from merge_runner.cli.options import (
     DbOption,
@@ -35,9 +32,12 @@ from merge_runner.cli.options import (
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB, refuse_another_kind
 from merge_runner.text_safety import say
+from merge_runner_analysis.human.commands import INTERRUPTED, human_app
+from merge_runner_analysis.power.commands import power
+from merge_runner_analysis.table_format import TableFormat
 
 if TYPE_CHECKING:
-    from analysis.data.study import Study
+    from merge_runner_analysis.data.study import Study
 
 __all__ = ["app", "main"]
 
@@ -76,7 +76,7 @@ ByOption = Annotated[
 
 
 def _table_names() -> list[str]:
-    from analysis.tables import TABLES
+    from merge_runner_analysis.tables import TABLES
 
     return list(TABLES)
 
@@ -133,8 +133,8 @@ def tables(
     if as_driver is not None and against is None:
         raise UsageError("--as DRIVER goes with --against paper")
     use_study(study_file, trust=trust)
-    from analysis.tables import finished_tables
-    from analysis.tables.formats import render, with_columns
+    from merge_runner_analysis.tables import finished_tables
+    from merge_runner_analysis.tables.formats import render, with_columns
 
     made = finished_tables(
         db,
@@ -146,7 +146,7 @@ def tables(
         without_fallbacks=without_fallbacks,
     )
     if against is not None:
-        from analysis.tables.against import against as beside
+        from merge_runner_analysis.tables.against import against as beside
 
         made = [beside(table, against, as_driver) for table in made]
     if columns is not None:
@@ -170,8 +170,8 @@ def explain(
 ) -> None:
     """Explain a cell of a table: its meaning, query and trials."""
     use_study(study_file, trust=trust)
-    from analysis.explain import explain as explain_cell
-    from analysis.tables import finished_tables
+    from merge_runner_analysis.explain import explain as explain_cell
+    from merge_runner_analysis.tables import finished_tables
 
     study = _study(db, None, where, study_file, by)
     made = finished_tables(db, None, [table], study)
@@ -196,7 +196,7 @@ def figures(
 ) -> None:
     """Draw all figures as PDF and PNG."""
     use_study(study_file, trust=trust)
-    from analysis.figures.gallery import write_figures
+    from merge_runner_analysis.figures.gallery import write_figures
 
     deque(write_figures(_study(db, models, where, study_file), out), maxlen=0)
     print_out(f"wrote the figures into {out}")
@@ -210,8 +210,8 @@ def export(
     db: DbOption = DEFAULT_DB,
 ) -> None:
     """Write every table as Parquet and CSV, with all columns explained."""
-    from analysis.data.human_counts import outcomes_table
     from merge_runner.results.export import export_tables
+    from merge_runner_analysis.data.human_counts import outcomes_table
 
     export_tables(db, folder, [outcomes_table()])
     print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")
@@ -237,7 +237,7 @@ def report(
 ) -> None:
     """Write conclusions, tables and figures as one HTML file."""
     use_study(study_file, trust=trust)
-    from analysis.report.writer import write_report
+    from merge_runner_analysis.report.writer import write_report
 
     refuse_another_kind(out, HTML, "page of HTML")
     deque(write_report(db, drivers(models), out, files, _at(where), study_file), maxlen=0)
@@ -252,7 +252,7 @@ def _study(
     file: str | None,
     by: str | None = None,
 ) -> Study:
-    from analysis.data.study import Study
+    from merge_runner_analysis.data.study import Study
 
     return Study(db, drivers(models), _at(where), file, by)
 
@@ -321,8 +321,8 @@ def view(
 
 
 def _serve(db: Path, port: int, reader: str | None) -> None:
-    from analysis.explorer.notes import reader_of
-    from analysis.explorer.server import serve
+    from merge_runner_analysis.explorer.notes import reader_of
+    from merge_runner_analysis.explorer.server import serve
 
     def announce(address: str) -> None:
         print_out(address)
@@ -332,7 +332,7 @@ def _serve(db: Path, port: int, reader: str | None) -> None:
 
 
 def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[str]) -> None:
-    from analysis.explorer.export import export_folder, export_page
+    from merge_runner_analysis.explorer.export import export_folder, export_page
 
     try:
         if folder is not None:

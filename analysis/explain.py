@@ -8,14 +8,14 @@ from functools import cache
 
 import duckdb
 
-from analysis.data.reference_data import citation
-from analysis.data.study import Group, Study, of_group
-from analysis.metrics import JUDGED, METRICS
-from analysis.tables.formats import shown_value
-from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.errors import unknown_name
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.reference_data import citation
+from merge_runner_analysis.data.study import Group, Study, of_group
+from merge_runner_analysis.metrics import JUDGED, METRICS
+from merge_runner_analysis.tables.formats import shown_value
+from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
 ACCOUNTS = "attempts"  # the table that counts repetitions of deterministic drivers, too
 

@@ -17,8 +17,6 @@ from pathlib import Path
 import duckdb
 import numpy as np
 
-from analysis.data.reference_data import PAIRS
-from analysis.human.record import SPEC, SPEC_HASH
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import (
     SIDES,
@@ -39,6 +37,8 @@ from merge_runner.results.store import Store, SweepRow
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner_analysis.data.reference_data import PAIRS
+from merge_runner_analysis.human.record import SPEC, SPEC_HASH
 
 SEED = 1
 BATCH = 500

@@ -24,7 +24,7 @@ title = "Taxi driver"
 files = ["mine.py"]
 """
 PLUGIN = """
-from analysis.metrics import Metric, register
+from merge_runner_analysis.metrics import Metric, register
 from merge_runner.drivers.registry import PROGRAMS, Program
 
 class Sleepy:

@@ -19,8 +19,8 @@ import typer.main
 from typer.testing import CliRunner
 
 import merge_runner as package
-from analysis.commands import app
 from merge_runner.cli.app import alone
+from merge_runner_analysis.commands import app
 from tests.harness import PROGRAM, environment
 
 COMMANDS = {

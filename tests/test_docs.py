@@ -16,9 +16,9 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from analysis.commands import app
-from analysis.data.reference_data import published
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.commands import app
+from merge_runner_analysis.data.reference_data import published
 from tests.analysis.recordings import drive, write_folder
 from tests.harness import PROJECT, environment, watched
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from analysis.commands import app
 from merge_runner import __version__
+from merge_runner_analysis.commands import app
 from tests.harness import PROGRAM, PROJECT, Run, environment
 
 MODULE = (sys.executable, "-m", "merge_runner")
@@ -66,16 +66,10 @@ def test_no_command_imports_from_the_folder_it_is_called_in(hostile, tmp_path):
         assert done.code == 0, done.err
 
 
-def test_a_module_that_hides_the_analysis_is_named_in_one_line(tmp_path):
-    hiding = tmp_path / "analysis.py"
-    hiding.write_text("")
-    for program in ((PROGRAM,), MODULE):
-        done = run(tmp_path, *program, "digest", PYTHONPATH=f"{tmp_path}:{PROJECT}")
-        assert done.code == 2
-        assert done.err == (
-            f"error: {hiding} hides the package analysis of merge-runner: rename it, or take its "
-            "folder off PYTHONPATH\n"
-        )
+def test_a_file_of_the_users_named_analysis_and_ours_are_two_modules(tmp_path):
+    (tmp_path / "analysis.py").write_text("MINE = True\n")
+    both = "import analysis; from merge_runner_analysis import table; assert analysis.MINE"
+    assert run(tmp_path, sys.executable, "-c", both).code == 0
 
 
 def test_a_library_that_is_not_there_is_named_in_one_line(tmp_path):
@@ -96,8 +90,8 @@ def checkout_in(folder: Path) -> Path:
     checkout = folder / "checkout"
     checkout.mkdir()
     tracked = subprocess.run(
-        ["git", "ls-files", "merge_runner", "analysis", "merge_runner_cei", "plugins",
-         "experiments", "cache", "pyproject.toml", "README.md", "LICENSE"],
+        ["git", "ls-files", "merge_runner", "merge_runner_analysis", "merge_runner_cei", "analysis",
+         "plugins", "experiments", "cache", "pyproject.toml", "README.md", "LICENSE"],
         cwd=PROJECT, capture_output=True, text=True, check=True,
     ).stdout.split()  # fmt: skip
     run(PROJECT, "cp", "--parents", "--no-dereference", *tracked, checkout)
@@ -121,7 +115,11 @@ def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the
         for link, folder in (("experiments", "experiments"), ("recordings", "cache/recordings"))
         for file in (PROJECT / folder).iterdir()
     }
-    shipped |= {"merge_runner/py.typed", "analysis/py.typed", "merge_runner_cei/driver.py"}
+    shipped |= {
+        "merge_runner/py.typed",
+        "merge_runner_analysis/py.typed",
+        "merge_runner_cei/driver.py",
+    }
     assert shipped <= from_checkout
     assert not {name for name in from_checkout if name.startswith(("tests", "benchmarks"))}
 

@@ -11,13 +11,13 @@ import pandas as pd
 import pytest
 
 import merge_runner
-from analysis.metrics import METRICS, Metric
 from merge_runner import Study
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import VARIANTS, Variant
 from merge_runner.results.store import results_digest
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner_analysis.metrics import METRICS, Metric
 from tests.harness import CONFIGURING, watched
 from tests.mock_server import BatchPlan, FaultPlan
 

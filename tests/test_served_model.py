@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.data.load import load_calls
-from analysis.data.provenance import provenance, tally
-from analysis.data.study import Study
-from analysis.explorer.catalogue import Catalogue, Filter
-from analysis.explorer.sweeps import find_sweep
-from analysis.tables.attempts import attempts
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.results.database import in_memory
 from merge_runner.results.store import sweep_facts
 from merge_runner.served_model import others_among, sql_of
+from merge_runner_analysis.data.load import load_calls
+from merge_runner_analysis.data.provenance import provenance, tally
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explorer.catalogue import Catalogue, Filter
+from merge_runner_analysis.explorer.sweeps import find_sweep
+from merge_runner_analysis.tables.attempts import attempts
 from tests.analysis.studies import Drive, Said, write_study
 
 SERVED = ("another", "o3", "o3-2025", "o3-2026", "it's")

@@ -32,8 +32,8 @@ from tests.harness import PROGRAM, PROJECT, environment
 
 # What commands import where they need it; nothing of it may start a thread.
 WARM = (
-    "analysis.commands",
-    "analysis.report.writer",
+    "merge_runner_analysis.commands",
+    "merge_runner_analysis.report.writer",
     "merge_runner.llm.http",
     "merge_runner.emulator.server",
     "merge_runner.run.summary",
@@ -230,7 +230,7 @@ def wait_until_nobody_holds(folder: str | Path) -> None:
 
 def _attend(link: socket.socket) -> None:
     """Run one request in a child of its own, and tell how it ended."""
-    from analysis.commands import main
+    from merge_runner_analysis.commands import main
 
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     data, streams, _, _ = socket.recv_fds(link, 2**16, 3)

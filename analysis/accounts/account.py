@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from math import ceil, isinf
 from typing import Any, Literal
 
-from analysis.accounts.classes import (
+from merge_runner.records import SIDES, Side
+from merge_runner_analysis.accounts.classes import (
     ACTED_MPS,
     BOTH_GAVE_WAY,
     BOTH_INSISTED,
@@ -20,8 +21,7 @@ from analysis.accounts.classes import (
     driven_at,
     judged_at,
 )
-from analysis.accounts.course import BRAKING, SPEEDING_UP, TICK_S, Course
-from merge_runner.records import SIDES, Side
+from merge_runner_analysis.accounts.course import BRAKING, SPEEDING_UP, TICK_S, Course
 
 SAYS = {"M": "merge", "Y": "yield"}
 # Of a driver that changes its mind more often, only the last word is told.

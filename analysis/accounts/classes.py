@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from analysis.accounts.course import BRAKING, SPEEDING_UP, TICK_S, Course
 from merge_runner.records import SIDES, Side
+from merge_runner_analysis.accounts.course import BRAKING, SPEEDING_UP, TICK_S, Course
 
 BOTH_INSISTED, BOTH_GAVE_WAY = "both insisted", "both gave way"
 ONE_TOO_LITTLE, NO_ACTION, INVALID_PLAN = "one too little", "no action", "invalid plan"

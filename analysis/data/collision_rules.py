@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from analysis.data.load import load_each, load_specs
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import collided, rectangles_overlap
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.load import load_each, load_specs
 
 # The rule of the human experiment is boxes that overlap, looked for so often.
 LOOKS_HZ = 20

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import duckdb
 
-import analysis
 import merge_runner
+import merge_runner_analysis
 from merge_runner.registry import in_use, plugin_sources, plugins
 from merge_runner.results.database import read_database
 
@@ -49,7 +49,7 @@ LIBRARIES = (
     "scipy",
     "statsmodels",
 )
-PACKAGES = (Path(analysis.__file__).parent, Path(merge_runner.__file__).parent)
+PACKAGES = (Path(merge_runner_analysis.__file__).parent, Path(merge_runner.__file__).parent)
 PATIENCE_S = 0.5
 LOG = logging.getLogger(__name__)
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from analysis.data.load import load
-from analysis.data.reference_data import HUMAN_TRIALS, PAIRS, published
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.load import load
+from merge_runner_analysis.data.reference_data import HUMAN_TRIALS, PAIRS, published
 
 OUTCOMES = ["left_first", "right_first", "collided"]
 COUNTS = ["trials", *OUTCOMES]

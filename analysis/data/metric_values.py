@@ -8,11 +8,11 @@ from pathlib import Path
 import duckdb
 import pandas as pd
 
-from analysis.data.load import TRIALS, load_each
-from analysis.data.reference_data import human_outcomes
-from analysis.metrics import JUDGED, METRICS, Metric
 from merge_runner.errors import UsageError
 from merge_runner.text_safety import first_line
+from merge_runner_analysis.data.load import TRIALS, load_each
+from merge_runner_analysis.data.reference_data import human_outcomes
+from merge_runner_analysis.metrics import JUDGED, METRICS, Metric
 
 Load = Callable[[Sequence[Metric]], pd.DataFrame]
 

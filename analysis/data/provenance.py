@@ -12,13 +12,13 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.data.load import ANSWERED, load_each, load_specs, rows
-from analysis.data.study import Group, Study, of_group
 from merge_runner.audit.checks import make_views
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.results.database import read_database
 from merge_runner.served_model import ALIASES, others_among
+from merge_runner_analysis.data.load import ANSWERED, load_each, load_specs, rows
+from merge_runner_analysis.data.study import Group, Study, of_group
 
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from analysis.data.human_counts import human_counts
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.human_counts import human_counts
 
 DATA = Path(__file__).parent
 # Standard deviation in m of the human gaps about their regression: what the four standard errors of

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from analysis.data.load import load_each
 from merge_runner.study.crossing import MODEL, PROMPT
+from merge_runner_analysis.data.load import load_each
 
 KEYS = ["trial_id", "spec_hash"]
 # The newest run comes first: the order of its levels counts.

@@ -14,12 +14,31 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.data.collision_rules import judged
-from analysis.data.derived_cache import options_text, present_state
-from analysis.data.driver_words import has_chance, language_models, stand_in, unresponsive
-from analysis.data.imported_humans import RECORDINGS, Imported, imported, of_published_pairs
-from analysis.data.intermittency import measure_profiles
-from analysis.data.load import (
+from merge_runner.audit.checks import ASKED_DECISIONS, not_judged
+from merge_runner.errors import UsageError, unknown_name
+from merge_runner.paths import DEFAULT_DB
+from merge_runner.records import SIDES, Side, canonical_json, spec_hash
+from merge_runner.registry import require
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF, listed_levels
+from merge_runner.study.file import StudySource, read_study
+from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.collision_rules import judged
+from merge_runner_analysis.data.derived_cache import options_text, present_state
+from merge_runner_analysis.data.driver_words import (
+    has_chance,
+    language_models,
+    stand_in,
+    unresponsive,
+)
+from merge_runner_analysis.data.imported_humans import (
+    RECORDINGS,
+    Imported,
+    imported,
+    of_published_pairs,
+)
+from merge_runner_analysis.data.intermittency import measure_profiles
+from merge_runner_analysis.data.load import (
     ASKED_TRIALS,
     EGO_SPEEDS,
     FIRST_ACTIONS,
@@ -33,18 +52,9 @@ from analysis.data.load import (
     load_each,
     load_specs,
 )
-from analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
-from analysis.data.studies import Order, Studies, read_studies, study_name
-from analysis.names import BASELINE, HUMAN
-from merge_runner.audit.checks import ASKED_DECISIONS, not_judged
-from merge_runner.errors import UsageError, unknown_name
-from merge_runner.paths import DEFAULT_DB
-from merge_runner.records import SIDES, Side, canonical_json, spec_hash
-from merge_runner.registry import require
-from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF, listed_levels
-from merge_runner.study.file import StudySource, read_study
-from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
+from merge_runner_analysis.data.studies import Order, Studies, read_studies, study_name
+from merge_runner_analysis.names import BASELINE, HUMAN
 
 # What tells groups apart, and is no measure.
 COLUMNS_OF_GROUPS = [

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.explorer.analysis_worker import Numbers
-from analysis.explorer.catalogue import State, stamp_of
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.registry import in_use, use
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import catalogue_of
+from merge_runner_analysis.explorer.analysis_worker import Numbers
+from merge_runner_analysis.explorer.catalogue import State, stamp_of
 
 Request = tuple[str, ...]
 REMEMBERED = 100

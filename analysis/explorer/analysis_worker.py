@@ -11,19 +11,24 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
-from analysis.metrics import GAP, LEFT_FIRST, Metric
-from analysis.names import HUMAN
-from analysis.tables import make_tables
-from analysis.tables.formats import shown_value
-from analysis.tables.model import Table, from_text, to_text
 from merge_runner.errors import UsageError
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.derived_cache import (
+    finished,
+    keep_finished,
+    options_text,
+    present_state,
+)
+from merge_runner_analysis.metrics import GAP, LEFT_FIRST, Metric
+from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.tables.formats import shown_value
+from merge_runner_analysis.tables.model import Table, from_text, to_text
 
 if TYPE_CHECKING:
-    from analysis.data.study import Group, Study
-    from analysis.explain import Source
+    from merge_runner_analysis.data.study import Group, Study
+    from merge_runner_analysis.explain import Source
 
 # The tables that have the rows of groups: of each driver and prompt, or each level of a factor.
 VARIANTS, FACTORS = "ablation-quantitative", "factors"
@@ -64,7 +69,7 @@ class Numbers:
     @cached_property
     def study(self) -> Study:
         """The study, once it is read."""
-        from analysis.data.study import Study
+        from merge_runner_analysis.data.study import Study
 
         return Study(self.db)
 
@@ -98,7 +103,7 @@ class Numbers:
         return {name: self._made[name] for name in names}
 
     def _cell(self, name: str, row_id: str, column_name: str) -> dict[str, Any]:
-        from analysis.explain import sources_of, sql_command
+        from merge_runner_analysis.explain import sources_of, sql_command
 
         table = self._finished([name])[name]
         rows = {row.id: row for row in table.rows}
@@ -126,7 +131,7 @@ class Numbers:
         }
 
     def _figure(self, name: str) -> str:
-        from analysis.figures.gallery import rendered
+        from merge_runner_analysis.figures.gallery import rendered
 
         return rendered(self.study, name, "svg").decode()
 
@@ -146,7 +151,7 @@ class Numbers:
 
 def home_panels(study: Study, factor: str) -> dict[str, Any]:
     """Who goes first and the gap: of the humans, and every driver and prompt, or every level."""
-    from analysis.stats.factors import levels_by_factor
+    from merge_runner_analysis.stats.factors import levels_by_factor
 
     groups = [group for group in study.groups if group.id == HUMAN]
     shown = [_group_facts(group) for group in groups]
@@ -194,8 +199,8 @@ def _beside_humans(
     ``published`` holds what is published of the rest, by the metric's name: ``values`` by
     condition, as far as there are such, and a ``text`` that says what they are.
     """
-    from analysis.data.reference_data import HUMAN_TRIALS, citation
-    from analysis.stats.measures import known, outcomes_note
+    from merge_runner_analysis.data.reference_data import HUMAN_TRIALS, citation
+    from merge_runner_analysis.stats.measures import known, outcomes_note
 
     there = study.human in study.groups
     unknown = [metric for metric in metrics if not known(study.human, metric)]
@@ -220,7 +225,7 @@ def _beside_humans(
 
 def _in_condition(group: Group, condition: str, metrics: Sequence[Metric]) -> dict[str, Any]:
     """Return the estimates of metrics in one condition, with 95 % intervals, by their names."""
-    from analysis.stats.measures import estimate, known
+    from merge_runner_analysis.stats.measures import estimate, known
 
     part = group.part(lambda trials: trials["condition"] == condition)
     return {
@@ -230,8 +235,8 @@ def _in_condition(group: Group, condition: str, metrics: Sequence[Metric]) -> di
 
 def _published(metric: Metric) -> dict[str, Any]:
     """The human values of a metric in each condition, as far as they are published."""
-    from analysis.data.reference_data import citation
-    from analysis.stats.measures import human_reference, no_human_value
+    from merge_runner_analysis.data.reference_data import citation
+    from merge_runner_analysis.stats.measures import human_reference, no_human_value
 
     found = human_reference(metric)
     if found is None:
@@ -248,8 +253,8 @@ def _published_gaps() -> dict[str, float]:
     """The human gap in m that the published regression gives in each condition."""
     import numpy as np
 
-    from analysis.data.reference_data import published
-    from analysis.stats.regressions import gap_design
+    from merge_runner_analysis.data.reference_data import published
+    from merge_runner_analysis.stats.regressions import gap_design
 
     terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
     headway = np.array([one.projected_headway_m for one in HUMAN_CONDITIONS.values()])

@@ -26,10 +26,11 @@ from starlette.responses import (
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from analysis.explorer.assets import STATIC
-from analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
-from analysis.explorer.offline import page_of_trials
-from analysis.explorer.pages import (
+from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner_analysis.explorer.assets import STATIC
+from merge_runner_analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
+from merge_runner_analysis.explorer.offline import page_of_trials
+from merge_runner_analysis.explorer.pages import (
     ablations,
     comparing,
     conditions,
@@ -42,8 +43,7 @@ from analysis.explorer.pages import (
     trials,
     words,
 )
-from analysis.explorer.site import NothingNew, NotThere, Site
-from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site
 
 LOG = logging.getLogger(__name__)
 # The browser asks for the page again after this many s.

@@ -14,12 +14,6 @@ from typing import Any
 import duckdb
 from pydantic import ValidationError
 
-from analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
-from analysis.accounts.course import Course
-from analysis.data.driver_words import language_models, stand_in, unresponsive
-from analysis.explorer.details import scenario_of
-from analysis.explorer.display_text import csv_cell
-from analysis.explorer.reading import PATIENCE_S, Row, reading, records
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
 from merge_runner.records import SIDES
@@ -27,6 +21,12 @@ from merge_runner.results.database import Instance, schema_sql
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer, quoted
+from merge_runner_analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
+from merge_runner_analysis.accounts.course import Course
+from merge_runner_analysis.data.driver_words import language_models, stand_in, unresponsive
+from merge_runner_analysis.explorer.details import scenario_of
+from merge_runner_analysis.explorer.display_text import csv_cell
+from merge_runner_analysis.explorer.reading import PATIENCE_S, Row, reading, records
 
 PAGE = 100
 # Equal where the same trials are listed; unlike a stamp it does not change when a table is kept.

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
 
-from analysis.explorer.analysis_worker import FACTORS
-from analysis.explorer.pictures import Axis, reach
-from analysis.explorer.urls import Links
-from analysis.explorer.views import condition_text
-from analysis.figures.styles import COLOURS, HUMAN_STYLE, Style, driver_style
-from analysis.metrics import Metric, intervals_of, shown_in
-from analysis.names import HUMAN
+from merge_runner_analysis.explorer.analysis_worker import FACTORS
+from merge_runner_analysis.explorer.pictures import Axis, reach
+from merge_runner_analysis.explorer.urls import Links
+from merge_runner_analysis.explorer.views import condition_text
+from merge_runner_analysis.figures.styles import COLOURS, HUMAN_STYLE, Style, driver_style
+from merge_runner_analysis.metrics import Metric, intervals_of, shown_in
+from merge_runner_analysis.names import HUMAN
 
 SHAPE_WORDS = {"down": "triangle that points down"}
 # Shapes of lines, which have no inside.

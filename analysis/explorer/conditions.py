@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from analysis.explorer.catalogue import Catalogue
-from analysis.explorer.views import condition_text
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.explorer.catalogue import Catalogue
+from merge_runner_analysis.explorer.views import condition_text
 
 
 def condition_texts(catalogue: Catalogue) -> dict[str, str]:

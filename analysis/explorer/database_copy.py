@@ -15,9 +15,9 @@ from pathlib import Path
 
 import duckdb
 
-from analysis.explorer.catalogue import stamp_of
-from analysis.explorer.reading import reading
 from merge_runner.errors import StoreLocked, UsageError
+from merge_runner_analysis.explorer.catalogue import stamp_of
+from merge_runner_analysis.explorer.reading import reading
 
 LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
 

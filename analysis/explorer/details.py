@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from analysis.data.driver_words import unresponsive
-from analysis.explorer.prompts import Part, parts_of
-from analysis.explorer.reading import Row, reading, records
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
+from merge_runner_analysis.data.driver_words import unresponsive
+from merge_runner_analysis.explorer.prompts import Part, parts_of
+from merge_runner_analysis.explorer.reading import Row, reading, records
 
 ONE = "WHERE trial_id = $trial AND spec_hash = $spec"
 STATES = f"""

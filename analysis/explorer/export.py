@@ -18,17 +18,17 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 
 import httpx
 
-from analysis.explorer.app import explorer
-from analysis.explorer.assets import STATIC
-from analysis.explorer.catalogue import FACETS, FACTOR, Filter
-from analysis.explorer.guard import LOOPBACK
-from analysis.explorer.leaks import Leaks
-from analysis.explorer.offline import offline, page_of_trials
-from analysis.explorer.reading import Row
-from analysis.explorer.site import Site
-from analysis.explorer.urls import query_of
 from merge_runner.errors import UsageError
 from merge_runner.paths import refuse_another_kind
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.assets import STATIC
+from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, Filter
+from merge_runner_analysis.explorer.guard import LOOPBACK
+from merge_runner_analysis.explorer.leaks import Leaks
+from merge_runner_analysis.explorer.offline import offline, page_of_trials
+from merge_runner_analysis.explorer.reading import Row
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.urls import query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
 # The pages of an export by the first part of their path, with what their addresses may ask for.

@@ -11,14 +11,14 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 
 from markupsafe import Markup
 
-from analysis.explorer.assets import STATIC
-from analysis.explorer.display_text import visible
-from analysis.explorer.leaks import Leaks
-from analysis.explorer.pages.comparing import At, offered
-from analysis.explorer.pages.trial import trial_page
-from analysis.explorer.reading import Row
-from analysis.explorer.site import Site
-from analysis.explorer.urls import query_of
+from merge_runner_analysis.explorer.assets import STATIC
+from merge_runner_analysis.explorer.display_text import visible
+from merge_runner_analysis.explorer.leaks import Leaks
+from merge_runner_analysis.explorer.pages.comparing import At, offered
+from merge_runner_analysis.explorer.pages.trial import trial_page
+from merge_runner_analysis.explorer.reading import Row
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.urls import query_of
 
 # What a template marks, and forms but these.
 _SERVED = r'<(\w+)\b[^>]*\sdata-served\b[^>]*>.*?</\1>|<form\b(?![^>]*"(?:{})").*?</form>'

@@ -13,8 +13,8 @@ from math import ceil, floor, log10
 from statistics import quantiles
 from typing import Any
 
-from analysis.explorer.reading import Row
 from merge_runner.records import SIDES
+from merge_runner_analysis.explorer.reading import Row
 
 SPARK_WIDTH, SPARK_HEIGHT = 96.0, 22.0
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import duckdb
 
-from analysis.explorer.database_copy import Copies
-from analysis.explorer.display_text import csv_cell, text_of
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.results.database import SETTINGS, fetched, in_memory
 from merge_runner.results.store import answering
 from merge_runner.text_safety import csv_writer, first_line, in_spreadsheet
+from merge_runner_analysis.explorer.database_copy import Copies
+from merge_runner_analysis.explorer.display_text import csv_cell, text_of
 
 AT_ONCE = 2
 WAITING = 8  # beside those that run: each keeps a thread of the server

@@ -9,10 +9,10 @@ from typing import Any
 
 import duckdb
 
-from analysis.explorer.catalogue import SEVERAL, Catalogue, Filter
-from analysis.explorer.database_copy import Copies
-from analysis.explorer.reading import Row, records
-from analysis.explorer.snippets import Snippet, snippet
+from merge_runner_analysis.explorer.catalogue import SEVERAL, Catalogue, Filter
+from merge_runner_analysis.explorer.database_copy import Copies
+from merge_runner_analysis.explorer.reading import Row, records
+from merge_runner_analysis.explorer.snippets import Snippet, snippet
 
 PAGE = 50
 LONGEST = 65_536  # characters of a text that are searched

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import uvicorn
 
-from analysis.explorer.app import explorer
-from analysis.explorer.guard import LOOPBACK
-from analysis.explorer.reading import reading
-from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.guard import LOOPBACK
+from merge_runner_analysis.explorer.reading import reading
+from merge_runner_analysis.explorer.site import Site
 
 
 def serve(db: Path, port: int, say: Callable[[str], None], reader: str) -> None:

@@ -11,21 +11,21 @@ from pathlib import Path
 
 import jinja2
 
-from analysis.explorer.analysis_process import Computing
-from analysis.explorer.assets import STYLES
-from analysis.explorer.catalogue import Catalogue
-from analysis.explorer.conditions import condition_texts
-from analysis.explorer.database_copy import Copies
-from analysis.explorer.display_text import visible
-from analysis.explorer.glossary import sections
-from analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
-from analysis.explorer.queries import Queries
-from analysis.explorer.search import Words
-from analysis.explorer.urls import HOME, Links
-from analysis.explorer.views import clock, condition_text
-from analysis.metrics import METRICS
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
+from merge_runner_analysis.explorer.analysis_process import Computing
+from merge_runner_analysis.explorer.assets import STYLES
+from merge_runner_analysis.explorer.catalogue import Catalogue
+from merge_runner_analysis.explorer.conditions import condition_texts
+from merge_runner_analysis.explorer.database_copy import Copies
+from merge_runner_analysis.explorer.display_text import visible
+from merge_runner_analysis.explorer.glossary import sections
+from merge_runner_analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
+from merge_runner_analysis.explorer.queries import Queries
+from merge_runner_analysis.explorer.search import Words
+from merge_runner_analysis.explorer.urls import HOME, Links
+from merge_runner_analysis.explorer.views import clock, condition_text
+from merge_runner_analysis.metrics import METRICS
 
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {

@@ -9,14 +9,14 @@ from datetime import UTC, datetime, timedelta
 
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
-from analysis.data.driver_words import stand_in
-from analysis.explorer.catalogue import FACTOR, Catalogue, Filter
-from analysis.explorer.reading import Row
 from merge_runner.config import both_sides, pair_name
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.results.progress_file import Standing, read_standing
 from merge_runner.study.crossing import MODEL, PROMPT
 from merge_runner.study.file import study_files
+from merge_runner_analysis.data.driver_words import stand_in
+from merge_runner_analysis.explorer.catalogue import FACTOR, Catalogue, Filter
+from merge_runner_analysis.explorer.reading import Row
 
 OF_SWEEP = "SEMI JOIN (FROM members WHERE sweep = ?) USING (number)"
 SWEEPS = """

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from analysis.explorer.catalogue import Catalogue
-from analysis.explorer.conditions import ordered
-from analysis.explorer.views import condition_text, view_box
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, MEAN_SPEED_MPS, Condition
 from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner_analysis.explorer.catalogue import Catalogue
+from merge_runner_analysis.explorer.conditions import ordered
+from merge_runner_analysis.explorer.views import condition_text, view_box
 
 # The sizes of vehicles in the trials of drivers, the commonest last.
 SIZES = """

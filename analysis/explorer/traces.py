@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
-from analysis.explorer.reading import Row, reading, records
+from merge_runner_analysis.explorer.reading import Row, reading, records
 
 # What is drawn of a trial, each as a list; the headway is that of its first vehicle.
 MEASURES = ("first_mps", "second_mps", "headway_m")

@@ -6,17 +6,17 @@ from bisect import bisect_left
 from collections.abc import Callable
 from typing import Any
 
-from analysis.accounts.account import Account, account
-from analysis.accounts.classes import ACTED_MPS
-from analysis.accounts.course import Course
-from analysis.explorer.details import Decision, Trial
-from analysis.explorer.display_text import visible
-from analysis.explorer.reading import Row
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
 from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner_analysis.accounts.account import Account, account
+from merge_runner_analysis.accounts.classes import ACTED_MPS
+from merge_runner_analysis.accounts.course import Course
+from merge_runner_analysis.explorer.details import Decision, Trial
+from merge_runner_analysis.explorer.display_text import visible
+from merge_runner_analysis.explorer.reading import Row
 
 # Vehicles touch up to some 13 m apart: halved so often, that is less than a millimetre.
 BISECTIONS = 14

@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
-from analysis.data.reference_data import HUMAN_TRIALS
-from analysis.data.study import Group, Study
-from analysis.figures.panels import Array, Point
-from analysis.figures.styles import Style
+from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.figures.panels import Array, Point
+from merge_runner_analysis.figures.styles import Style
 
 # IEEE transactions: one column and the whole page, in inches.
 COLUMN_IN, PAGE_IN = 3.5, 7.16

@@ -7,12 +7,12 @@ from math import ceil
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.data.study import Study
-from analysis.figures.drawing import PAGE_IN, line_count, say, wrapped
-from analysis.figures.styles import driver_style
-from analysis.metrics import METRICS, Metric
-from analysis.stats.factors import Level, levels_by_factor
-from analysis.stats.measures import estimate
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.figures.drawing import PAGE_IN, line_count, say, wrapped
+from merge_runner_analysis.figures.styles import driver_style
+from merge_runner_analysis.metrics import METRICS, Metric
+from merge_runner_analysis.stats.factors import Level, levels_by_factor
+from merge_runner_analysis.stats.measures import estimate
 
 PANELS = 4
 NAME_IN, ROW_IN, AXIS_IN = 1.1, 0.2, 0.55

@@ -6,14 +6,14 @@ from itertools import count
 
 from matplotlib.figure import Figure
 
-from analysis.data.reference_data import published
-from analysis.data.study import Study
-from analysis.figures.drawing import COLUMN_IN, draw_points, key, wrapped
-from analysis.figures.panels import Point
-from analysis.figures.styles import HUMAN_STYLE, driver_style
-from analysis.names import BASELINE
-from analysis.stats.first_action import Seat, first_actions, mean, seats
-from analysis.stats.intervals import Estimate, interval
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.figures.drawing import COLUMN_IN, draw_points, key, wrapped
+from merge_runner_analysis.figures.panels import Point
+from merge_runner_analysis.figures.styles import HUMAN_STYLE, driver_style
+from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.stats.first_action import Seat, first_actions, mean, seats
+from merge_runner_analysis.stats.intervals import Estimate, interval
 
 COLUMNS = 2
 

@@ -15,8 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
-from analysis.data.study import Group, Study
-from analysis.figures.drawing import (
+from merge_runner.errors import UsageError
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.figures.drawing import (
     COLUMN_IN,
     LINE_IN,
     MISSING,
@@ -32,9 +33,9 @@ from analysis.figures.drawing import (
     velocity_text,
     wrapped,
 )
-from analysis.figures.factor_figure import figure_of_factors
-from analysis.figures.first_action_figure import figure_of_first_actions
-from analysis.figures.panels import (
+from merge_runner_analysis.figures.factor_figure import figure_of_factors
+from merge_runner_analysis.figures.first_action_figure import figure_of_first_actions
+from merge_runner_analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     Point,
     deviations,
@@ -46,13 +47,12 @@ from analysis.figures.panels import (
     published_gap_line,
     velocities_mps,
 )
-from analysis.figures.styles import HUMAN_STYLE, ORANGE, SKY_BLUE, Style, driver_style
-from analysis.figures.variant_figure import figure_2_variants
-from analysis.metrics import Metric, shown_in
-from analysis.stats.group_scores import score
-from analysis.stats.indicators import INDICATORS
-from analysis.stats.measures import human_reference, known, values
-from merge_runner.errors import UsageError
+from merge_runner_analysis.figures.styles import HUMAN_STYLE, ORANGE, SKY_BLUE, Style, driver_style
+from merge_runner_analysis.figures.variant_figure import figure_2_variants
+from merge_runner_analysis.metrics import Metric, shown_in
+from merge_runner_analysis.stats.group_scores import score
+from merge_runner_analysis.stats.indicators import INDICATORS
+from merge_runner_analysis.stats.measures import human_reference, known, values
 
 LEGEND_COLUMNS = 4
 OF_TWO = "Of two different drivers, the left vehicle is that of the one named first."

@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from analysis.data.reference_data import published
-from analysis.data.study import Group, Study, of_group
-from analysis.metrics import Bounded
-from analysis.stats.intervals import mean, proportion
-from analysis.stats.regressions import gap_design
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.study import Group, Study, of_group
+from merge_runner_analysis.metrics import Bounded
+from merge_runner_analysis.stats.intervals import mean, proportion
+from merge_runner_analysis.stats.regressions import gap_design
 
 Array = NDArray[np.float64]
 HUMAN_VELOCITIES_MPS = sorted({c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()})

@@ -9,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analysis.data.study import Group, Study
-from analysis.figures.drawing import (
+from merge_runner.prompts.blocks import title_of
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.figures.drawing import (
     LINE_IN,
     MISSING,
     PAGE_IN,
@@ -24,7 +25,7 @@ from analysis.figures.drawing import (
     velocity_text,
     wrapped,
 )
-from analysis.figures.panels import (
+from merge_runner_analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     Point,
     deviations,
@@ -36,7 +37,7 @@ from analysis.figures.panels import (
     published_gap_line,
     velocities_mps,
 )
-from analysis.figures.styles import (
+from merge_runner_analysis.figures.styles import (
     BLUE,
     GREEN,
     ORANGE,
@@ -46,8 +47,7 @@ from analysis.figures.styles import (
     Style,
     turned,
 )
-from analysis.metrics import Bounded
-from merge_runner.prompts.blocks import title_of
+from merge_runner_analysis.metrics import Bounded
 
 # Laid out by hand: many rows of equal panels need no solver. In inches.
 LABEL_IN, ROW_IN = 1.15, 0.62

@@ -18,8 +18,8 @@ from merge_runner.text_safety import say
 if TYPE_CHECKING:
     import pandas as pd
 
-    from analysis.human.archive import File
-    from analysis.human.load import Download, Report
+    from merge_runner_analysis.human.archive import File
+    from merge_runner_analysis.human.load import Download, Report
 
 INTERRUPTED = 130
 MOST_ALIKE = 20
@@ -48,10 +48,10 @@ def human_import(
     from rich.console import Console
     from rich.progress import track
 
-    from analysis.data.imported_humans import human_trials, imported
-    from analysis.human.archive import open_files
-    from analysis.human.load import import_pages, import_trials, sort_files
     from merge_runner.results.store import Store
+    from merge_runner_analysis.data.imported_humans import human_trials, imported
+    from merge_runner_analysis.human.archive import open_files
+    from merge_runner_analysis.human.load import import_pages, import_trials, sort_files
 
     try:
         with open_files(path) as files:
@@ -85,7 +85,7 @@ def human_import(
 @human_app.command("status")
 def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
     """Count the human trials, beside the published counts."""
-    from analysis.data.imported_humans import (
+    from merge_runner_analysis.data.imported_humans import (
         COUNTS,
         OUTCOMES,
         by_condition,
@@ -93,7 +93,7 @@ def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None
         human_trials,
         imported,
     )
-    from analysis.data.reference_data import HUMAN_DOI
+    from merge_runner_analysis.data.reference_data import HUMAN_DOI
 
     trials = human_trials(db) if db.exists() else None
     if as_json:
@@ -116,7 +116,7 @@ def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None
 
 
 def _counts(trials: pd.DataFrame | None) -> dict[str, object]:
-    from analysis.data.imported_humans import by_condition, by_pair, imported
+    from merge_runner_analysis.data.imported_humans import by_condition, by_pair, imported
 
     counts: dict[str, object] = {}
     if trials is not None and not trials.empty:

@@ -8,14 +8,20 @@ from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import PurePath
 
-from analysis.data.reference_data import PAIRS
-from analysis.human.archive import File, Unreadable, refuse_bombs
-from analysis.human.record import PAGE_SPEC, PAGE_SPEC_HASH, SPEC, SPEC_HASH, trial_record
-from analysis.human.trace import parse_csv
-from analysis.human.velocity_pages import condition_of, trace_of, trials_of
 from merge_runner.records import TrialRecord
 from merge_runner.results.store import Store, query
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.reference_data import PAIRS
+from merge_runner_analysis.human.archive import File, Unreadable, refuse_bombs
+from merge_runner_analysis.human.record import (
+    PAGE_SPEC,
+    PAGE_SPEC_HASH,
+    SPEC,
+    SPEC_HASH,
+    trial_record,
+)
+from merge_runner_analysis.human.trace import parse_csv
+from merge_runner_analysis.human.velocity_pages import condition_of, trace_of, trials_of
 
 BATCH = 100
 NAME = re.compile(

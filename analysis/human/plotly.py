@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.human.archive import Unreadable
+from merge_runner_analysis.human.archive import Unreadable
 
 BEGIN = b"Plotly.newPlot("
 # The types that Plotly names; the bytes of base64 are little-endian.

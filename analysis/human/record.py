@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from analysis.data.imported_humans import VELOCITY_PAGES
-from analysis.data.reference_data import HUMAN_DOI, PAIRS
-from analysis.human.archive import Unreadable
-from analysis.human.trace import Trace
 from merge_runner.records import (
     SIDES,
     Side,
@@ -20,6 +16,10 @@ from merge_runner.records import (
 )
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
 from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner_analysis.data.imported_humans import VELOCITY_PAGES
+from merge_runner_analysis.data.reference_data import HUMAN_DOI, PAIRS
+from merge_runner_analysis.human.archive import Unreadable
+from merge_runner_analysis.human.trace import Trace
 
 STATUSES: dict[str, Status] = {
     "Finished": "finished",

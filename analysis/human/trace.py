@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
-from analysis.human.archive import Unreadable
 from merge_runner.records import SIDES, Side
+from merge_runner_analysis.human.archive import Unreadable
 
 POSITIONS: dict[Side, str] = {side: f"travelled_distance.{side}" for side in SIDES}
 VELOCITIES: dict[Side, str] = {side: f"velocities.{side}" for side in SIDES}

@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from analysis.data.reference_data import PAIRS
-from analysis.human.archive import Unreadable
-from analysis.human.plotly import numbers, traces
-from analysis.human.record import END_TOLERANCE_M
-from analysis.human.trace import Trace
 from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner_analysis.data.reference_data import PAIRS
+from merge_runner_analysis.human.archive import Unreadable
+from merge_runner_analysis.human.plotly import numbers, traces
+from merge_runner_analysis.human.record import END_TOLERANCE_M
+from merge_runner_analysis.human.trace import Trace
 
 # The pages leave out the letter of a condition.
 PAGES = {f"{name.partition('_')[2]}.html": name for name in HUMAN_CONDITIONS}

@@ -50,13 +50,13 @@ def power(
     as_json: JsonOption = False,
 ) -> None:
     """Say what a study could find and what it costs; send nothing."""
-    from analysis.data.study import Study
-    from analysis.power.study import MULTIPLES, chances, times
-    from analysis.power.table import table
-    from analysis.table_format import TableFormat
-    from analysis.tables.formats import render
     from merge_runner.run.plan import Options, make_plan
     from merge_runner.run.sweep import unsent
+    from merge_runner_analysis.data.study import Study
+    from merge_runner_analysis.power.study import MULTIPLES, chances, times
+    from merge_runner_analysis.power.table import table
+    from merge_runner_analysis.table_format import TableFormat
+    from merge_runner_analysis.tables.formats import render
 
     plan = make_plan(
         study,

@@ -9,9 +9,15 @@ from functools import cache, partial
 import numpy as np
 from scipy import stats
 
-from analysis.data.study import Group
-from analysis.names import BASELINE
-from analysis.power.truths import (
+from merge_runner.config import validated
+from merge_runner.planted_effect import PlantedEffect, planted_fields
+from merge_runner.run.estimate import Estimate, typical_prompt
+from merge_runner.run.plan import Plan
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.study.crossing import Arm
+from merge_runner_analysis.data.study import Group
+from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.power.truths import (
     SPEED,
     Conditions,
     Sample,
@@ -22,16 +28,10 @@ from analysis.power.truths import (
     played,
     simulate,
 )
-from analysis.stats.indicators import ALPHA, GAP_MARGIN_M, ROBUST
-from analysis.stats.intervals import POWER
-from analysis.stats.many_fits import Holds, firth_differences, mean_gap_differences
-from analysis.stats.regressions import WHO_FIRST_TERMS
-from merge_runner.config import validated
-from merge_runner.planted_effect import PlantedEffect, planted_fields
-from merge_runner.run.estimate import Estimate, typical_prompt
-from merge_runner.run.plan import Plan
-from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.study.crossing import Arm
+from merge_runner_analysis.stats.indicators import ALPHA, GAP_MARGIN_M, ROBUST
+from merge_runner_analysis.stats.intervals import POWER
+from merge_runner_analysis.stats.many_fits import Holds, firth_differences, mean_gap_differences
+from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS
 
 MULTIPLES = (0.5, 1.0, 2.0)
 MOST = 4  # so many times the study's repetitions are looked at

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from analysis.power.study import MOST, MULTIPLES, Chance
-from analysis.stats.intervals import POWER
-from analysis.tables.model import Column, Row, Table
+from merge_runner_analysis.power.study import MOST, MULTIPLES, Chance
+from merge_runner_analysis.stats.intervals import POWER
+from merge_runner_analysis.tables.model import Column, Row, Table
 
 NOT_FINDABLE, NOTHING = "not findable", "nothing to find"
 COLUMNS = (

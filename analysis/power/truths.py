@@ -10,15 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from analysis.data.reference_data import HUMAN_GAP_SD_M, HUMAN_TRIALS, human_outcomes, published
-from analysis.data.study import Group
-from analysis.stats.ceiling import SEED
-from analysis.stats.group_scores import fits
-from analysis.stats.many_fits import Draws, Fits, firth_fits, gap_fits
-from analysis.stats.regressions import WHO_FIRST_TERMS, gap_data
 from merge_runner.planted_effect import PlantedEffect
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.reference_data import (
+    HUMAN_GAP_SD_M,
+    HUMAN_TRIALS,
+    human_outcomes,
+    published,
+)
+from merge_runner_analysis.data.study import Group
+from merge_runner_analysis.stats.ceiling import SEED
+from merge_runner_analysis.stats.group_scores import fits
+from merge_runner_analysis.stats.many_fits import Draws, Fits, firth_fits, gap_fits
+from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, gap_data
 
 SPEED = WHO_FIRST_TERMS.index("relative_velocity")
 # The emulator's script aims at gaps from 1.8 to 6.5 m, all as likely; in one condition of every

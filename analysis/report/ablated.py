@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from analysis.data.study import Group, Study
-from analysis.metrics import Metric, compared
-from analysis.stats.indicators import ALPHA
-from analysis.tables import finished_tables
-from analysis.tables.model import Row
-from analysis.tables.notes import listed
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.metrics import Metric, compared
+from merge_runner_analysis.stats.indicators import ALPHA
+from merge_runner_analysis.tables import finished_tables
+from merge_runner_analysis.tables.model import Row
+from merge_runner_analysis.tables.notes import listed
 
 DETECTABLE = (
     "That does not show that the others are equal: the table contrasts has the smallest difference "

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from analysis.data.provenance import Mismatch, Provenance, tally
-from analysis.data.study import Group, Study
-from analysis.tables.notes import equal_note
 from merge_runner.drivers.registry import MOCKS
+from merge_runner_analysis.data.provenance import Mismatch, Provenance, tally
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.tables.notes import equal_note
 
 # The share of a group's decisions above which an alarm is raised: a convention.
 MANY_FALLBACKS = 0.05

@@ -5,17 +5,19 @@ Each sentence is built from the numbers that it reports. None includes scripted 
 
 from __future__ import annotations
 
-from analysis.data.provenance import Provenance
-from analysis.data.reference_data import HUMAN_TRIALS, PAIRS
-from analysis.data.study import Group, Study
-from analysis.metrics import BOXES, Metric, shown_in
-from analysis.names import BASELINE
-from analysis.report.ablated import ablation_sentences
-from analysis.report.alarms import mismatch
-from analysis.report.unlike import unlike
-from analysis.stats.against_humans import by_known_pairs, contrast_with_humans
-from analysis.stats.group_scores import Score, fits, score, unjudged
-from analysis.stats.indicators import (
+from merge_runner.records import SIDES
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.provenance import Provenance
+from merge_runner_analysis.data.reference_data import HUMAN_TRIALS, PAIRS
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.metrics import BOXES, Metric, shown_in
+from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.report.ablated import ablation_sentences
+from merge_runner_analysis.report.alarms import mismatch
+from merge_runner_analysis.report.unlike import unlike
+from merge_runner_analysis.stats.against_humans import by_known_pairs, contrast_with_humans
+from merge_runner_analysis.stats.group_scores import Score, fits, score, unjudged
+from merge_runner_analysis.stats.indicators import (
     ALPHA,
     GAP_MARGIN_M,
     INDICATORS,
@@ -23,19 +25,17 @@ from analysis.stats.indicators import (
     Verdict,
     furthest_apart,
 )
-from analysis.stats.intervals import interval
-from analysis.stats.likeness import difference, held, mean_gain
-from analysis.stats.measures import (
+from merge_runner_analysis.stats.intervals import interval
+from merge_runner_analysis.stats.likeness import difference, held, mean_gain
+from merge_runner_analysis.stats.measures import (
     estimate,
     human_reference,
     known,
     no_human_value,
     undecided_note,
 )
-from analysis.stats.regressions import MIN_PAIRS, Regression
-from analysis.tables.notes import one_sided_note, replayed_notes
-from merge_runner.records import SIDES
-from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.stats.regressions import MIN_PAIRS, Regression
+from merge_runner_analysis.tables.notes import one_sided_note, replayed_notes
 
 NAMES = {
     "I1": "going first becomes likelier with a projected headway advantage",

@@ -9,19 +9,19 @@ from pathlib import Path
 import jinja2
 import pandas as pd
 
-from analysis.data.provenance import provenance
-from analysis.data.reference_data import published
-from analysis.data.study import Study
-from analysis.explain import Source, sources_of, sql_command
-from analysis.figures.gallery import FIGURES
-from analysis.report.alarms import alarms, posing
-from analysis.report.conclusions import not_shown, nothing, shown
-from analysis.report.design import design
-from analysis.stats.factors import levels_by_factor
-from analysis.tables.against import PAPER, against, in_paper
-from analysis.tables.formats import table_view
-from analysis.tables.model import Column, Row, Table
 from merge_runner.results.provenance import program
+from merge_runner_analysis.data.provenance import provenance
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import Source, sources_of, sql_command
+from merge_runner_analysis.figures.gallery import FIGURES
+from merge_runner_analysis.report.alarms import alarms, posing
+from merge_runner_analysis.report.conclusions import not_shown, nothing, shown
+from merge_runner_analysis.report.design import design
+from merge_runner_analysis.stats.factors import levels_by_factor
+from merge_runner_analysis.tables.against import PAPER, against, in_paper
+from merge_runner_analysis.tables.formats import table_view
+from merge_runner_analysis.tables.model import Column, Row, Table
 
 TEMPLATES = Path(__file__).with_name("templates")
 # At most so many trials are listed for a cell: a page with all of them would be unwieldy.

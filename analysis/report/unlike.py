@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from analysis.data.study import Group, Study
-from analysis.stats.contrasts import corrected
-from analysis.stats.indicators import ALPHA
-from analysis.stats.intervals import POWER, Difference
-from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions
-from analysis.tables.notes import listed
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats.contrasts import corrected
+from merge_runner_analysis.stats.indicators import ALPHA
+from merge_runner_analysis.stats.intervals import POWER, Difference
+from merge_runner_analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions
+from merge_runner_analysis.tables.notes import listed
 
 # How a sentence names each coefficient of the regressions, and its unit.
 SLOPES = {

@@ -6,15 +6,15 @@ import base64
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from analysis.data.derived_cache import finished, keep_finished
-from analysis.data.study import Study
-from analysis.figures.gallery import FIGURES, rendered, write_figures
-from analysis.report.page import report_html
-from analysis.table_format import TableFormat
-from analysis.tables import finished_tables
-from analysis.tables.formats import render
-from analysis.tables.model import Table
 from merge_runner.errors import UsageError
+from merge_runner_analysis.data.derived_cache import finished, keep_finished
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.figures.gallery import FIGURES, rendered, write_figures
+from merge_runner_analysis.report.page import report_html
+from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.tables import finished_tables
+from merge_runner_analysis.tables.formats import render
+from merge_runner_analysis.tables.model import Table
 
 
 def write_report(

@@ -12,12 +12,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from analysis.data.study import Group
-from analysis.metrics import Metric
-from analysis.stats.contrasts import contrast_cells, contrast_means, shared_cells
-from analysis.stats.intervals import Difference, difference
-from analysis.stats.measures import trials_of, undecided
-from analysis.stats.regressions import MIN_PAIRS
+from merge_runner_analysis.data.study import Group
+from merge_runner_analysis.metrics import Metric
+from merge_runner_analysis.stats.contrasts import contrast_cells, contrast_means, shared_cells
+from merge_runner_analysis.stats.intervals import Difference, difference
+from merge_runner_analysis.stats.measures import trials_of, undecided
+from merge_runner_analysis.stats.regressions import MIN_PAIRS
 
 Array = NDArray[np.float64]
 

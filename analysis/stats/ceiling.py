@@ -15,9 +15,10 @@ from functools import cache
 import numpy as np
 import pandas as pd
 
-from analysis.data.reference_data import HUMAN_GAP_SD_M, human_outcomes, published
-from analysis.stats.indicators import PAPER, ROBUST
-from analysis.stats.many_fits import (
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M, human_outcomes, published
+from merge_runner_analysis.stats.indicators import PAPER, ROBUST
+from merge_runner_analysis.stats.many_fits import (
     HEADWAYS,
     VELOCITIES,
     Array,
@@ -28,8 +29,7 @@ from analysis.stats.many_fits import (
     logit_fits,
     passes,
 )
-from analysis.stats.regressions import gap_design
-from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.stats.regressions import gap_design
 
 SEED = 260409609
 DATA_SETS = 1000

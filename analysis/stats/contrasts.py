@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
-from analysis.stats.intervals import (
+from merge_runner_analysis.stats.intervals import (
     LEVEL,
     POWER,
     Difference,

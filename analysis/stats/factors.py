@@ -9,9 +9,9 @@ from math import isnan
 
 import pandas as pd
 
-from analysis.data.study import Group, Study, in_one_study, levels_of
-from analysis.metrics import Metric
-from analysis.stats.contrasts import (
+from merge_runner_analysis.data.study import Group, Study, in_one_study, levels_of
+from merge_runner_analysis.metrics import Metric
+from merge_runner_analysis.stats.contrasts import (
     contrast_cells,
     contrast_means,
     interaction_of_means,
@@ -19,8 +19,8 @@ from analysis.stats.contrasts import (
     shared_cells,
     within,
 )
-from analysis.stats.intervals import Difference
-from analysis.stats.measures import trials_of, undecided
+from merge_runner_analysis.stats.intervals import Difference
+from merge_runner_analysis.stats.measures import trials_of, undecided
 
 Cell = tuple[str, ...]
 

@@ -16,13 +16,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from analysis.data.driver_words import has_chance
-from analysis.data.reference_data import human_outcomes
-from analysis.data.study import Group, Study, of_group
-from analysis.metrics import Bounded
-from analysis.stats.intervals import interval
-from analysis.stats.regressions import Array, unfit_for_logit
 from merge_runner.records import SIDES
+from merge_runner_analysis.data.driver_words import has_chance
+from merge_runner_analysis.data.reference_data import human_outcomes
+from merge_runner_analysis.data.study import Group, Study, of_group
+from merge_runner_analysis.metrics import Bounded
+from merge_runner_analysis.stats.intervals import interval
+from merge_runner_analysis.stats.regressions import Array, unfit_for_logit
 
 # A human pedal seldom holds a speed exactly: within this a driver holds, beyond it goes or brakes.
 HOLD_MPS2 = 0.2

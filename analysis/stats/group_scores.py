@@ -8,12 +8,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 
-from analysis.data.reference_data import published
-from analysis.data.study import Group, Study
-from analysis.stats.ceiling import Ceiling, Population, ceiling, imported_humans, published_humans
-from analysis.stats.indicators import INDICATORS, PAPER, ROBUST, Verdict, verdicts
-from analysis.stats.likeness import piecewise_constant
-from analysis.stats.regressions import Regression, gap_ols, who_first_firth, who_first_logit
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats.ceiling import (
+    Ceiling,
+    Population,
+    ceiling,
+    imported_humans,
+    published_humans,
+)
+from merge_runner_analysis.stats.indicators import INDICATORS, PAPER, ROBUST, Verdict, verdicts
+from merge_runner_analysis.stats.likeness import piecewise_constant
+from merge_runner_analysis.stats.regressions import (
+    Regression,
+    gap_ols,
+    who_first_firth,
+    who_first_logit,
+)
 
 PUBLISHED = "as published, no human traces are imported"
 BY_EYE = "by eye, the paper"

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from analysis.stats.regressions import WHO_FIRST_TERMS, Regression, VelocityPair
+from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, Regression, VelocityPair
 
 ALPHA = 0.05
 # Equivalence margin of I4: how far relative velocity alone may move the gap.

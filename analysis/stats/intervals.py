@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from analysis.metrics import Bounded
+from merge_runner_analysis.metrics import Bounded
 
 LEVEL = 0.95
 POWER = 0.8

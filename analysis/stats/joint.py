@@ -16,11 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 
-from analysis.data.reference_data import citation, published
-from analysis.data.study import Group
-from analysis.stats.group_scores import fits
-from analysis.stats.intervals import Difference
-from analysis.stats.regressions import (
+from merge_runner_analysis.data.reference_data import citation, published
+from merge_runner_analysis.data.study import Group
+from merge_runner_analysis.stats.group_scores import fits
+from merge_runner_analysis.stats.intervals import Difference
+from merge_runner_analysis.stats.regressions import (
     GAP_TERMS,
     MIN_PAIRS,
     WHO_FIRST_TERMS,

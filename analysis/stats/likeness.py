@@ -15,10 +15,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from analysis.data.study import Group, Study
-from analysis.stats import intervals
-from analysis.stats.indicators import Verdict
-from analysis.stats.intervals import Estimate, finite, mean, proportion, standard_error
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats import intervals
+from merge_runner_analysis.stats.indicators import Verdict
+from merge_runner_analysis.stats.intervals import Estimate, finite, mean, proportion, standard_error
 
 Array = NDArray[np.float64]
 

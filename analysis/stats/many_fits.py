@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import expit
 
-from analysis.stats import firth
-from analysis.stats.indicators import APART, Criterion
-from analysis.stats.regressions import (
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.stats import firth
+from merge_runner_analysis.stats.indicators import APART, Criterion
+from merge_runner_analysis.stats.regressions import (
     GAP_TERMS,
     WHO_FIRST_TERMS,
     gap_design,
     velocity_contrasts,
 )
-from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 Array = NDArray[np.float64]
 Holds = NDArray[np.bool_]

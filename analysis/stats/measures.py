@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from analysis.data.reference_data import citation, human_outcomes, published
-from analysis.data.study import Group
-from analysis.metrics import BOXES, JUDGED, HumanReference, Metric
-from analysis.stats.intervals import LEVEL, Estimate, mean, proportion
+from merge_runner_analysis.data.reference_data import citation, human_outcomes, published
+from merge_runner_analysis.data.study import Group
+from merge_runner_analysis.metrics import BOXES, JUDGED, HumanReference, Metric
+from merge_runner_analysis.stats.intervals import LEVEL, Estimate, mean, proportion
 
 PAPER = "paper_ablation_quantitative"
 

@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from analysis.stats import firth, intervals
+from merge_runner_analysis.stats import firth, intervals
 
 Array = NDArray[np.float64]
 

@@ -11,12 +11,12 @@ from functools import cache
 
 import pandas as pd
 
-from analysis.data.study import Study, of_group
-from analysis.stats.first_action import HOLD_MPS2, Seat
-from analysis.stats.indicators import ALPHA
-from analysis.stats.intervals import Estimate, proportion
-from analysis.stats.regressions import Regression, who_first_firth
 from merge_runner.records import SIDES
+from merge_runner_analysis.data.study import Study, of_group
+from merge_runner_analysis.stats.first_action import HOLD_MPS2, Seat
+from merge_runner_analysis.stats.indicators import ALPHA
+from merge_runner_analysis.stats.intervals import Estimate, proportion
+from merge_runner_analysis.stats.regressions import Regression, who_first_firth
 
 CUES = {"projected_headway": "headway", "relative_velocity": "relative velocity"}
 

@@ -8,15 +8,20 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
-from analysis.tables.formats import value_names, value_rows
-from analysis.tables.model import Row, Table, Value, from_text, to_text
 from merge_runner.errors import unknown_name
+from merge_runner_analysis.data.derived_cache import (
+    finished,
+    keep_finished,
+    options_text,
+    present_state,
+)
+from merge_runner_analysis.tables.formats import value_names, value_rows
+from merge_runner_analysis.tables.model import Row, Table, Value, from_text, to_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from analysis.data.study import Group, Study
+    from merge_runner_analysis.data.study import Group, Study
 
 
 class Listed(NamedTuple):
@@ -104,8 +109,8 @@ OF_ASKED = "first-action"
 
 def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
     """Compute the named tables, or all of them; raises UsageError for an unknown name."""
-    from analysis.tables.against import placed
-    from analysis.tables.notes import footnoted
+    from merge_runner_analysis.tables.against import placed
+    from merge_runner_analysis.tables.notes import footnoted
 
     made = [_with_unjudged(_made(name, study), study) for name in _valid(names)]
     return [placed(footnoted(table, study), study) for table in made]
@@ -150,7 +155,7 @@ def finished_tables(
     # A name may be given twice; the table is computed once.
     missing = [name for name in dict.fromkeys(wanted) if name not in found]
     if missing:
-        from analysis.data.study import Study
+        from merge_runner_analysis.data.study import Study
 
         study = study or Study(*chosen)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
@@ -167,7 +172,7 @@ def table(study: Study | Path | str, name: str) -> pd.DataFrame:
     """
     import pandas as pd
 
-    from analysis.data.study import Study
+    from merge_runner_analysis.data.study import Study
 
     read = study if isinstance(study, Study) else Study(study)
     (made,) = make_tables(read, [name])
@@ -191,6 +196,6 @@ def _valid(names: Sequence[str]) -> Sequence[str]:
 
 
 def _made(name: str, study: Study) -> Table:
-    module = import_module(f"analysis.tables.{TABLES[name].module}")
+    module = import_module(f"merge_runner_analysis.tables.{TABLES[name].module}")
     maker: Callable[[Study], Table] = getattr(module, name.replace("-", "_"))
     return replace(maker(study), number=TABLES[name].number)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from analysis.data.study import Group, Study
-from analysis.metrics import RULES_NOTE, HumanReference, Metric, intervals_of, shown_in
-from analysis.stats.group_scores import score
-from analysis.stats.indicators import INDICATORS
-from analysis.stats.measures import (
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.metrics import RULES_NOTE, HumanReference, Metric, intervals_of, shown_in
+from merge_runner_analysis.stats.group_scores import score
+from merge_runner_analysis.stats.indicators import INDICATORS
+from merge_runner_analysis.stats.measures import (
     estimate_or_reference,
     no_human_value,
     outcomes_note,
     undecided_note,
 )
-from analysis.tables.indicators import (
+from merge_runner_analysis.tables.indicators import (
     RULES,
     ceiling_values,
     score_note,
@@ -20,8 +20,8 @@ from analysis.tables.indicators import (
     verdict_note,
     verdict_values,
 )
-from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
-from analysis.tables.notes import (
+from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.notes import (
     ceiling_notes,
     intermittency_notes,
     listed,

@@ -7,14 +7,14 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.data.reference_data import citation, published
-from analysis.data.study import Group, Study
-from analysis.metrics import shown_in
-from analysis.names import HUMAN
-from analysis.stats.indicators import INDICATORS
-from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
+from merge_runner_analysis.data.reference_data import citation, published
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.metrics import shown_in
+from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.stats.indicators import INDICATORS
+from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
 PAPER = "paper"
 # The drivers that have rows in the paper.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from analysis.data.load import ANSWERED
-from analysis.data.provenance import ANSWERS, Tally, tally
-from analysis.data.study import Group, Study
-from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
-from analysis.tables.notes import sample_notes
 from merge_runner.served_model import sql_of
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.load import ANSWERED
+from merge_runner_analysis.data.provenance import ANSWERS, Tally, tally
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.notes import sample_notes
 
 NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
 FALLBACK = (

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from analysis.data.reference_data import citation, published
-from analysis.data.study import Group, Study
-from analysis.metrics import shown_in
-from analysis.stats.measures import values
-from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
-from analysis.tables.notes import measured_notes, sample_notes
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.reference_data import citation, published
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.metrics import shown_in
+from merge_runner_analysis.stats.measures import values
+from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.notes import measured_notes, sample_notes
 
 # Quartiles, since the human times are published as these; named as the columns of that file.
 QUARTILES = {"crt_q1_s": 0.25, "crt_median_s": 0.5, "crt_q3_s": 0.75}

@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from math import isinf
 
-from analysis.data.study import Group, Study, in_one_study
-from analysis.metrics import JUDGED, RULES_NOTE, Metric, compared
-from analysis.names import BASELINE, HUMAN
-from analysis.stats.against_humans import by_known_pairs, contrast_with_humans
-from analysis.stats.contrasts import contrast_cells, contrast_means, corrected, shared_cells
-from analysis.stats.intervals import Difference
-from analysis.stats.joint import NO_PAIRS
-from analysis.stats.measures import known, outcomes_note, trials_of, undecided
-from analysis.tables.model import Column, Row, Table
-from analysis.tables.notes import listed, replayed_notes, sample_notes
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.study import Group, Study, in_one_study
+from merge_runner_analysis.metrics import JUDGED, RULES_NOTE, Metric, compared
+from merge_runner_analysis.names import BASELINE, HUMAN
+from merge_runner_analysis.stats.against_humans import by_known_pairs, contrast_with_humans
+from merge_runner_analysis.stats.contrasts import (
+    contrast_cells,
+    contrast_means,
+    corrected,
+    shared_cells,
+)
+from merge_runner_analysis.stats.intervals import Difference
+from merge_runner_analysis.stats.joint import NO_PAIRS
+from merge_runner_analysis.stats.measures import known, outcomes_note, trials_of, undecided
+from merge_runner_analysis.tables.model import Column, Row, Table
+from merge_runner_analysis.tables.notes import listed, replayed_notes, sample_notes
 
 # The columns that rest on human outcomes, in rows whose metric does.
 COLUMNS = ("difference", "ci", "p", "p_holm", "p_bh", "n", "n_reference")

@@ -1,20 +1,27 @@
 """Whether drivers differ from humans, by interactions with the source in a joint model.
 
-For the model and its errors see ``analysis.stats.joint``.
+For the model and its errors see ``merge_runner_analysis.stats.joint``.
 """
 
 from __future__ import annotations
 
 from math import isinf
 
-from analysis.data.study import Group, Study
-from analysis.names import BASELINE
-from analysis.stats.intervals import Difference
-from analysis.stats.joint import GAP, NARROW, WHO_FIRST, Interaction, interactions, pairs_known
-from analysis.stats.regressions import MIN_PAIRS
-from analysis.tables.model import Column, Row, Table, Value
-from analysis.tables.notes import replayed_notes, sample_notes
-from analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.stats.intervals import Difference
+from merge_runner_analysis.stats.joint import (
+    GAP,
+    NARROW,
+    WHO_FIRST,
+    Interaction,
+    interactions,
+    pairs_known,
+)
+from merge_runner_analysis.stats.regressions import MIN_PAIRS
+from merge_runner_analysis.tables.model import Column, Row, Table, Value
+from merge_runner_analysis.tables.notes import replayed_notes, sample_notes
+from merge_runner_analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
 
 OUTCOMES = {WHO_FIRST: "left first (logit)", GAP: "gap (m)"}
 COUNTS = {WHO_FIRST: WITH_MERGER, GAP: WITH_GAP}

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 
-from analysis.data.study import Study, levels_of
-from analysis.metrics import METRICS, RULES_NOTE, Metric, intervals_of
-from analysis.stats.contrasts import corrected
-from analysis.stats.factors import (
+from merge_runner.registry import require
+from merge_runner_analysis.data.study import Study, levels_of
+from merge_runner_analysis.metrics import METRICS, RULES_NOTE, Metric, intervals_of
+from merge_runner_analysis.stats.contrasts import corrected
+from merge_runner_analysis.stats.factors import (
     Level,
     balance,
     difference,
@@ -17,11 +18,10 @@ from analysis.stats.factors import (
     interaction,
     levels_by_factor,
 )
-from analysis.stats.intervals import Difference
-from analysis.stats.measures import estimate, undecided_note
-from analysis.tables.model import Column, Kind, Row, Table, Value
-from analysis.tables.notes import sample_notes
-from merge_runner.registry import require
+from merge_runner_analysis.stats.intervals import Difference
+from merge_runner_analysis.stats.measures import estimate, undecided_note
+from merge_runner_analysis.tables.model import Column, Kind, Row, Table, Value
+from merge_runner_analysis.tables.notes import sample_notes
 
 DIFFERENCES = (
     "differences are from the reference, the level that stands first, in the cells that both have "

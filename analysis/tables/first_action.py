@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from analysis.data.reference_data import citation, published
-from analysis.data.study import Group, Study
-from analysis.stats.first_action import (
+from merge_runner_analysis.data.reference_data import citation, published
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats.first_action import (
     HOLD_MPS2,
     Clustered,
     exchange_rate,
@@ -20,8 +20,8 @@ from analysis.stats.first_action import (
     seats,
     slope,
 )
-from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
-from analysis.tables.notes import repeated_note, sample_notes
+from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.notes import repeated_note, sample_notes
 
 ENDED = "status <> 'failed'"
 FILE = "human_first_actions"

@@ -14,11 +14,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import accumulate, takewhile
 
-from analysis.table_format import TableFormat
-from analysis.tables.model import Column, Row, Table, Value
 from merge_runner.errors import unknown_name
 from merge_runner.prompts.blocks import title_of
 from merge_runner.text_safety import csv_writer, in_spreadsheet
+from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
 MISSING = "–"
 BETWEEN = "   "

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-from analysis.data.study import Group, Study
-from analysis.metrics import RULES_NOTE, HumanReference, Metric, shown_in
-from analysis.stats.group_scores import Score, score, total, unjudged
-from analysis.stats.indicators import GAP_MARGIN_M, INDICATORS, TESTED, Verdict, disagree
-from analysis.stats.likeness import difference, gains, held, mean_gain
-from analysis.stats.measures import (
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.metrics import RULES_NOTE, HumanReference, Metric, shown_in
+from merge_runner_analysis.stats.group_scores import Score, score, total, unjudged
+from merge_runner_analysis.stats.indicators import (
+    GAP_MARGIN_M,
+    INDICATORS,
+    TESTED,
+    Verdict,
+    disagree,
+)
+from merge_runner_analysis.stats.likeness import difference, gains, held, mean_gain
+from merge_runner_analysis.stats.measures import (
     estimate_or_reference,
     no_human_value,
     outcomes_note,
     undecided_note,
 )
-from analysis.tables.model import Column, Row, Table, Value, row_of
-from analysis.tables.notes import ceiling_notes, intermittency_notes, no_ceiling, sample_notes
-from analysis.tables.profiles import gain_values
+from merge_runner_analysis.tables.model import Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.notes import (
+    ceiling_notes,
+    intermittency_notes,
+    no_ceiling,
+    sample_notes,
+)
+from merge_runner_analysis.tables.profiles import gain_values
 
 # The indicators that rest on who merged first, and the columns of their rows that do so too.
 OF_OUTCOMES = ("I1", "I2")

@@ -12,7 +12,7 @@ from math import isnan
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from analysis.data.study import Group
+    from merge_runner_analysis.data.study import Group
 
 Kind = Literal["text", "count", "number", "percent", "p", "verdict", "interval"]
 Value = str | int | float | bool | tuple[float, float] | None

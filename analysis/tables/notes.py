@@ -8,12 +8,12 @@ from functools import cache
 
 import pandas as pd
 
-from analysis.data.intermittency import RANDOM_SECONDS, STEADY_MPS, random_gain
-from analysis.data.reference_data import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
-from analysis.data.study import Group, Study
-from analysis.stats import ceiling
-from analysis.tables.model import Table
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.intermittency import RANDOM_SECONDS, STEADY_MPS, random_gain
+from merge_runner_analysis.data.reference_data import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats import ceiling
+from merge_runner_analysis.tables.model import Table
 
 
 def listed(items: Sequence[str]) -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from analysis.data.study import Group, Study, of_group
-from analysis.stats.likeness import NO_ACTION, difference, gains, held, mean_gain
-from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
-from analysis.tables.notes import intermittency_notes, sample_notes
+from merge_runner_analysis.data.study import Group, Study, of_group
+from merge_runner_analysis.stats.likeness import NO_ACTION, difference, gains, held, mean_gain
+from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.notes import intermittency_notes, sample_notes
 
 
 def velocity_profiles(study: Study) -> Table:

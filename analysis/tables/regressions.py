@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from analysis.data.reference_data import citation, published
-from analysis.data.study import Group, Study
-from analysis.stats.group_scores import fits
-from analysis.stats.indicators import GAP_MARGIN_M, equivalence_p, furthest_apart
-from analysis.stats.measures import outcomes_note
-from analysis.stats.regressions import (
+from merge_runner_analysis.data.reference_data import citation, published
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats.group_scores import fits
+from merge_runner_analysis.stats.indicators import GAP_MARGIN_M, equivalence_p, furthest_apart
+from merge_runner_analysis.stats.measures import outcomes_note
+from merge_runner_analysis.stats.regressions import (
     GAP_TERMS,
     WHO_FIRST_TERMS,
     Regression,
@@ -18,8 +18,8 @@ from analysis.stats.regressions import (
     gap_ols,
     who_first_logit,
 )
-from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
-from analysis.tables.notes import sample_notes
+from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.notes import sample_notes
 
 TERM_NAMES = {
     "intercept": "Intercept",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from analysis.data.study import Study
-from analysis.stats.first_action import HOLD_MPS2, Seat, seats
-from analysis.stats.intervals import Estimate
-from analysis.stats.words import CUES, Words
-from analysis.stats.words import words as words_of
-from analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
-from analysis.tables.notes import sample_notes
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.stats.first_action import HOLD_MPS2, Seat, seats
+from merge_runner_analysis.stats.intervals import Estimate
+from merge_runner_analysis.stats.words import CUES, Words
+from merge_runner_analysis.stats.words import words as words_of
+from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.notes import sample_notes
 
 ENDED = "status <> 'failed'"
 SHARES = {

@@ -94,9 +94,7 @@ def _told(exc: Exception) -> tuple[int, str]:
     match exc:
         case MergeRunnerError():
             return exc.exit_code, f"error: {exc}"
-        case ModuleNotFoundError(name=str(name)) if not name.startswith(
-            ("merge_runner", "analysis")
-        ):
+        case ModuleNotFoundError(name=str(name)) if not name.startswith("merge_runner"):
             text = f"error: this needs {name}, which is not installed: pip install {name}"
             return UsageError.exit_code, text
         case OSError() if exc.errno in OUTPUT_ERRORS:

@@ -26,7 +26,6 @@ from merge_runner.errors import (
     ReplayMiss,
     SweepStopped,
 )
-from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.http_outcome import (
@@ -40,7 +39,7 @@ from merge_runner.llm.http_outcome import (
     next_wait_s,
     why_refused,
 )
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger, cost_usd
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Budget, Ledger, PaidAttempt, cost_usd
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -436,7 +435,7 @@ class LlmClient:
             with self._waiting(call, "for calls in flight to be paid, under --max-cost", idle=True):
                 paid = await self.money.set_aside(*who)
         else:
-            paid = self.money.going_on(*who, call.open.note.ledger)
+            paid = self.money.going_on(*who)
         with closing(paid):
             if rounds is None or singly:
                 outcome, record = await self._send(call, paid)

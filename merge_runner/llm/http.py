@@ -8,7 +8,7 @@ import re
 import select
 import ssl
 from base64 import b64encode
-from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
@@ -137,29 +137,6 @@ class HttpTransport:
         """Ask for anything; raises TransportFailure."""
         async with self._exchange(method, path, headers, body, timeout_s) as (reply, _):
             return await self._read(reply, most_bytes or self._most_bytes)
-
-    async def lines(
-        self, path: str, headers: Mapping[str, str], *, timeout_s: float
-    ) -> AsyncGenerator[str | RawReply]:
-        """Get a body of lines; where the status is not 200, the whole reply instead.
-
-        No part of it may take longer than ``timeout_s``. A line of more than ``most_bytes`` is cut.
-        Raises TransportFailure.
-        """
-        loop, line = asyncio.get_running_loop(), bytearray()
-        async with self._exchange("GET", path, headers, b"", timeout_s) as (reply, limit):
-            if reply.status_code != 200:
-                yield await self._read(reply, self._most_bytes)
-                return
-            async for chunk in reply.aiter_bytes():
-                limit.reschedule(loop.time() + timeout_s)
-                *ended, last = chunk.split(b"\n")
-                for part in ended:
-                    line += part[: self._most_bytes - len(line)]
-                    yield self._text(line)
-                    line.clear()
-                line += last[: self._most_bytes - len(line)]
-            yield self._text(line)
 
     @asynccontextmanager
     async def _exchange(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from decimal import Decimal
 from itertools import chain, product
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, computed_field
 
@@ -26,7 +26,7 @@ from merge_runner.config import (
     validated,
 )
 from merge_runner.drivers.pace import model_pace
-from merge_runner.drivers.registry import PROGRAMS, HumanTrials, Program
+from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
@@ -193,6 +193,11 @@ class Plan(BaseModel):
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
         return any(map(_is_scripted, self.arms))
+
+    @property
+    def is_free(self) -> bool:
+        """Whether no model costs anything."""
+        return all(entry.price == "free" for entry in self.entries.values())
 
     @property
     def is_rehearsal(self) -> bool:
@@ -378,7 +383,8 @@ def _first_decision(arm: Arm) -> Arm:
 
     Such a trial is planned, played, kept and checked as any other; its calls have the texts and the
     slots, and so the keys, of the first decisions of the study's sweep. Its source is ``seat``,
-    which tables of trials that were driven to their end leave out (``analysis.data.load.TRIALS``).
+    which tables of trials that were driven to their end leave out
+    (``merge_runner_analysis.data.load.TRIALS``).
     """
     given = arm.scenario.model_dump(exclude_unset=True)
     given["timeout_s"] = 1 / arm.scenario.prompt_rate_hz
@@ -411,7 +417,7 @@ def _axis(text: str) -> tuple[str, list[float]]:
     )
 
 
-def _replayed(arm: Arm) -> list[tuple[Program, HumanTrials]]:
+def _replayed(arm: Arm) -> list[tuple[Program, Any]]:
     """Return the programs of an arm that replay human trials, with these."""
     programs = (PROGRAMS[name] for name in {*arm.asked.values()} - {*arm.entries})
     return [(program, program.data) for program in programs if program.data is not None]

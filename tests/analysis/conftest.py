@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.commands import main
-from analysis.data.study import Study
-from analysis.stats.ceiling import ceiling
-from analysis.tables import make_tables
+from merge_runner_analysis.commands import main
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.stats.ceiling import ceiling
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import ANSWERS, Said, write_study, yielding
 from tests.harness import CONFIGURING
 
@@ -57,7 +57,7 @@ def in_process(tmp_path, monkeypatch):
 @pytest.fixture
 def few_draws(monkeypatch):
     """For tests that look at no chance: never with the studies that others read."""
-    monkeypatch.setattr("analysis.stats.ceiling.DATA_SETS", 20)
+    monkeypatch.setattr("merge_runner_analysis.stats.ceiling.DATA_SETS", 20)
     # What is kept of the published humans has another number of draws.
     ceiling.cache_clear()
     yield

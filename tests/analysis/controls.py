@@ -11,7 +11,13 @@ from functools import cache
 import numpy as np
 from scipy import stats
 
-from analysis.data.intermittency import SAMPLE_S, at_5_hz, clocked, gains, without_resistance
+from merge_runner_analysis.data.intermittency import (
+    SAMPLE_S,
+    at_5_hz,
+    clocked,
+    gains,
+    without_resistance,
+)
 
 SECONDS = 10
 PROFILES = 200

@@ -15,15 +15,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from analysis.data.reference_data import PAIRS, published
-from analysis.explorer.export import export_folder
-from analysis.human.archive import open_files
-from analysis.human.load import import_trials, sort_files
-from analysis.report.writer import write_report
 from merge_runner.config import ScenarioConfig
 from merge_runner.results.database import open_database
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.reference_data import PAIRS, published
+from merge_runner_analysis.explorer.export import export_folder
+from merge_runner_analysis.human.archive import open_files
+from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_analysis.report.writer import write_report
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import Drive, Said, as_humans, write_study, yielding
 

@@ -8,11 +8,11 @@ import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from analysis.human.archive import File
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.vehicle import advance
+from merge_runner_analysis.human.archive import File
 
 STEP_S = 0.05
 HEADER = (

@@ -12,7 +12,6 @@ from tempfile import TemporaryDirectory
 
 import duckdb
 
-from analysis.data.study import Study
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import (
     SIDES,
@@ -31,6 +30,7 @@ from merge_runner.results.store import Store, SweepRow
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner_analysis.data.study import Study
 
 SCENARIO = ScenarioConfig()
 ANSWERS = ("ok", "refusal", "truncated", "empty")

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import pytest
 
-from analysis.data.intermittency import measure_profiles
-from analysis.data.load import SPEEDS
-from analysis.data.provenance import provenance
-from analysis.data.study import Study, of_group
-from analysis.explain import explain
-from analysis.explorer.analysis_worker import home_panels
-from analysis.figures.gallery import figure_2
-from analysis.figures.variant_figure import figure_2_variants
-from analysis.human.archive import open_files
-from analysis.human.load import import_trials, sort_files
-from analysis.report.conclusions import not_shown, shown
-from analysis.stats.ceiling import published_humans
-from analysis.stats.group_scores import population, score
-from analysis.stats.indicators import Verdict
-from analysis.stats.intervals import mean
-from analysis.stats.likeness import gains
-from analysis.tables import make_tables
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.intermittency import measure_profiles
+from merge_runner_analysis.data.load import SPEEDS
+from merge_runner_analysis.data.provenance import provenance
+from merge_runner_analysis.data.study import Study, of_group
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.explorer.analysis_worker import home_panels
+from merge_runner_analysis.figures.gallery import figure_2
+from merge_runner_analysis.figures.variant_figure import figure_2_variants
+from merge_runner_analysis.human.archive import open_files
+from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_analysis.report.conclusions import not_shown, shown
+from merge_runner_analysis.stats.ceiling import published_humans
+from merge_runner_analysis.stats.group_scores import population, score
+from merge_runner_analysis.stats.indicators import Verdict
+from merge_runner_analysis.stats.intervals import mean
+from merge_runner_analysis.stats.likeness import gains
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding
 

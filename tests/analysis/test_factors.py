@@ -9,12 +9,12 @@ import duckdb
 import pytest
 from statsmodels.stats.multitest import multipletests
 
-from analysis.commands import drivers
-from analysis.data.study import Study
-from analysis.explain import explain
-from analysis.stats.factors import levels_by_factor
-from analysis.tables import make_tables
 from merge_runner.errors import UsageError
+from merge_runner_analysis.commands import drivers
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.stats.factors import levels_by_factor
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import changed, write_study, yielding
 from tests.crossed_study import PLUGIN
 

@@ -9,12 +9,15 @@ import pytest
 from matplotlib.text import Text
 from scipy import stats
 
-from analysis.data.metric_values import outcomes_with_metrics
-from analysis.data.study import Study
-from analysis.figures.gallery import distributions
-from analysis.human.archive import open_files
-from analysis.human.load import import_trials, sort_files
-from analysis.metrics import (
+from merge_runner.errors import UsageError
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.metric_values import outcomes_with_metrics
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.figures.gallery import distributions
+from merge_runner_analysis.human.archive import open_files
+from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_analysis.metrics import (
     BOXES,
     COLLISIONS,
     GAP,
@@ -26,9 +29,9 @@ from analysis.metrics import (
     register,
     shown_in,
 )
-from analysis.report.conclusions import shown
-from analysis.stats.contrasts import contrast_means
-from analysis.stats.measures import (
+from merge_runner_analysis.report.conclusions import shown
+from merge_runner_analysis.stats.contrasts import contrast_means
+from merge_runner_analysis.stats.measures import (
     counts,
     estimate,
     human_reference,
@@ -36,10 +39,7 @@ from analysis.stats.measures import (
     no_human_value,
     values,
 )
-from analysis.tables import make_tables
-from merge_runner.errors import UsageError
-from merge_runner.results.store import Store
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding
 

@@ -7,9 +7,9 @@ import re
 
 import pytest
 
-from analysis.data.study import Study
-from analysis.report.page import report_html
-from analysis.tables import make_tables
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.report.page import report_html
+from merge_runner_analysis.tables import make_tables
 from tests.analysis import odd_databases
 from tests.analysis.odd_databases import KINDS, made
 

@@ -10,12 +10,12 @@ import re
 
 import pytest
 
-from analysis.data.load import load
-from analysis.data.study import Study
-from analysis.explain import explain
-from analysis.report.design import design
-from analysis.tables import make_tables
 from merge_runner.errors import UsageError
+from merge_runner_analysis.data.load import load
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.report.design import design
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import changed
 
 pytestmark = pytest.mark.usefixtures("few_draws")

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.data.provenance import provenance
-from analysis.data.study import Study
-from analysis.explorer.pages.ablations import ablations
-from analysis.report.alarms import alarms
-from analysis.report.conclusions import not_shown, nothing, shown
-from analysis.tables import make_tables
 from merge_runner.audit.checks import not_judged
 from merge_runner.run.stored_replay import audit_database
+from merge_runner_analysis.data.provenance import provenance
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explorer.pages.ablations import ablations
+from merge_runner_analysis.report.alarms import alarms
+from merge_runner_analysis.report.conclusions import not_shown, nothing, shown
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Said, changed, write_study, yielding
 
 PROSE = Said(failure="no_array")

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.data.reference_data import HUMAN_GAP_SD_M, published
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
@@ -18,6 +17,7 @@ from merge_runner.records import FAR_BEHIND_M, SIDES, Observation, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.vehicle import advance
 from merge_runner.trial import play_trial
+from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M, published
 
 FINE = ScenarioConfig(step_s=0.05, plan_step_s=0.2)
 DRAG = FINE.model_copy(update={"resistance": "human"})

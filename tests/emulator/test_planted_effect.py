@@ -9,8 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.stats.regressions import WHO_FIRST_TERMS, who_first_logit
-from analysis.tables import table
 from merge_runner.config import PROVIDERS, ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.planted_effect import PARAMETERS, PlantedEffect, planted_fields
@@ -20,6 +18,8 @@ from merge_runner.records import SIDES, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, who_first_logit
+from merge_runner_analysis.tables import table
 
 HURRIED = "You are in a hurry."
 REPETITIONS = range(1, 201)

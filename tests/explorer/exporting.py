@@ -6,12 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from analysis.explorer.export import export_folder
+from merge_runner_analysis.explorer.export import export_folder
 
 FEW_TABLES = {
-    "analysis.explorer.pages.tables.TABLES": {"attempts": None},
-    "analysis.explorer.pages.tables.ABOUT": {"attempts": "a table"},
-    "analysis.explorer.pages.tables.FIGURES": {"ablation-matrix": "a figure"},
+    "merge_runner_analysis.explorer.pages.tables.TABLES": {"attempts": None},
+    "merge_runner_analysis.explorer.pages.tables.ABOUT": {"attempts": "a table"},
+    "merge_runner_analysis.explorer.pages.tables.FIGURES": {"ablation-matrix": "a figure"},
 }
 
 

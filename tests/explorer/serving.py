@@ -12,9 +12,9 @@ from pathlib import Path
 
 import uvicorn
 
-from analysis.explorer.app import explorer
-from analysis.explorer.server import listen
-from analysis.explorer.site import Site
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.server import listen
+from merge_runner_analysis.explorer.site import Site
 
 
 @contextmanager

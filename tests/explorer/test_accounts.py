@@ -11,10 +11,10 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.catalogue import Filter
-from analysis.explorer.site import Site
 from merge_runner.results.store import Store
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.site import Site
 from tests.analysis.accounts.crashes import CLOSING_IN, EXAMPLES, drive
 from tests.analysis.studies import as_humans, played, write_study
 

@@ -8,19 +8,19 @@ from html import unescape
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.analysis_worker import Numbers
-from analysis.explorer.app import explorer
-from analysis.explorer.charts import Kind, chart, marks
-from analysis.explorer.pictures import marker
-from analysis.explorer.site import Site
-from analysis.figures.styles import HUMAN_STYLE, MARKERS, driver_style
-from analysis.human.archive import open_files
-from analysis.human.load import import_trials, sort_files
-from analysis.metrics import GAP, RMSE
-from analysis.names import HUMAN
 from merge_runner.config import ScenarioConfig
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.explorer.analysis_worker import Numbers
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.charts import Kind, chart, marks
+from merge_runner_analysis.explorer.pictures import marker
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.figures.styles import HUMAN_STYLE, MARKERS, driver_style
+from merge_runner_analysis.human.archive import open_files
+from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_analysis.metrics import GAP, RMSE
+from merge_runner_analysis.names import HUMAN
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import Drive, write_study, yielding
 from tests.explorer.test_tables_pages import Awaited, InProcess

@@ -11,10 +11,10 @@ import pytest
 from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.catalogue import Filter
-from analysis.explorer.pages.comparing import offered
-from analysis.explorer.site import Site
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.pages.comparing import offered
+from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import Drive, as_humans, write_study
 
 HOST = "127.0.0.1:8700"

@@ -10,10 +10,10 @@ import pytest
 from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.pages import conditions
-from analysis.explorer.site import Site
-from analysis.explorer.traces import MEASURES, POINTS, read_band, read_traces
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.pages import conditions
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.traces import MEASURES, POINTS, read_band, read_traces
 from tests.analysis.studies import Drive, as_humans, write_study, yielding
 from tests.explorer.exporting import export_with_a_table
 from tests.explorer.serving import served

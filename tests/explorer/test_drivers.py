@@ -11,14 +11,14 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.catalogue import Filter
-from analysis.explorer.pages.ablations import ablations_page
-from analysis.explorer.pages.home import home_page
-from analysis.explorer.pages.trial import trial_page
-from analysis.explorer.pages.trials import filter_of, trials_page
-from analysis.explorer.site import Site
-from analysis.explorer.sweeps import list_sweeps
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.pages.ablations import ablations_page
+from merge_runner_analysis.explorer.pages.home import home_page
+from merge_runner_analysis.explorer.pages.trial import trial_page
+from merge_runner_analysis.explorer.pages.trials import filter_of, trials_page
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.sweeps import list_sweeps
 from tests.harness import FAST
 
 SMALL = ("--reps", 1, "--conditions", "L_4_0,N_0_0", "--yes", *FAST)

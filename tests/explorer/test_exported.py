@@ -11,9 +11,9 @@ import duckdb
 import pytest
 from playwright.sync_api import expect
 
-from analysis.explorer.export import export_page
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
+from merge_runner_analysis.explorer.export import export_page
 from tests.explorer.axe import serious
 from tests.explorer.exporting import export, export_with_a_table
 
@@ -171,7 +171,7 @@ def test_a_secret_leaves_the_earlier_export_as_it_was(study, tmp_path, monkeypat
 
 
 def test_of_too_many_trials_a_line_says_how_else_to_send_them(study, tmp_path, monkeypatch):
-    monkeypatch.setattr("analysis.explorer.export.MOST", 3)
+    monkeypatch.setattr("merge_runner_analysis.explorer.export.MOST", 3)
     told = "8 trials, .* for 3: .*--trials, or send study.duckdb .*view --db study.duckdb"
     with pytest.raises(UsageError, match=told):
         export(study, tmp_path / "pages")

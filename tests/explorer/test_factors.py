@@ -12,8 +12,8 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.site import Site
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.site import Site
 from tests.explorer.exporting import export_with_a_table
 
 HOST = "127.0.0.1:8700"
@@ -68,7 +68,7 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
 ASK = """
 import sys
 from pathlib import Path
-from analysis.explorer.analysis_process import Worker
+from merge_runner_analysis.explorer.analysis_process import Worker
 from merge_runner.study.parts import load_study
 
 load_study(sys.argv[2], trust=True)

@@ -8,9 +8,9 @@ from html import unescape
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.glossary import sections
-from analysis.explorer.site import Site
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.glossary import sections
+from merge_runner_analysis.explorer.site import Site
 from tests.harness import PROJECT
 
 HOST = "127.0.0.1:8700"

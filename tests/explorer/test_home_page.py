@@ -14,26 +14,26 @@ import pytest
 from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
-from analysis.data.human_counts import human_counts
-from analysis.data.reference_data import published
-from analysis.data.study import Study
-from analysis.explorer.analysis_process import Computing
-from analysis.explorer.app import explorer
-from analysis.explorer.assets import STATIC, STYLES
-from analysis.explorer.pages.home import Played, account_rows, home_page
-from analysis.explorer.site import NothingNew, Site
-from analysis.explorer.task_picture import task_picture
-from analysis.figures import SHOWS
-from analysis.figures.gallery import FIGURES as DRAWN
-from analysis.figures.styles import COLOURS
-from analysis.metrics import shown_in
-from analysis.table_format import TableFormat
-from analysis.tables import make_tables
-from analysis.tables.formats import render
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explorer.analysis_process import Computing
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.assets import STATIC, STYLES
+from merge_runner_analysis.explorer.pages.home import Played, account_rows, home_page
+from merge_runner_analysis.explorer.site import NothingNew, Site
+from merge_runner_analysis.explorer.task_picture import task_picture
+from merge_runner_analysis.figures import SHOWS
+from merge_runner_analysis.figures.gallery import FIGURES as DRAWN
+from merge_runner_analysis.figures.styles import COLOURS
+from merge_runner_analysis.metrics import shown_in
+from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.tables.formats import render
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import served
 from tests.explorer.test_charts import import_some

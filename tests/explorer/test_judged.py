@@ -9,16 +9,16 @@ import pytest
 from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.details import read_trial
-from analysis.explorer.site import Site
-from analysis.explorer.views import collision_bounds
-from analysis.human.archive import open_files
-from analysis.human.load import import_trials, sort_files
 from merge_runner.config import ScenarioConfig
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.details import read_trial
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.views import collision_bounds
+from merge_runner_analysis.human.archive import open_files
+from merge_runner_analysis.human.load import import_trials, sort_files
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import Drive, write_study
 from tests.explorer.serving import served

@@ -9,10 +9,10 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.catalogue import Filter
-from analysis.explorer.pictures import sparkline, speed_range
-from analysis.explorer.site import Site
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.pictures import sparkline, speed_range
+from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import Drive, as_humans, write_study, yielding
 from tests.explorer.exporting import export
 
@@ -125,8 +125,8 @@ def test_a_name_that_hides_something_is_neutral_where_it_is_found_to_compare_wit
 def test_a_name_that_hides_something_is_neutral_on_every_page_of_an_export(
     db, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("analysis.explorer.catalogue.PAGE", 7)
-    monkeypatch.setattr("analysis.explorer.pages.trials.PAGE", 7)
+    monkeypatch.setattr("merge_runner_analysis.explorer.catalogue.PAGE", 7)
+    monkeypatch.setattr("merge_runner_analysis.explorer.pages.trials.PAGE", 7)
     files = export(db, tmp_path / "pages", ["*"])
     assert len([*files.glob("trials-page-*.html")]) == 2
     for page in tmp_path.glob("pages/**/*.html"):

@@ -69,8 +69,8 @@ def test_a_trial_that_no_list_led_to_has_no_neighbours(page):
 
 @pytest.mark.long
 def test_the_next_page_of_the_list_follows_its_last_row(page, monkeypatch):
-    monkeypatch.setattr("analysis.explorer.catalogue.PAGE", 2)
-    monkeypatch.setattr("analysis.explorer.pages.trials.PAGE", 2)
+    monkeypatch.setattr("merge_runner_analysis.explorer.catalogue.PAGE", 2)
+    monkeypatch.setattr("merge_runner_analysis.explorer.pages.trials.PAGE", 2)
     page.goto(f"{LIST}&page=2")
     before = page.locator("tbody th a").all_inner_texts()
     page.goto(LIST)

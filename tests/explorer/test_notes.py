@@ -13,10 +13,10 @@ import pytest
 from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import MOST_NOTED, explorer
-from analysis.explorer.notes import LONGEST_NAME, LONGEST_TEXT, Notes, reader_of
-from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
+from merge_runner_analysis.explorer.app import MOST_NOTED, explorer
+from merge_runner_analysis.explorer.notes import LONGEST_NAME, LONGEST_TEXT, Notes, reader_of
+from merge_runner_analysis.explorer.site import Site
 from tests.explorer.axe import serious
 from tests.explorer.exporting import export, export_with_a_table
 from tests.explorer.hostile import HOSTILE

@@ -10,9 +10,9 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.analysis_process import Computing, Result, Worker
-from analysis.explorer.app import explorer
-from analysis.explorer.site import Site
+from merge_runner_analysis.explorer.analysis_process import Computing, Result, Worker
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.site import Site
 from tests.explorer.serving import held
 from tests.explorer.test_tables_pages import InProcess
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from analysis.explorer import queries as module
-from analysis.explorer.database_copy import Copies
-from analysis.explorer.queries import Limits, Queries
 from merge_runner.errors import UsageError
 from merge_runner.results.database import open_database
+from merge_runner_analysis.explorer import queries as module
+from merge_runner_analysis.explorer.database_copy import Copies
+from merge_runner_analysis.explorer.queries import Limits, Queries
 from tests.analysis.studies import write_study, yielding
 
 ENDLESS = "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM r) SELECT max(n) FROM r"

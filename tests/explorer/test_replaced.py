@@ -10,9 +10,9 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.site import Site
 from merge_runner.results.database import SCHEMA_VERSION
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import write_study, yielding
 
 pytestmark = pytest.mark.long

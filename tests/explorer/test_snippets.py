@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from markupsafe import Markup, escape
 
-from analysis.explorer.snippets import (
+from merge_runner_analysis.explorer.snippets import (
     LONGEST_QUERY,
     MOST_MATCHES,
     MOST_TERMS,

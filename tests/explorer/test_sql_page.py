@@ -13,13 +13,13 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.pages.sql import EXAMPLES
-from analysis.explorer.queries import Limits, QueryResult
-from analysis.explorer.site import Site
 from merge_runner.errors import UsageError
 from merge_runner.results.export import tables
 from merge_runner.results.store import query
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.pages.sql import EXAMPLES
+from merge_runner_analysis.explorer.queries import Limits, QueryResult
+from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import write_study, yielding
 from tests.harness import PROJECT
 

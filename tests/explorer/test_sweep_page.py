@@ -14,14 +14,20 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.pages import sweep as page
-from analysis.explorer.pages.trials import filter_of
-from analysis.explorer.site import Site
-from analysis.explorer.sweeps import Config, ListedSweep, Model, assessment_of, config_of
 from merge_runner.results.progress_file import remove_standing, write_standing
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.pages import sweep as page
+from merge_runner_analysis.explorer.pages.trials import filter_of
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.sweeps import (
+    Config,
+    ListedSweep,
+    Model,
+    assessment_of,
+    config_of,
+)
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import held
 from tests.run.standings import progress, runner

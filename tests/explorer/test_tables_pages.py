@@ -16,17 +16,23 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.data.study import Study
-from analysis.explain import explain
-from analysis.explorer.analysis_process import Answering, Computing, Result, Waiting, Worker
-from analysis.explorer.analysis_worker import Numbers
-from analysis.explorer.app import explorer
-from analysis.explorer.pages.ablations import ablations
-from analysis.explorer.pictures import ends_and_ticks
-from analysis.explorer.site import Site
-from analysis.metrics import METRICS, shown_in
-from analysis.tables import make_tables
 from merge_runner.errors import UsageError
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.explorer.analysis_process import (
+    Answering,
+    Computing,
+    Result,
+    Waiting,
+    Worker,
+)
+from merge_runner_analysis.explorer.analysis_worker import Numbers
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.pages.ablations import ablations
+from merge_runner_analysis.explorer.pictures import ends_and_ticks
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.metrics import METRICS, shown_in
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Said, write_study, yielding
 from tests.gate import HANGS_S
 

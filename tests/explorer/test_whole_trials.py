@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.explorer.catalogue import Filter
-from analysis.explorer.details import read_decision, read_trial, read_whole
-from analysis.explorer.pages.trial import decision_fragment, whole_panels
-from analysis.explorer.prompts import parts_of
-from analysis.explorer.site import Site
+from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.details import read_decision, read_trial, read_whole
+from merge_runner_analysis.explorer.pages.trial import decision_fragment, whole_panels
+from merge_runner_analysis.explorer.prompts import parts_of
+from merge_runner_analysis.explorer.site import Site
 
 WORDS = st.lists(st.sampled_from(["give", "way", ",", "3.5", "\n", "m/s"])).map(" ".join)
 

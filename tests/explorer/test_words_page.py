@@ -10,9 +10,9 @@ import pytest
 from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.search import PAGE
-from analysis.explorer.site import Site
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.search import PAGE
+from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import Drive, Said, write_study
 from tests.explorer.axe import serious
 from tests.explorer.serving import held

@@ -19,12 +19,11 @@ from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry, Price
 from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.ledger import Ledger, cost_usd
+from merge_runner.llm.ledger import Budget, Ledger, cost_usd
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot, Usage, canonical_json
 from tests.emulator.scenarios import SCENARIOS

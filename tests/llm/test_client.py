@@ -15,11 +15,10 @@ from merge_runner.errors import (
     TrialSuspended,
     UsageError,
 )
-from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient, Meter
 from merge_runner.llm.http_outcome import RawReply, TransportFailure
-from merge_runner.llm.ledger import Asked, Ledger
+from merge_runner.llm.ledger import Asked, Budget, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.records import Slot
 from tests.virtual_time import in_virtual_time, now_s

@@ -9,9 +9,9 @@ import json
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.site import Site
 from merge_runner.text_safety import csv_writer, in_spreadsheet
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import write_study, yielding
 
 HOST = "127.0.0.1:8700"

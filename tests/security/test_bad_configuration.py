@@ -6,11 +6,11 @@ import sys
 
 import pytest
 
-from analysis.commands import main
 from merge_runner.config import PROVIDERS, ModelEntry, ScenarioConfig
 from merge_runner.prompts.blocks import VARIANTS
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.file import StudyFile
+from merge_runner_analysis.commands import main
 
 MODEL = {
     "provider": '"local"',

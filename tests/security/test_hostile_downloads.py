@@ -11,9 +11,9 @@ from contextlib import suppress
 
 import pytest
 
-from analysis.human.archive import Unreadable, open_files
 from merge_runner.errors import UsageError
 from merge_runner.results.store import query
+from merge_runner_analysis.human.archive import Unreadable, open_files
 from tests.analysis.recordings import drive, write_folder, write_zip
 from tests.harness import Run, environment
 

@@ -10,7 +10,7 @@ import duckdb
 import pytest
 from aiohttp import web
 
-from analysis.report.writer import write_report
+from merge_runner_analysis.report.writer import write_report
 from tests.harness import FAST, watched
 
 KEYS = {
@@ -141,7 +141,7 @@ async def test_no_key_and_no_account_id_is_in_anything_that_a_sweep_leaves(
         runs.append(await merge_runner("recording", "info", "o3.parquet", **env))
     assert [run.code for run in runs] == [0] * len(runs), runs
     # What chance draws is of no interest here.
-    monkeypatch.setattr("analysis.stats.ceiling.DATA_SETS", 20)
+    monkeypatch.setattr("merge_runner_analysis.stats.ceiling.DATA_SETS", 20)
     results = tmp_path / "results"
     report = write_report(
         results / "merge.duckdb", None, results / "report.html", tmp_path / "files"

@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from analysis.explorer import views
-from analysis.explorer.catalogue import Filter
-from analysis.explorer.pages.computed import computed
-from analysis.explorer.pictures import Scale, marker
-from analysis.explorer.site import NotThere, Site
-from analysis.metrics import COLLISIONS
-from analysis.metrics import JOINT as JOINT_RATE
-from analysis.names import BASELINE
-from analysis.tables.formats import printed, shown_value
-from analysis.tables.model import Column, Row, Table, Value, from_text
 from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
+from merge_runner_analysis.explorer import views
+from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.pages.computed import computed
+from merge_runner_analysis.explorer.pictures import Scale, marker
+from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.metrics import COLLISIONS
+from merge_runner_analysis.metrics import JOINT as JOINT_RATE
+from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.tables.formats import printed, shown_value
+from merge_runner_analysis.tables.model import Column, Row, Table, Value, from_text
 
 # The blocks of each prompt, as its spec names them; a program has none.
 STORED = """

@@ -5,12 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from analysis.explorer.details import read_trial
-from analysis.explorer.display_text import visible
-from analysis.explorer.pages.trial import DRIVER, HUMAN, OFFERS, REPETITION, find, replayed, ribbons
-from analysis.explorer.reading import Row, reading, records
-from analysis.explorer.site import NotThere, Site
-from analysis.explorer.views import account_of
+from merge_runner_analysis.explorer.details import read_trial
+from merge_runner_analysis.explorer.display_text import visible
+from merge_runner_analysis.explorer.pages.trial import (
+    DRIVER,
+    HUMAN,
+    OFFERS,
+    REPETITION,
+    find,
+    replayed,
+    ribbons,
+)
+from merge_runner_analysis.explorer.reading import Row, reading, records
+from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.explorer.views import account_of
 
 At = tuple[str, str]
 """A trial: its name and its spec."""

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
-from analysis.explorer.analysis_process import Request, Result, Waiting
-from analysis.explorer.site import NotThere, Site
-from analysis.explorer.urls import query_of, seconds
 from merge_runner.errors import MergeRunnerError
+from merge_runner_analysis.explorer.analysis_process import Request, Result, Waiting
+from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.explorer.urls import query_of, seconds
 
 # What is kept comes within this time; what takes longer is asked for again.
 AT_ONCE_S = 0.3

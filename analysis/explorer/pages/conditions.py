@@ -8,12 +8,12 @@ from itertools import pairwise
 from math import ceil
 from typing import Any
 
-from analysis.explorer.catalogue import Filter
-from analysis.explorer.pictures import Axis, Scale
-from analysis.explorer.reading import Row
-from analysis.explorer.site import NotThere, Site, news_of
-from analysis.explorer.traces import MEASURES, read_band, read_traces
-from analysis.names import HUMAN
+from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.pictures import Axis, Scale
+from merge_runner_analysis.explorer.reading import Row
+from merge_runner_analysis.explorer.site import NotThere, Site, news_of
+from merge_runner_analysis.explorer.traces import MEASURES, read_band, read_traces
+from merge_runner_analysis.names import HUMAN
 
 # So many trials are drawn: a browser can still show them, and more would be one dark spot.
 MOST = 500

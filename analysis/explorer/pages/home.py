@@ -6,24 +6,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from analysis.data.human_counts import human_counts, published_accounts
-from analysis.data.studies import DESCRIPTIONS
-from analysis.explorer.catalogue import FACTOR, Filter
-from analysis.explorer.charts import Kind, drawn
-from analysis.explorer.conditions import ordered
-from analysis.explorer.pages.computed import Computed, computed
-from analysis.explorer.pictures import marker
-from analysis.explorer.reading import Row
-from analysis.explorer.site import NotThere, Site, news_of
-from analysis.explorer.sweeps import standing_of
-from analysis.explorer.task_picture import task_picture
-from analysis.explorer.urls import HOME
-from analysis.metrics import GAP, LEFT_FIRST
-from analysis.names import HUMAN
-from analysis.tables.formats import notes_of, printed
-from analysis.tables.model import Table, from_text
 from merge_runner.audit.checks import not_judged
 from merge_runner.study.crossing import PROMPT
+from merge_runner_analysis.data.human_counts import human_counts, published_accounts
+from merge_runner_analysis.data.studies import DESCRIPTIONS
+from merge_runner_analysis.explorer.catalogue import FACTOR, Filter
+from merge_runner_analysis.explorer.charts import Kind, drawn
+from merge_runner_analysis.explorer.conditions import ordered
+from merge_runner_analysis.explorer.pages.computed import Computed, computed
+from merge_runner_analysis.explorer.pictures import marker
+from merge_runner_analysis.explorer.reading import Row
+from merge_runner_analysis.explorer.site import NotThere, Site, news_of
+from merge_runner_analysis.explorer.sweeps import standing_of
+from merge_runner_analysis.explorer.task_picture import task_picture
+from merge_runner_analysis.explorer.urls import HOME
+from merge_runner_analysis.metrics import GAP, LEFT_FIRST
+from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.tables.formats import notes_of, printed
+from merge_runner_analysis.tables.model import Table, from_text
 
 # More groups than these cannot be told apart in a picture.
 DRAWN = 12

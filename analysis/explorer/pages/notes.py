@@ -5,15 +5,15 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Mapping, Sequence
 
-from analysis.explorer.display_text import csv_cell
-from analysis.explorer.notes import Note, tags_of
-from analysis.explorer.pages.trial import find
-from analysis.explorer.reading import Row
-from analysis.explorer.site import Site
-from analysis.explorer.urls import whole
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.text_safety import csv_writer
+from merge_runner_analysis.explorer.display_text import csv_cell
+from merge_runner_analysis.explorer.notes import Note, tags_of
+from merge_runner_analysis.explorer.pages.trial import find
+from merge_runner_analysis.explorer.reading import Row
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.urls import whole
 
 COLUMNS = ("at", "reader", "trial_id", "spec_hash", "side", "decision", "tags", "text")
 

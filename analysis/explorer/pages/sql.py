@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from analysis.explorer.display_text import visible
-from analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST, QueryResult
-from analysis.explorer.site import Site
 from merge_runner.errors import MergeRunnerError
 from merge_runner.results.export import tables, units
+from merge_runner_analysis.explorer.display_text import visible
+from merge_runner_analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST, QueryResult
+from merge_runner_analysis.explorer.site import Site
 
 NUMBERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
            "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE", "DECIMAL", "BIGNUM")  # fmt: skip

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from analysis.explorer.conditions import ordered
-from analysis.explorer.site import NothingNew, NotThere, Site, news_of
-from analysis.explorer.sweeps import Sweep, VariantCondition, duration, find_sweep, list_sweeps
-from analysis.explorer.views import prompt_text
 from merge_runner.prompts.blocks import VARIANTS
+from merge_runner_analysis.explorer.conditions import ordered
+from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site, news_of
+from merge_runner_analysis.explorer.sweeps import (
+    Sweep,
+    VariantCondition,
+    duration,
+    find_sweep,
+    list_sweeps,
+)
+from merge_runner_analysis.explorer.views import prompt_text
 
 KINDS = {
     "trial": "Trials that failed",

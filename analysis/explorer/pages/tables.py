@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from analysis.explorer.analysis_process import Request
-from analysis.explorer.pages.computed import computed
-from analysis.explorer.site import NotThere, Site
-from analysis.figures import SHOWS as FIGURES
-from analysis.table_format import TableFormat
-from analysis.tables import TABLES
-from analysis.tables.formats import render, table_view
-from analysis.tables.model import from_text
 from merge_runner.errors import StoreError
+from merge_runner_analysis.explorer.analysis_process import Request
+from merge_runner_analysis.explorer.pages.computed import computed
+from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.figures import SHOWS as FIGURES
+from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.tables import TABLES
+from merge_runner_analysis.tables.formats import render, table_view
+from merge_runner_analysis.tables.model import from_text
 
 # What each shows, for the list: their own titles are known only when they are made.
 ABOUT = {

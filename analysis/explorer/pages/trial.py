@@ -8,16 +8,22 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from analysis.accounts.account import Account
-from analysis.explorer import views
-from analysis.explorer.assets import REPLAY
-from analysis.explorer.details import Decision, Trial, read_decision, read_trial, read_whole
-from analysis.explorer.display_text import clamped, shortened
-from analysis.explorer.pictures import step_points
-from analysis.explorer.reading import Row
-from analysis.explorer.site import NotThere, Site
-from analysis.explorer.urls import whole
 from merge_runner.records import SIDES
+from merge_runner_analysis.accounts.account import Account
+from merge_runner_analysis.explorer import views
+from merge_runner_analysis.explorer.assets import REPLAY
+from merge_runner_analysis.explorer.details import (
+    Decision,
+    Trial,
+    read_decision,
+    read_trial,
+    read_whole,
+)
+from merge_runner_analysis.explorer.display_text import clamped, shortened
+from merge_runner_analysis.explorer.pictures import step_points
+from merge_runner_analysis.explorer.reading import Row
+from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.explorer.urls import whole
 
 # What is offered to lay beside a trial, and by what rule.
 HUMAN, REPETITION, DRIVER = "nearest human", "next repetition", "other driver"

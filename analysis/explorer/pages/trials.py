@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
-from analysis.explorer.pages.computed import computed
-from analysis.explorer.pictures import sparkline, speed_range
-from analysis.explorer.site import NotThere, Site, news_of
-from analysis.explorer.urls import whole
-from analysis.tables import TABLES
 from merge_runner.errors import StoreError
+from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
+from merge_runner_analysis.explorer.pages.computed import computed
+from merge_runner_analysis.explorer.pictures import sparkline, speed_range
+from merge_runner_analysis.explorer.site import NotThere, Site, news_of
+from merge_runner_analysis.explorer.urls import whole
+from merge_runner_analysis.tables import TABLES
 
 EXPORT_WAIT_S = 300.0
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from analysis.explorer.pages.trials import filter_of
-from analysis.explorer.search import KINDS, LONGEST, OWN_FACETS, Wanted
-from analysis.explorer.site import Site
-from analysis.explorer.snippets import LONGEST_QUERY, MOST_TERMS, terms_of
-from analysis.explorer.urls import whole
+from merge_runner_analysis.explorer.pages.trials import filter_of
+from merge_runner_analysis.explorer.search import KINDS, LONGEST, OWN_FACETS, Wanted
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.snippets import LONGEST_QUERY, MOST_TERMS, terms_of
+from merge_runner_analysis.explorer.urls import whole
 
 HEADINGS = {
     "tactical": "said",

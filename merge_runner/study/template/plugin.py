@@ -1,9 +1,9 @@
 """What this study adds. An edited driver is another one: its trials are played anew."""
 
-from analysis.metrics import Metric, register
 from merge_runner.drivers.base import Seat
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.records import Decision, Observation
+from merge_runner_analysis.metrics import Metric, register
 
 
 class HesitantDriver:

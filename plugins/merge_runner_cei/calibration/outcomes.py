@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from analysis.stats.regressions import gap_ols, who_first_logit
 from merge_runner.records import SIDES
+from merge_runner_analysis.stats.regressions import gap_ols, who_first_logit
 from merge_runner_cei.batch import Traces, Trial
 from merge_runner_cei.collision_interval import exact_bounds
 from merge_runner_cei.motion import Task

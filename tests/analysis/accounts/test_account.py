@@ -6,10 +6,10 @@ from math import inf
 
 import pytest
 
-from analysis.accounts.account import Mark, Prediction, account, changes_of_mind
-from analysis.accounts.classes import collision_class
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
+from merge_runner_analysis.accounts.account import Mark, Prediction, account, changes_of_mind
+from merge_runner_analysis.accounts.classes import collision_class
 from tests.analysis.accounts.crashes import EXAMPLES, NO_PLAN, course_of, crash, decided, drive
 from tests.analysis.studies import Drive, played
 

@@ -6,14 +6,14 @@ from collections import Counter
 
 import pytest
 
-from analysis.accounts.classes import COLLISIONS, collision_class, judged_at
-from analysis.accounts.course import BRAKING, SPEEDING_UP
-from analysis.data.reference_data import human_outcomes, published
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES, other_side
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner_analysis.accounts.classes import COLLISIONS, collision_class, judged_at
+from merge_runner_analysis.accounts.course import BRAKING, SPEEDING_UP
+from merge_runner_analysis.data.reference_data import human_outcomes, published
 from tests.analysis.accounts.crashes import EXAMPLES, NO_PLAN, crash
 
 INSISTING = ("N_0_0", (0.5,) * 5, (0.4,) * 5)
@@ -28,8 +28,8 @@ SCENARIOS = {
 def braked(course, condition, side, since, mps2):
     """What the world makes of a side that brakes from a sample on while the other drives on."""
     scenario, other = course.scenario, other_side(side)
-    world = World(scenario, CONDITIONS[condition], TRACK)
-    world.start_at({s: (course.positions_m[s][since], course.speeds_mps[s][since]) for s in SIDES})
+    starts = {s: (course.positions_m[s][since], course.speeds_mps[s][since]) for s in SIDES}
+    world = World(scenario, CONDITIONS[condition], TRACK, starts)
     sample = since
     while world.status is None:
         sample += 1

@@ -8,12 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.data.collision_rules import judged
-from analysis.data.load import load_trials
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import StateRow, TrialRecord, TrialSpec
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.collision_rules import judged
+from merge_runner_analysis.data.load import load_trials
 from tests.analysis.studies import Drive, write_study
 
 

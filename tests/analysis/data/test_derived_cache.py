@@ -10,15 +10,20 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from analysis.data import derived_cache as kept
-from analysis.data.derived_cache import finished, keep_finished, options_text, present_state
-from analysis.data.study import Study
-from analysis.report.writer import finished_figures
-from analysis.table_format import TableFormat
-from analysis.tables import TABLES, finished_tables, make_tables
-from analysis.tables.formats import render
-from analysis.tables.model import from_text, to_text
 from merge_runner.errors import UsageError
+from merge_runner_analysis.data import derived_cache as kept
+from merge_runner_analysis.data.derived_cache import (
+    finished,
+    keep_finished,
+    options_text,
+    present_state,
+)
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.report.writer import finished_figures
+from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.tables import TABLES, finished_tables, make_tables
+from merge_runner_analysis.tables.formats import render
+from merge_runner_analysis.tables.model import from_text, to_text
 from tests.analysis.studies import write_study, yielding
 
 # Changes of the results that tables show, and one of each table that they are made of.
@@ -56,7 +61,7 @@ def made(monkeypatch):
         names.extend(missing)
         return make_tables(study, missing)
 
-    monkeypatch.setattr("analysis.tables.make_tables", make)
+    monkeypatch.setattr("merge_runner_analysis.tables.make_tables", make)
     return names
 
 
@@ -101,20 +106,22 @@ def test_after_any_change_of_the_results_tables_are_made_anew(db, made, what):
 @pytest.mark.slow
 def test_another_program_makes_tables_anew(db, made, monkeypatch):
     for name in ("one", "one", "other", "other"):
-        monkeypatch.setattr("analysis.data.derived_cache.program", lambda name=name: name)
+        monkeypatch.setattr(
+            "merge_runner_analysis.data.derived_cache.program", lambda name=name: name
+        )
         finished_tables(db, None, ["velocity-profiles"])
     assert made == ["velocity-profiles"] * 2
 
 
 def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, monkeypatch):
     (tmp_path / "a.py").write_text("x = 1")
-    monkeypatch.setattr("analysis.data.derived_cache.PACKAGES", (tmp_path,))
+    monkeypatch.setattr("merge_runner_analysis.data.derived_cache.PACKAGES", (tmp_path,))
     found = {kept.program.__wrapped__()}
     (tmp_path / "a.py").write_text("x = 2")
     found.add(kept.program.__wrapped__())
     (tmp_path / "b.csv").write_text("1")
     found.add(kept.program.__wrapped__())
-    monkeypatch.setattr("analysis.data.derived_cache.version", lambda _: "0")
+    monkeypatch.setattr("merge_runner_analysis.data.derived_cache.version", lambda _: "0")
     found.add(kept.program.__wrapped__())
     assert len(found) == 4
 
@@ -163,8 +170,8 @@ def test_what_cannot_be_kept_is_made_and_said_once(db, made, caplog):
 
 
 def test_a_figure_is_not_taken_for_the_table_of_its_name(db, monkeypatch):
-    monkeypatch.setattr("analysis.report.writer.FIGURES", {"attempts": None})
-    monkeypatch.setattr("analysis.report.writer.rendered", lambda *_: b"<svg/>")
+    monkeypatch.setattr("merge_runner_analysis.report.writer.FIGURES", {"attempts": None})
+    monkeypatch.setattr("merge_runner_analysis.report.writer.rendered", lambda *_: b"<svg/>")
     (table,) = finished_tables(db, None, ["attempts"])
     assert finished_figures(Study(db)) == {"attempts": "PHN2Zy8+"}
     (again,) = finished_tables(db, None, ["attempts"])
@@ -174,9 +181,12 @@ def test_a_figure_is_not_taken_for_the_table_of_its_name(db, monkeypatch):
 @pytest.mark.slow
 def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
     drawn = []
-    monkeypatch.setattr("analysis.report.writer.FIGURES", {"figure2": None, "distributions": None})
     monkeypatch.setattr(
-        "analysis.report.writer.rendered", lambda *wanted: drawn.append(wanted[1:]) or b"<svg/>"
+        "merge_runner_analysis.report.writer.FIGURES", {"figure2": None, "distributions": None}
+    )
+    monkeypatch.setattr(
+        "merge_runner_analysis.report.writer.rendered",
+        lambda *wanted: drawn.append(wanted[1:]) or b"<svg/>",
     )
     first = finished_figures(Study(db))
     assert finished_figures(Study(db)) == first == dict.fromkeys(first, "PHN2Zy8+")
@@ -189,7 +199,7 @@ def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
 @pytest.mark.long
 def test_a_warm_table_waits_for_no_heavy_library(db, tmp_path):
     check = (
-        "import sys; from analysis.commands import app; "
+        "import sys; from merge_runner_analysis.commands import app; "
         "app(['tables', 'gap', '--db', sys.argv[1]], standalone_mode=False); "
         "heavy = {'pandas', 'scipy', 'statsmodels', 'matplotlib', 'numpy'} & sys.modules.keys(); "
         "assert not heavy, heavy"

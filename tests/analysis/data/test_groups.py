@@ -7,19 +7,19 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.data.driver_words import stand_in
-from analysis.data.load import load
-from analysis.data.provenance import provenance
-from analysis.data.study import Study
-from analysis.explain import explain
-from analysis.explorer.catalogue import Filter
-from analysis.explorer.site import Site
-from analysis.explorer.sweeps import list_sweeps
-from analysis.report.alarms import alarms
-from analysis.tables import make_tables
-from analysis.tables.formats import value_rows
 from merge_runner.config import both_sides
 from merge_runner.errors import UsageError
+from merge_runner_analysis.data.driver_words import stand_in
+from merge_runner_analysis.data.load import load
+from merge_runner_analysis.data.provenance import provenance
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.sweeps import list_sweeps
+from merge_runner_analysis.report.alarms import alarms
+from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.tables.formats import value_rows
 from tests.analysis.studies import changed, write_study, yielding
 
 pytestmark = pytest.mark.usefixtures("few_draws")

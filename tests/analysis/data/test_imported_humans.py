@@ -7,21 +7,21 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from analysis.data.imported_humans import (
+from merge_runner.records import StateRow, TrialRecord, TrialSpec
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.imported_humans import (
     RECORDINGS,
     by_condition,
     by_pair,
     human_trials,
     imported,
 )
-from analysis.data.reference_data import PAIRS, human_outcomes
-from analysis.data.study import Study
-from analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST
-from analysis.stats.measures import counts, known
-from analysis.tables import make_tables
-from merge_runner.records import StateRow, TrialRecord, TrialSpec
-from merge_runner.results.store import Store
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.reference_data import PAIRS, human_outcomes
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST
+from merge_runner_analysis.stats.measures import counts, known
+from merge_runner_analysis.tables import make_tables
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.data.intermittency import (
+from merge_runner.scenarios.merge.vehicle import net_acceleration
+from merge_runner_analysis.data.intermittency import (
     CUBIC_SAMPLES,
     LINE_SAMPLES,
     SAMPLE_S,
@@ -23,7 +24,6 @@ from analysis.data.intermittency import (
     residuals,
     without_resistance,
 )
-from merge_runner.scenarios.merge.vehicle import net_acceleration
 from tests.analysis import controls
 from tests.analysis.controls import (
     CELLS,

@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import analysis
-from analysis import Study, load, load_trials, table
+import merge_runner_analysis
 from merge_runner.results.store import Store
+from merge_runner_analysis import Study, load, load_trials, table
 
 
 @pytest.mark.slow
@@ -33,11 +33,14 @@ def test_a_notebook_gets_the_tables_at_full_precision(study):
 
 
 def test_the_menu_is_small_and_loads_nothing_before_it_is_used():
-    assert analysis.__all__ == ["TABLES", "Study", "load", "load_trials", "table"]
-    assert all(hasattr(analysis, name) for name in analysis.__all__)
-    modules = {module.name for module in iter_modules(analysis.__path__)}
-    assert not modules & {*analysis.__all__}, "an import of the module would hide the name"
-    code = "import sys, analysis.commands; print('pandas' in sys.modules or 'scipy' in sys.modules)"
+    assert merge_runner_analysis.__all__ == ["TABLES", "Study", "load", "load_trials", "table"]
+    assert all(hasattr(merge_runner_analysis, name) for name in merge_runner_analysis.__all__)
+    modules = {module.name for module in iter_modules(merge_runner_analysis.__path__)}
+    assert not modules & {*merge_runner_analysis.__all__}, (
+        "an import of the module would hide the name"
+    )
+    loaded = "print('pandas' in sys.modules or 'scipy' in sys.modules)"
+    code = f"import sys, merge_runner_analysis.commands; {loaded}"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
 
 

@@ -11,15 +11,15 @@ import json
 import duckdb
 import pytest
 
-from analysis.data.load import load, load_trials
-from analysis.data.provenance import provenance
-from analysis.data.study import Study
-from analysis.explain import explain
-from analysis.report.conclusions import not_shown
-from analysis.stats.group_scores import fits
-from analysis.stats.regressions import who_first_logit
-from analysis.tables import make_tables
 from merge_runner.config import ego_side
+from merge_runner_analysis.data.load import load, load_trials
+from merge_runner_analysis.data.provenance import provenance
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.report.conclusions import not_shown
+from merge_runner_analysis.stats.group_scores import fits
+from merge_runner_analysis.stats.regressions import who_first_logit
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import write_study, yielding
 
 pytestmark = pytest.mark.usefixtures("few_draws")

@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.data.reference_data import (
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.reference_data import (
     DATA,
     HUMAN_DOI,
     HUMAN_GAP_SD_M,
@@ -15,10 +16,9 @@ from analysis.data.reference_data import (
     human_outcomes,
     published,
 )
-from analysis.metrics import BOXES, GAP, JOINT, RMSE
-from analysis.stats.measures import human_reference
-from analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.metrics import BOXES, GAP, JOINT, RMSE
+from merge_runner_analysis.stats.measures import human_reference
+from merge_runner_analysis.stats.regressions import GAP_TERMS, WHO_FIRST_TERMS
 
 # Cells that only 110 trials can have given: (driver, setting, trials without an outcome).
 OF_110 = [

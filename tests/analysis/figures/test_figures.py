@@ -12,11 +12,19 @@ import pytest
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
-from analysis.data.load import load
-from analysis.data.study import Study
-from analysis.figures.drawing import PAGE_IN
-from analysis.figures.gallery import FIGURES, SETTINGS, figure_2, rendered, write_figures
-from analysis.figures.panels import (
+from merge_runner.errors import UsageError
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
+from merge_runner_analysis.data.load import load
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.figures.drawing import PAGE_IN
+from merge_runner_analysis.figures.gallery import (
+    FIGURES,
+    SETTINGS,
+    figure_2,
+    rendered,
+    write_figures,
+)
+from merge_runner_analysis.figures.panels import (
     HUMAN_VELOCITIES_MPS,
     deviations,
     gaps,
@@ -24,11 +32,9 @@ from analysis.figures.panels import (
     left_traces,
     published_gap_line,
 )
-from analysis.figures.variant_figure import figure_2_variants
-from analysis.stats.intervals import mean, proportion
-from analysis.tables import make_tables
-from merge_runner.errors import UsageError
-from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
+from merge_runner_analysis.figures.variant_figure import figure_2_variants
+from merge_runner_analysis.stats.intervals import mean, proportion
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
 

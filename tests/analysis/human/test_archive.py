@@ -7,9 +7,9 @@ import zipfile
 
 import pytest
 
-from analysis.human import archive
-from analysis.human.archive import Unreadable, open_files, refuse_bombs
 from merge_runner.errors import UsageError
+from merge_runner_analysis.human import archive
+from merge_runner_analysis.human.archive import Unreadable, open_files, refuse_bombs
 from tests.analysis.recordings import file, write_folder, write_zip
 
 FILES = {"a/experiment_4_iter_1.csv": b"first" * 50, "b/c/experiment_4_iter_2.csv": b"second"}

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.human import load
-from analysis.human.load import import_trials, sort_files
-from analysis.human.record import SPEC, SPEC_HASH, trial_record
-from analysis.human.trace import parse_csv
 from merge_runner.errors import UsageError
 from merge_runner.results.rows import rows_of
 from merge_runner.results.store import Store, query, results_digest
+from merge_runner_analysis.human import load
+from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_analysis.human.record import SPEC, SPEC_HASH, trial_record
+from merge_runner_analysis.human.trace import parse_csv
 from tests.analysis.recordings import Recording, drive, file
 
 LEFT, RIGHT = drive("L_4_0"), drive("R_-4_0", yields="left")

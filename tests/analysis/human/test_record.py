@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import pytest
 
-from analysis.human.archive import Unreadable
-from analysis.human.record import SPEC_HASH, trial_record
-from analysis.human.trace import parse_csv
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.human.archive import Unreadable
+from merge_runner_analysis.human.record import SPEC_HASH, trial_record
+from merge_runner_analysis.human.trace import parse_csv
 from tests.analysis.recordings import drive
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from analysis.human.archive import Unreadable
-from analysis.human.trace import NEEDED, parse_csv
+from merge_runner_analysis.human.archive import Unreadable
+from merge_runner_analysis.human.trace import NEEDED, parse_csv
 from tests.analysis.recordings import drive
 
 

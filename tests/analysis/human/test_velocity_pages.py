@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.data.study import Study
-from analysis.human.archive import Unreadable
-from analysis.human.load import Report, import_pages, import_trials, sort_files
-from analysis.human.velocity_pages import condition_of, trace_of, trials_of
 from merge_runner.results.store import Store, query
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.human.archive import Unreadable
+from merge_runner_analysis.human.load import Report, import_pages, import_trials, sort_files
+from merge_runner_analysis.human.velocity_pages import condition_of, trace_of, trials_of
 from tests.analysis.pages import packed, velocity_page
 from tests.analysis.recordings import drive, file, write_folder
 

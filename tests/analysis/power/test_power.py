@@ -12,11 +12,6 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from analysis.power.study import BESIDE_HUMANS, OF_AN_ARM, OF_TWO_ARMS, Case, Search, chances
-from analysis.power.truths import SPEED, Conditions, human, planted
-from analysis.stats.ceiling import ceiling, published_humans
-from analysis.stats.indicators import ROBUST, judged
-from analysis.stats.regressions import who_first_firth
 from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.planted_effect import PlantedEffect
@@ -27,6 +22,18 @@ from merge_runner.run.sweep import unsent
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner_analysis.power.study import (
+    BESIDE_HUMANS,
+    OF_AN_ARM,
+    OF_TWO_ARMS,
+    Case,
+    Search,
+    chances,
+)
+from merge_runner_analysis.power.truths import SPEED, Conditions, human, planted
+from merge_runner_analysis.stats.ceiling import ceiling, published_humans
+from merge_runner_analysis.stats.indicators import ROBUST, judged
+from merge_runner_analysis.stats.regressions import who_first_firth
 
 HUMANS = Conditions(
     tuple(each.projected_headway_m for each in HUMAN_CONDITIONS.values()),

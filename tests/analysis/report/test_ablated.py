@@ -7,10 +7,10 @@ from dataclasses import replace
 import duckdb
 import pytest
 
-from analysis.data.study import Study
-from analysis.report.ablated import ablation_sentences
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.report.ablated import ablation_sentences
 from tests.analysis.studies import Drive, write_study, yielding
 
 LEVEL = [d for d in yielding("o3", reps=2) if d.condition == "N_0_0"]

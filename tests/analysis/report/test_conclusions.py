@@ -8,15 +8,15 @@ from dataclasses import replace
 
 import pytest
 
-from analysis.data.provenance import provenance
-from analysis.data.study import Study
-from analysis.report.conclusions import not_shown, nothing, shown
-from analysis.stats.ceiling import Ceiling
-from analysis.stats.group_scores import Score, score
-from analysis.stats.indicators import TESTED
-from analysis.tables import make_tables
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.provenance import provenance
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.report.conclusions import not_shown, nothing, shown
+from merge_runner_analysis.stats.ceiling import Ceiling
+from merge_runner_analysis.stats.group_scores import Score, score
+from merge_runner_analysis.stats.indicators import TESTED
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
 pytestmark = pytest.mark.usefixtures("few_draws")

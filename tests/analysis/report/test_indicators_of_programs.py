@@ -6,13 +6,13 @@ import re
 
 import pytest
 
-from analysis.data.provenance import provenance
-from analysis.data.study import Study
-from analysis.report.conclusions import not_shown, shown
-from analysis.stats.group_scores import score
-from analysis.stats.indicators import Verdict
-from analysis.stats.likeness import gains
-from analysis.tables import make_tables
+from merge_runner_analysis.data.provenance import provenance
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.report.conclusions import not_shown, shown
+from merge_runner_analysis.stats.group_scores import score
+from merge_runner_analysis.stats.indicators import Verdict
+from merge_runner_analysis.stats.likeness import gains
+from merge_runner_analysis.tables import make_tables
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_draws")]
 PROGRAMS = ("constant", "idm", "projected-order")

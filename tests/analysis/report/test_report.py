@@ -11,16 +11,16 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from analysis.data.provenance import provenance, tally
-from analysis.data.reference_data import published
-from analysis.data.study import Study
-from analysis.figures.gallery import FIGURES, rendered
-from analysis.report.alarms import alarms
-from analysis.report.conclusions import not_shown, shown
-from analysis.report.page import report_html
-from analysis.report.writer import finished_figures, write_report
-from analysis.tables import TABLES, make_tables
 from merge_runner.errors import UsageError
+from merge_runner_analysis.data.provenance import provenance, tally
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.figures.gallery import FIGURES, rendered
+from merge_runner_analysis.report.alarms import alarms
+from merge_runner_analysis.report.conclusions import not_shown, shown
+from merge_runner_analysis.report.page import report_html
+from merge_runner_analysis.report.writer import finished_figures, write_report
+from merge_runner_analysis.tables import TABLES, make_tables
 from tests.analysis.studies import Said, write_study, yielding
 
 
@@ -53,7 +53,7 @@ def one_figure():
     name = "ablation-matrix"
     with pytest.MonkeyPatch.context() as patch:
         for place in ("report.writer", "figures.gallery"):
-            patch.setattr(f"analysis.{place}.FIGURES", {name: FIGURES[name]})
+            patch.setattr(f"merge_runner_analysis.{place}.FIGURES", {name: FIGURES[name]})
         yield
 
 

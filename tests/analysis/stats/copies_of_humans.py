@@ -13,11 +13,17 @@ import numpy as np
 import pandas as pd
 from scipy.special import expit, logit
 
-from analysis.data.human_counts import human_counts
-from analysis.stats.against_humans import contrast_by_pairs
-from analysis.stats.contrasts import contrast_means
-from analysis.stats.regressions import Regression, by_pairs, differences, gap_ols, who_first_logit
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.stats.against_humans import contrast_by_pairs
+from merge_runner_analysis.stats.contrasts import contrast_means
+from merge_runner_analysis.stats.regressions import (
+    Regression,
+    by_pairs,
+    differences,
+    gap_ols,
+    who_first_logit,
+)
 
 SEED = 260409609
 COPIES = 500

@@ -11,15 +11,15 @@ import pytest
 from scipy import stats
 from statsmodels.regression.linear_model import OLS
 
-from analysis.data.metric_values import outcomes_with_metrics
-from analysis.data.study import Group, Study
-from analysis.explain import explain
-from analysis.metrics import BOXES, GAP
-from analysis.stats.against_humans import contrast_by_pairs, contrast_with_humans
-from analysis.stats.intervals import detectable
-from analysis.tables import make_tables
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.metric_values import outcomes_with_metrics
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.metrics import BOXES, GAP
+from merge_runner_analysis.stats.against_humans import contrast_by_pairs, contrast_with_humans
+from merge_runner_analysis.stats.intervals import detectable
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.stats.copies_of_humans import (
     WORLDS,
     called_different,

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from analysis.data.reference_data import human_outcomes
-from analysis.stats.ceiling import (
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.reference_data import human_outcomes
+from merge_runner_analysis.stats.ceiling import (
     DATA_SETS,
     Ceiling,
     Population,
@@ -19,8 +20,8 @@ from analysis.stats.ceiling import (
     imported_humans,
     published_humans,
 )
-from analysis.stats.indicators import PAPER, ROBUST, verdicts
-from analysis.stats.many_fits import (
+from merge_runner_analysis.stats.indicators import PAPER, ROBUST, verdicts
+from merge_runner_analysis.stats.many_fits import (
     HEADWAYS,
     VELOCITIES,
     Draws,
@@ -29,14 +30,13 @@ from analysis.stats.many_fits import (
     logit_fits,
     passes,
 )
-from analysis.stats.regressions import (
+from merge_runner_analysis.stats.regressions import (
     Regression,
     gap_ols,
     velocity_contrasts,
     who_first_firth,
     who_first_logit,
 )
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -51,7 +51,7 @@ COLUMNS = ["projected_headway_m", "relative_velocity_mps", "status", "merged_fir
 @pytest.fixture
 def few(monkeypatch):
     """Draws as many data sets as are compared with single fits."""
-    monkeypatch.setattr("analysis.stats.ceiling.DATA_SETS", COMPARED)
+    monkeypatch.setattr("merge_runner_analysis.stats.ceiling.DATA_SETS", COMPARED)
 
 
 def judged(draws):

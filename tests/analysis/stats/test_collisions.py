@@ -5,15 +5,15 @@ from __future__ import annotations
 import duckdb
 import pytest
 
-from analysis.data.human_counts import human_counts
-from analysis.data.load import load_trials
-from analysis.data.study import Study
-from analysis.explain import explain
-from analysis.metrics import BOXES, COLLISIONS
-from analysis.stats.intervals import wilson
-from analysis.stats.measures import counts
-from analysis.tables import make_tables
 from merge_runner.config import ScenarioConfig
+from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.data.load import load_trials
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.metrics import BOXES, COLLISIONS
+from merge_runner_analysis.stats.intervals import wilson
+from merge_runner_analysis.stats.measures import counts
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
 pytestmark = pytest.mark.usefixtures("few_draws")

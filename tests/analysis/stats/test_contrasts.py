@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from analysis.stats import intervals
-from analysis.stats.contrasts import (
+from merge_runner_analysis.stats import intervals
+from merge_runner_analysis.stats.contrasts import (
     Cells,
     contrast_cells,
     contrast_means,

@@ -7,9 +7,9 @@ import pandas as pd
 import pytest
 from scipy.special import expit
 
-from analysis.data.reference_data import published
-from analysis.stats.first_action import exchange_rate, human_exchange_rate, mean, slope
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.stats.first_action import exchange_rate, human_exchange_rate, mean, slope
 
 SLOPE, SPREAD = -0.34, 0.63
 HEADWAY, VELOCITY = 1.11, -3.30

@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from analysis.stats.group_scores import total
-from analysis.stats.indicators import (
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.stats.group_scores import total
+from merge_runner_analysis.stats.indicators import (
     APART,
     GAP_MARGIN_M,
     INDICATORS,
@@ -27,8 +28,7 @@ from analysis.stats.indicators import (
     judged,
     verdicts,
 )
-from analysis.stats.regressions import Regression, Term, gap_design, gap_ols
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.stats.regressions import Regression, Term, gap_design, gap_ols
 
 SEPARATED = "separation: no finite estimate of projected_headway; see Firth's fit"
 MISSING = Regression(0, {}, "no finished trial with a gap")

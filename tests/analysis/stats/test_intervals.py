@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from statsmodels.stats.proportion import proportion_confint
 
-from analysis.stats.intervals import (
+from merge_runner_analysis.stats.intervals import (
     Estimate,
     detectable,
     difference,

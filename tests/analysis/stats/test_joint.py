@@ -13,13 +13,13 @@ from scipy.special import expit
 from statsmodels.discrete.discrete_model import Logit
 from statsmodels.regression.linear_model import OLS
 
-from analysis.data.imported_humans import RECORDINGS, imported
-from analysis.data.reference_data import human_outcomes, published
-from analysis.data.study import Group
-from analysis.stats.intervals import detectable
-from analysis.stats.joint import GAP, WHO_FIRST, interactions
-from analysis.stats.regressions import by_pairs, gap_data, gap_ols, who_first_data
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.imported_humans import RECORDINGS, imported
+from merge_runner_analysis.data.reference_data import human_outcomes, published
+from merge_runner_analysis.data.study import Group
+from merge_runner_analysis.stats.intervals import detectable
+from merge_runner_analysis.stats.joint import GAP, WHO_FIRST, interactions
+from merge_runner_analysis.stats.regressions import by_pairs, gap_data, gap_ols, who_first_data
 
 H, V = np.array([(c.projected_headway_m, c.relative_velocity_mps) for c in CONDITIONS.values()]).T
 # Between pairs of humans: SD of the logit's intercept and of the gap in m, as published (S4, S6).

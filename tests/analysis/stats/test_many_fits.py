@@ -9,8 +9,8 @@ from scipy import stats
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from analysis.stats.contrasts import contrast_means
-from analysis.stats.many_fits import (
+from merge_runner_analysis.stats.contrasts import contrast_means
+from merge_runner_analysis.stats.many_fits import (
     Draws,
     firth_differences,
     firth_fits,
@@ -18,7 +18,7 @@ from analysis.stats.many_fits import (
     logit_fits,
     mean_gap_differences,
 )
-from analysis.stats.regressions import (
+from merge_runner_analysis.stats.regressions import (
     WHO_FIRST_TERMS,
     gap_ols,
     who_first_data,

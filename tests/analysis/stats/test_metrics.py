@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.data.load import load, load_trials
-from analysis.data.study import Study
-from analysis.tables.conflicts import criticality
 from merge_runner.config import ScenarioConfig
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner_analysis.data.load import load, load_trials
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.tables.conflicts import criticality
 from tests.analysis.studies import Drive, played, write_study
 
 SIZES = ((4.5, 1.8), (8.0, 2.5), (3.0, 1.2))

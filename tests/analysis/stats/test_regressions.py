@@ -10,10 +10,10 @@ import pytest
 from firthmodels import FirthLogisticRegression, detect_separation
 from scipy import optimize, stats
 
-from analysis.data.reference_data import human_outcomes
-from analysis.stats import firth
-from analysis.stats.regressions import gap_ols, who_first_firth, who_first_logit
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.reference_data import human_outcomes
+from merge_runner_analysis.stats import firth
+from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth, who_first_logit
 
 # A library's warning must not reach the user: what it warns of is a problem in words.
 pytestmark = pytest.mark.filterwarnings("error")

@@ -5,15 +5,15 @@ from __future__ import annotations
 import duckdb
 import pytest
 
-from analysis.data.reference_data import published
-from analysis.data.study import Study
-from analysis.human.archive import open_files
-from analysis.human.load import import_trials, sort_files
-from analysis.tables import finished_tables, make_tables
-from analysis.tables.against import DRIVERS, against, in_paper
 from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.human.archive import open_files
+from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_analysis.tables import finished_tables, make_tables
+from merge_runner_analysis.tables.against import DRIVERS, against, in_paper
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding
 

@@ -9,15 +9,15 @@ import duckdb
 import numpy as np
 import pytest
 
-from analysis.data.load import load
-from analysis.data.study import Study
-from analysis.explain import explain
-from analysis.explorer.catalogue import Catalogue
-from analysis.figures.first_action_figure import figure_of_first_actions
-from analysis.tables import make_tables
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.load import load
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.explorer.catalogue import Catalogue
+from merge_runner_analysis.figures.first_action_figure import figure_of_first_actions
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, write_study, yielding
 
 MIRRORED = {

@@ -11,22 +11,22 @@ from pathlib import Path
 import duckdb
 import pytest
 
-from analysis.data.load import load
-from analysis.data.study import Study
-from analysis.explain import explain
-from analysis.explorer.pages.tables import ABOUT
-from analysis.figures import SHOWS
-from analysis.stats.group_scores import score
-from analysis.stats.intervals import proportion
-from analysis.table_format import TableFormat
-from analysis.tables import TABLES, make_tables
-from analysis.tables.against import against, in_paper
-from analysis.tables.formats import as_text, render, with_columns
-from analysis.tables.model import Column, Row, Table
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.load import load
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.explorer.pages.tables import ABOUT
+from merge_runner_analysis.figures import SHOWS
+from merge_runner_analysis.stats.group_scores import score
+from merge_runner_analysis.stats.intervals import proportion
+from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.tables import TABLES, make_tables
+from merge_runner_analysis.tables.against import against, in_paper
+from merge_runner_analysis.tables.formats import as_text, render, with_columns
+from merge_runner_analysis.tables.model import Column, Row, Table
 from tests.analysis.studies import Drive, changed, write_study, yielding
 from tests.harness import PROJECT
 

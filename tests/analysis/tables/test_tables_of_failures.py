@@ -9,11 +9,11 @@ from dataclasses import replace
 import duckdb
 import pytest
 
-from analysis.data.load import load
-from analysis.data.provenance import tally
-from analysis.data.study import Study
-from analysis.explain import explain
-from analysis.tables import make_tables
+from merge_runner_analysis.data.load import load
+from merge_runner_analysis.data.provenance import tally
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, Said, write_study, yielding
 
 FAILED = Said(failure="no_array")

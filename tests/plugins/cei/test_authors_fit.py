@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from analysis.data.load import load
 from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
+from merge_runner_analysis.data.load import load
 from merge_runner_cei.calibration import __main__ as calibration
 from merge_runner_cei.calibration.authors_fit import GRID, REACTIONS, estimated, grid_speeds
 from merge_runner_cei.parameters import OFFSETS, SETS, Base

@@ -10,9 +10,6 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.explorer.app import explorer
-from analysis.explorer.site import Site
-from analysis.human.load import import_trials, sort_files
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
@@ -20,6 +17,9 @@ from merge_runner.results.store import Store, query
 from merge_runner.run.plan import make_plan
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.trial import play_trial
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.human.load import import_trials, sort_files
 from merge_runner_cei.human_replay import HUMAN_REPLAY, HUMANS
 from tests.analysis.recordings import drive, file
 

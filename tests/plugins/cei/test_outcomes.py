@@ -5,9 +5,9 @@ import asyncio
 import numpy as np
 import pytest
 
-from analysis.data.load import load
 from merge_runner.records import canonical_json
 from merge_runner.results.store import Store
+from merge_runner_analysis.data.load import load
 from merge_runner_cei.batch import simulate
 from merge_runner_cei.calibration.outcomes import measured, summary
 from tests.plugins.cei.trials import cei, model, played, scenario, simulated
