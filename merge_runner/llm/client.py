@@ -327,12 +327,13 @@ class LlmClient:
 
     async def _call(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
-        opened = self.rounds is not None and self.rounds.open_batch(call.request.key) is not None
-        if opened:
+        if self.rounds is not None:
+            call.open = self.rounds.open_batch(call.request.key)
+        if call.open:
             self.money.begin_anew(call.order)
         with self._waiting(call, "for trials before it to end, under --max-cost", idle=True):
             await self.money.admit(call.order)
-        alone = not self.passed and not opened  # nobody waits for an answer that may take hours
+        alone = not self.passed and not call.open  # nobody waits for an answer that may take hours
         if alone:
             with self._waiting(call, f"for the first answer of {self.driver}"):
                 await self._alone.acquire()
@@ -358,13 +359,9 @@ class LlmClient:
                 f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set aside "
                 f"in the cache as 'damaged {name}', and asked again"
             )
-        earlier = self.cache.unanswered(key)
-        if self.rounds is not None:
-            call.open = self.rounds.open_batch(key)
-        opened = call.open  # the attempt that has begun there is the one that goes on
-        call.attempts = [
-            each for each in earlier if not opened or each.number < opened.note.lines[key]
-        ]
+        # The attempt that has begun in a batch is the one that goes on.
+        end = call.open.note.lines[key] if call.open else math.inf
+        call.attempts = [each for each in self.cache.unanswered(key) if each.number < end]
         call.earlier = len(call.attempts)
 
     async def _attempts(self, call: Call) -> ChatReply:

@@ -267,19 +267,18 @@ def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | 
     """Return why all calls of a run would fail, and what to set; None: they might not."""
     raw, place = outcome.raw, f"[{name}] in {REGISTRY}"
     base_url = set_base_url(name, entry)
-    if outcome.name == "bad_certificate":
-        why = (
-            "the endpoint's certificate cannot be trusted, and nothing was sent; check the base "
-            "URL, or set SSL_CERT_FILE to the certificates of whoever signed it"
-        )
+    key = " or ".join(entry.key_envs) or f"`key_env` of {place}"
+    if outcome.action == "refused":
+        why = {
+            "bad_certificate": "the endpoint's certificate cannot be trusted, and nothing was "
+            "sent; check the base URL, or set SSL_CERT_FILE to the certificates of whoever signed "
+            "it",
+            "not_allowed": f"the endpoint does not accept the key; set {key} to a valid one",
+            "unknown_model": f"the endpoint has no model {entry.id!r}; see `merge-runner models`, "
+            f"or {base_url}",
+        }[outcome.name]
     elif raw is None or outcome.of_prompt:
         return None
-    elif outcome.action == "refused" and outcome.name == "not_allowed":
-        key = " or ".join(entry.key_envs) or f"`key_env` of {place}"
-        why = f"the endpoint does not accept the key; set {key} to a valid one"
-    elif outcome.action == "refused":
-        model = f"the endpoint has no model {entry.id!r}"
-        why = f"{model}; see `merge-runner models`, or {base_url}"
     elif outcome.action == "fail" and raw.status in REQUEST_ITSELF:
         why = f"the request is refused: look at {place}"
     elif (
