@@ -103,9 +103,9 @@ class WireFormat(ABC):
     def meaning(self, error: ServerError) -> str | None:
         """Return the meaning of an error whose status does not tell it.
 
-        It is ``refusal``, ``quota_exhausted``, ``unknown_model``, ``not_allowed``,
-        ``rate_limited`` or ``request_too_large``, as in the table of calls, or ``bad_prompt``,
-        which speaks of one prompt alone.
+        As in the table of calls: ``refusal``, ``quota_exhausted``, ``unknown_model``,
+        ``not_allowed``, ``rate_limited``, ``request_too_large``, or ``bad_prompt``, which speaks
+        of one prompt alone.
         """
         return None
 

@@ -131,8 +131,7 @@ class AttemptOutcome:
     ``accept`` it as the answer, ``retry`` after ``delay_s`` (all calls of the key wait where
     ``pause``), ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the
     endpoint ``refused`` the key or the model. ``name`` is its outcome in the calls table.
-    ``of_prompt`` says that a failure is of this prompt alone. Without a ``raw`` reply the attempt
-    may have been ``charged`` all the same.
+    Without a ``raw`` reply the attempt may have been ``charged`` all the same.
     """
 
     action: Action
@@ -141,7 +140,6 @@ class AttemptOutcome:
     reading: Reading = Reading("error")  # noqa: RUF009 # frozen
     delay_s: float | None = None
     pause: bool = False
-    of_prompt: bool = False
     raw: RawReply | None = None
     charged: bool = True
 
@@ -193,14 +191,12 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
     """Classify an error, whatever was asked for."""
     name = wire.meaning(error) or known_meaning(error) or STATUSES.get(error.status, "bad_request")
     action = ACTIONS.get(name, "fail")
-    of_prompt = name == "bad_prompt"
     return AttemptOutcome(
         action,
-        "bad_request" if of_prompt else name,
+        name,
         f"HTTP {error.status}: {error.message}",
         delay_s=server_delay_s(error, wire) if action == "retry" else None,
         pause=name == "rate_limited",
-        of_prompt=of_prompt,
     )
 
 
@@ -277,7 +273,7 @@ def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | 
             "unknown_model": f"the endpoint has no model {entry.id!r}; see `merge-runner models`, "
             f"or {base_url}",
         }[outcome.name]
-    elif raw is None or outcome.of_prompt:
+    elif raw is None or outcome.name == "bad_prompt":
         return None
     elif outcome.action == "fail" and raw.status in REQUEST_ITSELF:
         why = f"the request is refused: look at {place}"
