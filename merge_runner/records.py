@@ -71,11 +71,11 @@ class Slot:
     ``decision`` counts from 0 within a trial, ``repetition`` from 1, ``sample_set`` from 0.
     """
 
-    condition: str
-    repetition: int
+    condition: Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
+    repetition: Annotated[int, Field(ge=1, le=MOST_REPETITIONS)]
     side: Side
-    decision: int
-    sample_set: int
+    decision: Annotated[int, Field(ge=0, le=MOST_STEPS)]
+    sample_set: Annotated[int, Field(ge=0)]
 
     def __str__(self) -> str:
         """The slot for a reader."""
@@ -382,23 +382,15 @@ def check_call(key: str, request: ChatRequest, attempts: tuple[Attempt, ...]) ->
 
     The last attempt is the one that was answered.
     """
-    slot = request.slot
     content = call_key(
         endpoint=request.endpoint,
         path=request.path,
         headers=request.headers,
         body=request.body,
-        slot=slot,
+        slot=request.slot,
     )
     if not key == request.key == content:
         raise ValueError("its content does not belong to its key")
-    if not (
-        NAME.fullmatch(slot.condition)
-        and 1 <= slot.repetition <= MOST_REPETITIONS
-        and 0 <= slot.decision <= MOST_STEPS
-        and slot.sample_set >= 0
-    ):
-        raise ValueError("its slot is none of a study")
     numbers = [attempt.number for attempt in attempts]
     if numbers != sorted({*numbers}):
         raise ValueError("its attempts are not numbered one after the other")

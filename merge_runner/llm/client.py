@@ -317,7 +317,6 @@ class LlmClient:
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call
 
-
         def forget(done: asyncio.Task[ChatReply]) -> None:
             del self.under_way[request.key]
             if not done.cancelled():

@@ -106,7 +106,12 @@ requests = st.builds(
     headers=st.dictionaries(texts, texts, max_size=3),
     body=texts,
     slot=st.builds(
-        Slot, texts, st.integers(), st.sampled_from(["left", "right"]), st.integers(), st.integers()
+        Slot,
+        st.from_regex("[A-Za-z0-9_.-]+", fullmatch=True),
+        st.integers(1, 100_000),
+        st.sampled_from(["left", "right"]),
+        st.integers(0, 100_000),
+        st.integers(0),
     ),
 )
 
