@@ -460,8 +460,9 @@ class LlmClient:
         began, clock_s = datetime.now(UTC), asyncio.get_running_loop().time
         began_s, timeout_s = clock_s(), min(self.entry.timeout_s, call.left_s)
         try:
-            number = len(call.attempts) + 1
-            raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
+            raw = await self.transport.send(
+                call.request, attempt=len(call.attempts) + 1, timeout_s=timeout_s
+            )
             outcome = judge(raw, self._wire)
         except TransportFailure as exc:
             outcome = AttemptOutcome(exc.action, exc.outcome, str(exc), charged=exc.sent)

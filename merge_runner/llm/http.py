@@ -173,9 +173,10 @@ class HttpTransport:
         async for piece in reply.aiter_bytes():
             body += piece
             if len(body) > most_bytes:
-                why = f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)"
                 raise TransportFailure(
-                    "reply_refused", f"the reply is refused: {why}", action="fail"
+                    "reply_refused",
+                    f"the reply is longer than {most_bytes / 1e6:g} MB (max_reply_mb)",
+                    action="fail",
                 )
         headers = {name.lower(): value for name, value in reply.headers.items()}
         # As UTF-8, the encoding of JSON, whatever a header says. A provider may echo the key in an
