@@ -17,8 +17,7 @@ import duckdb
 
 from merge_runner.errors import RecordingError, StoreError
 from merge_runner.llm.cache import CachedCall
-from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.records import ANSWERED_FIELD, SIDES
+from merge_runner.records import ANSWERED_FIELD, SIDES, canonical_json
 from merge_runner.results.database import (
     SETTINGS,
     Instance,

@@ -32,7 +32,6 @@ from diskcache.core import METADATA, MODE_RAW, UNKNOWN
 from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
-from merge_runner.llm.content_hashes import DAMAGED, check_body, check_call
 from merge_runner.llm.durable import (
     BUSY_S,
     BatchWriter,
@@ -43,7 +42,7 @@ from merge_runner.llm.durable import (
     making,
 )
 from merge_runner.llm.ledger import LedgerFile
-from merge_runner.records import Attempt, ChatRequest
+from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
 from merge_runner.text_safety import one_line
 
 FILE = "cache.db"

@@ -34,15 +34,16 @@ from pydantic import (
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import (
+from merge_runner.paths import refuse_another_kind
+from merge_runner.records import (
     DAMAGED,
     KEY_VERSION,
+    ChatRequest,
     canonical_json,
     check_body,
     check_call,
+    is_scripted,
 )
-from merge_runner.paths import refuse_another_kind
-from merge_runner.records import ChatRequest, is_scripted
 from merge_runner.results import database
 from merge_runner.results.database import Settings, append, fetched, in_memory
 from merge_runner.results.rows import Row

@@ -11,11 +11,10 @@ from statistics import fmean
 from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.content_hashes import canonical_json, without_prompt
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import cost_usd
 from merge_runner.prompts.blocks import render_prompt
-from merge_runner.records import Usage, is_scripted
+from merge_runner.records import Usage, canonical_json, is_scripted, without_prompt
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK

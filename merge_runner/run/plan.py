@@ -17,7 +17,6 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, computed_field
 
 from merge_runner.config import (
-    MOST_REPETITIONS,
     REHEARSAL,
     ModelEntry,
     ScenarioConfig,
@@ -29,11 +28,18 @@ from merge_runner.config import (
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
-from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
-from merge_runner.records import SIDES, Side, TrialSpec
+from merge_runner.records import (
+    MOST_REPETITIONS,
+    SIDES,
+    SPEC_VERSION,
+    Side,
+    TrialSpec,
+    canonical_json,
+    spec_hash,
+)
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import (
     CONDITIONS,

@@ -23,11 +23,20 @@ from merge_runner.config import ModelEntry
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed, MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import DAMAGED, make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply, judge
 from merge_runner.prompts.blocks import blocks_of
-from merge_runner.records import ANSWERS, SIDES, Attempt, Slot, TrialRecord, TrialSpec, Usage
+from merge_runner.records import (
+    ANSWERS,
+    DAMAGED,
+    SIDES,
+    Attempt,
+    Slot,
+    TrialRecord,
+    TrialSpec,
+    Usage,
+    make_request,
+)
 from merge_runner.registry import in_use, require, use
 from merge_runner.results.recording import leaves
 from merge_runner.results.rows import Stored, in_order, rows_of

@@ -32,11 +32,10 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import SHIPPED_RECORDINGS
-from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.records import TrialRecord, TrialSpec, canonical_json
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Miss, Spilled, described, explain, recorded_part

@@ -10,7 +10,6 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, JsonValue, model_validator
 
 from merge_runner.config import (
-    MOST_REPETITIONS,
     Count,
     Frozen,
     NotNegative,
@@ -22,6 +21,7 @@ from merge_runner.config import (
     validated,
 )
 from merge_runner.errors import UsageError, unknown_name
+from merge_runner.records import MOST_REPETITIONS
 from merge_runner.scenarios.merge.conditions import Condition
 
 BASELINE = "baseline"

@@ -28,8 +28,7 @@ from merge_runner.emulator.handler import (
     as_response,
 )
 from merge_runner.errors import UsageError
-from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_FIELD, SLOT_HEADER
+from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_FIELD, SLOT_HEADER, canonical_json
 from tests.mock_server.errors import ERRORS, as_error, error_body
 
 if TYPE_CHECKING:

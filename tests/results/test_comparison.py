@@ -8,8 +8,15 @@ import pytest
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.llm.content_hashes import make_request
-from merge_runner.records import Attempt, ChatReply, Slot, TrialRecord, TrialSpec, Usage
+from merge_runner.records import (
+    Attempt,
+    ChatReply,
+    Slot,
+    TrialRecord,
+    TrialSpec,
+    Usage,
+    make_request,
+)
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.rows import PLACES, rows_of, stored_rows
 from merge_runner.results.store import OF_A_RUN

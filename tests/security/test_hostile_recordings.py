@@ -17,8 +17,7 @@ import pytest
 
 from merge_runner.errors import MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import call_key, canonical_json, make_request
-from merge_runner.records import Attempt, Slot
+from merge_runner.records import Attempt, Slot, call_key, canonical_json, make_request
 from merge_runner.results.recording import COLUMNS, export_recording, import_recording, summarise
 
 CALLS = 3

@@ -20,7 +20,6 @@ from merge_runner.config import (
     is_own_host,
 )
 from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.content_hashes import LARGEST_STATUS, canonical_json
 from merge_runner.llm.formats import (
     ServerError,
     WireFormat,
@@ -38,7 +37,7 @@ from merge_runner.llm.http_outcome import (
     may_be_charged,
     status_within,
 )
-from merge_runner.records import SLOT_HEADER, ChatRequest
+from merge_runner.records import LARGEST_STATUS, SLOT_HEADER, ChatRequest, canonical_json
 
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
