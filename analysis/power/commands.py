@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -40,7 +39,7 @@ def power(
     variants: VariantsOption = None,
     sims: Annotated[
         int, typer.Option(metavar="N", help="Simulated studies of each size.", min=20)
-    ] = 200,
+    ] = 100,
     seed: Annotated[
         int, typer.Option(metavar="N", help="Another number draws other studies.", min=0)
     ] = 0,
@@ -53,8 +52,7 @@ def power(
     from merge_runner.run.plan import Options, make_plan
     from merge_runner.run.sweep import unsent
     from merge_runner_analysis.data.study import Study
-    from merge_runner_analysis.power.study import MULTIPLES, chances, times
-    from merge_runner_analysis.power.table import table
+    from merge_runner_analysis.power.study import chances, power_table
     from merge_runner_analysis.table_format import TableFormat
     from merge_runner_analysis.tables.formats import render
 
@@ -67,24 +65,17 @@ def power(
         only=levels(only or (), "--only"),
         trust=trust,
     )
-    expected = asyncio.run(
-        unsent(plan, Options(db=Path(db), cache=Path(cache)), say=say, whole=True)
-    )
+    options = Options(db=Path(db), cache=Path(cache))
+    expected = asyncio.run(unsent(plan, options, say=say, whole=True))
+    cost_usd = 0.0 if expected.free else expected.cost_usd
     played = Study(db).models if Path(db).exists() else []
-    found = {
-        "study": plan.name,
-        "driver": plan.driver,
-        "arms": len(plan.arms),
-        "trials": plan.trials,
-        "costs_usd": [times(expected.cost_usd, multiple) for multiple in MULTIPLES],
-        "free": expected.free,
-        "measured": bool(expected.measured),
-        "simulations": sims,
-        "seed": seed,
-    }
-    rows = chances(plan, expected, played, simulations=sims, seed=seed)
+    rows = list(chances(plan, cost_usd, played, sims, seed))
     if as_json:
-        found["chances"] = [asdict(row) for row in rows]
-        print_out(json.dumps(found, ensure_ascii=False))
-    else:
-        print_out(render([table(found, rows)], TableFormat.TEXT, terminal_width()))
+        facts = {"study": plan.name, "driver": plan.driver, "trials": plan.trials}
+        facts |= {"cost_usd": cost_usd, "simulations": sims, "seed": seed}
+        print_out(json.dumps(facts | {"chances": rows}, ensure_ascii=False))
+        return
+    costs = "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
+    about = f"{plan.driver}, {plan.trials} trials, {costs}; {sims} simulated studies"
+    table = power_table(f"What the study {plan.name} can find ({about})", rows)
+    print_out(render([table], TableFormat.TEXT, terminal_width()))

@@ -319,7 +319,7 @@ def _conditions(group: Group) -> str:
 
 def _limits(study: Study, group: Group) -> list[str]:
     found, texts = score(study, group), []
-    if len(group.finished) and sum(group.sizes):
+    if len(group.finished) and min(group.sizes):
         texts.append(
             f"{group.driver}: of human data sets with as many trials in each condition "
             f"({sum(group.sizes)} in all), {100 * found.ceiling.paper['I1-I4']:.0f} % pass I1 to "
@@ -340,8 +340,7 @@ def _human_limits(study: Study) -> list[str]:
     if study.imported is None:
         texts.append(
             "The human recordings are not imported: human gaps, speed deviations and profiles are "
-            "those that were published, the speed profiles have nothing to be compared with, and "
-            "the human ceiling rests on a normal approximation of the gaps."
+            "those that were published, and the speed profiles have nothing to be compared with."
         )
     elif not study.complete:
         texts.append(

@@ -293,7 +293,7 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     """Raise UsageError for a factor that there is not, and for a name that is taken."""
     parameters = sorted(known_parameters(registry.values()))
     valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
-    for name in file.factors:
+    for name in (*file.factors, *file.effect):
         require(valid, "factor", name, "models and skip stand above [factors]")
     taken = [f"drivers.{name}" for name in file.drivers if name in registry]
     taken += [f"{PERCEPTION}.{name}" for name in file.perception if name == PERFECT_ONE]

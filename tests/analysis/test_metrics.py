@@ -116,7 +116,6 @@ def test_a_metric_that_the_published_outcomes_cannot_tell_is_named(added):
 LEFT_AS_MEAN = {"value": "(merged_first = 'left')::DOUBLE", "humans_from": "outcomes"}
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_a_mean_of_published_outcomes_is_compared_with_these_after_a_part_of_an_import(
     added, partly
 ):
@@ -132,7 +131,6 @@ def test_a_mean_of_published_outcomes_is_compared_with_these_after_a_part_of_an_
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_a_sentence_on_published_outcomes_does_not_call_them_imported(added, partly):
     added(name="left_first_mean", shown=frozenset({"conclusions"}), **LEFT_AS_MEAN)
     said = " ".join(shown(Study(partly)))
@@ -183,7 +181,6 @@ def test_a_proportion_of_all_ended_trials_counts_those_of_which_it_is_known(adde
     assert counts(Study(db).models[0], slow) == (5, 10)
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_a_rate_that_is_published_without_its_conditions_is_not_tested_against_humans(added, db):
     """Nor is there a test of a median."""
     rate = {"estimator": "proportion", "value": "joint"}
@@ -197,7 +194,6 @@ def test_a_rate_that_is_published_without_its_conditions_is_not_tested_against_h
     assert not any(name.endswith("c_mps") for name in rows)
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_a_published_human_value_stands_in_the_tables_with_its_interval_and_source(added, db):
     known = HumanReference(0.5, "X (2026)", low=0.4, high=0.6)
     added(name="a_mps", label="a", word="a", human=known)

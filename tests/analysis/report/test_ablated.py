@@ -68,7 +68,6 @@ def test_without_variants_nothing_is_said(drives, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     ("change", "expected"),
     [

@@ -19,8 +19,6 @@ from merge_runner_analysis.stats.indicators import TESTED
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
-pytestmark = pytest.mark.usefixtures("few_draws")
-
 
 def texts(study):
     """What is shown, and what is not."""

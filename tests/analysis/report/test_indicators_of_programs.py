@@ -14,7 +14,7 @@ from merge_runner_analysis.stats.indicators import Verdict
 from merge_runner_analysis.stats.likeness import gains
 from merge_runner_analysis.tables import make_tables
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_draws")]
+pytestmark = pytest.mark.slow
 PROGRAMS = ("constant", "idm", "projected-order")
 # A trial that starts when the first of the two is under control, and a drag to drive against.
 DRAG = """

@@ -122,7 +122,6 @@ def test_only_the_conditions_that_both_have_count():
     )
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_a_driver_of_one_condition_is_set_against_the_human_trials_of_it(tmp_path):
     drives = [
         Drive(
@@ -143,7 +142,6 @@ def test_a_driver_of_one_condition_is_set_against_the_human_trials_of_it(tmp_pat
     assert "over all trials" not in notes
 
 
-@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize("pairs", [2, 3])
 def test_explain_lists_the_trials_of_the_shared_conditions_and_notes_say_what_has_no_test(
     pairs, tmp_path
