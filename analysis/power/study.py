@@ -17,6 +17,7 @@ from merge_runner.run.estimate import typical_prompt
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.crossing import PROMPT, Arm
+from merge_runner.study.file import Effect
 from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M, human_outcomes, published
 from merge_runner_analysis.data.study import Group
 from merge_runner_analysis.names import BASELINE
@@ -28,6 +29,7 @@ from merge_runner_analysis.stats.intervals import POWER
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
 MULTIPLES = (0.5, 1.0, 2.0, 4.0)
+SEED = 260409609
 HUMANS = "humans"
 # By question: its table, the number of a truth that it is about, and the unit of that.
 QUESTIONS = {
@@ -41,10 +43,8 @@ QUESTIONS = {
     "collisions": ("contrasts", "collided", "of 1"),
 }
 COLUMNS = (
-    *(Column(name, name) for name in ("table", "question", "arms", "against")),
-    Column("truth", "if trials go as"),
+    *(Column(n, n) for n in ("table", "question", "arms", "against", "truth", "unit")),
     Column("effect", "size", "number", 2),
-    Column("unit", "unit"),
     Column("trials", "n", "count"),
     *(Column(f"times_{m:g}", f"x{m:g}", "percent", 0) for m in MULTIPLES),
     Column("enough", "n for 80 %", "count", optional=True),
@@ -53,10 +53,9 @@ COLUMNS = (
 
 
 class Truth(NamedTuple):
-    """Coefficients of who merges first (Table III), then of the gap in m (Table IV).
+    """Coefficients of who merges first (Table III), of the gap in m (Table IV), collided share.
 
-    Gaps scatter normally by ``gap_sd_m``; ``collided`` is the share of trials that collide.
-    ``noise`` is the standard deviation of what is added to the logit of each trial.
+    Gaps scatter normally by ``gap_sd_m``, and the logit of each trial by ``noise``.
     """
 
     intercept: float
@@ -70,6 +69,10 @@ class Truth(NamedTuple):
     collided: float
     noise: float
     name: str
+
+    def plus(self, effect: Effect) -> Truth:
+        """Return the truth with an effect."""
+        return self._replace(**{name: getattr(self, name) + added for name, added in effect})
 
 
 @cache
@@ -85,22 +88,11 @@ def human() -> Truth:
     return Truth._make((*b, HUMAN_GAP_SD_M, human_trials()["collided"].mean(), 0.0, "human"))
 
 
-def planted(effect: PlantedEffect) -> Truth:
-    """Return the emulator with an effect.
-
-    Its script aims at gaps from 1.8 to 6.5 m, all as likely; in one condition of every third
-    repetition two vehicles collide.
-    """
-    gap = (4.15 + effect.x_gap_m, 0.0, 0.0, 0.0, 1.36)
-    return Truth(*effect.coefficients, *gap, 1 / 33, effect.x_noise, "as planted")
-
-
 def played(group: Group) -> Truth | None:
     """Return a driver as its trials went; None where these are too few for all coefficients."""
-    who_first, gap = fits(group).firth.terms, fits(group).ols.terms
-    if not (who_first and gap):
+    b = [term.b for fit in (fits(group).firth, fits(group).ols) for term in fit.terms.values()]
+    if len(b) < len(Truth._fields[:7]):
         return None
-    b = [term.b for term in (*who_first.values(), *gap.values())]
     design, gap_m, _ = regressions.gap_data(group.trials)
     scatter = np.linalg.norm(gap_m - design @ b[3:]) / fits(group).ols.freedom ** 0.5
     collided = group.ended["status"].eq("collided").mean()
@@ -168,60 +160,53 @@ class Case:
         return effects
 
     def chances(
-        self, conditions: Sequence[str], multiple: float, simulations: int, seed: int
+        self, conditions: Sequence[str], multiple: float, simulations: int
     ) -> dict[str, float]:
         """By question the share of simulated studies, of so many times this size, that find it."""
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(SEED)
         counts = dict.fromkeys(self.effects, 0)
         for _ in range(simulations if counts else 0):
             own = simulate(self.own, conditions, round(multiple * self.repetitions), rng)
-            other = human_trials() if self.other else None
-            if self.other and self.against != HUMANS:
-                size = round(multiple * self.other_repetitions)
-                other = simulate(self.other, conditions, size, rng)
+            other, size = None, round(multiple * self.other_repetitions)
+            if self.other:
+                other = simulate(self.other, conditions, size, rng) if size else human_trials()
             found = findings(own, other)
             counts = {name: count + found.get(name, False) for name, count in counts.items()}
         return {question: count / simulations for question, count in counts.items()}
 
 
 def chances(
-    plan: Plan, cost_usd: float | None, groups: Sequence[Group], simulations: int, seed: int
-) -> Iterator[dict[str, Value]]:
-    """Simulate a plan that costs so much; ``groups`` are played ones. Raises UsageError.
-
-    A row of COLUMNS for each question and truth, and for the arms that are equal in both.
-    """
-    arms: dict[Case, list[str]] = {}
+    plan: Plan, cost_usd: float | None, groups: Sequence[Group], simulations: int
+) -> Iterator[Row]:
+    """Simulate a plan that costs so much; ``groups`` are played ones. Raises UsageError."""
+    arms: dict[Case, list[str]] = {}  # equal arms share rows
     for label, case in _cases(plan, groups):
         arms.setdefault(case, []).append(label)
     for case, labels in arms.items():
         trials = case.repetitions * len(plan.conditions)
-        at = {m: case.chances(plan.conditions, m, simulations, seed) for m in MULTIPLES}
+        at = {m: case.chances(plan.conditions, m, simulations) for m in MULTIPLES}
         for question, effect in case.effects.items():
             table, _, unit = QUESTIONS[question]
             enough = next((m for m in MULTIPLES if at[m][question] >= POWER), None)
-            key: list[Value] = [table, question, ", ".join(labels), case.against, case.own.name]
+            key = [table, question, ", ".join(labels), case.against, case.own.name]
             shares: list[Value] = [100 * at[m][question] for m in MULTIPLES]
             size = None if enough is None else round(enough * trials)
             cost = None if enough is None or cost_usd is None else enough * cost_usd
-            values = [*key, effect, unit, trials, *shares, size, cost]
-            yield {column.name: value for column, value in zip(COLUMNS, values, strict=True)}
+            values = [*key, unit, effect, trials, *shares, size, cost]
+            yield Row("/".join(key), (), dict(zip([c.name for c in COLUMNS], values, strict=True)))
 
 
-def power_table(title: str, rows: Sequence[dict[str, Value]]) -> Table:
+def power_table(title: str, rows: Sequence[Row]) -> Table:
     """Return the rows of ``chances`` as a table."""
     notes = (
         f"n: trials of an arm; {', '.join(f'x{m:g}' for m in MULTIPLES)}: the share of simulated "
         "studies with so many times the repetitions that find the effect at p < .05 (I1 to I4: by "
-        "the robust tests), each by itself; n for 80 %: the smallest of these sizes with this "
-        "power; USD: the whole study then",
-        "if trials go as: the published humans, the driver as it was played, or what is planted in "
-        "the emulator, with the [effect] that the study names; without one, an arm leaves 1 m more "
-        "than the first, and collides twice as often",
+        "the robust tests); n for 80 %, USD: the smallest of these sizes with this power",
+        "truth: published humans, the driver as it was played, or what is planted in the emulator, "
+        "with the [effect] that the study names; without one, an arm leaves 1 m more than the "
+        "first, and collides twice as often",
     )
-    ids = ["/".join(map(str, [*row.values()][:5])) for row in rows]
-    made = [Row(name, (), row) for name, row in zip(ids, rows, strict=True)]
-    return Table("power", title, COLUMNS, made, notes)
+    return Table("power", title, COLUMNS, rows, notes)
 
 
 def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, Case]]:
@@ -234,9 +219,8 @@ def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, Case]]:
         pairs = zip(_truths(plan, arm, groups), _truths(plan, first, groups), strict=False)
         for own, other in pairs:
             nothing_named = own == other == human()
-            more = own._replace(gap_m=own.gap_m + 1, collided=2 * own.collided)
-            case = (first.label, other, first.repetitions)
-            yield arm.label, Case(more if nothing_named else own, arm.repetitions, *case)
+            more = own.plus(Effect(gap_m=1.0, collided=own.collided)) if nothing_named else own
+            yield arm.label, Case(more, arm.repetitions, first.label, other, first.repetitions)
 
 
 def _truths(plan: Plan, arm: Arm, groups: Sequence[Group]) -> list[Truth]:
@@ -244,14 +228,18 @@ def _truths(plan: Plan, arm: Arm, groups: Sequence[Group]) -> list[Truth]:
     entries = [arm.entries.get(name) for name in arm.asked.values()]
     fields = [planted_fields(entry.parameters) if entry else {} for entry in entries]
     if all(fields) and fields[0] == fields[1]:
-        effect = validated(PlantedEffect, fields[0], "what is planted")
-        return [planted(effect.before(typical_prompt(plan, arm)))]
-    by_setting = {(group.name, group.setting): group for group in groups}
-    known = [by_setting.get((arm.model, variant)) for variant in (arm.variant, BASELINE)]
-    truths = [human(), *filter(None, [played(group) for group in known if group][:1])]
-    for factor, named in plan.study.file.effect.items():
+        planted = validated(PlantedEffect, fields[0], "what is planted")
+        planted = planted.before(typical_prompt(plan, arm))
+        # The script aims at gaps from 1.8 to 6.5 m; in 1 of 33 trials two vehicles collide.
+        gap = (4.15 + planted.x_gap_m, 0.0, 0.0, 0.0, 1.36)
+        return [Truth(*planted.coefficients, *gap, 1 / 33, planted.x_noise, "as planted")]
+    named = plan.study.file.effect
+    by_setting = {(group.name, group.setting): group for group in reversed(groups)}
+    prompts = (BASELINE,) if PROMPT in named else (arm.variant, BASELINE)
+    known = [by_setting[arm.model, p] for p in prompts if (arm.model, p) in by_setting]
+    truths = [human(), *filter(None, map(played, known[:1]))]
+    for factor, added in named.items():
         level = arm.variant if factor == PROMPT else arm.factors.get(factor)
         if level not in (None, plan.levels[factor][0]):
-            added = [{k: getattr(truth, k) + more for k, more in named} for truth in truths]
-            truths = [truth._replace(**more) for truth, more in zip(truths, added, strict=True)]
+            truths = [truth.plus(added) for truth in truths]
     return truths
