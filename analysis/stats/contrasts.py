@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import inf
@@ -80,15 +81,22 @@ def contrast_cells(both: Cells) -> Difference:
 
 
 def interaction_of_rates(one: Cells, other: Cells) -> Difference:
-    """Return how far two differences of rates differ; p is the level at which 0 is excluded."""
-    rates = (*one.rates, *reversed(other.rates))
+    """Return how far two differences of rates differ."""
+    return difference_of_rates([*one.rates, *reversed(other.rates)])
+
+
+def difference_of_rates(rates: Sequence[tuple[float, float]]) -> Difference:
+    """Return a difference of rates, (rate, trials) each, with the interval of ``newcombe``.
+
+    Its p is the level at which that interval leaves 0 out.
+    """
     value = sum(rate if place % 2 == 0 else -rate for place, (rate, _) in enumerate(rates))
 
     def excludes_zero_by(z: float) -> float:
         low, high = newcombe(rates, z)
         return low if value > 0 else -high
 
-    largest = 40.0  # of this quantile p is 0 to 300 digits
+    largest = 30.0  # of this quantile p is 0 to 190 digits
     z = 0.0
     if value:
         ends = excludes_zero_by(largest)
