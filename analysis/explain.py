@@ -78,6 +78,11 @@ def explain(study: Study, table: Table, cell: str) -> Explanation:
     )
 
 
+RESAMPLED = Source(
+    "human", "data sets resampled from the published counts and regression, not trials", "", ()
+)
+
+
 def sql_command(study: Study) -> str:
     """How a query is run on a study's database."""
     return "merge-runner sql" + ("" if study.db == DEFAULT_DB else f" --db {study.db}")
@@ -86,7 +91,7 @@ def sql_command(study: Study) -> str:
 def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> tuple[Source, ...]:
     """The trials of each group behind a cell, or behind a row where no column is named."""
     if column is not None and column.name.startswith("ceiling"):
-        return (_resampled(study),)
+        return (RESAMPLED,)
     predicate = row.counts or _predicate(table, column)
     whose = {"own": row.groups, "reference": row.references, "both": (*row.groups, *row.references)}
     groups = row.groups if column is None or not row.references else whose[column.of]
@@ -148,11 +153,6 @@ def _decided(group: Group, column: str) -> str:
     left_open = group.ended.loc[group.ended[column].isna(), "trial_id"]
     names = ", ".join(map(quoted, left_open))
     return "status <> 'failed'" + (f" AND trials.trial_id NOT IN ({names})" if names else "")
-
-
-def _resampled(study: Study) -> Source:
-    source = "imported trials" if study.complete else "published counts and regression"
-    return Source("human", f"data sets resampled from the {source}, not trials", "", ())
 
 
 @cache

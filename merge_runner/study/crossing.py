@@ -183,7 +183,7 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     """Raise UsageError for a factor that there is not, and for a driver's name that is taken."""
     parameters = sorted(known_parameters(registry.values()))
     valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
-    for name in file.factors:
+    for name in (*file.factors, *file.effect):
         require(valid, "factor", name, "models and skip stand above [factors]")
     for name in file.drivers.keys() & registry.keys():
         raise UsageError(f"[drivers.{name}] needs another name: there is one of this name already")

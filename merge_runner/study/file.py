@@ -115,14 +115,28 @@ class StudyDriver(Frozen):
     clock: Positive | None = None
 
 
+class Effect(Frozen):
+    """What a level of a factor is supposed to add, before anything is played.
+
+    To the coefficients of who merges first, to the gap in m, and to the share of collisions.
+    """
+
+    intercept: float = 0.0
+    projected_headway: float = 0.0
+    relative_velocity: float = 0.0
+    gap_m: float = 0.0
+    collided: Annotated[float, Field(ge=-1, le=1)] = 0.0
+
+
 class StudyFile(Frozen):
     """One study. ``repetitions`` are per condition, for each prompt or for all of them.
 
     ``conditions`` are by name; one without numbers is known already.
     ``factors`` are crossed with each other, with the ``models`` and with the conditions; ``skip``
     leaves crossings out: each row names levels, or lists of them. Tables compare the levels of a
-    factor with its first one, or with that which ``reference`` names. With ``mirror`` two different
-    drivers are played both ways round. ``perception`` holds by name what the levels of the factors
+    factor with its first one, or with that which ``reference`` names; ``effect`` is by factor what
+    each other level adds, for ``merge-runner power``. With ``mirror`` two different drivers are
+    played both ways round. ``perception`` holds by name what the levels of the factors
     perception, perception_left and perception_right stand for. ``budget`` is what it may cost, in
     USD over all models, runs and days, ``plugins`` are Python files that register drivers, prompt
     blocks, metrics and so on, beside the study.
@@ -138,6 +152,7 @@ class StudyFile(Frozen):
     factors: dict[str, tuple[JsonValue, ...]] = Field(default_factory=dict)
     skip: tuple[dict[str, JsonValue], ...] = ()
     reference: dict[str, JsonValue] = Field(default_factory=dict)
+    effect: dict[str, Effect] = Field(default_factory=dict)
     mirror: bool = False
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)
