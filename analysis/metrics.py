@@ -311,6 +311,12 @@ def _criticality(name: str, label: str, unit: str, meaning: str) -> Metric:
 
 
 _criticality(
+    "conflict_resolution_s",
+    "conflict resolution",
+    "s",
+    "until the vehicles are first off a collision course",
+)
+_criticality(
     "time_to_merge_s", "time to merge", "s", "until the first vehicle reaches the merge point"
 )
 _criticality(

@@ -317,8 +317,8 @@ class Study:
         return replace(kept, narrowed=_among(kept.trials))
 
     def _with_fallbacks(self, group: Group) -> set[str]:
-        decisions = of_group(self.calls.decisions, group, group.trials)
-        return set(decisions.loc[decisions["fallback"], "trial_id"])
+        trials = of_group(self.calls.trials, group, group.trials)
+        return set(trials.loc[trials["fallback"] > 0, "trial_id"])
 
     def is_of_file(self, trials: pd.DataFrame) -> pd.Series:
         """Whether each of these trials was played for the study that was chosen, if any was."""

@@ -79,13 +79,10 @@ TABLES = {
         "profiles",
         "the numbers behind I5, and by how much plans are revised",
     ),
-    "conflict-resolution": Listed(
-        "conflicts",
-        "quartiles of the conflict resolution time, by condition",
-    ),
     "criticality": Listed(
         "conflicts",
-        "time to merge, post-encroachment time, time to collision, largest acceleration",
+        "medians and quartiles of the conflict resolution time, time to merge, post-encroachment "
+        "time, time to collision and largest acceleration",
     ),
     "attempts": Listed(
         "attempts",

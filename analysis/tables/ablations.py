@@ -20,7 +20,15 @@ from merge_runner_analysis.tables.indicators import (
     verdict_note,
     verdict_values,
 )
-from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.model import (
+    ENDED,
+    GROUP_COLUMNS,
+    Column,
+    Row,
+    Table,
+    Value,
+    row_of,
+)
 from merge_runner_analysis.tables.notes import (
     ceiling_notes,
     intermittency_notes,
@@ -29,15 +37,7 @@ from merge_runner_analysis.tables.notes import (
     sample_notes,
 )
 
-KEYS = (
-    *GROUP_COLUMNS,
-    Column("n", "n", "count", 0, "trials that ended", "status <> 'failed'"),
-)
-# Columns that rest on who merged first: before a complete import the published outcomes of humans
-# fill these, while the others rest on the imported trials.
-OF_OUTCOMES = tuple(
-    f"{name}_{rule}" for name in ("i1", "i2") for rule in ("paper", "robust", "differ")
-)
+KEYS = (*GROUP_COLUMNS, Column("n", "n", "count", 0, "trials that ended"))
 
 
 def ablation_qualitative(study: Study) -> Table:
@@ -110,10 +110,10 @@ def ablation_quantitative(study: Study) -> Table:
 
 
 def _metric_columns(metric: Metric) -> tuple[Column, Column]:
-    counts, digits = metric.counts, metric.decimals
+    digits, counts = metric.decimals, metric.column if metric.rate else ""
     return (
         Column(metric.name, metric.heading, metric.kind, digits, metric.meaning, counts),
-        Column(f"{metric.name}_ci", "95 % CI", "interval", digits, "", counts, optional=True),
+        Column(f"{metric.name}_ci", "95 % CI", "interval", digits, optional=True),
     )
 
 
@@ -142,7 +142,7 @@ def _qualitative_row(study: Study, group: Group) -> Row:
     else:
         values |= ceiling_values(found, "I1-I4")
     remarks.append(no_ceiling(group))
-    return row_of(group, values, *remarks, published=("n", *OF_OUTCOMES))
+    return row_of(group, values, *remarks, counts=ENDED)
 
 
 def _quantitative_row(group: Group) -> Row:
@@ -172,21 +172,7 @@ def _quantitative_row(group: Group) -> Row:
     if missing:
         remarks.append(f"no trial with {', '.join(missing)}")
     remarks += [_shipped_note(found, source) for source, found in shipped.items()]
-    return row_of(
-        group,
-        values,
-        *remarks,
-        printed=tuple(metric.name for found in shipped.values() for metric in found),
-        published=(
-            "n",
-            *(
-                name
-                for metric in metrics
-                if metric.humans_from == "outcomes"
-                for name in (metric.name, f"{metric.name}_ci")
-            ),
-        ),
-    )
+    return row_of(group, values, *remarks, counts=ENDED)
 
 
 def _shipped_note(metrics: list[Metric], source: str) -> str:

@@ -65,14 +65,9 @@ def _placed(row: Row, group: Group) -> Row:
         row,
         beside=asked if own and asked in DRIVERS else "",
         stand_in_for=group.models if posing else (),
-        printed=_printed(row, group),
+        # A comparison of published values with themselves would test nothing.
+        printed=not group.measured or group.published_outcomes is not None,
     )
-
-
-def _printed(row: Row, group: Group) -> tuple[str, ...]:
-    """The columns that rest on published values, which a comparison with those cannot test."""
-    of_outcomes = not group.measured or group.published_outcomes is not None
-    return (*row.printed, *row.published) if of_outcomes else row.printed
 
 
 def against(table: Table, reference: str, driver: str | None = None) -> Table:
@@ -226,6 +221,6 @@ def _compared(row: Row, name: str, printed: dict[str, Any] | None, theirs: str) 
     if theirs.upper() in INDICATORS:
         return {f"{name}_in_paper": bool(value)}
     values: dict[str, Value] = {f"{name}_in_paper": value}
-    if isinstance(ours, (int, float)) and name not in row.printed:
+    if isinstance(ours, (int, float)) and not row.printed:
         values[f"{name}_difference"] = ours - value
     return values

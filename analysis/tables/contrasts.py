@@ -22,8 +22,6 @@ from merge_runner_analysis.stats.measures import known, outcomes_note, trials_of
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.notes import listed, replayed_notes, sample_notes
 
-# The columns that rest on human outcomes, in rows whose metric does.
-COLUMNS = ("difference", "ci", "p", "p_holm", "p_bh", "n", "n_reference")
 # How measures are tested against humans, by whether the pairs of their trials are known.
 ERRORS = {
     False: f"the published counts, compared as prompts are; {NO_PAIRS}",
@@ -201,7 +199,6 @@ def _row(
         },
         "; ".join(filter(None, (outcomes_note(other), _powerless(contrast, metric)))),
         counts=metric.counts if whole else f"{metric.counts} AND condition IN ({named})",
-        published=COLUMNS if metric.humans_from == "outcomes" else (),
     )
 
 

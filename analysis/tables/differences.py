@@ -16,26 +16,20 @@ from merge_runner_analysis.stats.joint import (
     WHO_FIRST,
     Interaction,
     interactions,
-    pairs_known,
 )
-from merge_runner_analysis.stats.regressions import MIN_PAIRS
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
 from merge_runner_analysis.tables.notes import replayed_notes, sample_notes
 from merge_runner_analysis.tables.regressions import TERM_NAMES, WITH_GAP, WITH_MERGER
 
 OUTCOMES = {WHO_FIRST: "left first (logit)", GAP: "gap (m)"}
 COUNTS = {WHO_FIRST: WITH_MERGER, GAP: WITH_GAP}
-# The shipped files that describe the humans where there are too few traces of them, and the columns
-# that rest on these files.
-FILES = {WHO_FIRST: "human_outcomes", GAP: "paper_gap"}
-OF_HUMANS = ("n_human", "b_human", "difference", "ci", "p", "freedom", "detectable")
 
 
 def differences(study: Study) -> Table:
     """Every driver's baseline against the humans: a row per outcome and term."""
     human = study.human
     compared = study.compared if human in study.groups else []
-    rows = [_row(human, group, one) for group in compared for one in interactions(human, group)]
+    rows = [_row(group, one) for group in compared for one in interactions(human, group)]
     return Table(
         "differences",
         "Differences of the baseline from humans, tested in one model of both",
@@ -44,42 +38,19 @@ def differences(study: Study) -> Table:
             Column("outcome", "outcome"),
             Column("term", "term"),
             Column("n", "n", "count", 0, "trials of the driver in the model"),
-            Column(
-                "n_human",
-                "n humans",
-                "count",
-                0,
-                "trials of the humans in the model",
-                of="reference",
-            ),
+            Column("n_human", "n humans", "count", 0, "trials of the humans in the model"),
             Column("b_driver", "driver b", "number", 2, "coefficient of the driver"),
-            Column("b_human", "human b", "number", 2, "coefficient of the humans", of="reference"),
-            Column(
-                "difference",
-                "difference",
-                "number",
-                2,
-                "interaction: driver minus humans",
-                of="both",
-            ),
-            Column("ci", "95 % CI", "interval", 2, "of the interaction", of="both"),
-            Column("p", "p", "p", 3, "test of the interaction", of="both"),
-            Column(
-                "freedom",
-                "df",
-                "number",
-                0,
-                "of its t test; none: normal",
-                optional=True,
-                of="both",
-            ),
+            Column("b_human", "human b", "number", 2, "coefficient of the humans"),
+            Column("difference", "difference", "number", 2, "interaction: driver minus humans"),
+            Column("ci", "95 % CI", "interval", 2, "of the interaction"),
+            Column("p", "p", "p", 3, "test of the interaction"),
+            Column("freedom", "df", "number", 0, "of its t test; none: normal", optional=True),
             Column(
                 "detectable",
                 "detectable",
                 "number",
                 2,
                 "smallest difference found with power .8: (t.975 + t.8) SE",
-                of="both",
             ),
             Column("method", "method", meaning="how the model is fitted", optional=True),
         ),
@@ -108,9 +79,7 @@ def differences(study: Study) -> Table:
     )
 
 
-def _row(human: Group, group: Group, found: Interaction) -> Row:
-    # Fewer pairs cannot show how pairs vary: then the humans' side is the published values.
-    of_traces = pairs_known(human, found.outcome) >= MIN_PAIRS
+def _row(group: Group, found: Interaction) -> Row:
     said = found.problem or found.remark
     return Row(
         f"{group.id}/{found.outcome}/{found.term}",
@@ -128,9 +97,6 @@ def _row(human: Group, group: Group, found: Interaction) -> Row:
         },
         f"{found.outcome}: {said}" if said else "",
         counts=COUNTS[found.outcome],
-        references=(human.id,),
-        published=() if of_traces else OF_HUMANS,
-        cited="" if of_traces else FILES[found.outcome],
     )
 
 

@@ -321,9 +321,7 @@ def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> di
                         "text": shown_value(column, row.values.get(column.name)),
                         "left": column.kind == "text",
                         "header": i < leading,
-                        "link": None
-                        if column.kind == "text" or row.values.get(column.name) is None
-                        else link(table, row, column),
+                        "link": link(table, row, column) if _linked(row, column) else None,
                         "label": f"{column.heading} of {row.id}",
                     }
                     for i, column in enumerate(columns)
@@ -333,3 +331,10 @@ def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> di
         ],
         "notes": notes_of(table),
     }
+
+
+def _linked(row: Row, column: Column) -> bool:
+    """Whether a value leads to trials: a published one has none, nor has a count of zero."""
+    value = row.values.get(column.name)
+    nothing = value is None or (column.counts and not value)
+    return bool(row.counts) and column.kind != "text" and not nothing

@@ -43,11 +43,10 @@ def velocity_profiles(study: Study) -> Table:
                 "number",
                 3,
                 "mean |new plan - old plan| over the instants of both, in units of full throttle",
-                "true",
-                True,
+                optional=True,
             ),
             Column(
-                "revised_percent", "> 0.1 (%)", "percent", 1, "revisions above 0.1", "true", True
+                "revised_percent", "> 0.1 (%)", "percent", 1, "revisions above 0.1", optional=True
             ),
             Column(
                 "coarse_percent",
@@ -55,8 +54,7 @@ def velocity_profiles(study: Study) -> Table:
                 "percent",
                 1,
                 "plans of at most two distinct values",
-                "true",
-                True,
+                optional=True,
             ),
         ),
         [_row(study, group) for group in study.groups],

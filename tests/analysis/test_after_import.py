@@ -78,25 +78,16 @@ def test_human_rows_come_from_the_traces(imported):
     assert any("66 of 990 trials" in note for note in tables["who-first"].notes)
 
 
-def test_a_cell_of_published_outcomes_names_no_imported_trial(imported):
+def test_a_row_of_humans_names_their_trials_and_the_published_outcomes(imported):
     tables = {table.name: table for table in make_tables(imported)}
-    for name, cell in (
-        ("ablation-quantitative", "human:n"),
-        ("ablation-quantitative", "human:collided_boxes_percent"),
-        ("indicators", "human/I1:n"),
-        ("who-first", "human/intercept:b"),
-        ("who-first", "human/intercept:firth_b"),
-        ("contrasts", "o3/baseline/human/collided_boxes_percent:p"),
+    for name, row, trials in (
+        ("ablation-quantitative", "human", 66),
+        ("who-first", "human/intercept", 55),
+        ("who-first", "human/clustered/intercept", 55),
     ):
-        (human,) = (s for s in explain(imported, tables[name], cell).sources if s.group == "human")
-        assert human.trials == (), (name, cell)
-        assert human.text.startswith("990 published outcomes"), (name, cell)
-    for name, cell in (
-        ("ablation-quantitative", "human:gap_m"),
-        ("who-first", "human/clustered/intercept:n"),
-    ):
-        (human,) = explain(imported, tables[name], cell).sources
-        assert len(human.trials) == 55, (name, cell)
+        (human,) = explain(imported, tables[name], row).sources
+        assert len(human.trials) == trials, (name, row)
+        assert "those of 990 published outcomes" in human.text
 
 
 def test_the_ceiling_of_humans_is_left_out_where_their_indicators_rest_on_both(imported):
@@ -128,19 +119,11 @@ def test_humans_have_further_rows_with_errors_by_pair(imported):
         assert all(row.values.get("b") is not None or row.note for row in rows)
 
 
-def test_a_difference_from_humans_names_their_trials_where_it_rests_on_them(imported):
+def test_a_difference_from_humans_names_the_trials_of_the_driver(imported):
     (table,) = make_tables(imported, ["differences"])
-    with_gap = next(r.values["n_human"] for r in table.rows if r.id.endswith("gap/intercept"))
-    for cell, behind in {
-        "gap/intercept:n": {"o3/baseline": 22},
-        "gap/intercept:n_human": {"human": with_gap},
-        "gap/intercept:p": {"human": with_gap, "o3/baseline": 22},
-        "who-first/intercept:b_driver": {"o3/baseline": 22},
-        "who-first/intercept:b_human": {"human": 0},  # published outcomes
-        "who-first/intercept:difference": {"human": 0, "o3/baseline": 22},
-    }.items():
-        sources = explain(imported, table, f"o3/baseline/{cell}").sources
-        assert {source.group: len(source.trials) for source in sources} == behind, cell
+    for row in ("gap/intercept", "who-first/intercept"):
+        (source,) = explain(imported, table, f"o3/baseline/{row}").sources
+        assert (source.group, len(source.trials)) == ("o3/baseline", 22), row
     assert any("jackknife over 3 pairs" in row.note for row in table.rows)
     assert not any("intervals and tests take the trials" in note for note in table.notes)
 
