@@ -18,6 +18,7 @@ from merge_runner_analysis.tables.formats import shown_value
 from merge_runner_analysis.tables.model import Column, Row, Table
 
 ACCOUNTS = "attempts"  # the table that counts repetitions of deterministic drivers, too
+SEE_NOTES = "see the notes of the table"
 # What no column of the database holds: the analysis finds it out of each trial.
 FOUND_OUT = re.compile(r"\b(counted_|collided\b|collided_boxes\b)")
 
@@ -98,13 +99,16 @@ def sources_of(
     if table.name == ACCOUNTS:
         groups = [group.stored for group in groups]
     condition = column.counts if column else ""
-    return tuple(_source(study, group, row.counts, condition) for group in groups)
+    return tuple(
+        _source(study, group, row.counts, condition)
+        if row.counts and group.measured
+        else Source(group.id, f"published, not from traces: {row.note or SEE_NOTES}", "", ())
+        for group in groups
+    )
 
 
 @cache
 def _source(study: Study, group: Group, predicate: str, condition: str) -> Source:
-    if not predicate or group.spec_hash is None:
-        return Source(group.id, "published, not from traces: see the notes of the table", "", ())
     rows = _trials(study, group).sql(
         f"SELECT trial_id, {condition or 'NULL'} FROM trials WHERE {predicate} ORDER BY trial_id"  # noqa: S608 # ours
     )
@@ -126,12 +130,14 @@ def _source(study: Study, group: Group, predicate: str, condition: str) -> Sourc
 
 def _query(group: Group, predicate: str, trials: tuple[str, ...]) -> str:
     """The query that lists these trials of a group, which a predicate is true of."""
+    if not trials:
+        return ""
     specs = ", ".join(map(quoted, sorted(group.trials["spec_hash"].unique())))
     conditions = [f"trials.spec_hash IN ({specs})"]
     if group.setting:
         conditions.append(f"variant = {quoted(group.setting)}")
     # The database does not know mirrored trials by their images either.
-    if trials and (group.seats[1] or FOUND_OUT.search(predicate)):
+    if group.seats[1] or FOUND_OUT.search(predicate):
         conditions.append(f"trials.trial_id IN ({', '.join(map(quoted, trials))})")
     else:
         conditions += [*filter(None, [group.narrowed]), predicate]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from merge_runner.drivers.registry import MOCKS
 from merge_runner_analysis.data.provenance import Mismatch, Provenance, tally
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.tables.notes import equal_note
+from merge_runner_analysis.tables.notes import equal_notes
 
 # The share of a group's decisions above which an alarm is raised: a convention.
 MANY_FALLBACKS = 0.05
@@ -51,7 +51,7 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
         ),
         (
             "Some trials are equal",
-            [f"{group.id}: {equal_note(group)}" for group in study.models if group.equal],
+            equal_notes(study.models),
             "Where a cache on the way answered, or the temperature is 0, they are no samples, and "
             "intervals and tests claim too much.",
         ),

@@ -29,7 +29,7 @@ from merge_runner_analysis.tables.model import (
     Value,
     row_of,
 )
-from merge_runner_analysis.tables.notes import repeated_note, sample_notes
+from merge_runner_analysis.tables.notes import repeated_notes, sample_notes
 
 FILE = "human_first_actions"
 # By the sign of the own relative velocity.
@@ -153,8 +153,7 @@ def _asked_notes(study: Study) -> Iterator[str]:
             f"{group.id}: asked without the loop (`merge-runner sweep --first`), in "
             f"{len(group.ended)} trials that end before a second decision"
         )
-        if group.repeated:
-            yield f"{group.id}: {repeated_note(group)}"
+    yield from repeated_notes(study.asked)
 
 
 def _left_out_notes(study: Study) -> Iterator[str]:
