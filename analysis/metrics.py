@@ -1,6 +1,6 @@
 """The list of metrics: what each trial has, how a group is summed up, and where that is shown.
 
-Tables, figures, conclusions and pages ask this list, and name no metric that is not in it.
+Tables, figures and pages ask this list, and name no metric that is not in it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 
 Estimator = Literal["proportion", "mean", "median"]
 # tables: Tables V and VII, the contrasts, and the sentences and pages made of these; criticality:
-# the table of this name; distributions: the figure; conclusions: a sentence on each driver.
-Place = Literal["tables", "criticality", "distributions", "conclusions"]
+# the table of this name; distributions: the figure.
+Place = Literal["tables", "criticality", "distributions"]
 PLACES: frozenset[Place] = frozenset(get_args(Place))
 EVERYWHERE = PLACES - {"criticality"}
 # The trials that a metric may be of, in SQL.
@@ -29,8 +29,6 @@ INTERVALS: dict[Estimator, str] = {
 # What the analysis finds out of each trial that no column of the database has: whether it collided
 # by the rule of its scenario, and by that of the human experiment.
 JUDGED = ("collided", "collided_boxes")
-# The fields of a sentence on a driver.
-TOLD = ("value", "subject", "estimator", "trials")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +71,8 @@ class Metric:
 
     ``label`` and ``unit`` head a column, ``meaning`` says what the number of one trial is, or of
     what a proportion is the share. ``word`` is how a list in a sentence names it, ``phrase`` what a
-    sentence has as its subject, and ``told`` is what the report says of a driver, with the fields
-    TOLD. ``lowest`` and ``highest`` are ends that an axis always has. Raises UsageError where these
-    do not fit together.
+    sentence has as its subject. ``lowest`` and ``highest`` are ends that an axis always has. Raises
+    UsageError where these do not fit together.
 
     ``human`` is a published value beside those of the paper: ``paper_of_drivers`` and
     ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``. ``humans_from`` says
@@ -93,7 +90,6 @@ class Metric:
     decimals: int = 2
     word: str = ""
     phrase: str = ""
-    told: str = "comes to {value} in {subject}, the {estimator} of {trials}"
     lowest: float | None = None
     highest: float | None = None
     human: HumanReference | None = None
@@ -116,10 +112,6 @@ class Metric:
             yield "is a share, and criticality shows medians and quartiles"
         if self.value in JUDGED and self.trials != "ended":
             yield f"is {self.value}, which ended trials are judged by: it needs trials='ended'"
-        try:
-            self.told.format(**dict.fromkeys(TOLD, ""))
-        except (LookupError, ValueError, AttributeError):
-            yield f"is told as {self.told!r}; valid fields: {', '.join(TOLD)}"
 
     @property
     def heading(self) -> str:
@@ -256,7 +248,6 @@ GAP = register(
         unit="m",
         meaning="net gap when the first vehicle reaches the merge point",
         value="gap_m",
-        told="leaves {value} on average of {trials}",
         paper_of_drivers="gap_m",
         paper_of_humans="gap_m",
     )
@@ -273,7 +264,6 @@ RMSE = register(
         lowest=0.0,
         paper_of_drivers="rmse_mps",
         paper_of_humans="rmse_mps",
-        shown=EVERYWHERE - {"conclusions"},
     )
 )
 JOINT = register(

@@ -14,6 +14,9 @@ DATA = Path(__file__).parent
 # Standard deviation in m of the human gaps about their regression: what the four standard errors of
 # arXiv 2604.09609 (Table IV, human rows, n = 962) imply.
 HUMAN_GAP_SD_M = 1.82
+# Standard deviation in m of the mean gap between the nine human pairs: that of their random
+# intercepts in table S6 of the supplement to PNAS Nexus pgae420, human column.
+HUMAN_GAP_PAIR_SD_M = 1.3
 HUMAN_TRIALS = 990
 # The experiments whose pairs the publications number 1 to 9.
 PAIRS = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import unified_diff
 
@@ -33,8 +34,11 @@ class Design:
     prompts: list[tuple[str, str]]
 
 
-def design(study: Study) -> Design:
-    """Read the design of a study from what was played."""
+def design(study: Study, sent: Mapping[str, Mapping[str, Mapping[str, object]]]) -> Design:
+    """Read the design of a study from what was played.
+
+    ``sent`` holds the parameters that models were asked with, by spec hash and side.
+    """
     found = load_each({"descriptions": DESCRIPTIONS, "prompts": PROMPTS}, study.db)
     specs = {name for group in study.played for name in group.trials["spec_hash"]}
     prompts = found["prompts"]
@@ -46,13 +50,22 @@ def design(study: Study) -> Design:
     factors = {name: levels[name] for name in levels if name != "model"}
     drivers = list(dict.fromkeys(group.label for group in study.played))
     driven = {name for group in study.played for name in group.trials["condition"]}
-    rows = {"drivers": drivers, **factors, "conditions": sorted(driven)}
+    parameters = dict.fromkeys(
+        f"{group.label}: " + ", ".join(f"{name} = {value}" for name, value in asked.items())
+        for group in study.played
+        for asked in sent.get(group.spec_hash or "", {}).values()
+        if asked
+    )
+    rows = {"drivers": drivers, "parameters": parameters, **factors, "conditions": sorted(driven)}
     trials = sum(len(group.trials) for group in study.played)
     return Design(
         list(found["descriptions"]["description"])
         if study.source is None
         else [study.source.file.description] * bool(study.source.file.description),
-        [*((name, ", ".join(values)) for name, values in rows.items()), ("trials", str(trials))],
+        [
+            *((name, ", ".join(values)) for name, values in rows.items() if values),
+            ("trials", str(trials)),
+        ],
         [
             (f"{title_of(name)}: first prompt", texts[name])
             if baseline is None or name == BASELINE

@@ -1,4 +1,4 @@
-"""The HTML of the report: conclusions, figures, tables, provenance, and the trials behind them."""
+"""The HTML of the report: verdicts, figures, tables, provenance, and the trials behind them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures.gallery import FIGURES
 from merge_runner_analysis.report.alarms import alarms, posing
-from merge_runner_analysis.report.conclusions import not_shown, nothing, shown
 from merge_runner_analysis.report.design import design
 from merge_runner_analysis.stats.factors import levels_by_factor
 from merge_runner_analysis.tables.against import PAPER, against, in_paper
 from merge_runner_analysis.tables.formats import table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
+from merge_runner_analysis.tables.verdicts import verdicts
+from merge_runner_analysis.verdict_words import TABLE, sentences
 
 TEMPLATES = Path(__file__).with_name("templates")
 # At most so many trials are listed for a row: a page with all of them would be unwieldy.
@@ -59,16 +60,17 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         lstrip_blocks=True,
     )
     origin = provenance(study.db)
+    finished = next((table for table in tables if table.name == TABLE), None)
+    said = sentences((finished or verdicts(study)).rows)
     views = {
         table.name: table_view(table, links.to) for table in tables if table.name not in left_out
     }
     return environment.get_template("report.html").render(
         study=study,
-        design=design(study),
+        design=design(study, origin.sent),
         alarms=alarms(study, origin),
-        shown=shown(study),
-        not_shown=not_shown(study, origin),
-        nothing=nothing(study),
+        headline=said[0],
+        sentences=said[1:],
         posing=posing(study),
         figures=[
             {"name": name, "caption": FIGURES[name][1], "data": data}

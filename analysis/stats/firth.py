@@ -40,17 +40,41 @@ def tested_fits(
     return b, p, found
 
 
+def signed_roots(
+    design: Array, n: Array, left: Array, column: int, estimate: float, at: Array
+) -> Array:
+    """The signed roots of twice what the profile likelihood of one data set loses, (k,).
+
+    ``estimate`` is the coefficient of ``column``, which is held at each of the values ``at`` (k,).
+    """
+    values = np.append(at, estimate)
+    start = np.zeros((len(values), design.shape[1]))
+    start[:, column] = values
+    free = tuple(other for other in range(design.shape[1]) if other != column)
+    some, firsts = np.tile(n, (len(values), 1)), np.tile(left, (len(values), 1))
+    # Far out the last steps are small and many: what they add to the likelihood is less than seen.
+    best, _, _ = _fit(design, some, firsts, np.ones(len(values), bool), free, start)
+    loss = np.maximum(best[-1] - best[:-1], 0.0)
+    return np.asarray(np.sign(at - estimate) * np.sqrt(2 * loss))
+
+
 def _fit(
-    design: Array, n: Array, left: Array, alive: Holds, free: tuple[int, ...]
+    design: Array,
+    n: Array,
+    left: Array,
+    alive: Holds,
+    free: tuple[int, ...],
+    start: Array | None = None,
 ) -> tuple[Array, Array, Holds]:
     """Maximal penalised log-likelihoods (sets,), coefficients (sets, terms), and convergence.
 
-    Only the ``free`` coefficients differ from 0.
+    Only the ``free`` coefficients differ from 0, or from those of ``start``.
 
     Newton steps on Firth's score with the whole design's information, halved where they do not
     increase the penalised likelihood (Heinze and Schemper 2002).
     """
-    b, best = np.zeros((len(n), design.shape[1])), np.zeros(len(n))
+    b = np.zeros((len(n), design.shape[1])) if start is None else start.copy()
+    best = np.zeros(len(n))
     rows = np.flatnonzero(alive)  # a data set that has converged is left as it is
     best[rows] = _penalised(design, n[rows], left[rows], b[rows])
     for _ in range(STEPS):

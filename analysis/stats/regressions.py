@@ -83,26 +83,6 @@ def wald_term(b: float, se: float, freedom: float = inf) -> Term:
     return Term(b, se, statistic, intervals.two_sided_p(statistic, freedom))
 
 
-def differences(first: Regression, second: Regression, by: str) -> dict[str, intervals.Difference]:
-    """By term: how the coefficients of fits to two independent groups differ.
-
-    A model of both in which every term may differ between them falls apart into a fit of each: the
-    interaction is the difference of the coefficients, and its variance the sum of theirs. A term
-    that neither fit leaves an error of is not there.
-    """
-    found = {
-        name: intervals.difference(
-            term.b - second.terms[name].b,
-            (term.se, first.freedom),
-            (second.terms[name].se, second.freedom),
-            by=by,
-        )
-        for name, term in first.terms.items()
-        if name in second.terms
-    }
-    return {name: one for name, one in found.items() if one is not None}
-
-
 def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:
     """Design (n, 3) of intercept, h in m, dv in m/s; and left-first as 0 or 1, shape (n,)."""
     chosen = trials[(trials["status"] == "finished") & trials["merged_first"].notna()]

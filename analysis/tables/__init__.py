@@ -35,6 +35,11 @@ class Listed(NamedTuple):
 # A module is imported only when its table is computed, so that a table stored in the database can
 # be shown without waiting for pandas.
 TABLES = {
+    "verdicts": Listed(
+        "verdicts",
+        "every driver and prompt beside the humans: estimate, difference and verdict for who goes "
+        "first, collisions, the gap and I5",
+    ),
     "who-first": Listed(
         "regressions",
         "logit of left-first on projected headway h (m) and relative velocity Δv (m/s), both left "
@@ -64,16 +69,12 @@ TABLES = {
     ),
     "contrasts": Listed(
         "contrasts",
-        "every prompt against its driver's reference, every baseline against the humans",
+        "every prompt against its driver's reference",
     ),
     "factors": Listed(
         "factors",
         "the levels of each factor of a study, of models and of prompts, pooled over all other "
         "factors: every metric with its interval, and the difference from the reference",
-    ),
-    "differences": Listed(
-        "differences",
-        "every baseline against the humans in one model of both: who merged first, the gap",
     ),
     "velocity-profiles": Listed(
         "profiles",

@@ -1,4 +1,4 @@
-"""Differences between prompts, and between drivers and humans, corrected for their number."""
+"""Differences between prompts, corrected for their number; for humans see ``verdicts``."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ from math import isinf
 
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.data.study import Group, Study, in_one_study
-from merge_runner_analysis.metrics import JUDGED, RULES_NOTE, Metric, compared
-from merge_runner_analysis.names import BASELINE, HUMAN
-from merge_runner_analysis.stats.against_humans import by_known_pairs, contrast_with_humans
+from merge_runner_analysis.metrics import RULES_NOTE, Metric, compared
 from merge_runner_analysis.stats.contrasts import (
     contrast_cells,
     contrast_means,
@@ -17,47 +15,30 @@ from merge_runner_analysis.stats.contrasts import (
     shared_cells,
 )
 from merge_runner_analysis.stats.intervals import Difference
-from merge_runner_analysis.stats.joint import NO_PAIRS
-from merge_runner_analysis.stats.measures import known, outcomes_note, trials_of, undecided
+from merge_runner_analysis.stats.measures import trials_of, undecided
 from merge_runner_analysis.tables.model import Column, Row, Table
-from merge_runner_analysis.tables.notes import listed, replayed_notes, sample_notes
-
-# How measures are tested against humans, by whether the pairs of their trials are known.
-ERRORS = {
-    False: f"the published counts, compared as prompts are; {NO_PAIRS}",
-    True: "by a linear model with a level for each condition (of rates a linear probability "
-    "model), which has the weights above; errors are clustered by human pair (jackknife, CV3) and "
-    "independent over the driver's trials (HC3; of rates at least those that equal rates give); "
-    "Student's t with Satterthwaite's df",
-}
+from merge_runner_analysis.tables.notes import sample_notes
 
 
 def contrasts(study: Study) -> Table:
-    """Every prompt against its driver's reference, and every baseline against the humans.
-
-    Without a baseline it is the reference that is set against the humans.
-    """
+    """Every prompt against its driver's reference."""
     rows: list[Row] = []
     for driver in dict.fromkeys(group.driver for group in study.models):
         # A family is one question asked of several variants. Correcting over all metrics at once
         # would make the result depend on how many are registered.
         for metric in compared():
             rows += _family(study, driver, metric)
-    of_humans, human_notes = _against_humans(study)
-    rows += of_humans
     judged = "judged " if study.unjudged else ""
     return Table(
         "contrasts",
-        "Differences between prompts, and from humans",
+        "Differences between prompts",
         (
             Column("driver", "driver"),
             Column("setting", "setting"),
             Column("reference", "against"),
             Column("measure", "measure"),
             Column("difference", "difference", "number", 2, "first minus second"),
-            Column(
-                "ci", "95 % CI", "interval", 2, "Newcombe; least squares; by pairs", optional=True
-            ),
+            Column("ci", "95 % CI", "interval", 2, "Newcombe; least squares", optional=True),
             Column("p", "p", "p", 3, "Fisher's exact test or t test"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
             Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
@@ -73,7 +54,6 @@ def contrasts(study: Study) -> Table:
             Column(
                 "n_reference", "n ref.", "count", 0, "trials of the reference in these conditions"
             ),
-            Column("errors", "errors", meaning="what is taken as independent: trials, or pairs"),
             Column("freedom", "df", "number", 0, "of a t test", optional=True),
         ),
         rows,
@@ -81,16 +61,13 @@ def contrasts(study: Study) -> Table:
             "all are compared within the conditions that both have: rates by the weights of Mantel "
             "and Haenszel, with Newcombe's interval and Fisher's exact test within conditions; "
             "means by least squares, with its t test. A family is one measure of "
-            "one driver over its prompts, or over all drivers against humans",
-            *human_notes,
+            "one driver over its prompts",
             "detectable: the smallest difference that is found at p < .05, before correction, with "
             "a power of .8; rates: by the exact power of Fisher's test of all these trials as if "
             "of one condition, the reference's true rate being the observed one, in the direction "
-            "in which less is enough; means, and all that is tested by pairs: (t.975 + t.8) times "
-            "the standard error of the linear model, with its degrees of freedom",
+            "in which less is enough; means: (t.975 + t.8) times the standard error of the linear "
+            "model, with its degrees of freedom",
             RULES_NOTE,
-            *_recordings_note(study),
-            *replayed_notes(study),
             *_shared_notes(study),
             *sample_notes(study, study.groups, pooled=False),
             *([] if rows else [f"there is no pair of {judged}groups to compare"]),
@@ -110,42 +87,6 @@ def _family(study: Study, driver: str, metric: Metric) -> list[Row]:
         if group is not reference and in_one_study(study, group, reference)
     }
     return _corrected(found, reference, metric, study.reference)
-
-
-def _against_humans(study: Study) -> tuple[list[Row], list[str]]:
-    """Every driver against the humans, for metrics that these have, and notes on the tests."""
-    human = study.human
-    if human not in study.groups:
-        return [], []
-    prompt = BASELINE if study.compared else study.reference
-    groups = [group for group in study.models if group.setting == prompt and not group.caution]
-    rows: list[Row] = []
-    untested: list[str] = []
-    tested: dict[bool, list[str]] = {}
-    for metric in (metric for metric in compared() if known(human, metric)):
-        found = {group: contrast_with_humans(human, group, metric) for group in groups}
-        untested += [
-            f"{group.id}: {metric.heading} is not tested against humans: {reason}"
-            for group, reason in found.items()
-            if reason and isinstance(reason, str)
-        ]
-        if of_metric := _corrected(found, human, metric, HUMAN):
-            rows += of_metric
-            tested.setdefault(by_known_pairs(human, metric), []).append(metric.heading)
-    notes = [f"{listed(names)} against humans: {ERRORS[pairs]}" for pairs, names in tested.items()]
-    return rows, [*notes, *untested]
-
-
-def _recordings_note(study: Study) -> list[str]:
-    """Which measures cannot be compared with humans before the recordings are imported."""
-    absent = [
-        one.in_lists
-        for one in compared()
-        if one.value not in JUDGED and not known(study.human, one)
-    ]
-    need = "needs" if len(absent) == 1 else "need"
-    command = "merge-runner human import"
-    return [f"{listed(absent)} against humans {need} the recordings: {command}"] if absent else []
 
 
 def _corrected(
@@ -194,10 +135,9 @@ def _row(
             "detectable": None if contrast.detectable is None else contrast.detectable * factor,
             "n": int(in_both[0].sum()),
             "n_reference": int(in_both[1].sum()),
-            "errors": contrast.by or "trials",
             "freedom": None if isinf(contrast.freedom) else contrast.freedom,
         },
-        "; ".join(filter(None, (outcomes_note(other), _powerless(contrast, metric)))),
+        _powerless(contrast, metric),
         counts=metric.counts if whole else f"{metric.counts} AND condition IN ({named})",
     )
 

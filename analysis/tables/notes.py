@@ -40,7 +40,7 @@ def sample_notes(
     notes += _pooled_notes(study, [group for group in shown if group.setting])
     if study.human in study.groups:
         notes += [*_human_notes(study, pooled), *_own_notes(study, shown)]
-    return [*notes, *repeated_notes(shown), *equal_notes(shown), *_pair_notes(shown)]
+    return [*notes, *repeated_notes(shown), *equal_notes(shown), *pair_notes(shown)]
 
 
 def _failed(group: Group) -> str:
@@ -129,7 +129,7 @@ def equal_notes(groups: Iterable[Group]) -> list[str]:
     return [f"{', '.join(counts)} {text}"] if counts else []
 
 
-def _pair_notes(groups: Iterable[Group]) -> list[str]:
+def pair_notes(groups: Iterable[Group]) -> list[str]:
     """Say whose odds those of two different drivers are, and on which sides they sat."""
     pairs = [f"{group.id}: {_seats_note(group)}" for group in groups if group.is_mixed]
     if not pairs:

@@ -12,7 +12,6 @@ from merge_runner_analysis.data.provenance import provenance
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explorer.pages.ablations import ablations
 from merge_runner_analysis.report.alarms import alarms
-from merge_runner_analysis.report.conclusions import not_shown, nothing, shown
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Said, changed, write_study, yielding
 
@@ -64,7 +63,7 @@ def test_tables_show_it_without_a_value_and_the_rest_as_if_it_were_not_there(
             continue
         for row in unjudged:
             names = {name for name, value in row.values.items() if value is not None}
-            assert names <= {"driver", "setting", table.columns[0].name}, table.name
+            assert names <= {"driver", "setting", "kind", table.columns[0].name}, table.name
             assert row.note.startswith("not judged: "), table.name
         assert len(unjudged) == 2, table.name
         judged = [row for row in table.rows if row not in unjudged]
@@ -78,21 +77,23 @@ def test_tables_show_it_without_a_value_and_the_rest_as_if_it_were_not_there(
 
 def test_report_and_audit_say_that_it_is_not_judged_and_conclude_nothing(mixed):
     study, origin = Study(mixed), provenance(mixed)
-    assert not any("bad" in text or "A1" in text for text in shown(study))
+    (table,) = make_tables(study, ["verdicts"])
+    assert "bad" not in table.notes[0]
     (alarm,) = alarms(study, origin)
     assert alarm.title == "Too few valid decisions"
     for group in ("bad/baseline", "o3/A1"):
         assert f"{group}: not judged: " in alarm.text
-        assert any(text.startswith(f"{group}: not judged: ") for text in not_shown(study, origin))
+        assert any(text.startswith(f"{group}: Not judged: ") for text in table.notes)
         notes = [note for audit in audit_database(mixed) for note in audit.notes]
         assert any(note.startswith(f"{group}: not judged: ") for note in notes)
 
 
 def test_where_no_driver_is_judged_nothing_is_concluded(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", failing(yielding("bad", reps=1))))
-    assert shown(study) == []
-    assert "too many decisions are invalid" in nothing(study)
-    assert "too many decisions are invalid" in nothing(Study(study.db, ["bad"]))
+    (table,) = make_tables(study, ["verdicts"])
+    assert table.notes[0] == "No language model is judged here."
+    (row,) = (row for row in table.rows if row.groups != ("human",))
+    assert "state" not in row.values
 
 
 @pytest.mark.parametrize(("first", "judged"), [([0], True), (range(3), False)])
@@ -108,10 +109,7 @@ def test_of_a_pair_the_decisions_of_each_model_count_by_themselves(tmp_path, fir
 def test_a_comparison_without_a_judged_driver_says_what_it_takes(tmp_path):
     """Not that there is no driver: one was played."""
     study = Study(write_study(tmp_path / "t.duckdb", failing(yielding("bad"))))
-    for name, said in (
-        ("differences", "nothing is compared: that takes the humans, and a driver that is judged"),
-        ("contrasts", "there is no pair of judged groups to compare"),
-    ):
+    for name, said in (("contrasts", "there is no pair of judged groups to compare"),):
         (table,) = make_tables(study, [name])
         assert [row.id for row in table.rows] == ["bad/baseline"]
         assert any(note.startswith(said) for note in table.notes), name

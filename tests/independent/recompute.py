@@ -27,9 +27,6 @@ METRICS = (
     ("min_ttc_s", "ttc", "median", False),
     ("max_acceleration_mps2", "hardest", "median", False),
 )
-# The paper's regression of the human gap, with its errors, of 962 trials.
-HUMAN_GAP = ((3.54, 0.146), (0.17, 0.034), (-0.20, 0.166), (0.06, 0.029))
-HUMAN_TRIALS = 962
 MOST_INVALID = 0.2
 
 
@@ -54,8 +51,7 @@ def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
         "ablation-qualitative": {_id(k): _qualities(v) for k, v in (humans | judged).items()},
         "ablation-quantitative": {_id(k): _quantities(v) for k, v in (humans | judged).items()},
         "indicators": _indicators(who | baselines),
-        "differences": _differences(recorded, baselines),
-        "contrasts": _prompts(judged, trials.attrs["orders"]) | _humans(recorded, baselines),
+        "contrasts": _prompts(judged, trials.attrs["orders"]),
         "factors": _factors(judged, trials.attrs["orders"]),
     }
     for rows in found.values():
@@ -282,43 +278,6 @@ def _both(row: dict, p: tuple, b: tuple, sign: int) -> tuple[bool | None, bool |
     )
 
 
-def _differences(recorded: pd.DataFrame, baselines) -> dict[str, dict]:
-    """Every baseline less the humans, term by term of one model of both."""
-    if recorded.empty:
-        who = statistics.logit(*who_first_data(measured.published_humans())[:2])[:, :2]
-        gap, freedom = np.array(HUMAN_GAP), (np.inf, HUMAN_TRIALS - len(GAP))
-        sizes = HUMAN_TRIALS, HUMAN_TRIALS
-    else:
-        found = [who_first_data(recorded), gap_data(recorded)]
-        fits = (statistics.logit, _ordinary)
-        who, gap = (
-            statistics.by_pairs(fit, x, y, used["pair"].to_numpy())
-            for fit, (x, y, used) in zip(fits, found, strict=True)
-        )
-        sizes = [len(y) for _, y, _ in found]
-        freedom = [used["pair"].nunique() - 1 for _, _, used in found]
-    rows = {}
-    for key, trials in baselines.items():
-        x, y, _ = who_first_data(trials)
-        u, v, _ = gap_data(trials)
-        sides = (
-            ("who-first", WHO_FIRST, statistics.logit(x, y), np.inf, len(y), who),
-            ("gap", GAP, statistics.least_squares(u, v)[1], len(v) - 4, len(v), gap),
-        )
-        for k, (outcome, terms, own, own_freedom, n, human) in enumerate(sides):
-            for i, term in enumerate(terms):
-                row = {"n": n, "n_human": sizes[k]}
-                if own is None or human is None:
-                    row |= dict.fromkeys(("b_driver", "b_human", "difference", "ci_low", "p"))
-                else:
-                    row |= {"b_driver": own[i, 0], "b_human": human[i, 0]}
-                    row |= statistics.difference(
-                        (*own[i, :2], own_freedom), (*human[i, :2], freedom[k])
-                    )
-                rows[f"{_id(key)}/{outcome}/{term}"] = row
-    return rows
-
-
 def _prompts(groups, orders) -> dict[str, dict]:
     """Every prompt of a driver against the first that its study lists."""
     listed = _order(orders).get("prompt", ["baseline"])
@@ -333,34 +292,6 @@ def _prompts(groups, orders) -> dict[str, dict]:
                 sizes = [int(one[column].notna().sum()) for one in (trials, reference)]
                 found |= {"n": sizes[0], "n_reference": sizes[1], "family": (driver, name)}
                 rows[f"{driver}/{variant}/{listed[0]}/{name}"] = found
-    return rows
-
-
-def _humans(recorded: pd.DataFrame, baselines) -> dict[str, dict]:
-    """Every baseline against the humans, within the conditions that both have."""
-    human = measured.published_humans() if recorded.empty else recorded
-    rows = {}
-    for (driver, variant), trials in baselines.items():
-        for name, column, kind, shown in METRICS:
-            if not shown or column not in human or _undecided(trials, column):
-                continue
-            if recorded.empty:
-                found = _compared(trials, human, column, kind)
-            elif _undecided(human, column):
-                continue
-            else:
-                frames = []
-                for each in (trials, human):
-                    counted = each[each[column].notna()]
-                    frames.append(counted.assign(value=counted[column].astype(float)))
-                found = statistics.by_pairs_within(*frames, rate=kind == "rate")
-                unit = 100 if kind == "rate" else 1
-                for scaled in ("difference", "ci_low", "ci_high", "detectable"):
-                    found |= {scaled: unit * found[scaled]} if found else {}
-            if found:
-                sizes = [int(one[column].notna().sum()) for one in (trials, human)]
-                found |= {"n": sizes[0], "n_reference": sizes[1], "family": ("human", name)}
-                rows[f"{driver}/{variant}/human/{name}"] = found
     return rows
 
 

@@ -251,51 +251,6 @@ def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
     }
 
 
-def by_pairs_within(one: pd.DataFrame, other: pd.DataFrame, *, rate: bool) -> dict:
-    """A driver's mean less the humans', within the cells that both have; columns value, cell, pair.
-
-    Least squares with a level for each cell. The squared error is that of the humans, a jackknife
-    over their pairs, plus that of the driver, HC3 over its trials, of a rate at least that of its
-    trials if both rates are equal; t with Satterthwaite's freedom. Empty where nothing is tested.
-    """
-    shared = sorted(set(one["cell"]) & set(other["cell"]))
-    one, other = (each[each["cell"].isin(shared)] for each in (one, other))
-    if not shared or len(one) < 2:
-        return {}
-
-    def fitted(humans):
-        both = pd.concat([one, humans])
-        levels = both["cell"].to_numpy()[:, None] == _column(shared)
-        x = np.column_stack([np.arange(len(both)) < len(one), levels]).astype(float)
-        x, y = x[:, x.any(axis=0)], both["value"].to_numpy(float)
-        bread = np.linalg.inv(x.T @ x)
-        return x, y, bread, bread @ x.T @ y
-
-    x, y, bread, b = fitted(other)
-    pairs = other["pair"].unique()
-    moved = [fitted(other[other["pair"] != pair])[3][0] - b[0] for pair in pairs]
-    humans = np.sqrt(np.sum(np.square(moved)) * (len(pairs) - 1) / len(pairs))
-    leverage = np.einsum("ij,jk,ik->i", x, bread, x)
-    own = slice(0, len(one))  # of whose trials the error of the driver is
-    weight = (bread @ x.T)[0]
-    variance = np.sum((weight * (y - x @ b) / (1 - leverage))[own] ** 2)
-    if rate:
-        cell = x[:, 1:].argmax(axis=1)
-        spread = np.array([y[cell == k].var(ddof=1) for k in range(len(shared))])
-        variance = max(variance, np.sum(weight[own] ** 2 * spread[cell[own]]))
-    if max(variance, humans**2) < 1e-24:
-        return {}
-    ends = (b[0], np.sqrt(variance), len(one) - 1), (0.0, humans, len(pairs) - 1)
-    return difference(*ends)
-
-
-def _column(values: list) -> np.ndarray:
-    """An array of objects, which may be tuples."""
-    found = np.empty(len(values), dtype=object)
-    found[:] = values
-    return found
-
-
 def corrections(p: list[float]) -> tuple[np.ndarray, np.ndarray]:
     """A family's p by Holm (1979) and by Benjamini and Hochberg (1995)."""
     p, m = np.array(p), len(p)

@@ -21,7 +21,7 @@ ALLOWED = {"__future__", "json", "numpy", "scipy", "statsmodels", "pandas", "duc
 OWN = "tests.independent"
 TABLES = (
     "who-first", "gap", "indicators", "ablation-qualitative", "ablation-quantitative", "contrasts",
-    "differences", "factors",
+    "factors",
 )  # fmt: skip
 # Columns that are found by iteration; all others follow from closed forms.
 ITERATED = {"b", "se", "z", "t", "p", "firth_b", "firth_se", "firth_p", "detectable"}

@@ -17,7 +17,6 @@ from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.figures.gallery import FIGURES, rendered
 from merge_runner_analysis.report.alarms import alarms
-from merge_runner_analysis.report.conclusions import not_shown, shown
 from merge_runner_analysis.report.page import report_html
 from merge_runner_analysis.report.writer import finished_figures, write_report
 from merge_runner_analysis.tables import TABLES, make_tables
@@ -115,9 +114,7 @@ def test_equal_results_give_equal_reports(small):
 @pytest.mark.usefixtures("few_draws")
 def test_an_empty_database_concludes_nothing(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", []))
-    assert shown(study) == []
-    assert "nothing can be concluded" in " ".join(not_shown(study, provenance(study.db)))
-    assert "Nothing yet" in Page(report_html(study, [], {})).text
+    assert "No language model is judged here." in Page(report_html(study, [], {})).text
 
 
 def asking(folder, said, *, variant="baseline"):
@@ -127,8 +124,7 @@ def asking(folder, said, *, variant="baseline"):
 
 
 def test_what_went_wrong_stands_at_the_top_before_any_number(page):
-    warnings, _, rest = page.text.partition("What can be concluded")
-    assert "What can be concluded" not in warnings
+    warnings, _, _ = page.text.partition("What can be concluded")
     assert "Read this first" in warnings
     for said in (
         "Another model answered. other was asked for, impostor answered: 3 answers, sweep sweep-1.",
@@ -137,7 +133,6 @@ def test_what_went_wrong_stands_at_the_top_before_any_number(page):
         "Attempts of unknown fate. 1 of 896 of o3/A1.",
     ):
         assert said in warnings
-    assert "Another model answered" in rest, "and again among what cannot be concluded"
 
 
 @pytest.mark.usefixtures("few_draws")

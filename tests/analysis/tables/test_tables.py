@@ -220,9 +220,7 @@ def test_prompts_are_contrasted_without_one_that_is_called_baseline(tmp_path):
     )
     assert cell(table, "o3/calm/hurry/gap_m", "difference") == pytest.approx(0, abs=1e-12)
     assert cell(table, "o3/calm/hurry/gap_m", "reference") == "hurry"
-    ids = [row.id for row in table.rows]
-    assert "o3/hurry/human/collided_boxes_percent" in ids
-    assert not any(name.startswith("o3/calm/human/") for name in ids)
+    assert not any(row.values["reference"] == "human" for row in table.rows)
 
 
 EMPTY = "holds no trial of a model"

@@ -1,0 +1,405 @@
+"""Drivers beside the humans: estimate, interval and test of each measure from one model.
+
+- Who goes first: Firth's penalised logit of left-first on h and dv, with profile likelihood
+  intervals, finite also under separation (Heinze and Schemper 2002).
+- Collisions: rates with Wilson's interval, the humans' with the weights of the driver's conditions.
+- The mean gap: Student's t over trials, the humans' over their nine pairs; Welch's test.
+- Slopes of the gap: least squares with HC3 errors, the humans' as published or by pairs.
+- I5: how far accelerations are held, in human standard deviations (see ``likeness``).
+
+A difference of slopes of a logit, and of rates, has the interval that both intervals give (MOVER:
+Zou and Donner 2008; of rates it is Newcombe's of 1998), and its p is the level at which that
+interval leaves 0 out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from math import asin, hypot, inf, sin, sqrt
+
+import numpy as np
+import pandas as pd
+from scipy import interpolate, optimize
+
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
+from merge_runner_analysis.data.reference_data import HUMAN_GAP_PAIR_SD_M, PAIRS, published
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.metrics import BOXES
+from merge_runner_analysis.stats import firth, intervals, likeness
+from merge_runner_analysis.stats.contrasts import corrected
+from merge_runner_analysis.stats.group_scores import fits, score
+from merge_runner_analysis.stats.indicators import Verdict
+from merge_runner_analysis.stats.intervals import Difference, Z, two_sided_p, wilson
+from merge_runner_analysis.stats.measures import counts, undecided, undecided_note
+from merge_runner_analysis.stats.regressions import (
+    GAP_TERMS,
+    MIN_PAIRS,
+    WHO_FIRST_TERMS,
+    by_pairs,
+    gap_ols,
+    who_first_data,
+)
+from merge_runner_analysis.verdict_words import (
+    MEASURES,
+    OPEN,
+    SHOWN,
+    STRONGER,
+    UNLIKE,
+    WEAKER,
+    Measure,
+)
+
+# By measure: the term of its regression, the factor to its unit, and the indicator that tests it.
+SLOPES = {
+    "headway": ("projected_headway", 1.0, "I1"),
+    "velocity": ("relative_velocity", 1.0, "I2"),
+    "gap-headway": ("abs_projected_headway", 1.0, "I3"),
+    "gap-velocity": ("abs_relative_velocity", 0.8, "I4"),
+}
+# How far from an estimate its profile is followed, in standard errors, and at how many points.
+REACH, POINTS = 30.0, 61
+Limits = Callable[[float], tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A value of ``n`` trials with its interval at any quantile z, and with its standard error.
+
+    ``freedom`` is that of Student's t. ``problem`` says why there is no value, ``remark`` what to
+    know of it. A rate counts ``k`` trials; with ``undecided`` ones it has no value, and the limits
+    hold whether none or all of them count (Manski 1989).
+    """
+
+    value: float | None
+    n: int
+    limits: Limits | None = None
+    se: float | None = None
+    freedom: float = inf
+    problem: str = ""
+    remark: str = ""
+    k: int | None = None
+    undecided: int = 0
+
+    @property
+    def ci(self) -> tuple[float, float] | None:
+        """The 95 % interval."""
+        return None if self.limits is None else self.limits(Z)
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A driver beside the humans in one measure; ``p_holm`` is corrected over its measures."""
+
+    measure: Measure
+    own: Estimate
+    human: Estimate
+    difference: Difference | None
+    state: str
+    note: str
+    p_holm: float | None = None
+
+
+@cache
+def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
+    """Compare a driver with the humans by every measure."""
+    found = [_compared(study, group, measure) for measure in MEASURES.values()]
+    tested = [one.difference.p for one in found if one.difference]
+    holm = iter(corrected(tested)[0] if tested else ())
+    return tuple(
+        replace(one, p_holm=float(next(holm)) if one.difference else None) for one in found
+    )
+
+
+@cache
+def of_humans(study: Study) -> dict[str, Estimate]:
+    """The humans by measure, over all conditions."""
+    return {name: _human(study, study.human, name) for name in MEASURES}
+
+
+def _compared(study: Study, group: Group, measure: Measure) -> Comparison:
+    # Conditions that no human drove would pass for another behaviour.
+    alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
+    own, human = _own(study, alike, measure.name), _human(study, alike, measure.name)
+    difference = None if measure.name == "held" else _difference(own, human)
+    if own.undecided:
+        difference = _of_worst_cases(own, human)
+    verdict = score(study, group).robust.get(SLOPES[measure.name][2]) if measure.is_slope else None
+    state = _state(measure, own, human, difference, verdict)
+    notes = [own.problem, human.problem, own.remark, human.remark]
+    if measure.name in SLOPES and verdict and verdict.passed is None and not own.problem:
+        notes.append(verdict.why)
+    return Comparison(measure, own, human, difference, state, "; ".join(filter(None, notes)))
+
+
+def _state(
+    measure: Measure,
+    own: Estimate,
+    human: Estimate,
+    difference: Difference | None,
+    verdict: Verdict | None,
+) -> str:
+    """The state of a measure, empty where it cannot be judged; see ``Measure.rule``."""
+    if own.ci is None or (own.value is None and not own.undecided):
+        return ""
+    low, high = own.ci
+    if measure.margin is not None:
+        alike = verdict.passed if verdict else max(-low, high) < measure.margin
+        if alike:
+            return SHOWN
+        return UNLIKE if max(low, -high) > measure.margin else OPEN
+    if difference is None or human.value is None:
+        return ""
+    assert difference.low is not None
+    assert difference.high is not None
+    differs = not difference.low <= 0 <= difference.high
+    if verdict is None or not verdict.passed:
+        return "" if verdict and verdict.passed is None else UNLIKE if differs else OPEN
+    if not differs:
+        return SHOWN
+    return WEAKER if abs(own.value or 0.0) < abs(human.value) else STRONGER
+
+
+def _of_worst_cases(own: Estimate, human: Estimate) -> Difference | None:
+    """The difference whether no undecided trial collided or all did, with the larger p.
+
+    Its value is the one nearer to 0.
+    """
+    if own.k is None or human.value is None:
+        return None
+    cases = [_mover(_rate(k / own.n, own.n, own.n), human) for k in (own.k, own.k + own.undecided)]
+    least, most = cases
+    nearest = min(cases, key=lambda one: abs(one.value))
+    return replace(nearest, low=least.low, high=most.high, p=max(one.p for one in cases))
+
+
+def _difference(own: Estimate, human: Estimate) -> Difference | None:
+    """The driver's value less the humans'; None where one of them, or every error, is missing."""
+    if own.value is None or human.value is None or own.limits is None or human.limits is None:
+        return None
+    value = own.value - human.value
+    if own.se is not None and human.se is not None and human.freedom < inf:
+        return intervals.difference(value, (own.se, own.freedom), (human.se, human.freedom))
+    return _mover(own, human)
+
+
+def _mover(own: Estimate, human: Estimate) -> Difference:
+    """The difference from the limits of both, and the level at which these leave 0 out."""
+    assert own.value is not None
+    assert human.value is not None
+    assert own.limits is not None
+    assert human.limits is not None
+    value, of_own, of_humans = own.value - human.value, own.limits, human.limits
+    middle, other = own.value, human.value
+
+    def ends(z: float) -> tuple[float, float]:
+        (low, high), (human_low, human_high) = of_own(z), of_humans(z)
+        return (
+            value - hypot(middle - low, human_high - other),
+            value + hypot(high - middle, other - human_low),
+        )
+
+    def beyond(z: float) -> float:
+        low, high = ends(z)
+        return low if value > 0 else -high
+
+    largest = 30.0  # of this quantile p is 0 to 190 digits
+    z = 0.0
+    if value:
+        sure = beyond(largest) > 0
+        z = largest if sure else float(optimize.brentq(beyond, 0.0, largest))
+    low, high = ends(Z)
+    if own.se is None or human.se is None:
+        least = _detectable_rate(own.n, human.n, other)
+    else:
+        least = intervals.detectable(hypot(own.se, human.se))
+    return Difference(value, low, high, two_sided_p(z), least)
+
+
+def _detectable_rate(n: int, m: int, percent: float) -> float:
+    """How many points above ``percent`` of m trials a rate of n must lie to be found (80 %).
+
+    By the arcsine of the square root, whose variance is 1 / 4n (Cohen 1988).
+    """
+    apart = intervals.detectable(sqrt(1 / n + 1 / m)) / 2
+    highest = min(asin(sqrt(percent / 100)) + apart, asin(1.0))
+    return 100 * sin(highest) ** 2 - percent
+
+
+def _own(study: Study, group: Group, name: str) -> Estimate:
+    """A driver's estimate, of its trials in the humans' conditions."""
+    if name == "collisions":
+        return _collided(group)
+    if name == "gap":
+        return _mean(group.finished["gap_m"].dropna().to_numpy(float))
+    if name == "held":
+        return _held(study, group)
+    return _slope(group, name)
+
+
+def _human(study: Study, group: Group, name: str) -> Estimate:
+    """The humans' estimate beside a group's: rates and means of the same conditions."""
+    human = study.human
+    if name == "collisions":
+        return _standardised(human, group)
+    if name == "held":
+        return Estimate(0.0, len(human.finished))
+    if name in ("headway", "velocity"):
+        return _slope(human, name)
+    if study.imported and not study.imported.contradicting and _pairs(human) >= MIN_PAIRS:
+        return _gap_of_pairs(human, group) if name == "gap" else _gap_slope_of_pairs(human, name)
+    return _published_gap(group) if name == "gap" else _published_gap_slope(name)
+
+
+@cache
+def _slope(group: Group, name: str) -> Estimate:
+    """A slope of who goes first by Firth's fit, or of the gap with HC3 errors."""
+    term, factor, _ = SLOPES[name]
+    if term in WHO_FIRST_TERMS:
+        fit = fits(group).firth
+        if fit.problem:
+            return Estimate(None, fit.n, problem=fit.problem)
+        limits = _profile(group.outcomes, term, fit.terms[term].b, fit.terms[term].se)
+        return Estimate(fit.terms[term].b, fit.n, limits, fit.terms[term].se)
+    fit = fits(group).hc3
+    if fit.problem:
+        return Estimate(None, fit.n, problem=fit.problem)
+    return _by_t(factor * fit.terms[term].b, factor * fit.terms[term].se, fit.freedom, fit.n)
+
+
+def _by_t(value: float, se: float, freedom: float, n: int, remark: str = "") -> Estimate:
+    """An estimate with Student's t."""
+
+    def limits(z: float) -> tuple[float, float]:
+        return intervals.interval(value, se, freedom, 1 - two_sided_p(z))
+
+    return Estimate(value, n, limits, se, freedom, remark=remark)
+
+
+def _profile(trials: pd.DataFrame, term: str, value: float, se: float) -> Limits:
+    """The interval of a slope by Firth's profile likelihood, at any quantile.
+
+    The signed root of twice the loss of penalised likelihood is followed over the slope, the other
+    terms fitted anew at each point, and inverted by a monotone interpolation.
+    """
+    design, left = who_first_data(trials)
+    cells, place, trials_of = np.unique(design, axis=0, return_inverse=True, return_counts=True)
+    n, lefts = trials_of.astype(float), np.bincount(place, weights=left).astype(float)
+    at = value + se * np.sinh(np.linspace(-np.arcsinh(REACH), np.arcsinh(REACH), POINTS))
+    roots = firth.signed_roots(cells, n, lefts, WHO_FIRST_TERMS.index(term), value, at)
+    # Far out a fit may stop early: the root must rise all the way.
+    sound = np.isfinite(roots) & (np.maximum.accumulate(np.nan_to_num(roots, nan=-np.inf)) == roots)
+    at, roots = at[sound], roots[sound]
+    keep = np.flatnonzero(np.diff(roots, prepend=-np.inf) > 0)
+    at, roots = at[keep], roots[keep]
+    inside = interpolate.PchipInterpolator(roots, at)
+    first, last = np.diff(at[:2]) / np.diff(roots[:2]), np.diff(at[-2:]) / np.diff(roots[-2:])
+
+    def place_of(root: float) -> float:
+        if root < roots[0]:
+            return float(at[0] + (root - roots[0]) * first[0])
+        if root > roots[-1]:
+            return float(at[-1] + (root - roots[-1]) * last[0])
+        return float(inside(root))
+
+    return lambda z: (place_of(-z), place_of(z))
+
+
+def _collided(group: Group) -> Estimate:
+    """The share of ended trials with a collision by the humans' rule, in percent."""
+    k, decided = counts(group, BOXES)
+    n = decided + (cut_off := undecided(group, BOXES))
+    if not n:
+        return Estimate(None, 0, problem=f"no trial ended: {group.left_out}")
+    least, most = (_rate((k + more) / n, n, n) for more in (0, cut_off))
+    if not cut_off:
+        return replace(least, k=k)
+    assert least.ci is not None
+    assert most.ci is not None
+    ends = least.ci[0], most.ci[1]
+    note = undecided_note(group, BOXES)
+    return Estimate(None, n, lambda _: ends, problem=note, k=k, undecided=cut_off)
+
+
+def _rate(rate: float, as_good_as: float, n: int) -> Estimate:
+    """A rate in percent with Wilson's interval of so many trials."""
+
+    def limits(z: float) -> tuple[float, float]:
+        low, high = wilson(rate, as_good_as, z) if z else (rate, rate)
+        return 100 * low, 100 * high
+
+    return Estimate(100 * rate, n, limits)
+
+
+def _standardised(human: Group, group: Group) -> Estimate:
+    """The humans' collisions in the conditions of a group, which weigh as they do there."""
+    trials = human.outcomes.dropna(subset=[BOXES.column])
+    by_condition = trials.astype({BOXES.column: bool}).groupby("condition")[BOXES.column]
+    rates, sizes = by_condition.mean(), by_condition.size()
+    played = group.outcomes.dropna(subset=[BOXES.column])["condition"]
+    weights = played.value_counts(normalize=True).reindex(rates.index).dropna()
+    if weights.empty:
+        return Estimate(None, 0, problem="no human drove its conditions")
+    weights /= weights.sum()
+    as_good_as = 1 / float((weights**2 / sizes[weights.index]).sum())
+    rate = float((weights * rates[weights.index]).sum())
+    return _rate(rate, as_good_as, int(sizes[weights.index].sum()))
+
+
+def _mean(values: np.ndarray, n: int | None = None, remark: str = "") -> Estimate:
+    """A mean with Student's t."""
+    if len(values) < 2:
+        problem = "a single trial has no error" if len(values) else "no trial finished with a gap"
+        return Estimate(float(values[0]) if len(values) else None, len(values), problem=problem)
+    se = intervals.standard_error(values)
+    return _by_t(float(values.mean()), se, len(values) - 1, n or len(values), remark)
+
+
+def _held(study: Study, group: Group) -> Estimate:
+    """How far accelerations are held, less the humans, in human standard deviations (I5)."""
+    found = likeness.difference(study, group) if group.measured and len(group.finished) else None
+    if found is None or found.value is None:
+        why = "too few human recordings are imported" if not study.calibrated else "no trial acted"
+        return Estimate(None, len(group.finished), problem=f"I5 is not compared: {why}")
+    ends = found.bounds()
+    limits = (lambda _: ends) if ends else None  # its limits are wanted at 95 % alone
+    return Estimate(found.value, found.n, limits)
+
+
+def _pairs(human: Group) -> int:
+    return int(human.finished["pair"].nunique()) if "pair" in human.finished else 0
+
+
+def _gap_of_pairs(human: Group, group: Group) -> Estimate:
+    """The humans' mean gap in the conditions of a group, over the means of their pairs."""
+    alike = human.finished["condition"].isin(group.trials["condition"].unique())
+    trials = human.finished[alike].dropna(subset=["gap_m"])
+    return _mean(trials.groupby("pair")["gap_m"].mean().to_numpy(float), len(trials))
+
+
+def _published_gap(group: Group) -> Estimate:
+    """The published mean of all conditions, with the spread of the nine pairs."""
+    row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
+    value, se = float(row["gap_m"]), HUMAN_GAP_PAIR_SD_M / len(PAIRS) ** 0.5
+    n = int(published("paper_gap").query("driver == 'human'")["n"].iloc[0])
+    if {*HUMAN_CONDITIONS} - {*group.trials["condition"]}:
+        return Estimate(None, n, problem="the published human gap is that of all 11 conditions")
+    return _by_t(value, se, len(PAIRS) - 1, n, "humans as published")
+
+
+def _gap_slope_of_pairs(human: Group, name: str) -> Estimate:
+    term, factor, _ = SLOPES[name]
+    fit = by_pairs(gap_ols, human.trials, "gap_m")
+    if fit.problem:
+        return Estimate(None, fit.n, problem=f"humans: {fit.problem}")
+    return _by_t(factor * fit.terms[term].b, factor * fit.terms[term].se, fit.freedom, fit.n)
+
+
+def _published_gap_slope(name: str) -> Estimate:
+    term, factor, _ = SLOPES[name]
+    rows = published("paper_gap").query("driver == 'human'").set_index("term")
+    row = rows.loc[term]
+    n = int(row["n"])
+    value, se = factor * float(row["b"]), factor * float(row["se"])
+    return _by_t(value, se, n - len(GAP_TERMS), n, "humans as published")

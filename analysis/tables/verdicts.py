@@ -1,0 +1,139 @@
+"""What each driver and prompt shows beside the humans: a row for each of seven measures.
+
+Headlines, sentences, the report and the pages read this table and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from merge_runner.records import SIDES
+from merge_runner_analysis.data.driver_words import language_models
+from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.stats.verdicts import Comparison, Estimate, compared, of_humans
+from merge_runner_analysis.tables.model import Column, Row, Table, Value
+from merge_runner_analysis.tables.notes import pair_notes, replayed_notes
+from merge_runner_analysis.verdict_words import (
+    HUMANS,
+    LANGUAGE_MODEL,
+    MEASURES,
+    MOCK,
+    PROGRAM,
+    TABLE,
+    sentences,
+)
+
+COLUMNS = (
+    Column("driver", "driver"),
+    Column("setting", "prompt"),
+    Column("kind", "kind", meaning="language model, program or mock model"),
+    Column("measure", "measure", optional=True),
+    Column("n", "n", "count", 0, "trials that the estimate rests on", optional=True),
+    Column("k", "k", "count", 0, "trials that collided", "collided_boxes", optional=True),
+    Column("undecided", "undecided", "count", 0, "ended by another rule", optional=True),
+    Column("estimate", "estimate", "number", 2, "in the unit of the measure"),
+    Column("ci", "95 % CI", "interval", 2, "of the same model", optional=True),
+    Column("human", "humans", "number", 2, "in the same conditions", optional=True),
+    Column("human_ci", "95 % CI", "interval", 2, "of the humans", optional=True),
+    Column("difference", "difference", "number", 2, "driver minus humans", optional=True),
+    Column("difference_ci", "95 % CI", "interval", 2, "of the difference", optional=True),
+    Column("p", "p", "p", 3, "of no difference, by the same model", optional=True),
+    Column("p_holm", "Holm", "p", 3, "corrected over the measures of the driver", optional=True),
+    Column(
+        "detectable",
+        "detectable",
+        "number",
+        2,
+        "smallest difference that is found at 5 % with power .8",
+        optional=True,
+    ),
+    Column("state", "verdict", meaning="what is shown", optional=True),
+    Column("rule", "rule", meaning="how the verdict is set", optional=True),
+)
+
+
+def verdicts(study: Study) -> Table:
+    """Every driver and prompt that is judged, and the humans first, by every measure."""
+    rows = [] if study.human not in study.groups else [*_human_rows(study)]
+    for group in study.models:
+        if not group.caution:
+            rows += [_row(group, _kind(study, group), one) for one in compared(study, group)]
+    rows += [
+        Row(group.id, (group.id,), _named(group, _kind(study, group)), group.unjudged)
+        for group in study.unjudged
+    ]
+    return Table(
+        TABLE,
+        "What drivers show beside the humans",
+        COLUMNS,
+        rows,
+        (
+            *sentences(rows),
+            *(
+                f"{one.name}: {one.trait}, {one.unit}; verdict: {one.rule}"
+                for one in MEASURES.values()
+            ),
+            "shown: as in humans; weaker, stronger: shown, and the interval of the difference "
+            "leaves 0 out; unlike: not shown, and it leaves 0 out; inconclusive: neither",
+            "collisions: by the rule of the human experiment, outlines that overlap, looked for at "
+            "20 Hz; the humans' share weighs conditions as the driver's trials do",
+            f"intervals take trials as independent. The {HUMAN_TRIALS} human trials are of nine "
+            "pairs who differ, which only the mean gap and imported gaps allow for",
+            *pair_notes(study.models),
+            *replayed_notes(study),
+        ),
+    )
+
+
+def _kind(study: Study, group: Group) -> str:
+    if group.scripted:
+        return MOCK
+    models = dict(zip(SIDES, (*group.models, *group.models), strict=False))
+    asked = language_models(models, study.specs.get(group.spec_hash or "", {}))
+    return LANGUAGE_MODEL if asked else PROGRAM
+
+
+def _named(group: Group, kind: str) -> dict[str, Value]:
+    return {"driver": group.label, "setting": group.setting, "kind": kind}
+
+
+def _row(group: Group, kind: str, found: Comparison) -> Row:
+    difference, measure = found.difference, found.measure
+    values: dict[str, Value] = _named(group, kind) | {
+        "measure": measure.name,
+        **_values(found.own),
+        "human": found.human.value,
+        "human_ci": found.human.ci,
+        "state": found.state or None,
+        "rule": measure.rule,
+    }
+    if difference is not None:
+        values |= {
+            "difference": difference.value,
+            "difference_ci": difference.bounds(),
+            "p": difference.p,
+            "p_holm": found.p_holm,
+            "detectable": difference.detectable,
+        }
+    return Row(f"{group.id}/{measure.name}", (group.id,), values, found.note, measure.counts)
+
+
+def _human_rows(study: Study) -> Iterator[Row]:
+    for name, found in of_humans(study).items():
+        values = _named(study.human, HUMANS) | {"measure": name, **_values(found)}
+        note = "; ".join(filter(None, (found.problem, found.remark)))
+        # What is published rests on no trials here.
+        counts = "" if found.remark or not study.human.measured else MEASURES[name].counts
+        yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, counts)
+
+
+def _values(found: Estimate) -> dict[str, Value]:
+    return {
+        "n": found.n,
+        "k": found.k,
+        "undecided": found.undecided or None,
+        "estimate": found.value,
+        "ci": found.ci,
+    }
