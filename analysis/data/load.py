@@ -157,17 +157,6 @@ LEFT JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash, side)
 ANTI JOIN (FROM specs WHERE spec->>'$.scenario.control_start' = 'own_exit') USING (spec_hash)
 ORDER BY ALL
 """
-# How many calls of a variant's spec share their reply with a baseline's spec.
-SHARED = """
-WITH used AS (
-    SELECT DISTINCT spec_hash, variant, call_key
-    FROM decisions JOIN trials USING (trial_id, spec_hash)
-    WHERE call_key IS NOT NULL AND source <> 'seat'
-), totals AS (SELECT spec_hash, count(*) AS calls FROM used GROUP BY ALL)
-SELECT one.spec_hash, base.spec_hash AS baseline, calls, count(*) AS shared
-FROM used AS one JOIN used AS base USING (call_key) JOIN totals ON totals.spec_hash = one.spec_hash
-WHERE one.variant <> 'baseline' AND base.variant = 'baseline' GROUP BY ALL ORDER BY ALL
-"""
 # Fates of the attempts that were answered, also without a plan.
 ANSWERED = ("driven", "fallback")
 # One row a trial: what became of its calls and decisions. ``failures`` has the reason of each

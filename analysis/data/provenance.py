@@ -105,7 +105,7 @@ class Provenance:
 
     ``sweeps``, ``calls``, ``sweep_costs`` and ``model_costs`` are rows of the queries here;
     ``switches`` holds, by driver, variant and spec_hash, the settings of the driving task that
-    differ from the defaults, and ``tasks`` the same by spec_hash, empty where none does;
+    differ from the defaults;
     ``mismatches`` says where another model answered than was asked for. ``alike`` has the drivers
     all of whose answers to a prompt that was asked before are word for word as before, with their
     number. ``sent`` holds what was sent to the models beside the prompt, by spec_hash and side.
@@ -116,7 +116,6 @@ class Provenance:
     sweep_costs: pd.DataFrame
     model_costs: pd.DataFrame
     switches: dict[str, str]
-    tasks: dict[str, str]
     mismatches: list[Mismatch]
     alike: dict[str, int]
     sent: dict[str, dict[str, dict[str, object]]]
@@ -147,7 +146,6 @@ def provenance(db: Path) -> Provenance:
             f"{row.driver}/{row.variant} ({row.spec_hash})": _switched(spec) or "defaults"
             for row, spec in specs.items()
         },
-        tasks={row.spec_hash: _switched(spec) for row, spec in specs.items()},
         mismatches=_mismatches(found["served"], found["aliases"]),
         alike=_alike(db),
         sent={row.spec_hash: _sent(spec) for row, spec in specs.items()},

@@ -44,7 +44,6 @@ from merge_runner_analysis.data.load import (
     EGO_SPEEDS,
     FIRST_ACTIONS,
     PLANS,
-    SHARED,
     SPEEDS,
     TRACES,
     WORDS,
@@ -373,11 +372,6 @@ class Study:
     def calls(self) -> Calls:
         """What became of the calls, by trial."""
         return load_calls(self.db)
-
-    @cached_property
-    def shared(self) -> pd.DataFrame:
-        """One row a variant: how many of its calls share their reply with the baseline."""
-        return self._read(SHARED)
 
     def _read(self, sql: str) -> pd.DataFrame:
         return load_each({"rows": sql}, self.db)["rows"]

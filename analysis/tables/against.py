@@ -47,25 +47,21 @@ def _placed(row: Row, group: Group) -> Row:
     # same driver: it only draws other samples.
     (asked, *others) = group.models
     sample_set = "" if group.name == asked else f"/set{group.trials['sample_set'].iloc[0]}"
-    apart = group.scripted or group.unjudged
-    own = not others and group.name == asked + sample_set and not apart
+    own = asked in DRIVERS and not others and group.name == asked + sample_set
+    beside = asked if own and not group.unjudged else ""
     # A mock model under its own name misleads nobody.
     posing = group.scripted and not MOCKS.issuperset(group.models)
-    return replace(
-        row,
-        beside=asked if own and asked in DRIVERS else "",
-        stand_in_for=group.models if posing else (),
-        # A comparison of published values with themselves would test nothing.
-        printed=not group.measured or group.published_outcomes is not None,
-    )
+    # A comparison of published values with themselves would test nothing.
+    printed = not group.measured or group.published_outcomes is not None
+    return replace(row, beside=None if posing else beside, printed=printed)
 
 
 def against(table: Table, reference: str, driver: str | None = None) -> Table:
     """A table with published values and differences.
 
     Each row is compared with the paper's row of the same name. With ``driver``, the rows of all
-    drivers are compared with that driver's, except for stand-ins that answered in its name. Raises
-    UsageError for any other reference, and for a driver that is not in the paper.
+    drivers are compared with that driver's, except for stand-ins that answered in a model's name.
+    Raises UsageError for any other reference, and for a driver that is not in the paper.
     """
     if reference != PAPER:
         raise UsageError(f"--against {reference}: valid is {PAPER}")
@@ -84,7 +80,7 @@ def against(table: Table, reference: str, driver: str | None = None) -> Table:
     notes = [
         *table.notes,
         *(f"paper: {citation(name)}" for name in FILES[table.name]),
-        *_placements(table, driver),
+        *([] if driver is None else [f"every driver stands beside the paper's {driver}"]),
         *([] if any(found) else ["the paper has none of these drivers and variants"]),
     ]
     rows = [_beside(row, values) for row, values in zip(table.rows, found, strict=True)]
@@ -94,24 +90,6 @@ def against(table: Table, reference: str, driver: str | None = None) -> Table:
 def in_paper(table: Table) -> bool:
     """Whether the paper prints this table."""
     return table.name in FILES
-
-
-def _placements(table: Table, driver: str | None) -> list[str]:
-    """Notes on rows that are compared with another driver's, and on those kept from comparison."""
-    names = [name for name in DRIVERS if driver in {None, name}]
-    kept_off = [
-        (row.values["driver"], name)
-        for row in table.rows
-        for name in names
-        if name in row.stand_in_for
-    ]
-    return [
-        *([] if driver is None else [f"every driver stands beside the paper's {driver}"]),
-        *(
-            f"{label} does not stand beside the paper's {name}"
-            for label, name in dict(kept_off).items()
-        ),
-    ]
 
 
 def _paper(table: str) -> dict[Key, dict[str, Value]]:
@@ -175,9 +153,9 @@ def _key(row: Row, named: str | None) -> Key:
     The rows of mixed models have no counterpart there.
     """
     group = row.groups[0]
-    driver = row.beside
-    if named is not None and driver != HUMAN:
-        driver = "" if named in row.stand_in_for else named
+    driver = row.beside or ""
+    if named is not None and row.beside not in {None, HUMAN}:
+        driver = named
     # The humans had no prompt, and hence no setting in the file.
     setting = "" if driver == HUMAN else group.rpartition("/")[2]
     return driver, setting, row.id.removeprefix(group).lstrip("/")

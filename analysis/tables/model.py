@@ -44,9 +44,9 @@ class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
     ``counts`` is the SQL predicate for its trials, empty where it rests on none. ``beside`` is the
-    paper's driver whose row it is compared with, if any, and ``printed`` says that values are
-    published ones, which have no difference from these. ``stand_in_for`` are the models in whose
-    names a scripted stand-in answered.
+    paper's driver whose row it is compared with, if any, and None where a scripted stand-in
+    answered in the name of a model. ``printed`` says that values are published ones, which have no
+    difference from these.
     """
 
     id: str
@@ -54,9 +54,8 @@ class Row:
     values: Mapping[str, Value]
     note: str = ""
     counts: str = FINISHED
-    beside: str = ""
+    beside: str | None = ""
     printed: bool = False
-    stand_in_for: tuple[str, ...] = ()
 
 
 GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "setting"))
@@ -124,6 +123,6 @@ def from_text(text: str) -> Table:
         for name in intervals & row["values"].keys():
             if row["values"][name] is not None:
                 row["values"][name] = tuple(row["values"][name])
-        row |= {name: tuple(row[name]) for name in ("groups", "stand_in_for")}
+        row["groups"] = tuple(row["groups"])
     rows = [Row(**row) for row in content["rows"]]
     return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})
