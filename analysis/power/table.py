@@ -40,7 +40,6 @@ def table(found: Mapping[str, Any], chances: Sequence[Chance]) -> Table:
         costs = f"about {', '.join(f'{usd(cost)} (x{m:g})' for cost, m in each)} USD, {how}"
     return Table(
         "power",
-        f"What the study {found['study']} can find ({found['driver']}, {found['trials']} trials)",
         COLUMNS,
         [_row(each, usd) for each in chances],
         (
@@ -58,6 +57,8 @@ def table(found: Mapping[str, Any], chances: Sequence[Chance]) -> Table:
             "arms); each by itself, without correction for their number",
             f"the whole study costs {costs}",
         ),
+        title=f"What the study {found['study']} can find ({found['driver']}, "
+        f"{found['trials']} trials)",
     )
 
 

@@ -80,7 +80,6 @@ def ablation_qualitative(study: Study) -> Table:
     ]
     return Table(
         "ablation-qualitative",
-        "Alignment with qualitative indicators of human behaviour across prompt ablations",
         columns,
         [_qualitative_row(study, group) for group in study.groups],
         (
@@ -98,7 +97,6 @@ def ablation_quantitative(study: Study) -> Table:
     metrics = shown_in("tables")
     return Table(
         "ablation-quantitative",
-        "Quantitative measures across prompt ablations",
         [*KEYS, *(column for metric in metrics for column in _metric_columns(metric))],
         [_quantitative_row(group) for group in study.groups],
         (

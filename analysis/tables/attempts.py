@@ -43,7 +43,6 @@ def attempts(study: Study) -> Table:
     columns = [column for name in names for column in _columns(name)]
     return Table(
         "attempts",
-        "What became of the calls",
         (*GROUP_COLUMNS, *columns),
         [
             row_of(group, _values(columns, counts), _note(counts), counts="true")

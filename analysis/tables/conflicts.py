@@ -22,7 +22,6 @@ def criticality(study: Study) -> Table:
         ]
     return Table(
         "criticality",
-        "When conflicts are resolved, and how close the vehicles come",
         columns,
         [_row(group) for group in study.measured],
         (

@@ -30,7 +30,6 @@ def contrasts(study: Study) -> Table:
     judged = "judged " if study.unjudged else ""
     return Table(
         "contrasts",
-        "Differences between prompts",
         (
             Column("driver", "driver"),
             Column("setting", "setting"),

@@ -56,7 +56,6 @@ def factors(study: Study) -> Table:
     judged = "judged " if study.unjudged else ""
     return Table(
         "factors",
-        "Each factor's levels, pooled over all other factors" + (f", by {by}" if by else ""),
         (
             *([Column("at", by)] if by else []),
             Column("factor", "factor"),

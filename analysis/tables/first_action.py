@@ -60,7 +60,6 @@ def first_action(study: Study) -> Table:
     groups = (*study.groups, *study.asked)
     return Table(
         "first-action",
-        "Net acceleration (m/s²) at the first decision, by own relative velocity",
         (*GROUP_COLUMNS, *(replace(one, optional=True) for one in COLUMNS)),
         [row for group in groups for row in _rows(study, group)],
         (

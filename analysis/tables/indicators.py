@@ -50,7 +50,6 @@ def indicators(study: Study) -> Table:
         rows += [_metric_row(group, metric) for group in study.baselines]
     return Table(
         "indicators",
-        "Qualitative and quantitative indicators of behaviour during merging conflicts",
         (
             Column("indicator", "indicator"),
             Column("driver", "driver"),

@@ -86,10 +86,10 @@ class Table:
     """A table: a missing value in a required column always has a note, and NaN never occurs."""
 
     name: str
-    title: str
     columns: Sequence[Column]
     rows: Sequence[Row]
     notes: Sequence[str] = field(default_factory=tuple)
+    title: str = ""
     number: str = ""
 
     # NaN is not valid JSON, and a reader could not tell its cause: a missing value is None.

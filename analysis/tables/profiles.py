@@ -12,7 +12,6 @@ def velocity_profiles(study: Study) -> Table:
     """A row per group: how far accelerations are held, compared with humans, and plan revisions."""
     return Table(
         "velocity-profiles",
-        "Piecewise-linear velocity profiles (I5) and plan revisions",
         (
             *GROUP_COLUMNS,
             Column("n", "n", "count", 0, "finished trials"),

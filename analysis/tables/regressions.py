@@ -58,7 +58,6 @@ def who_first(study: Study) -> Table:
     """Table III: logistic regression of left-first on h (m) and dv (m/s)."""
     return Table(
         "who-first",
-        "Logistic regression of which driver merged first (1: left)",
         (
             *KEYS,
             Column("z", "z", "number", 2, "b / SE"),
@@ -76,7 +75,6 @@ def gap(study: Study) -> Table:
     """Table IV: linear regression of the gap (m) on |h|, |dv| and h*dv."""
     return Table(
         "gap",
-        "Linear regression of the gap at the merge point (m, net of the vehicle length)",
         (
             *KEYS,
             Column("t", "t", "number", 2, "b / SE"),

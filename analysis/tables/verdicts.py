@@ -66,7 +66,6 @@ def verdicts(study: Study) -> Table:
     ]
     return Table(
         TABLE,
-        "What drivers show beside the humans",
         COLUMNS,
         rows,
         (

@@ -33,7 +33,6 @@ def words(study: Study) -> Table:
     judged = "judged " if study.unjudged else ""
     return Table(
         "words",
-        "Words and deeds: what follows M (merge first) and Y (yield)",
         (*GROUP_COLUMNS, *_share_columns(), *_cue_columns()),
         [_row(seat, found) for seat, found in spoken],
         (
