@@ -125,10 +125,10 @@ def _source(study: Study, group: Group, predicate: str, condition: str) -> Sourc
         )
     if condition:
         text += f"; the value counts {len(numerator)} of them"
-    return Source(group.id, text, _query(group, predicate, trials), trials, numerator)
+    return Source(group.id, text, _query(study, group, predicate, trials), trials, numerator)
 
 
-def _query(group: Group, predicate: str, trials: tuple[str, ...]) -> str:
+def _query(study: Study, group: Group, predicate: str, trials: tuple[str, ...]) -> str:
     """The query that lists these trials of a group, which a predicate is true of."""
     if not trials:
         return ""
@@ -137,10 +137,9 @@ def _query(group: Group, predicate: str, trials: tuple[str, ...]) -> str:
     if group.setting:
         conditions.append(f"variant = {quoted(group.setting)}")
     # The database does not know mirrored trials by their images either.
-    if group.seats[1] or FOUND_OUT.search(predicate):
-        conditions.append(f"trials.trial_id IN ({', '.join(map(quoted, trials))})")
-    else:
-        conditions += [*filter(None, [group.narrowed]), predicate]
+    if study.holds_more(group) or group.seats[1] or FOUND_OUT.search(predicate):
+        predicate = f"trials.trial_id IN ({', '.join(map(quoted, trials))})"
+    conditions.append(predicate)
     return (
         "SELECT trials.trial_id, condition, status, merged_first, "  # noqa: S608 # ours
         "trial_metrics.* EXCLUDE (trial_id, spec_hash) FROM trials "

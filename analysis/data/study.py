@@ -58,7 +58,7 @@ from merge_runner_analysis.names import BASELINE, HUMAN
 
 # What tells groups apart, and is no measure.
 COLUMNS_OF_GROUPS = [
-    "driver", "image", "task", "usual", "mark", "apart", "shared", "trace", "left_scripted",
+    "driver", "image", "task", "usual", "mark", "apart", "trace", "left_scripted",
     "right_scripted",
 ]  # fmt: skip
 MEAN_SPEED = "mean_speed_mps"
@@ -66,6 +66,7 @@ MEAN_SPEED = "mean_speed_mps"
 FIRST = (MODEL, PROMPT)
 USUAL = (BASELINE, DEFAULT, SELF)
 ONLY_ASKED = " [asked]"  # ends the name of a driver that was only asked
+SPEC = ["spec_hash", "variant"]
 QUERIES = {
     "asked": ASKED_TRIALS,
     "decisions": ASKED_DECISIONS,
@@ -94,8 +95,6 @@ class Group:
     deterministic driver are distinct, and ``whole`` is the group with their repetitions; ``equal``
     counts the trials of a language model that went as an earlier one.
     ``unjudged`` says why nothing is concluded from them, and is empty where something is.
-    ``narrowed`` is what tells the trials in SQL from others of their spec and variant, empty where
-    there are none.
     ``published_outcomes`` stand in the place of the trials' outcomes where these are a part of the
     published ones.
     """
@@ -116,7 +115,6 @@ class Group:
     whole: Group | None = None
     equal: int = 0
     unjudged: str = ""
-    narrowed: str = ""
     published_outcomes: pd.DataFrame | None = None
     levels: Mapping[str, str] = field(default_factory=dict)
 
@@ -246,8 +244,9 @@ class Study:
         recorded = trials["source"] == HUMAN
         self.imported = _imported(trials[recorded], self.specs) if recorded.any() else None
         self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
-        played = self._groups(trials[~recorded], found)
-        asked = found["asked"]
+        played, asked = self._groups(trials[~recorded], found), found["asked"]
+        every = pd.concat([trials[SPEC], asked[SPEC]])
+        self._sizes = every.value_counts(dropna=False).reset_index(name="trials")
         asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED), found)
         # Those that were only asked are chosen by the names of their models.
         names = {group: group.driver for group in played}
@@ -271,7 +270,7 @@ class Study:
         if self.file:
             trials = trials[self.studies.holds(self.file, trials)]
         trials = trials.merge(found["traces"], on=KEYS, how="left")
-        groups = _model_groups(trials, self.specs, found["decisions"], part=bool(self.file))
+        groups = _model_groups(trials, self.specs, found["decisions"])
         return [
             self._kept_trials(replace(group, levels=_levels(found["levels"], group)))
             for group in groups
@@ -284,7 +283,15 @@ class Study:
         kept = group.part(lambda trials: ~trials["trial_id"].isin(self._with_fallbacks(group)))
         if kept.trials.empty:
             return replace(group, unjudged=group.unjudged or "every trial had a fallback")
-        return replace(kept, narrowed=_among(kept.trials))
+        return kept
+
+    def holds_more(self, group: Group) -> bool:
+        """Whether the database has other trials with the specs and the prompt of a group."""
+        sizes = self._sizes
+        alike = sizes["spec_hash"].isin(group.trials["spec_hash"])
+        if group.setting:
+            alike &= sizes["variant"] == group.setting
+        return int(sizes.loc[alike, "trials"].sum()) > len(group.trials)
 
     def _with_fallbacks(self, group: Group) -> set[str]:
         trials = of_group(self.calls.trials, group, group.trials)
@@ -396,7 +403,6 @@ def _imported(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> I
 def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
     if known is None:
         return _published_group()
-    pairs = ", ".join(quoted(pair) for pair in sorted(trials["pair"].unique()))
     return Group(
         HUMAN,
         "",
@@ -405,7 +411,6 @@ def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
         label=known.label,
         models=(HUMAN,),
         name=HUMAN,
-        narrowed=f"pair IN ({pairs})" if known.left_out else "",
         published_outcomes=None if known.complete else outcomes_with_metrics(),
     )
 
@@ -538,12 +543,8 @@ def _model_groups(
     trials: pd.DataFrame,
     specs: Mapping[str, Mapping[str, Any]],
     decisions: pd.DataFrame,
-    *,
-    part: bool,
 ) -> list[Group]:
-    """Groups by driver and variant, scripted stand-ins last, of all trials or of a ``part``.
-
-    ``decisions`` are ASKED_DECISIONS.
+    """Groups by driver and variant, scripted stand-ins last; ``decisions`` are ASKED_DECISIONS.
 
     Where a driver was run under several settings of the task, all but the most frequent carry a
     mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
@@ -564,9 +565,6 @@ def _model_groups(
     keyed["mark"] = _marks(keyed, ["driver"], "task")
     keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "usual")
     keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
-    # Two names of one model have equal specs, as under two prices.
-    keyed["shared"] = keyed.groupby(["spec_hash", "variant"])["driver"].transform("nunique") > 1
-    keyed["shared"] |= part
     keys = ["driver", "mark", "apart", "scripted", "variant", "usual"]
     groups = [
         _model_group(
@@ -593,8 +591,6 @@ def _model_group(
     said = "; ".join(filter(None, (posing, caution)))
     seats = rows["ego"].value_counts()
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
-    narrowed = [f"scripted = {str(scripted).lower()}"] if first["apart"] else []
-    by_name = [_among(rows)] if rows["shared"].any() else []
     again = _again(rows)
     group = Group(
         driver,
@@ -611,18 +607,10 @@ def _model_group(
         caution=caution,
         equal=len(again) if first["source"] != "driver" else 0,
         unjudged=_unjudged(decisions, rows),
-        narrowed=" AND ".join(narrowed + by_name),
     )
     if again.empty or not _is_deterministic(rows, specs):
         return group
-    trials = group.trials.drop(index=again)
-    return replace(
-        group, trials=trials, whole=group, narrowed=" AND ".join([*narrowed, _among(trials)])
-    )
-
-
-def _among(rows: pd.DataFrame) -> str:
-    return f"trials.trial_id IN ({', '.join(map(quoted, rows['trial_id']))})"
+    return replace(group, trials=group.trials.drop(index=again), whole=group)
 
 
 def _unjudged(decisions: pd.DataFrame, rows: pd.DataFrame) -> str:
