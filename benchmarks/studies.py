@@ -33,7 +33,7 @@ from merge_runner.records import (
     TrialSpec,
     Usage,
 )
-from merge_runner.results.store import Store, SweepRow
+from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
@@ -93,7 +93,8 @@ def write_study(path: Path, trials: int) -> None:
         for driver, variant in MODELS
     }
     config = json.dumps({"models": {"o3": {"id": "o3", "aliases": ["o3-2025-04-16"]}}})
-    store.begin_sweep(SweepRow("sweep-1", "made", STARTED, config, None, None, "{}"), specs, [])
+    sweep = {"sweep_id": "sweep-1", "name": "made", "started_at": STARTED}
+    store.begin_sweep({**sweep, "config": config, "versions": "{}"}, specs, [])
     rng = np.random.default_rng(SEED)
     played = (
         _played(rng, driver, variant, name, rep)

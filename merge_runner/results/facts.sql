@@ -12,11 +12,22 @@ SELECT *, driver_name(model, spec->>('$.' || side || '.endpoint')) AS driver
 FROM attempts LEFT JOIN specs USING (spec_hash) SEMI JOIN played USING (trial_id, spec_hash);
 
 CREATE OR REPLACE TEMP VIEW outcomes AS
-SELECT condition, status, merged_first, count(*) AS trials FROM played GROUP BY ALL ORDER BY ALL;
+SELECT status, count(*) AS trials FROM played GROUP BY ALL ORDER BY ALL;
 
+-- Outcomes in each condition, in all, and at each level of each factor.
 CREATE OR REPLACE TEMP VIEW levels AS
-SELECT factor, value, status, merged_first, count(*) AS trials
-FROM played JOIN trial_levels USING (trial_id, spec_hash) GROUP BY ALL ORDER BY ALL;
+SELECT factor, value AS level, count(*) AS trials,
+    count(*) FILTER (status = 'finished' AND merged_first = 'left') AS "left first",
+    count(*) FILTER (status = 'finished' AND merged_first = 'right') AS "right first",
+    count(*) FILTER (status = 'collided') AS collided,
+    count(*) FILTER (status = 'timeout') AS timeout,
+    count(*) FILTER (status = 'failed') AS failed
+FROM played JOIN (
+    SELECT trial_id, spec_hash, 'condition' AS factor, unnest([condition, 'all']) AS value
+    FROM played
+    UNION ALL SELECT trial_id, spec_hash, factor, value FROM trial_levels
+) USING (trial_id, spec_hash)
+GROUP BY ALL ORDER BY ALL;
 
 CREATE OR REPLACE TEMP VIEW failed AS
 SELECT trial_id, error FROM played WHERE status = 'failed' ORDER BY ALL;

@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from datetime import datetime
 from fnmatch import fnmatchcase
 from itertools import chain, groupby
@@ -77,19 +76,6 @@ OF_THE_DIGEST = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class SweepRow:
-    """One row of the sweeps table; ``config`` and ``versions`` are JSON texts."""
-
-    sweep_id: str
-    name: str
-    started_at: datetime
-    config: str
-    git_commit: str | None
-    git_dirty: bool | None
-    versions: str
-
-
 class Store:
     """Writes sweeps and whole trials; every method is one short transaction."""
 
@@ -110,16 +96,16 @@ class Store:
                 connection.execute("INSERT INTO meta VALUES (?)", [SCHEMA_VERSION])
 
     def begin_sweep(
-        self, sweep: SweepRow, specs: dict[str, str], stored: Sequence[TrialSpec]
+        self, sweep: dict[str, Any], specs: dict[str, str], stored: Sequence[TrialSpec]
     ) -> None:
-        """Add a sweep, what its spec hashes stand for, and those of its trials already stored.
+        """Add a sweep's row, what its spec hashes stand for, and its trials already stored.
 
         Their levels are added, too, which another study may have stored without.
         """
         with write_database(self.path) as connection:
-            connection.execute("INSERT INTO sweeps BY NAME SELECT unnest(?)", [asdict(sweep)])
+            connection.execute("INSERT INTO sweeps BY NAME SELECT unnest(?)", [sweep])
             _add_specs(connection, specs)
-            links = ((sweep.sweep_id, spec.trial_id, spec.spec_hash) for spec in stored)
+            links = ((sweep["sweep_id"], spec.trial_id, spec.spec_hash) for spec in stored)
             append(connection, "sweep_trials", links)
             _add_factors(connection, [*chain.from_iterable(map(factor_rows, stored))])
 
@@ -295,33 +281,18 @@ def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str
     return rows, [key for *_, key in keys]
 
 
-@dataclass(frozen=True, slots=True)
-class SweepFacts:
-    """What the database says of one sweep: each list is the view of its name in facts.sql."""
-
-    outcomes: list[tuple[str, str, str | None, int]]
-    levels: list[tuple[str, str, str, str | None, int]]
-    failed: list[tuple[str, str]]
-    others: list[tuple[str, str, int]]
-    stand_ins: list[tuple[str, str, str, int, int]]
-    first_looks: list[dict[str, Any]]
-    decisions: int
-    invalid: int
-    fallbacks: int
-
-
-def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
-    """Count a sweep's trials, decisions and answers."""
+def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:
+    """Count a sweep's trials, decisions and answers, by the views of facts.sql."""
     with read_database(path) as connection:
         connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
         connection.execute(FACTS.read_text(encoding="utf-8"))
         append(connection, "other_models", other_models(connection))
         facts = next(by_name(connection.execute("FROM decided")))
-        for name in ("outcomes", "levels", "failed", "others", "stand_ins"):
+        for name in ("outcomes", "failed", "others", "stand_ins"):
             facts[name] = connection.execute(f"FROM {name}").fetchall()
-        return SweepFacts(
-            **facts, first_looks=list(by_name(connection.execute("FROM first_looks")))
-        )
+        for name in ("levels", "first_looks"):
+            facts[name] = list(by_name(connection.execute(f"FROM {name}")))
+        return facts
 
 
 def to_forget(db: Path, patterns: Sequence[str]) -> tuple[list[str], str]:

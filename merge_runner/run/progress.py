@@ -31,7 +31,6 @@ from merge_runner.llm.client import Meter
 from merge_runner.llm.ledger import Ledger
 from merge_runner.records import Status
 from merge_runner.results.export import write_table
-from merge_runner.results.store import SweepFacts
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan
 from merge_runner.text_safety import printable, say
@@ -47,7 +46,6 @@ PULSE_S = 0.05
 PUBLISHED_EVERY, PLAIN_EVERY = 20, 100
 SHOWN, REASONS_SHOWN = 10, 3
 CLOSE_IT = "you may close this: the same command goes on"
-COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
 # While a sweep checks what it stored, the file is silent: only its process shows that it lives.
 STALE_S = {"playing": 10.0, "checking": 600.0}
 MOST_BYTES = 1_000_000
@@ -328,7 +326,7 @@ def as_dict(
     options: Options,
     progress: Progress,
     expected: Estimate | None,
-    checked: tuple[SweepFacts, Audit] | None,
+    checked: tuple[dict[str, Any], Audit] | None,
     **told: object,
 ) -> dict[str, Any]:
     """The summary as JSON values; ``expected`` is the estimate made before the run, if any.
@@ -371,40 +369,22 @@ def as_dict(
     if checked is None:
         return summary
     facts, audit = checked
-    statuses = Counter(dict.fromkeys(get_args(Status), 0))
-    for _, status, _, number in facts.outcomes:
-        statuses[status] += number
-    summary["trials"] |= statuses
-    return summary | {
-        "scripted": bool(facts.stand_ins),
-        "audit": audit.as_dict(),
-        "decisions": facts.decisions,
-        "invalid_decisions": facts.invalid,
-        "fallbacks": facts.fallbacks,
-        "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts.others},
-        "stand_ins": [row[:3] for row in facts.stand_ins],
-        "failed": dict(facts.failed),
-        "outcomes_by_level": [*_tallies(plan, facts)],
-        "first_looks": facts.first_looks,
-    }
-
-
-def _tallies(plan: Plan, facts: SweepFacts) -> Iterator[dict[str, Any]]:
-    """Counts of trials by COLUMNS, for each condition, all, and each level of each factor."""
+    summary["trials"] |= dict.fromkeys(get_args(Status), 0) | dict(facts["outcomes"])
     shown = {"condition": [*plan.conditions, "all"], **plan.levels}
-    tallies = {(name, level): Counter[str]() for name in shown for level in shown[name]}
-    rows = [
-        ("condition", level, status, merged_first, trials)
-        for condition, status, merged_first, trials in facts.outcomes
-        for level in (condition, "all")
-    ]
-    for factor, level, status, merged_first, trials in [*rows, *facts.levels]:
-        outcome = f"{merged_first} first" if status == "finished" else status
-        tally = tallies.setdefault((factor, level), Counter())
-        tally.update({"trials": trials, outcome: trials})
-    for (factor, level), tally in tallies.items():
-        if tally["trials"]:
-            yield {"factor": factor, "level": level, **{name: tally[name] for name in COLUMNS}}
+    order = [(factor, level) for factor, levels in shown.items() for level in levels]
+    by_level = {(row["factor"], row["level"]): row for row in facts["levels"]}
+    return summary | {
+        "scripted": bool(facts["stand_ins"]),
+        "audit": audit.as_dict(),
+        "decisions": facts["decisions"],
+        "invalid_decisions": facts["invalid"],
+        "fallbacks": facts["fallbacks"],
+        "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts["others"]},
+        "stand_ins": [row[:3] for row in facts["stand_ins"]],
+        "failed": dict(facts["failed"]),
+        "outcomes_by_level": [by_level[place] for place in order if place in by_level],
+        "first_looks": facts["first_looks"],
+    }
 
 
 def as_lines(summary: dict[str, Any]) -> Iterator[str]:
@@ -426,7 +406,9 @@ def _results(summary: dict[str, Any]) -> Iterator[str]:
     if looks := summary["first_looks"]:
         yield as_table(looks)
     for factor, group in groupby(summary["outcomes_by_level"], key=itemgetter("factor")):
-        levels = [{factor: row["level"], **{name: row[name] for name in COLUMNS}} for row in group]
+        levels = [{factor: row["level"], **row} for row in group]
+        for row in levels:
+            del row["factor"], row["level"]
         if len(levels) > 1 and not looks:
             yield as_table(levels)
     decisions, invalid = summary["decisions"], summary["invalid_decisions"]

@@ -39,7 +39,7 @@ from merge_runner.records import TrialRecord, TrialSpec, canonical_json
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Miss, Spilled, described, explain, recorded_part
-from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
+from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.clients import (
     check_batches,
     live_clients,
@@ -222,19 +222,19 @@ class Sweep:
     async def _begin(self, store: Store) -> str:
         started_at = datetime.now(UTC).replace(tzinfo=None)
         commit, dirty = await asyncio.to_thread(git_state)
-        row = SweepRow(
-            sweep_id=f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}",
-            name=self._plan.name,
-            started_at=started_at,
-            config=canonical_json(
-                {**self._plan.model_dump(mode="json"), "max_cost_usd": self._options.max_cost_usd}
-            ),
-            git_commit=commit,
-            git_dirty=dirty,
-            versions=canonical_json(versions()),
-        )
+        sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
+        config = self._plan.model_dump(mode="json")
+        row = {
+            "sweep_id": sweep_id,
+            "name": self._plan.name,
+            "started_at": started_at,
+            "config": canonical_json({**config, "max_cost_usd": self._options.max_cost_usd}),
+            "git_commit": commit,
+            "git_dirty": dirty,
+            "versions": canonical_json(versions()),
+        }
         store.begin_sweep(row, self._plan.specs(), self._stored)
-        return row.sweep_id
+        return sweep_id
 
     async def _runner(self, store: Store, stack: AsyncExitStack) -> LocalRunner | DaskTasks:
         """What plays the trials: this process, or the workers of a cluster."""
@@ -356,7 +356,7 @@ class Sweep:
 
     def _check(
         self, store: Store, sweep_id: str, first: FirstDecisions
-    ) -> tuple[SweepFacts, Audit] | None:
+    ) -> tuple[dict[str, Any], Audit] | None:
         """Read back what the database holds of the sweep, audit it, and note how it ended."""
         keys = [(spec.trial_id, spec.spec_hash) for spec in (*self._stored, *self.todo)]
         checked = None

@@ -26,7 +26,7 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
-from merge_runner.results.store import Store, SweepRow
+from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
@@ -173,15 +173,13 @@ def write_study(
         )
         for record in records
     }
-    sweep = SweepRow(
-        "sweep-1",
-        "test",
-        datetime(2026, 11, 21, tzinfo=UTC).replace(tzinfo=None),
-        json.dumps(config or {}),
-        None,
-        None,
-        "{}",
-    )
+    sweep = {
+        "sweep_id": "sweep-1",
+        "name": "test",
+        "started_at": datetime(2026, 11, 21, tzinfo=UTC).replace(tzinfo=None),
+        "config": json.dumps(config or {}),
+        "versions": "{}",
+    }
     store.begin_sweep(sweep, specs, [])
     store.write("sweep-1", records, patience_s=5)
     return path

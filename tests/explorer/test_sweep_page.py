@@ -114,19 +114,19 @@ def test_the_page_has_the_numbers_of_the_database(written):
             "SELECT count(*) FROM calls WHERE http_status = 200"
         ).fetchone()
         (attempts,) = connection.execute("SELECT count(*) FROM attempts").fetchone()
-    collided = sum(row[-1] for row in facts.outcomes if row[1] == "collided")
+    collided = dict(facts["outcomes"])["collided"]
     for said in (
         f"collisions {collided} of 29 ended trials",
-        f"failed trials {len(facts.failed)} of 30 stored trials",
-        f"invalid replies {facts.invalid} of {facts.decisions} decisions",
-        f"fallbacks {facts.fallbacks} of {facts.decisions} decisions",
+        f"failed trials {len(facts['failed'])} of 30 stored trials",
+        f"invalid replies {facts['invalid']} of {facts['decisions']} decisions",
+        f"fallbacks {facts['fallbacks']} of {facts['decisions']} decisions",
         f"refusals 1 of {attempts} attempts",
         f"another model answered 1 of {answers} answers",
         "asked for: o3 → another (1 answers)",
         "its runs could spend at most 9.00 USD; 1 attempts of unknown cost are not in it",
     ):
         assert said in text
-    assert (facts.invalid, facts.fallbacks, len(facts.failed)) == (2, 2, 1)
+    assert (facts["invalid"], facts["fallbacks"], len(facts["failed"])) == (2, 2, 1)
 
 
 def test_every_cell_and_every_cause_leads_to_the_trials_that_it_counts(written):

@@ -17,13 +17,14 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import TrialRecord, TrialSpec
-from merge_runner.results.store import Store, SweepRow, query, results_digest, sweep_facts
+from merge_runner.results.store import Store, query, results_digest, sweep_facts
 from merge_runner.run.local_runner import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
 SCENARIO = ScenarioConfig()
-SWEEP = SweepRow("s1", "baseline", datetime(2026, 1, 1), "{}", None, None, "{}")  # noqa: DTZ001
+SWEEP = {"sweep_id": "s1", "name": "baseline", "started_at": datetime(2026, 1, 1)}  # noqa: DTZ001
+SWEEP |= {"config": "{}", "versions": "{}"}
 LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True); input()"
 
 
@@ -77,7 +78,7 @@ def test_a_failed_trial_is_replaced_and_an_ended_one_never(store, path):
     record = played()
     store.write("s1", [failed(record)], patience_s=1)
     assert store.ended_trials([("m/baseline/L_4_0/rep01", "h")]) == set()
-    assert sweep_facts(path, "s1").failed == [("m/baseline/L_4_0/rep01", "it broke")]
+    assert sweep_facts(path, "s1")["failed"] == [("m/baseline/L_4_0/rep01", "it broke")]
     store.write("s1", [record], patience_s=1)
     assert store.write("s1", [failed(record)], patience_s=1) == {}
     assert rows(path, "select status, error from trials") == [("finished", None)]
