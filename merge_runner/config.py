@@ -86,11 +86,6 @@ class Perception(Frozen):
     view_from_m: Positive | None = None
     own: Annotated[bool, Field(strict=True)] = False
 
-    @cached_property
-    def is_perfect(self) -> bool:
-        """Whether a driver is told the truth."""
-        return self == PERFECT
-
     @property
     def is_random(self) -> bool:
         """Whether errors or dropouts are drawn."""
@@ -531,14 +526,21 @@ def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
     return {v: os.environ[v] for v in variables if v and os.environ.get(v)}
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file as a dict; raises UsageError."""
+def read_text(path: Path) -> str:
+    """The text of a file; raises UsageError."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as exc:
-        raise UsageError(f"{path} cannot be read: {exc.strerror}") from exc
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as exc:
+        why = getattr(exc, "strerror", exc)
+        raise UsageError(f"{path} cannot be read: {why}") from exc
+
+
+def toml_of(text: str, where: str) -> dict[str, Any]:
+    """A TOML text as a dict; raises UsageError, which says ``where`` it stands."""
+    try:
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as exc:  # also a number of thousands of digits
-        raise UsageError(f"{path} is no TOML file: {exc}") from exc
+        raise UsageError(f"{where} is no TOML file: {exc}") from exc
 
 
 def validated(model: type[ModelT], value: object, where: str) -> ModelT:

@@ -14,7 +14,7 @@ from math import exp, inf, sqrt, tanh
 from statistics import NormalDist
 
 from merge_runner.chance import draw
-from merge_runner.config import Perception, ScenarioConfig
+from merge_runner.config import PERFECT, Perception, ScenarioConfig
 from merge_runner.drivers.base import Driver
 from merge_runner.errors import CallFailed, ReplayMiss, UsageError
 from merge_runner.records import (
@@ -97,7 +97,7 @@ class _Seated:
         self._pace = driver.seat.pace
         self.interval = self._pace.interval_steps
         perception, self.eyes = scenario.perception(side), None
-        if not perception.is_perfect:
+        if perception != PERFECT:
             observe = partial(world.observe, side)
             self.eyes = Eyes(perception, driver.seat.seed, scenario.step_s, observe)
         self.told: Observation | None = None

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from merge_runner.config import Perception, ScenarioConfig
+from merge_runner.config import PERFECT, Perception, ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import program_pace
 from merge_runner.drivers.registry import PROGRAMS
@@ -89,7 +89,7 @@ def of_the_own(seen):
 def test_without_errors_delay_dropout_and_range_the_truth_is_told(condition, scenario, pairs, seed):
     """By the eyes themselves, which a trial with such a perception does without."""
     true = truths("right", pairs, condition=condition, scenario=scenario)
-    assert Perception().is_perfect
+    assert Perception() == PERFECT
     assert list(watched({}, true, seed)) == true
 
 

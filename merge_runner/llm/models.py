@@ -16,7 +16,8 @@ from merge_runner.config import (
     endpoint_identity,
     experiments,
     model_id,
-    read_toml,
+    read_text,
+    toml_of,
     validated,
 )
 from merge_runner.errors import UsageError, unknown_name
@@ -53,7 +54,7 @@ def read_entries(path: Path) -> dict[str, ModelEntry]:
 
     Raises UsageError.
     """
-    tables = read_toml(path).items()
+    tables = toml_of(read_text(path), str(path)).items()
     return {name: validated(ModelEntry, table, f"{path}: [{name}]") for name, table in tables}
 
 

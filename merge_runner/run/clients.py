@@ -194,8 +194,12 @@ def check_batches(plan: Plan, options: Options) -> None:
     """Raise UsageError where a run cannot use batches as it is told to."""
     if not options.batch:
         return
-    if options.replay or options.dask is not None or not plan.entries:
-        raise UsageError("--batch asks models from this process: leave it, --replay or --dask out")
+    in_process = plan.scripted and not os.environ.get("EMULATOR_BASE_URL")
+    if options.replay or options.dask is not None or not plan.entries or in_process:
+        raise UsageError(
+            "--batch asks models from this process, and neither programs nor the emulator have a "
+            "batch mode: leave it, --replay or --dask out"
+        )
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         if batch_terms(entry) is None:

@@ -5,16 +5,15 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from itertools import chain, product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, computed_field
+from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from merge_runner.config import (
     REHEARSAL,
@@ -116,18 +115,6 @@ class Options:
         return self.rpm or entry.rpm, self.tpm or entry.tpm
 
 
-def _stored_study(study: StudySource) -> dict[str, object]:
-    return {"name": study.name, "text": study.text, "plugins": study.plugins}
-
-
-def _study_of(stored: object) -> object:
-    """Return a stored study as it was read; it has no path any more."""
-    if not isinstance(stored, dict):
-        return stored
-    file = StudyFile.model_validate(tomllib.loads(stored["text"]))
-    return StudySource(file=file, path=Path(f"{stored['name']}.toml"), **stored)
-
-
 class Plan(BaseModel):
     """A sweep before it runs: the arms of its study, each played in all conditions.
 
@@ -142,7 +129,7 @@ class Plan(BaseModel):
     model_config = ConfigDict(frozen=True, serialize_by_alias=True, validate_by_name=True)
 
     name: str
-    study: Annotated[StudySource, BeforeValidator(_study_of), PlainSerializer(_stored_study)]
+    study: StudySource
     model: str
     levels: dict[str, list[str]]
     description: str

@@ -111,8 +111,7 @@ def remove_standing(db: Path, sweep_id: str) -> None:
 
 def read_standing(db: Path, sweep_id: str) -> Standing | None:
     """The snapshot of a sweep that runs, or was killed; None without a file."""
-    standing = _read(_path(db, sweep_id))
-    return standing if standing and standing.sweep_id == sweep_id else None
+    return _read(_path(db, sweep_id))
 
 
 def running(db: Path) -> list[Standing]:

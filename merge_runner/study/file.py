@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +17,8 @@ from merge_runner.config import (
     Positive,
     ScenarioConfig,
     experiments,
-    read_toml,
+    read_text,
+    toml_of,
     validated,
 )
 from merge_runner.errors import UsageError, unknown_name
@@ -161,15 +162,21 @@ class StudyFile(Frozen):
     plugins: dict[Literal["files"], tuple[str, ...]] = Field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class StudySource:
-    """A study's file as it was read, with the source of its plug-ins by file name."""
+class StudySource(Frozen):
+    """The text of a study's file, with the source of its plug-ins by file name.
+
+    One that is read from a database has no ``path``.
+    """
 
     name: str
-    file: StudyFile
     text: str
-    path: Path
     plugins: dict[str, str]
+    path: Path = Field(default=Path(), exclude=True)
+
+    @cached_property
+    def file(self) -> StudyFile:
+        """What the text says; raises UsageError."""
+        return validated(StudyFile, toml_of(self.text, str(self.path)), str(self.path))
 
 
 def study_files() -> dict[str, Path]:
@@ -186,17 +193,14 @@ def read_study(name: str) -> StudySource:
         if name not in files:
             raise unknown_name("sweep", name, sorted(files), "or a path")
         path = files[name]
-    file = validated(StudyFile, read_toml(path), str(path))
-    sources = {}
-    for each in file.plugins.get("files", ()):
+    text, sources = read_text(path), dict[str, str]()
+    study = StudySource(name=path.stem, text=text, plugins=sources, path=path)
+    for each in study.file.plugins.get("files", ()):
         plugin = path.parent / each
         if not plugin.resolve().is_relative_to(path.parent.resolve()):
             raise UsageError(f"{path}: the plug-in {each} lies outside of the study's folder")
-        try:
-            sources[each] = plugin.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as exc:
-            raise UsageError(f"{path}: the plug-in {each} cannot be read: {exc}") from exc
-    return StudySource(path.stem, file, path.read_text(encoding="utf-8"), path, sources)
+        sources[each] = read_text(plugin)
+    return study.model_copy(update={"plugins": sources})
 
 
 def write_folder(folder: Path) -> list[Path]:

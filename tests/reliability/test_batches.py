@@ -230,11 +230,12 @@ async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
         (("--batch", "--replay"), "leave it, --replay or --dask out"),
         (("--batch", "--dask", "local:1"), "leave it, --replay or --dask out"),
         (("--batch", "--model", "constant"), "leave it, --replay or --dask out"),
+        (("--batch", "--model", "emulator"), "leave it, --replay or --dask out"),
         (("--batch", "--model", "local"), "local has no batch mode that is known; valid with"),
     ],
 )
 async def test_what_cannot_go_in_batches_is_refused_in_one_line(merge_runner, options, says):
-    run = await merge_runner("sweep", "baseline", *options, LOCAL_MODEL="m")
+    run = await merge_runner("sweep", "baseline", *options, LOCAL_MODEL="m", EMULATOR_BASE_URL="")
     assert run.code == 2
     assert says in run.err.splitlines()[-1]
     assert (run.out, run.err.count("error: ")) == ("", 1)

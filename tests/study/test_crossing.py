@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from merge_runner.config import PERFECT
 from merge_runner.errors import UsageError
 from merge_runner.run.plan import make_plan
 
@@ -219,7 +220,7 @@ def test_a_perception_is_a_factor_of_both_sides_or_of_one(plan_of):
         "perception=foggy",
     }
     one = plan_of(f'[factors]\nperception_right = ["foggy"]\n{FOGGY}')
-    assert one.arms[0].scenario.perception_left.is_perfect
+    assert one.arms[0].scenario.perception_left == PERFECT
     assert one.arms[0].scenario.perception_right.speed_sd_mps == 0.3
 
 

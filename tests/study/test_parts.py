@@ -218,7 +218,7 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
         ('[prompts.x]\nadd = [{ block = "C9" }]\n', None, "unknown prompt block 'C9'; valid: C0"),
         ('[prompts.x]\nadd = [{ block = "C2" }]\n', None, "C2, which it has already"),
         ("[prompts.x]\nad = []\n", None, "unknown key 'prompts.x.ad'; valid: based_on, remove"),
-        ('[plugins]\nfiles = ["none.py"]\n', None, "the plug-in none.py cannot be read"),
+        ('[plugins]\nfiles = ["none.py"]\n', None, "none.py cannot be read"),
         (
             '[plugins]\nfiles = ["mine.py"]\n',
             "\n1 / 0",
