@@ -16,7 +16,7 @@ STUDY = ("baseline", "--reps", "1", "--db", "results.duckdb")
 # The emulator's and the audit's files are no part of the path; those of the store are entered for
 # the rows of each call.
 OFF = ("emulator/", "audit/")
-MOST_FILES = {"live": 33, "replayed": 26}
+MOST_FILES = {"live": 20, "replayed": 16}
 
 
 @pytest.fixture(scope="module")
