@@ -67,10 +67,10 @@ ACTIONS: dict[str, Action] = {
     **dict.fromkeys(("server_error", "overloaded", "server_timeout"), "retry"),
 }
 
-_UNIT_S = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+_UNIT_S = {"ms": 0.001, "milli": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 # 1.574s and 6m0s, but also 5 minutes.
-_PART = r"(\d+(?:\.\d+)?) ?(ms|[smhd])(?:ec|econd|in|inute|our|ay)?s?(?![a-z])"
-_IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ((?:{_PART} ?)+)", re.I)
+_PART = r"(\d+(?:\.\d+)?)\s*(ms|milli|[smhd])(?:ec|sec|econd|second|in|inute|r|our|ay)?s?(?![a-z])"
+_IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_PART}(?:(?:,|\s|and)*{_PART})*)", re.I)
 # A header that is sent several times has all its values in one, and a date has a comma of its own.
 _LISTED = re.compile("[A-Z][a-z]{2}, [^,]+|[^,]+")
 

@@ -24,7 +24,7 @@ import asyncio
 import bisect
 import contextlib
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -35,7 +35,7 @@ from threading import Lock, RLock
 from typing import TYPE_CHECKING, Any
 
 from merge_runner.config import ModelEntry, Price
-from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
+from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
 from merge_runner.llm.durable import BatchWriter, Operation, connect, making
 from merge_runner.records import Attempt, Usage
 
@@ -74,6 +74,7 @@ _OPEN = "INSERT INTO open VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _BEGUN = """
 SELECT since FROM open WHERE call = ? AND attempt > ? AND outcome = 'in flight' ORDER BY attempt
 """
+_IN_FLIGHT = "SELECT call, attempt, driver FROM open WHERE scope = ? AND outcome = 'in flight'"
 _PAY = """
 INSERT INTO spent VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET usd = usd + excluded.usd,
 overrun_usd = overrun_usd + excluded.overrun_usd,
@@ -293,6 +294,16 @@ class Ledger:
         if usd > aside_usd + TOLERANCE_USD:
             over = (usd - aside_usd, usd / max(honest_usd, TOLERANCE_USD))
         self._money.write(_PAY, scope, driver, usd, *over)
+
+    def settle_kept(self, drivers: Collection[str]) -> None:
+        """Settle what was kept right before a run of these drivers was killed; none goes on."""
+        rows = self._money.read(_IN_FLIGHT, self.scope)
+        for key, number, driver in (row for row in rows if row[2] in drivers):
+            with contextlib.suppress(RecordingError):
+                entry = self.cache.get(key)
+                for attempt in entry.attempts if entry else self.cache.unanswered(key):
+                    if attempt.number == number and attempt.outcome != "unknown":
+                        self._money.run_now([partial(self._settled, key, attempt, driver)])
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""

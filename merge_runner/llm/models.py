@@ -123,6 +123,8 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
     *outer, last = places.get(parameter, (parameter,))
     table = parameters
     for each in outer:
-        table = table.setdefault(each, {})
+        if not isinstance(table.get(each), dict):
+            table[each] = {}
+        table = table[each]
     table[last] = level
     return entry.model_copy(update={"parameters": parameters})

@@ -180,11 +180,14 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
 
 def has_long_texts(connection: duckdb.DuckDBPyConnection) -> bool:
     """Whether the open database is larger than one of as many calls with short replies."""
-    (calls, path), *_ = connection.execute(
+    tables = connection.execute(
         "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
     ).fetchall()
-    return Path(path).stat().st_size > int(calls) * BYTES_OF_A_CALL + MERGED_BYTES
+    return any(
+        Path(path).stat().st_size > int(calls) * BYTES_OF_A_CALL + MERGED_BYTES
+        for calls, path in tables
+    )
 
 
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:

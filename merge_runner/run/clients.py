@@ -8,10 +8,7 @@ from contextlib import AsyncExitStack
 from resource import RLIM_INFINITY, RLIMIT_NOFILE, getrlimit, setrlimit
 from typing import TYPE_CHECKING
 
-from merge_runner.config import (
-    rehearsal_endpoint,
-    resolve_endpoint,
-)
+from merge_runner.config import driver_name, rehearsal_endpoint, resolve_endpoint
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.batch.rounds import Rounds
@@ -150,7 +147,10 @@ def _connections(
 
 
 def _check_money(plan: Plan, options: Options, ledger: Ledger) -> None:
-    """Raise UsageError where a price is unknown under a cap, or what is spent is damaged."""
+    """Settle what a killed run has kept.
+
+    Raises UsageError where a price is unknown under a cap, or what is spent is damaged.
+    """
     for name, entry in plan.entries.items():
         unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
         if options.max_cost_usd is not None and unknown:
@@ -159,6 +159,7 @@ def _check_money(plan: Plan, options: Options, ledger: Ledger) -> None:
                 "experiments/models.toml"
             )
     if any(entry.price != "free" for entry in plan.entries.values()):
+        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
         ledger.read()
 
 

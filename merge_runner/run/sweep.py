@@ -99,9 +99,15 @@ async def play(
 
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
-    """Whether a model of a plan is recorded, or it has none."""
-    models = {entry.id or UNNAMED for entry in plan.entries.values()}
-    return not models or any(entry.request.model in models for entry in cache.entries())
+    """Whether a model of a plan is recorded, or it has none; what is damaged may be of it."""
+    models, damaged = {entry.id or UNNAMED for entry in plan.entries.values()}, list[str]()
+    recorded = any(entry.request.model in models for entry in cache.entries(damaged))
+    return recorded or bool(damaged) or not models
+
+
+def _misses(record: TrialRecord) -> list[Miss]:
+    missed = [call.request for call in record.failed_calls if call.missed]
+    return [Miss(record.spec.trial_id, request) for request in missed]
 
 
 def _recorded(plan: Plan, recordings: Sequence[Path]) -> Plan:
@@ -147,11 +153,12 @@ class Sweep:
         ``expected`` is an estimate that the user has agreed to.
         """
         db, sweep_id, checked = self._options.db, "", None
-        if self._options.replay and not _has_replies(self._cache, self._plan):
+        if self._options.replay and (missing := await self._missing()):
             progress = self._progress(LocalRunner.sealed(self._plan, self._cache))
             held = described(self._options.recordings, self._cache.entries())
             nothing = f"nothing of this replay is recorded, and nothing is stored: {held}"
-            self._fail(ReplayMiss.exit_code, nothing)
+            self._explain(missing)
+            self.messages.append(nothing)
         else:
             async with AsyncExitStack() as stack:
                 store = Store(db)
@@ -169,6 +176,23 @@ class Sweep:
             self._options, progress, expected, checked,
             sweep_id=sweep_id, exit_code=self.exit_code, messages=self.messages,
         )  # fmt: skip
+
+    async def _missing(self) -> list[Miss]:
+        """The first misses of each trial where no call is recorded; none where any is."""
+        runner, misses = LocalRunner.sealed(self._plan, self._cache), list[Miss]()
+        for spec in self.todo:
+            misses += _misses(await runner.play_one(spec))
+            if any(meter.calls_cached for meter in runner.meters.values()):
+                return []
+        return misses
+
+    def _explain(self, misses: list[Miss]) -> None:
+        left_out: list[str] = []
+        for line in explain(misses, self._cache.entries(left_out)) if misses else ():
+            self._fail(ReplayMiss.exit_code, line)
+        if left_out:
+            number = len(left_out)
+            self.messages.append(f"{number} rows of the cache are left out, one: {left_out[0]}")
 
     def _progress(self, runner: LocalRunner | DaskTasks) -> Progress:
         return Progress(
@@ -280,8 +304,7 @@ class Sweep:
                 suspended = str(record)
             else:
                 counts[record.status] += 1
-                missed = [call.request for call in record.failed_calls if call.missed]
-                misses.extend(Miss(spec.trial_id, request) for request in missed)
+                misses.extend(_misses(record))
                 flusher.add(record)
 
         async def drained() -> None:
@@ -313,8 +336,7 @@ class Sweep:
         finally:
             progress.ended_at = datetime.now(UTC)
             is_stored = await self._store_rest(flusher)
-        for line in explain(misses, self._cache.entries()) if misses else ():
-            self._fail(ReplayMiss.exit_code, line)
+        self._explain(misses)
         if counts["failed"] and not misses:
             self._fail(1, f"{counts['failed']} trials failed")
         return is_stored

@@ -185,8 +185,10 @@ def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
     valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
     for name in (*file.factors, *file.effect):
         require(valid, "factor", name, "models and skip stand above [factors]")
-    for name in file.drivers.keys() & registry.keys():
-        raise UsageError(f"[drivers.{name}] needs another name: there is one of this name already")
+    taken = [f"drivers.{name}" for name in file.drivers if name in registry]
+    taken += [f"{PERCEPTION}.{name}" for name in file.perception if name == PERFECT_ONE]
+    if taken:
+        raise UsageError(f"[{taken[0]}] needs another name: there is one of this name already")
 
 
 def _skipped(

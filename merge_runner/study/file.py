@@ -68,6 +68,8 @@ class RoadTexts(Frozen):
         given = {"text": value} if isinstance(value, str) else value
         if not isinstance(given, dict) or "text" not in given:
             return given
+        if given.keys() & {"block", "merge", "straight"}:
+            raise ValueError(ONE_OF_EACH)
         rest = {key: each for key, each in given.items() if key != "text"}
         return {"merge": given["text"], "straight": given["text"], **rest}
 

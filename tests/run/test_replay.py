@@ -200,7 +200,8 @@ async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, s
     )  # fmt: skip
     out, _ = await run.communicate()
     assert run.returncode == 4
-    (told,) = json.loads(out)["messages"]
+    told, held = json.loads(out)["messages"]
+    assert "small.parquet holds 206 calls of scripted-driver" in held
     assert "recorded '- Your speed: 1" in told
     assert "wanted '- Your spead: 1" in told
     assert told.endswith("; 22 calls of 11 trials differ like this")
@@ -211,8 +212,10 @@ async def test_a_replay_that_finds_nothing_stores_nothing_and_says_what_is_recor
     merge_runner, tmp_path
 ):
     other = ("replay", "ablations", "--model", "o3", "--recording", RECORDING)
+    small = ("--reps", 1, "--conditions", "N_0_0", "--recording", RECORDING)
+    fresh = await merge_runner("replay", "baseline", "--sample-set", 3, *small)
     run = await merge_runner(*other)
-    assert run.code == 4
+    assert (fresh.code, run.code) == (4, 4)
     assert not (tmp_path / "results").exists()
     assert (
         "nothing of this replay is recorded, and nothing is stored: "

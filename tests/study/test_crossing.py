@@ -241,6 +241,7 @@ def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
             '[factors]\nperception = ["late"]\n[perception.late]\ndelay_s = 0.3\n',
             "no whole number of 0.2 s: set step_s ",
         ),
+        ("[perception.perfect]\ndelay_s = 0.2\n", r"perception.perfect\] needs another name"),
         ("[perception.foggy]\nspeed_sd = 1\n", "'perception.foggy.speed_sd'; valid: position_sd"),
     ],
 )

@@ -215,6 +215,11 @@ def test_what_an_earlier_study_added_is_gone(plan_of):
             None,
             "give it a block, a text, or merge",
         ),
+        (
+            '[prompts.x]\nadd = [{ after = "C0", text = "a", merge = "b" }]\n',
+            None,
+            "give it a block, a text, or merge",
+        ),
         ('[prompts.x]\nadd = [{ block = "C9" }]\n', None, "unknown prompt block 'C9'; valid: C0"),
         ('[prompts.x]\nadd = [{ block = "C2" }]\n', None, "C2, which it has already"),
         ("[prompts.x]\nad = []\n", None, "unknown key 'prompts.x.ad'; valid: based_on, remove"),

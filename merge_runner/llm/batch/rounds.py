@@ -323,7 +323,7 @@ class Rounds:
             await self._not_asked(batch, status.failure, "batch_failed")
             return
         try:
-            await self._patiently(batch, partial(self._read, batch, status), ENDING_S)
+            await self._patiently(batch, partial(self._read, batch), ENDING_S)
         except BatchFailed as exc:
             if exc.kind != "again":
                 raise
@@ -331,9 +331,10 @@ class Rounds:
         if note.model in self._most:
             self._most[note.model] = max(self._most[note.model], 2 * len(note.lines))
 
-    async def _read(self, batch: Batch, status: BatchStatus) -> None:
+    async def _read(self, batch: Batch) -> None:
         """Take the results of a batch; raises BatchFailed where there should be others."""
         note, service, broken = batch.note, self.services[batch.note.model], 0
+        status = await service.status(note.batch_id)  # which may name more files than before
         async for key, raw in service.results(status.paths or []):
             end = _no_answer("expired", "it was not asked in time", charged=False)
             if raw:  # no limit of single calls is meant, and no call waits for one
@@ -342,7 +343,7 @@ class Rounds:
             if key in note.lines:  # others are of other batches; of two the first counts
                 batch.ends.setdefault(key, end)
         there = len(batch.ends) + broken
-        if there < min(status.results, len(note.lines)):
+        if status.paths is None or there < min(status.results, len(note.lines)):
             raise BatchFailed("again", f"{there} of the {status.results} results are there")
 
     async def _not_asked(self, batch: Batch, exc: BatchFailed, outcome: str) -> None:
