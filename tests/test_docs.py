@@ -180,7 +180,7 @@ async def test_the_page_on_recording_has_the_prices_that_a_dry_run_prints(merge_
         model, sweep = what.split(", ")
         run = await merge_runner("sweep", sweep, "--model", model, "--batch", "--dry-run", "--json")
         told = json.loads(run.out)
-        costs = [f"{usd:.2f}" for usd in (told["cost_usd"], told["batch"]["cost_usd"])]
+        costs = [f"{usd:.2f}" for usd in (told["singly_usd"], told["cost_usd"])]
         counts = [told[name] for name in ("calls", "input_tokens", "output_tokens")]
         assert figures == [*map(str, counts), costs[0], str(told["minutes"]), costs[1]]
 

@@ -26,7 +26,6 @@ from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
-    from merge_runner.llm.ledger import Ledger
     from merge_runner.run.estimate import Estimate
     from merge_runner.run.plan import Options, Plan
 
@@ -389,7 +388,22 @@ def ledger(
         if release is not None:
             if release not in names:
                 raise unknown_name("sweep", release, names, f"with a ledger in {cache}")
-            _release(Ledger(opened, release), yes=yes)
+            chosen = Ledger(opened, release)
+            spending = chosen.read()
+            agree(
+                f"{spending.reserved_usd:.4f} USD are set aside for {spending.open_attempts} "
+                f"attempts at {release}. If the provider did charge for them, --max-cost may be "
+                "passed by as much",
+                "Release it?",
+                otherwise="nothing was released",
+                yes=yes,
+            )
+            if not opened.locks.take_all():
+                raise UsageError(
+                    f"another merge-runner works with {cache}: what it has in flight cannot be "
+                    "released; try again when it has ended"
+                )
+            chosen.release()
             names = [release]
         ledgers = [Ledger(opened, name) for name in names]
         rows = [
@@ -401,23 +415,6 @@ def ledger(
         return
     reasons = [{"sweep": row["sweep"], **reason} for row in rows for reason in row.pop("reasons")]
     print_out("\n".join(filter(None, map(as_table, (rows, reasons)))) or "Nothing is spent.")
-
-
-def _release(ledger: Ledger, *, yes: bool) -> None:
-    spending = ledger.read()
-    agree(
-        f"{spending.reserved_usd:.4f} USD are set aside for {spending.open_attempts} attempts at "
-        f"{ledger.scope}. If the provider did charge for them, --max-cost may be passed by as much",
-        "Release it?",
-        otherwise="nothing was released",
-        yes=yes,
-    )
-    if not ledger.cache.locks.take_all():
-        raise UsageError(
-            f"another merge-runner works with {ledger.cache.folder}: what it has in flight cannot "
-            "be released; try again when it has ended"
-        )
-    ledger.release()
 
 
 def models(as_json: cli.JsonOption = False) -> None:

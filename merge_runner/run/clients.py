@@ -1,4 +1,4 @@
-"""Makes the clients of a sweep's language models: connected, or answering from recordings."""
+"""Makes the clients of a sweep's language models, with their connections."""
 
 from __future__ import annotations
 
@@ -29,21 +29,6 @@ if TYPE_CHECKING:
 SPEED = 10
 # For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
-
-
-def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
-    """Clients that answer from recordings alone: no key, no connection."""
-    return {
-        name: LlmClient(
-            name=name,
-            entry=entry,
-            endpoint=plan.endpoints[name],
-            cache=cache,
-            transport=None,
-            limiter=Limiter(),
-        )
-        for name, entry in plan.entries.items()
-    }
 
 
 def live_clients(

@@ -34,9 +34,9 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient, Wait
 from merge_runner.llm.http_outcome import REGISTRY
+from merge_runner.llm.limiter import Limiter
 from merge_runner.records import SIDES, ChatReply, Decision, Slot, TrialRecord, TrialSpec
 from merge_runner.results.store import Store
-from merge_runner.run.clients import sealed_clients
 from merge_runner.run.plan import Plan
 from merge_runner.text_safety import one_line
 from merge_runner.trial import play_trial
@@ -167,11 +167,15 @@ class LocalRunner:
 
     @classmethod
     def sealed(cls, plan: Plan, cache: ResponseCache, in_flight: int = 1) -> LocalRunner:
-        """Return one that plays from recorded replies alone.
+        """Return one that plays from recorded replies alone: no key, no connection.
 
         They come at once: more trials in flight would only wait for each other.
         """
-        return cls(plan, sealed_clients(plan, cache), in_flight)
+        clients = {
+            name: LlmClient(name, entry, plan.endpoints[name], cache, None, Limiter())
+            for name, entry in plan.entries.items()
+        }
+        return cls(plan, clients, in_flight)
 
     @property
     def waits(self) -> Sequence[Wait]:

@@ -233,6 +233,14 @@ def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
     assert edited.trial_specs()[0].spec_hash not in {s.spec_hash for s in plan.trial_specs()}
 
 
+def test_a_parameter_within_what_is_no_table_takes_its_place(plan_of, tmp_path):
+    entry = 'provider = "local"\nformat = "openai-responses"\nid = "m"\nmax_output_tokens = 9\n'
+    (tmp_path / "models.toml").write_text(f'[mine]\n{entry}parameters = {{ reasoning = "low" }}\n')
+    plan = plan_of('[factors]\nreasoning_effort = ["low"]\n', ["mine"])
+    (entry,) = plan.arms[0].entries.values()
+    assert entry.parameters == {"reasoning": {"effort": "low"}}
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -289,6 +289,16 @@ async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves
 
 
 @in_virtual_time
+async def test_a_file_of_results_that_is_named_later_is_read(cache):
+    service = Memory()
+    service.batches["early"] = []
+    service.states = [BatchStatus(["early"], results=2)] * 2
+    run = Run(cache, service)
+    assert texts(await run.ask(2)) == ["batched 1", "batched 2"]
+    assert run.alone.asked == []
+
+
+@in_virtual_time
 async def test_where_no_batch_mode_is_at_the_first_creation_the_run_ends(cache):
     service = Memory()
     service.creations = [BatchFailed("refused", "HTTP 404", sent=False)]
