@@ -25,12 +25,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import duckdb
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    JsonValue,
-    field_validator,
-)
+from pydantic import BaseModel, ConfigDict, JsonValue, field_validator
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache

@@ -143,7 +143,7 @@ def _check_money(plan: Plan, options: Options, ledger: Ledger) -> None:
                 f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
                 "experiments/models.toml"
             )
-    if any(entry.price != "free" for entry in plan.entries.values()):
+    if not plan.is_free:
         ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
         ledger.read()
 

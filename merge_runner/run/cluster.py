@@ -306,7 +306,7 @@ class DaskTasks:
         recorded = await self._recorded(specs)
         name = f"task {secrets.token_hex(8)}"
         cap_usd = self._options.max_cost_usd
-        if any(entry.price != "free" for entry in self._plan.entries.values()):
+        if not self._plan.is_free:
             usd = sum((self._costs(spec.order) for spec in specs), 0.0)
             if cap_usd is not None:
                 usd = cap_usd = max(0.0, cap_usd - self._ledger.read().committed_usd) / idle

@@ -120,7 +120,7 @@ def estimate(
         singly_usd=None if math.isnan(usd) else round(singly_usd, 2),
         minutes=round(max(busy_s.values(), default=0.0) / 60, 1),
         rounds=rounds if options.batch else 0,
-        free=all(entry.price == "free" for entry in plan.entries.values()),
+        free=plan.is_free,
         measured=any(map(facts.get, plan.entries)),
     )
 

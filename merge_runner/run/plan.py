@@ -293,14 +293,10 @@ class Plan(BaseModel):
         }
 
 
-def most_prompts(arm: Arm) -> int:
-    """How many prompts a trial of an arm takes a language model at most: up to the timeout."""
-    return math.ceil(arm.scenario.timeout_steps / model_pace(arm.scenario).interval_steps)
-
-
 def usual_prompts(arm: Arm) -> float:
-    """How many prompts it usually takes a language model."""
-    return min(_PROMPTS_PER_DRIVER, most_prompts(arm))
+    """How many prompts a trial of an arm usually takes a language model."""
+    most = math.ceil(arm.scenario.timeout_steps / model_pace(arm.scenario).interval_steps)
+    return min(_PROMPTS_PER_DRIVER, most)
 
 
 def _is_scripted(arm: Arm) -> bool:

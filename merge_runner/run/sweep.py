@@ -40,11 +40,7 @@ from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Miss, Spilled, described, explain, recorded_part
 from merge_runner.results.store import Store, sweep_facts
-from merge_runner.run.clients import (
-    check_batches,
-    live_clients,
-    open_rounds,
-)
+from merge_runner.run.clients import check_batches, live_clients, open_rounds
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate
 from merge_runner.run.local_runner import (

@@ -11,14 +11,7 @@ from itertools import product
 
 from pydantic import JsonValue
 
-from merge_runner.config import (
-    PERFECT,
-    ModelEntry,
-    ScenarioConfig,
-    both_sides,
-    ego_side,
-    validated,
-)
+from merge_runner.config import PERFECT, ModelEntry, ScenarioConfig, both_sides, ego_side, validated
 from merge_runner.drivers.pace import pace_of
 from merge_runner.drivers.registry import EMULATOR, PROGRAMS, Program
 from merge_runner.errors import UsageError
