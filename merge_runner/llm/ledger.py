@@ -4,8 +4,8 @@ What tokens cost is told by the registry's figures, or by the table of genai-pri
 
 The worst case of an attempt is reserved when it queues for its turn, and durably, in one
 transaction that sums what is spent and open, right before it is sent; see PaidAttempt. A process
-that dies leaves its reservations: each attempt counts with its worst case until a user releases it,
-and stands in the call's list of attempts with an unknown outcome.
+that dies leaves its reservations: the next run settles what is kept already; any other attempt
+counts with its worst case until a user releases it, and is listed with an unknown outcome.
 
 So that money finishes trials instead of beginning ever more of them, a trial begins only where what
 it is expected to cost fits beside what the trials that have begun are still expected to cost.
