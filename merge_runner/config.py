@@ -27,8 +27,6 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 # A shorter key is a dummy, and may occur in any text.
 SHORTEST_SECRET = 8
 UNNAMED = "default"
-# What stands for the emulator where it takes the place of a provider.
-REHEARSAL = "rehearsal://localhost"
 
 
 # Strict, or else "4" and true would be numbers.
@@ -216,7 +214,7 @@ class ModelEntry(Frozen):
     ``reasoning_effort`` as parameters, for a model that has none of this name. ``successor`` names
     the entry to go on with from the ``shutdown`` on. ``price`` is ``free``, ``genai-prices`` (the
     table of that package) or explicit figures. ``rpm`` and ``tpm`` are requests and tokens a
-    minute. ``typical_output_tokens`` and ``typical_latency_s`` serve estimates and rehearsals
+    minute. ``typical_output_tokens`` and ``typical_latency_s`` serve estimates
     alone. A reply longer than ``max_reply_mb`` (unpacked) is refused. ``batch`` is the batch mode:
     the ``provider``'s, ``none``, or one on the terms of another server that speaks the format.
     """
@@ -342,19 +340,14 @@ class Endpoint:
     """Where the calls of one model go.
 
     ``identity`` enters every cache key: the provider's name at its default URL, ``emulator`` for
-    our own server, REHEARSAL where it takes the provider's place, otherwise the normalised base
-    URL. ``auth_headers`` hold the secret and are neither hashed nor stored.
+    our own server, otherwise the normalised base URL. ``auth_headers`` hold the secret and are
+    neither hashed nor stored.
     """
 
     provider: str
     identity: str
     base_url: str
     auth_headers: Mapping[str, str] = field(repr=False)
-
-    @property
-    def is_emulator(self) -> bool:
-        """Whether our own server answers there."""
-        return self.provider == "emulator" or self.identity == REHEARSAL
 
 
 def resolve_endpoint(name: str, entry: ModelEntry, env: Mapping[str, str] = os.environ) -> Endpoint:
@@ -392,17 +385,6 @@ def endpoint_url(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str:
     if variable and not entry.base_url and env.get(variable):
         return normalised_url(env[variable], variable)
     return normalised_url(entry.base_url or provider.base_url)
-
-
-def rehearsal_endpoint(entry: ModelEntry) -> Endpoint:
-    """The emulator, in the place of an entry's provider: without a key."""
-    path = urlsplit(PROVIDERS.require(entry.provider).base_url).path
-    return Endpoint(entry.provider, REHEARSAL, "http://127.0.0.1" + path, {})
-
-
-def is_own_host(provider: str, identity: str) -> bool:
-    """Whether an endpoint is the provider's own, or is taken for it in a rehearsal."""
-    return identity in (provider, REHEARSAL)
 
 
 def model_id(entry: ModelEntry, env: Mapping[str, str] = os.environ) -> str | None:

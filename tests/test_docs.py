@@ -202,11 +202,10 @@ async def test_the_page_on_recording_leads_to_a_file_that_replays(
     async with watched() as server:
         account = {"OPENAI_API_KEY": "k", "GEMINI_API_KEY": "k", base_url: server.url + version}
         for command in (line.replace("o3", model) for line in told):
-            env = {} if "--rehearse" in command else account
-            code, out = await shell(command, folder, **env, **forked)
+            code, out = await shell(command, folder, **account, **forked)
             assert code == 0, f"{command}\n{out}"
             said.append(out)
-    assert f"{model} at localhost: a scripted stand-in answered, not {model}" in said[0]
+    assert "The model `emulator` is a scripted stand-in, no language model." in said[0]
     first, second = (out.split()[-3] for out in said[-2:])
     assert first == second
     assert (folder / f"{model}.parquet").is_file()

@@ -22,7 +22,7 @@ import typer
 from merge_runner.cli import options as cli
 from merge_runner.cli.options import agree, print_out
 from merge_runner.errors import UsageError, unknown_name
-from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
 GOES_ON = (0, 1, 4)
-REHEARSALS = Path("results/rehearsal")
 GRID = (
     "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
     "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
@@ -41,7 +40,6 @@ STRICT = "Stop when another model answers."
 KEEP_GOING = "Go on with a model that gives no valid decision."
 DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
 BATCH = "Ask in the provider's batches, a decision of all trials a round, at a lower price."
-REHEARSE = "The emulator answers in the model's place, ten times as fast: no key, no cost."
 RECORDING = "Also replay from this file, without importing it; may be repeated."
 CACHE = "Replay from this cache folder, not from the stored replies."
 SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
@@ -93,7 +91,6 @@ def sweep(
     strict_model: Annotated[bool, cli.flag("--strict-model", STRICT)] = False,
     keep_going: Annotated[bool, cli.flag("--keep-going", KEEP_GOING)] = False,
     dry_run: Annotated[bool, cli.flag("--dry-run", "Only estimate.")] = False,
-    rehearse: Annotated[bool, cli.flag("--rehearse", REHEARSE)] = False,
     yes: cli.YesOption = False,
     trust: cli.TrustOption = False,
     replay: Annotated[bool, cli.flag("--replay", "From recorded replies alone.")] = False,
@@ -129,10 +126,8 @@ def sweep(
     for name in studies:
         if len(studies) > 1:
             say(f"{name}:")
-        plan, own = planned(name), options
-        if rehearse:
-            plan, own = _rehearsed(plan, options, home_of(name))
-        codes.append(_play(plan, own, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
+        plan = planned(name)
+        codes.append(_play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
         if codes[-1] not in GOES_ON:
             break
     sys.exit(next(filter(None, codes), 0))
@@ -142,37 +137,6 @@ def sweep(
 def replay(**options: Any) -> None:  # noqa: ANN401 # those of sweep
     """Play a sweep from recorded replies alone: no key, no network."""
     sweep(**{**options, "replay": True})
-
-
-def _rehearsed(plan: Plan, options: Options, home: Path) -> tuple[Plan, Options]:
-    """The sweep as it is, with the emulator in the place of its provider.
-
-    ``home`` is the folder in which the results of the sweep lie. Raises UsageError.
-    """
-    from merge_runner.config import PROVIDERS, REHEARSAL, ModelEntry, endpoint_identity
-    from merge_runner.llm.models import load_models
-
-    def possible(entry: ModelEntry) -> bool:
-        provider = PROVIDERS.require(entry.provider)
-        is_own = endpoint_identity(entry) == entry.provider and entry.path is None
-        return is_own and provider.key_needed and provider.base_url_env is not None
-
-    is_usual = (options.db, options.cache) == (home / DEFAULT_DB, home / DEFAULT_CACHE)
-    if not is_usual or options.replay or options.dask or options.batch:
-        raise UsageError(
-            f"a rehearsal keeps what it makes in {REHEARSALS}, plays in this process and asks "
-            "singly: leave --db, --cache, --dask, --replay and --batch out"
-        )
-    models = {plan.registered[name] for name in plan.entries}
-    if len(models) != 1 or not all(map(possible, plan.entries.values())):
-        registry = load_models(plan.study.path.parent)
-        valid = ", ".join(name for name, entry in registry.items() if possible(entry))
-        raise UsageError(
-            f"--rehearse takes one model at its provider's own address: --model with one of {valid}"
-        )
-    db, cache = home / REHEARSALS / "merge.duckdb", home / REHEARSALS / "responses"
-    plan = plan.model_copy(update={"endpoints": dict.fromkeys(plan.entries, REHEARSAL)})
-    return plan, replace(options, db=db, cache=cache)
 
 
 def _play(
@@ -185,8 +149,6 @@ def _play(
     from merge_runner.run import progress
     from merge_runner.run import sweep as running
 
-    if plan.is_rehearsal:
-        say(f"REHEARSAL: the emulator answers as {plan.driver}; nobody else is asked, or charges")
     if not options.replay:
         asked = {plan.registered[name]: entry for name, entry in plan.entries.items()}
         for note in shutdown_notes(asked, datetime.now(UTC).date()):

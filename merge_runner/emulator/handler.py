@@ -5,7 +5,6 @@ Requests and responses are those of httpx in both cases.
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import json
 import re
@@ -182,14 +181,9 @@ class Asked:
 
 
 class Emulator:
-    """Answers chat requests of every format in SERVED.
+    """Answers chat requests of every format in SERVED."""
 
-    Every answer takes ``latency_s``, and has about ``output_tokens`` with its reasoning, or a few
-    hundred.
-    """
-
-    def __init__(self, latency_s: float = 0.0, output_tokens: int | None = None) -> None:
-        self.latency_s, self._output_tokens = latency_s, output_tokens
+    def __init__(self) -> None:
         self._asked: Counter[str] = Counter()
 
     def transport(self) -> httpx.MockTransport:
@@ -227,9 +221,7 @@ class Emulator:
 
     async def reply(self, asked: Asked, attempt: int) -> httpx.Response:
         """Return the response to a chat request; raises UsageError where it is none."""
-        answer = self.answer(asked, attempt)
-        await asyncio.sleep(self.latency_s)
-        return as_json(answer)
+        return as_json(self.answer(asked, attempt))
 
     def answer(self, asked: Asked, attempt: int) -> Body:
         """Return the body of an answer; raises UsageError where the request is none."""
@@ -250,9 +242,6 @@ class Emulator:
         # A token is about four bytes.
         tokens_in, visible = len(prompt.encode()) // 4, len(text.encode()) // 4
         reasoning = 200 + draw_index(600, "reasoning", prompt)
-        if typical := self._output_tokens:
-            drawn = typical // 2 + draw_index(typical, "reasoning", prompt)
-            reasoning = max(0, drawn - visible)
         # Only the same attempt at the same request gets the same id: the audit takes one that
         # comes back for an answer that was given twice.
         which = f"{asked.path} {asked.where} {attempt}".encode()

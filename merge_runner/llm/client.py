@@ -15,7 +15,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import TYPE_CHECKING
 
-from merge_runner.config import ModelEntry, driver_name, is_own_host
+from merge_runner.config import ModelEntry, driver_name
 from merge_runner.errors import (
     CallFailed,
     EndpointRefused,
@@ -570,6 +570,4 @@ class LlmClient:
         if (usage.output_tokens or 0) > self.entry.max_output_tokens:
             return cost_usd(self.entry, replace(worst, output_tokens=usage.output_tokens))
         stray = raw.status == 200 and raw.is_web_page and not self.known
-        own = is_own_host(self.entry.provider, self.endpoint)
-        charged = may_be_charged(raw, self.entry.provider if own else None)
-        return None if charged and not stray else 0.0
+        return None if may_be_charged(raw, self.endpoint) and not stray else 0.0

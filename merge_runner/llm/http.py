@@ -96,7 +96,7 @@ class HttpTransport:
         carrier: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._endpoint = endpoint
-        self._tells_slot = endpoint.is_emulator
+        self._tells_slot = endpoint.provider == "emulator"
         self._most_bytes = most_bytes
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}

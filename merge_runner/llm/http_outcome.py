@@ -144,18 +144,19 @@ class AttemptOutcome:
     charged: bool = True
 
 
-def may_be_charged(raw: RawReply, provider: str | None) -> bool:
+def may_be_charged(raw: RawReply, endpoint: str) -> bool:
     """Return whether a reply without usage may have been billed.
 
-    A refusal before any work is not, nor an error with the members that the ``provider`` documents
-    for its own, from its own host (None: another server). That of a gateway, or one for want of
-    time, may follow an answer that was made.
+    A refusal before any work is not, nor an error with the members that a provider documents for
+    its own, where ``endpoint`` says that its own host answered. That of a gateway, or one for want
+    of time, may follow an answer that was made.
     """
+    own = PROVIDERS.get(endpoint)
     if raw.status < 300 or raw.status in TOO_LATE or '"usage' in raw.body:
         return True
     if raw.status < 500:
-        return provider is None and bool(raw.error.names & CHARGED_ERRORS)
-    members = PROVIDERS[provider].error_members if provider else frozenset()
+        return own is None and bool(raw.error.names & CHARGED_ERRORS)
+    members = own.error_members if own else frozenset()
     return not members or not members <= as_dict(as_dict(raw.payload).get("error")).keys()
 
 

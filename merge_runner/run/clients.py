@@ -8,7 +8,7 @@ from contextlib import AsyncExitStack
 from resource import RLIM_INFINITY, RLIMIT_NOFILE, getrlimit, setrlimit
 from typing import TYPE_CHECKING
 
-from merge_runner.config import driver_name, rehearsal_endpoint, resolve_endpoint
+from merge_runner.config import driver_name, resolve_endpoint
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.batch.rounds import Rounds
@@ -16,7 +16,7 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Budget, Ledger, cost_usd
-from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
+from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.records import Usage
 from merge_runner.run.estimate import trial_costs
@@ -25,8 +25,6 @@ from merge_runner.run.plan import Options, Plan
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
 
-# Time in a rehearsal: answers come so much sooner, and the limits of a minute hold within less.
-SPEED = 10
 # For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
 
@@ -64,9 +62,7 @@ def live_clients(
         stack.push_async_callback(transports[model].close)
         rates = options.rates(plan.entries[name])
         rpm, tpm = (limit and max(1, int(limit * share)) for limit in rates)
-        window_s = WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S
-        limiter = Limiter(rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]], window_s=window_s)
-        limiters.setdefault(model, limiter)
+        limiters.setdefault(model, Limiter(rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]]))
     budget = Budget(ledger, options.max_cost_usd, trial_costs(plan, earlier, batch=options.batch))
     under_way: dict[str, Call] = {}  # two names of one model may ask the same
     clients = {}
@@ -102,26 +98,19 @@ def _connections(
     from merge_runner.llm.http import HttpTransport
 
     in_process = None
-    if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
+    if plan.scripted and not env.get("EMULATOR_BASE_URL"):
         from merge_runner.emulator.handler import Emulator
 
-        emulator = Emulator()
-        if plan.is_rehearsal:  # of one model, whose entries differ in parameters alone
-            entry = next(iter(plan.entries.values()))
-            emulator = Emulator(entry.typical_latency_s / SPEED, entry.typical_output_tokens)
-        in_process = emulator.transport()
+        in_process = Emulator().transport()
 
     def connect(name: str) -> HttpTransport:
         entry = plan.entries[name]
-        if plan.is_rehearsal:
-            endpoint = rehearsal_endpoint(entry)
-        else:
-            endpoint = resolve_endpoint(name, entry, env)
+        endpoint = resolve_endpoint(name, entry, env)
         transport = HttpTransport(
             endpoint,
             connections=options.connections,
             most_bytes=int(entry.max_reply_mb * 1e6),
-            carrier=in_process if endpoint.is_emulator else None,
+            carrier=in_process if endpoint.provider == "emulator" else None,
         )
         if rounds is not None and batch_terms(entry) is not None:
             service = SERVICES[entry.format](transport, endpoint, FORMATS[entry.format])

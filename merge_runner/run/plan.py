@@ -16,7 +16,6 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from merge_runner.config import (
-    REHEARSAL,
     ModelEntry,
     ScenarioConfig,
     both_sides,
@@ -184,11 +183,6 @@ class Plan(BaseModel):
     def is_free(self) -> bool:
         """Whether no model costs anything."""
         return all(entry.price == "free" for entry in self.entries.values())
-
-    @property
-    def is_rehearsal(self) -> bool:
-        """Whether the emulator takes the place of the providers."""
-        return REHEARSAL in self.endpoints.values()
 
     @property
     def replays_humans(self) -> bool:

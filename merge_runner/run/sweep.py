@@ -420,7 +420,7 @@ async def open_sweep(
         stored = [spec for key, spec in specs.items() if key in ended]
         todo = [spec for key, spec in specs.items() if key not in ended]
         if todo and not options.sends_nothing:
-            if options.dask is None and not plan.is_rehearsal:
+            if options.dask is None:
                 for name, entry in plan.entries.items():
                     resolve_endpoint(name, entry)  # raises where its key is missing
             options = _less_what_is_spent(plan, options, cache, say)

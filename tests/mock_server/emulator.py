@@ -43,7 +43,7 @@ class FaultyEmulator(Emulator):
 
     def __init__(self, plan: FaultPlan | None = None) -> None:
         self.plan = plan or FaultPlan()
-        super().__init__(self.plan.latency_s, self.plan.output_tokens)
+        super().__init__()
         self._answered: Counter[tuple[str, str | None, str | None]] = Counter()
         self._batches = Batches(self)
         self._routes = [route for mode in MODES for route in mode(self._batches).routes()]
@@ -70,7 +70,7 @@ class FaultyEmulator(Emulator):
         """The response, or what takes its place; raises BrokenOff."""
         fault = self.plan.fault(asked.where, attempt)
         answer = self.answer(asked, attempt, fault)
-        await asyncio.sleep(self.latency_s)
+        await asyncio.sleep(self.plan.latency_s)
         if fault == "hang":
             await asyncio.sleep(self.plan.hang_s)
         if fault in BREAKS:

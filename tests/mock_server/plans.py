@@ -59,7 +59,6 @@ class FaultPlan:
     rates: Mapping[str, float] = field(default_factory=dict)
     latency_s: float = 0.0
     delay_s: float = 0.05
-    output_tokens: int | None = None
     seed: int = 0
     hang_s: float = 30.0
     batch: BatchPlan = field(default_factory=BatchPlan)

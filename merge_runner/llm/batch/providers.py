@@ -17,7 +17,6 @@ from merge_runner.config import (
     Endpoint,
     ModelEntry,
     endpoint_identity,
-    is_own_host,
 )
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.formats import (
@@ -130,7 +129,7 @@ class BatchService(ABC):
         """Return a line as it is sent, with the body as it is hashed."""
         slot = canonical_json(request.slot.as_dict())
         # Only our own emulator is told the slot.
-        told = f',"{SLOT_HEADER}":{slot}' if self.endpoint.is_emulator else ""
+        told = f',"{SLOT_HEADER}":{slot}' if self.endpoint.provider == "emulator" else ""
         line = self.template.format(
             key=request.key, path=request.path, body=request.body, slot=told
         )
@@ -235,8 +234,7 @@ class BatchService(ABC):
             return raw
         failure = self._failure_of(raw.error, gone)
         # Without a mark it cannot be looked for: what the provider says of itself decides.
-        own = is_own_host(self.endpoint.provider, self.endpoint.identity)
-        failure.sent = may_be_charged(raw, self.endpoint.provider if own else None)
+        failure.sent = may_be_charged(raw, self.endpoint.identity)
         failure.sent |= self.takes_mark and raw.status >= 500
         raise failure
 
