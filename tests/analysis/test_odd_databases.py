@@ -26,7 +26,7 @@ SAID = {
     ),
     "another_endpoint": (["o3 at localhost:8080"], [">o3</td>"]),
     "partial_import": (["humans (129 of 990 imported)", "5 pairs"], ["are not imported"]),
-    "complete_import": (["humans 12.1 m"], ["are not imported"]),
+    "complete_import": (["Collisions and gap: no difference shown."], ["are not imported"]),
     "other_vehicle_length": (["vehicle_length_m = 8.0"], []),
     "temperature": (["temperature = 0.2"], ["no temperature", "default sampling temperature"]),
     "programs": (
