@@ -15,16 +15,13 @@ from merge_runner_analysis.figures.gallery import figure_2
 from merge_runner_analysis.figures.variant_figure import figure_2_variants
 from merge_runner_analysis.human.archive import open_files
 from merge_runner_analysis.human.load import import_trials, sort_files
-from merge_runner_analysis.stats.ceiling import published_humans
-from merge_runner_analysis.stats.group_scores import population, score
+from merge_runner_analysis.stats.group_scores import score
 from merge_runner_analysis.stats.indicators import Verdict
 from merge_runner_analysis.stats.intervals import mean
 from merge_runner_analysis.stats.likeness import gains
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding
-
-pytestmark = pytest.mark.usefixtures("few_draws")
 
 
 @pytest.fixture(scope="module")
@@ -68,26 +65,17 @@ def test_human_rows_come_from_the_traces(imported):
     assert any("66 of 990 trials" in note for note in tables["who-first"].notes)
 
 
-def test_a_cell_of_published_outcomes_names_no_imported_trial(imported):
+def test_a_row_of_humans_names_their_trials_and_the_published_outcomes(imported):
     tables = {table.name: table for table in make_tables(imported)}
-    for name, cell in (
-        ("ablation-quantitative", "human:n"),
-        ("ablation-quantitative", "human:collided_boxes_percent"),
-        ("indicators", "human/I1:n"),
-        ("who-first", "human/intercept:b"),
-        ("who-first", "human/intercept:firth_b"),
-        ("verdicts", "human/collisions:ci"),
-        ("verdicts", "human/headway:estimate"),
+    for name, row, trials in (
+        ("ablation-quantitative", "human", 66),
+        ("who-first", "human/intercept", 55),
+        ("who-first", "human/clustered/intercept", 55),
+        ("verdicts", "human/collisions", 66),
     ):
-        (human,) = (s for s in explain(imported, tables[name], cell).sources if s.group == "human")
-        assert human.trials == (), (name, cell)
-        assert human.text.startswith("990 published outcomes"), (name, cell)
-    for name, cell in (
-        ("ablation-quantitative", "human:gap_m"),
-        ("who-first", "human/clustered/intercept:n"),
-    ):
-        (human,) = explain(imported, tables[name], cell).sources
-        assert len(human.trials) == 55, (name, cell)
+        (human,) = explain(imported, tables[name], row).sources
+        assert len(human.trials) == trials, (name, row)
+        assert "those of 990 published outcomes" in human.text
 
 
 def test_the_ceiling_of_humans_is_left_out_where_their_indicators_rest_on_both(imported):
@@ -167,11 +155,6 @@ def test_the_speeds_of_humans_are_judged_without_the_simulators_resistance(impor
         resisted = measure_profiles(of_group(speeds, group, group.trials))
         assert len(resisted) == 2 * len(group.trials)
         assert resisted.equals(imported.profiles_of(group)) == (group is imported.human)
-
-
-def test_ceilings_are_drawn_from_the_published_humans_while_some_are_missing(imported):
-    assert not imported.complete
-    assert population(imported) is published_humans()
 
 
 def test_nothing_says_any_more_that_recordings_are_missing(imported):

@@ -34,7 +34,6 @@ from merge_runner_analysis.figures.panels import (
 )
 from merge_runner_analysis.figures.variant_figure import figure_2_variants
 from merge_runner_analysis.stats.intervals import mean, proportion
-from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
 
@@ -153,8 +152,6 @@ def test_conditions_that_were_not_played_are_not_drawn(tmp_path):
     (axis, *others) = figure_2(study).subfigs[1].axes
     assert len(others) == 2, "one relative velocity"
     assert sorted({round(x) for line in axis.lines for x in line.get_xdata()}) == [0, 4]
-    (resolved,) = make_tables(study, ["conflict-resolution"])
-    assert {row.values["condition"] for row in resolved.rows} == {"N_0_0", "L_4_0"}
     humans = Study(write_study(tmp_path / "h.duckdb", []))
     assert {*humans.conditions} == {*HUMAN_CONDITIONS}
 
@@ -211,7 +208,6 @@ def written_words(figure):
     }
 
 
-@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize("name", FIGURES)
 def test_no_name_is_cut_and_none_lies_over_another(name, long_names):
     with mpl.rc_context(SETTINGS):
@@ -225,7 +221,6 @@ def test_no_name_is_cut_and_none_lies_over_another(name, long_names):
         assert not box.padded(-1).overlaps(another.padded(-1)), (one, other)
 
 
-@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure_says_who_is_a_stand_in_and_names_its_variant(name, long_names):
     figure = FIGURES[name][0](long_names)
@@ -294,7 +289,6 @@ def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     "drives",
     [
