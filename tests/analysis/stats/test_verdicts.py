@@ -70,7 +70,10 @@ def penalised(design, left, column, value):
 
 
 @pytest.mark.parametrize("name", ["headway", "velocity"])
-def test_a_slope_of_who_goes_first_has_the_interval_of_its_profile(study, name):
+@pytest.mark.parametrize("reps", [1, 5])
+def test_a_slope_of_who_goes_first_has_the_interval_of_its_profile(tmp_path, name, reps):
+    """Also where one trial of each condition separates them."""
+    study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=reps), BOXES))
     found = next(one for one in compared(study, study.models[0]) if one.measure.name == name)
     column = WHO_FIRST_TERMS.index(
         {"headway": "projected_headway", "velocity": "relative_velocity"}[name]
