@@ -23,7 +23,7 @@ LONGEST_STEP = 5.0
 CONVERGED = 1e-8
 # Of a log-likelihood: what is smaller than this is no loss.
 ROUNDING = 1e-11
-WIDENINGS = 40
+WIDENINGS, WIDER = 40, 1.3
 # The largest slope of a likelihood at its top: what is aimed at, and what is still taken for one.
 FLAT, SLOPING = 1e-7, 1e-3
 
@@ -114,19 +114,25 @@ class Counts:
         None where no bound is found.
         """
         lost = stats.chi2.ppf(level, 1) / 2
+        near = fit.b  # the last profile: far out the other terms are far from the estimate, too
 
         def excess(value: float) -> float:
-            profile = self.fit({term: value}, fit.b)
-            return np.nan if profile is None else float(fit.best - profile.best - lost)
+            nonlocal near
+            profile = self.fit({term: value}, near)
+            if profile is None:
+                return np.nan
+            near = profile.b
+            return float(fit.best - profile.best - lost)
 
         bounds = []
         for sign in (-1, 1):
+            near = fit.b
             inside, width = float(fit.b[term]), sign * float(self.errors(fit)[term])
             for _ in range(WIDENINGS):
                 outside = inside + width
                 if not excess(outside) < 0:
                     break
-                inside, width = outside, 2 * width
+                inside, width = outside, WIDER * width
             if not excess(outside) >= 0:
                 return None
             try:
