@@ -85,6 +85,11 @@ def explain(study: Study, table: Table, cell: str) -> Explanation:
     )
 
 
+RESAMPLED = Source(
+    "human", "data sets resampled from the published counts and regression, not trials", "", ()
+)
+
+
 def sql_command(study: Study) -> str:
     """How a query is run on a study's database."""
     return "merge-runner sql" + ("" if study.db == DEFAULT_DB else f" --db {study.db}")
@@ -94,6 +99,8 @@ def sources_of(
     study: Study, table: Table, row: Row, column: Column | None = None
 ) -> tuple[Source, ...]:
     """The trials of each group behind a row, and those of them that a share of it counts."""
+    if column is not None and column.name.startswith("ceiling"):
+        return (RESAMPLED,)
     known = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
     groups = [group for group in known if group.id in row.groups]
     if table.name == ACCOUNTS:

@@ -75,20 +75,16 @@ def last_chance_of_all(course: Course) -> int | None:
     return found
 
 
-def driven_at(decisions: Decided, side: Side, time_s: float) -> Mapping[str, Any] | None:
-    """The decision of a side that is driven at a time; None before the first."""
-    made = [d for d in decisions if d["side"] == side and d["time_s"] <= time_s + TICK_S]
-    return made[-1] if made else None
-
-
 def _drove_no_plan_of_its_own(course: Course, decisions: Decided, side: Side) -> bool:
-    if not any(d["fallback"] for d in decisions if d["side"] == side):
+    own = [decision for decision in decisions if decision["side"] == side]
+    if not any(decision["fallback"] for decision in own):
         return False
     chance = course.last_chance(side, BRAKING)
     if chance is None:
         return False
-    driven = driven_at(decisions, side, course.times_s[chance])
-    return driven is not None and bool(driven["fallback"])
+    until_s = course.times_s[chance] + TICK_S
+    made = [decision for decision in own if decision["time_s"] <= until_s]
+    return bool(made and made[-1]["fallback"])
 
 
 def _way(change_mps: float) -> float:

@@ -6,7 +6,6 @@ as it drove, and keeps its speed from where its samples end.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import inf
@@ -42,10 +41,6 @@ class Course:
     def last(self) -> int:
         """The number of the last sample."""
         return len(self.times_s) - 1
-
-    def at(self, time_s: float) -> int:
-        """The number of the last sample that is not after a time."""
-        return max(0, bisect_right(self.times_s, time_s + TICK_S) - 1)
 
     def change_mps(self, side: Side, sample: int) -> float:
         """How much faster a vehicle is than it was at the start of control."""

@@ -1,4 +1,4 @@
-"""What the imported human trials are, beside the 990 that are published."""
+"""The imported human trials beside the 990 published ones."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.reference_data import HUMAN_TRIALS, PAIRS, published
 
 OUTCOMES = ["left_first", "right_first", "collided"]
-COUNTS = ["trials", *OUTCOMES]
 # What a spec says of trials that were not read from the recordings.
 RECORDINGS, VELOCITY_PAGES = "recordings", "velocity pages"
 TRIALS = f"""
@@ -85,56 +84,47 @@ def imported(trials: pd.DataFrame) -> Imported:
     """Compare human trials, which have the columns of TRIALS, with the published counts."""
     chosen = of_published_pairs(trials)
     conditions = by_condition(trials)
+    known = published("human_outcomes").set_index("condition")[OUTCOMES]
+    whole = conditions["trials"] >= known.sum(axis=1)
+    if chosen["pair"].isin(PAIRS.values()).any():
+        # More of an outcome than is published, or another number of it in a whole condition.
+        other = (conditions[OUTCOMES] > known) | (conditions[OUTCOMES] != known).mul(whole, axis=0)
+        contradicting = tuple(
+            f"{condition} {outcome.replace('_', ' ')} {conditions[outcome][condition]} instead of "
+            f"{known[outcome][condition]}"
+            for condition, outcome in other.stack()[lambda cells: cells].index
+        )
+    else:
+        contradicting = ("no trial is of the nine published pairs",)
     others = trials.loc[trials.index.difference(chosen.index), "pair"]
-    foreign = not chosen["pair"].isin(PAIRS.values()).any()
-    complete = bool((conditions["trials"] >= conditions["trials_published"]).all())
     return Imported(
         trials=len(chosen),
         pairs=chosen["pair"].nunique(),
-        complete=complete and not foreign,
-        contradicting=(
-            ("no trial is of the nine published pairs",)
-            if foreign
-            else tuple(_contradicting(conditions))
-        ),
+        complete=bool(whole.all()),
+        contradicting=contradicting,
         left_out={str(pair): int(n) for pair, n in others.value_counts().sort_index().items()},
         from_pages=int((chosen["origin"] == VELOCITY_PAGES).sum()),
     )
 
 
 def by_pair(trials: pd.DataFrame) -> pd.DataFrame:
-    """Counts of each pair, with the columns COUNTS."""
-    return _counted(trials).groupby(trials["pair"]).sum()
+    """Counts of each pair: trials and OUTCOMES."""
+    return _counted(trials, "pair")
 
 
 def by_condition(trials: pd.DataFrame) -> pd.DataFrame:
-    """Counts of each condition over the published pairs, with the published counts.
-
-    Those have the suffix ``_published``.
-    """
+    """The same of each condition over the published pairs, and how many trials are published."""
     own = trials[trials["pair"].isin(PAIRS.values())]
-    found = _counted(own).groupby(own["condition"]).sum().reindex(HUMAN_CONDITIONS, fill_value=0)
-    known = published("human_outcomes").set_index("condition")[OUTCOMES]
-    return found.join(known.assign(trials=known.sum(axis=1)), suffixes=("", "_published"))
+    known = published("human_outcomes").set_index("condition")[OUTCOMES].astype(str)
+    counts = _counted(own, "condition").reindex(HUMAN_CONDITIONS, fill_value=0)
+    return counts.assign(published=known.agg(" ".join, axis=1))
 
 
-def _counted(trials: pd.DataFrame) -> pd.DataFrame:
-    return pd.DataFrame(
-        {
-            "trials": 1,
-            "left_first": trials["merged_first"] == "left",
-            "right_first": trials["merged_first"] == "right",
-            "collided": trials["status"] == "collided",
-        },
-        index=trials.index,
-    ).astype(int)
-
-
-def _contradicting(conditions: pd.DataFrame) -> Iterator[str]:
-    """More of an outcome than is published, or another number of it in a whole condition."""
-    for condition, row in conditions.iterrows():
-        whole = row["trials"] >= row["trials_published"]
-        for outcome in OUTCOMES:
-            known = row[f"{outcome}_published"]
-            if row[outcome] > known or (whole and row[outcome] != known):
-                yield f"{condition} {outcome.replace('_', ' ')} {row[outcome]} instead of {known}"
+def _counted(trials: pd.DataFrame, by: str) -> pd.DataFrame:
+    outcomes = {
+        "trials": 1,
+        "left_first": trials["merged_first"] == "left",
+        "right_first": trials["merged_first"] == "right",
+        "collided": trials["status"] == "collided",
+    }
+    return pd.DataFrame(outcomes, index=trials.index).astype(int).groupby(trials[by]).sum()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import duckdb
@@ -14,8 +14,6 @@ from merge_runner_analysis.data.load import TRIALS, load_each
 from merge_runner_analysis.data.reference_data import human_outcomes
 from merge_runner_analysis.metrics import JUDGED, METRICS, Metric
 
-Load = Callable[[Sequence[Metric]], pd.DataFrame]
-
 
 def trials_with_metrics(db: Path) -> pd.DataFrame:
     """The rows of ``load_trials`` with a column for each metric that is not JUDGED.
@@ -23,13 +21,12 @@ def trials_with_metrics(db: Path) -> pd.DataFrame:
     Raises UsageError, also where the SQL of a metric fails.
     """
 
-    def load(metrics: Sequence[Metric]) -> pd.DataFrame:
+    def load(columns: str) -> pd.DataFrame:
         # Subqueries of the metrics may have changed the order.
-        rows = f"({TRIALS}) AS trials"
-        sql = f"SELECT *, {_columns(metrics)} FROM {rows} ORDER BY trial_id, spec_hash"  # noqa: S608 # ours
+        sql = f"SELECT *, {columns} FROM ({TRIALS}) AS trials ORDER BY trial_id, spec_hash"  # noqa: S608 # ours
         return load_each({"trials": sql}, db)["trials"]
 
-    return _loaded(load, METRICS.values(), "fails")
+    return _loaded(load, list(METRICS.values()), "fails")
 
 
 def outcomes_with_metrics() -> pd.DataFrame:
@@ -39,38 +36,26 @@ def outcomes_with_metrics() -> pd.DataFrame:
     """
     outcomes = human_outcomes()
 
-    def load(metrics: Sequence[Metric]) -> pd.DataFrame:
+    def load(columns: str) -> pd.DataFrame:
         with duckdb.connect() as connection:
             connection.register("trials", outcomes.assign(number=outcomes.index))
-            sql = f"SELECT {_columns(metrics)} FROM trials ORDER BY number"  # noqa: S608 # ours
-            return connection.sql(sql).df()
+            return connection.sql(f"SELECT {columns} FROM trials ORDER BY number").df()  # noqa: S608 # ours
 
-    known = (one for one in METRICS.values() if one.humans_from == "outcomes")
+    known = [metric for metric in METRICS.values() if metric.humans_from == "outcomes"]
     return outcomes.join(_loaded(load, known, "fails on the published human outcomes"))
 
 
-def _loaded(load: Load, metrics: Iterable[Metric], fails: str) -> pd.DataFrame:
+def _loaded(load: Callable[[str], pd.DataFrame], metrics: list[Metric], fails: str) -> pd.DataFrame:
     """The columns of the metrics that are not JUDGED; UsageError names one whose SQL fails."""
     chosen = [metric for metric in metrics if metric.value not in JUDGED]
+    types = {metric.column: "boolean" if metric.rate else "float" for metric in chosen}
     try:
-        return load(chosen).astype(_types(chosen))
+        return load(", ".join(metric.selected for metric in chosen)).astype(types)
     except (duckdb.Error, UsageError):  # the latter where a results database is read
         for metric in chosen:
-            _try_alone(load, metric, fails)
+            try:
+                load(metric.selected)
+            except (duckdb.Error, UsageError) as exc:
+                reason = first_line(exc.__cause__ or exc)
+                raise UsageError(f"the SQL of the metric {metric.name} {fails}: {reason}") from exc
         raise
-
-
-def _try_alone(load: Load, metric: Metric, fails: str) -> None:
-    try:
-        load([metric])
-    except (duckdb.Error, UsageError) as exc:
-        said = first_line(exc.__cause__ or exc)
-        raise UsageError(f"the SQL of the metric {metric.name} {fails}: {said}") from exc
-
-
-def _columns(metrics: Iterable[Metric]) -> str:
-    return ", ".join(metric.selected for metric in metrics)
-
-
-def _types(metrics: Iterable[Metric]) -> dict[str, str]:
-    return {metric.column: "boolean" if metric.rate else "float" for metric in metrics}

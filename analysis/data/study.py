@@ -16,9 +16,8 @@ import pandas as pd
 
 from merge_runner.audit.checks import ASKED_DECISIONS, not_judged
 from merge_runner.errors import UsageError, unknown_name
-from merge_runner.llm.content_hashes import canonical_json, spec_hash
 from merge_runner.paths import DEFAULT_DB
-from merge_runner.records import SIDES, Side
+from merge_runner.records import SIDES, Side, canonical_json, spec_hash
 from merge_runner.registry import require
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF, listed_levels

@@ -23,16 +23,8 @@ MAX_TOTAL_BYTES = 4 * 2**30
 MAX_RATIO = 200
 ENCRYPTED = 0x1
 PAGE = ".html"
-DAMAGED = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    EOFError,
-    NotImplementedError,
-    OSError,
-    OverflowError,
-    ValueError,
-)
+DAMAGED = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, NotImplementedError, OSError,
+           OverflowError, ValueError)  # fmt: skip
 
 
 class Unreadable(MergeRunnerError):
@@ -57,30 +49,20 @@ def open_files(path: Path) -> Iterator[list[File]]:
     """All files of a folder and those below it, of a zip, or a page; raises UsageError."""
     if path.is_dir():
         yield list(_files_below(path))
-        return
-    if path.is_file() and path.suffix.lower() == PAGE:
+    elif path.is_file() and path.suffix.lower() == PAGE:
         yield [_file(path, path.name)]
-        return
-    if not path.exists():
+    elif not path.exists():
         raise UsageError(f"there is no {path}: name the downloaded zip, or the folder of its files")
-    try:
-        archive = zipfile.ZipFile(path)
-    except DAMAGED as exc:
-        raise UsageError(
-            f"{path} is neither a folder nor a whole zip ({exc}): download it again"
-        ) from exc
-    with archive:
-        _refuse_paths_outside(path, archive.infolist())
-        yield [
-            File(
-                one_line(member.filename.replace("\\", "/")),
-                member.file_size,
-                member.compress_size,
-                _reader(archive, member),
-            )
-            for member in archive.infolist()
-            if not member.filename.endswith("/")
-        ]
+    else:
+        try:
+            archive = zipfile.ZipFile(path)
+        except DAMAGED as exc:
+            raise UsageError(
+                f"{path} is neither a folder nor a whole zip ({exc}): download it again"
+            ) from exc
+        with archive:
+            _refuse_paths_outside(path, archive.infolist())
+            yield [_member(archive, member) for member in archive.infolist() if not member.is_dir()]
 
 
 def refuse_bombs(files: Iterable[File]) -> None:
@@ -134,7 +116,7 @@ def _refuse_paths_outside(path: Path, members: list[zipfile.ZipInfo]) -> None:
             )
 
 
-def _reader(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Callable[[], bytes]:
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> File:
     def read() -> bytes:
         if member.flag_bits & ENCRYPTED:
             raise Unreadable("it is encrypted: unpack the zip and import the folder")
@@ -152,4 +134,5 @@ def _reader(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Callable[[], b
             raise Unreadable("it is damaged in the zip: it is shorter than declared")
         return content
 
-    return read
+    name = one_line(member.filename.replace("\\", "/"))
+    return File(name, member.file_size, member.compress_size, read)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from merge_runner_analysis.human.archive import File
-    from merge_runner_analysis.human.load import Download, Report
+    from merge_runner_analysis.human.load import Report
 
 INTERRUPTED = 130
 MOST_ALIKE = 20
@@ -71,13 +71,13 @@ def human_import(
     except KeyboardInterrupt:
         say("interrupted: what is stored stays; run the same command again to go on")
         sys.exit(INTERRUPTED)
-    for line in _messages(download, report):
+    for line in _errors(report):
         say(line)
     for line in imported(human_trials(db)).findings():
         say(f"note: {line}")
     print_out(
         f"{report.added} trials added, {report.there} there already, {len(report.unreadable)} "
-        f"files could not be read, {download.training} training runs skipped"
+        f"files could not be read, {download.skipped} training or simulated runs skipped"
     )
     sys.exit(1 if report.unreadable or report.differing else 0)
 
@@ -85,45 +85,29 @@ def human_import(
 @human_app.command("status")
 def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None:
     """Count the human trials, beside the published counts."""
-    from merge_runner_analysis.data.imported_humans import (
-        COUNTS,
-        OUTCOMES,
-        by_condition,
-        by_pair,
-        human_trials,
-        imported,
-    )
+    from merge_runner_analysis.data import imported_humans as humans
     from merge_runner_analysis.data.reference_data import HUMAN_DOI
 
-    trials = human_trials(db) if db.exists() else None
+    trials = humans.human_trials(db) if db.exists() else None
+    tables: dict[str, pd.DataFrame] = {}
+    notes: list[str] = []
+    if trials is not None and not trials.empty:
+        tables = {"pairs": humans.by_pair(trials), "conditions": humans.by_condition(trials)}
+        notes = list(humans.imported(trials).findings())
     if as_json:
-        print_out(json.dumps(_counts(trials), ensure_ascii=False))
-        return
-    if trials is None or trials.empty:
+        counts = {name: table.to_dict("index") for name, table in tables.items()}
+        print_out(json.dumps({**counts, "notes": notes} if tables else {}, ensure_ascii=False))
+    elif not tables:
         print_out(
             "no human recordings are imported: merge-runner human import PATH, where PATH is the "
             f"download of https://doi.org/{HUMAN_DOI}"
         )
-        return
-    conditions = by_condition(trials)
-    known = conditions[[f"{outcome}_published" for outcome in OUTCOMES]].astype(str)
-    print_out(_text(by_pair(trials)))
-    print_out("")
-    print_out(_text(conditions[COUNTS].assign(published=known.agg(" ".join, axis=1))))
-    print_out("")
-    for line in imported(trials).findings():
-        print_out(line)
-
-
-def _counts(trials: pd.DataFrame | None) -> dict[str, object]:
-    from merge_runner_analysis.data.imported_humans import by_condition, by_pair, imported
-
-    counts: dict[str, object] = {}
-    if trials is not None and not trials.empty:
-        for name, frame in (("pairs", by_pair(trials)), ("conditions", by_condition(trials))):
-            counts[name] = frame.to_dict("index")
-        counts["notes"] = list(imported(trials).findings())
-    return counts
+    else:
+        for table in tables.values():
+            shown = table.rename_axis(None).rename(columns=lambda name: name.replace("_", " "))
+            print_out(f"{shown.to_string()}\n")
+        for line in notes:
+            print_out(line)
 
 
 def _nothing_in(path: Path, files: list[File]) -> str:
@@ -135,29 +119,14 @@ def _nothing_in(path: Path, files: list[File]) -> str:
     )
 
 
-def _messages(download: Download, report: Report) -> Iterator[str]:
-    if download.simulated:
-        yield f"note: {download.simulated} simulated trials are not human: they are skipped"
-    for line in _grouped(report.replaced):
-        yield f"note: {line}; another file of the trial was read"
-    for line in _grouped(report.unreadable):
-        yield f"error: {line}"
-    for trial_id in report.differing:
-        yield f"error: {trial_id} is stored with other values, which stay"
-
-
-def _grouped(files: Iterable[tuple[str, str]]) -> Iterator[str]:
-    """One line a file, and one line a reason that many share."""
+def _errors(report: Report) -> Iterator[str]:
+    """One line a file that could not be read, and one line a reason that many share."""
     names: dict[str, list[str]] = {}
-    for name, reason in files:
+    for name, reason in report.unreadable:
         names.setdefault(reason, []).append(name)
     for reason, alike in names.items():
         if len(alike) > MOST_ALIKE:
-            yield f"{len(alike)} files, the first is {alike[0]}: {reason}"
-        else:
-            yield from (f"{name}: {reason}" for name in alike)
-
-
-def _text(counts: pd.DataFrame) -> str:
-    shown = counts.rename_axis(None).rename(columns=lambda name: name.replace("_", " "))
-    return str(shown.to_string())
+            alike = [f"{len(alike)} files, the first is {alike[0]}"]  # noqa: PLW2901
+        yield from (f"error: {name}: {reason}" for name in alike)
+    for trial_id in report.differing:
+        yield f"error: {trial_id} is stored with other values, which stay"

@@ -23,95 +23,74 @@ from merge_runner_analysis.human.record import (
 from merge_runner_analysis.human.trace import parse_csv
 from merge_runner_analysis.human.velocity_pages import condition_of, trace_of, trials_of
 
-BATCH = 100
+CHUNK = 100
+# The recorder wrote a CSV, a MAT and a PKL of each trial; unpickling would run code in the file.
 NAME = re.compile(
     r"(?P<what>experiment|simulation)_(?P<experiment>[0-9]{1,6})"
     r"_(?P<phase>iter|training)_(?P<number>[0-9]{1,6})\.(?P<suffix>csv|mat|pkl)",
     re.IGNORECASE,
 )
-# The recorder wrote a CSV, a MAT and a PKL of each trial; unpickling would run code in the file.
-NOT_READ = "the CSV that the experiment's program writes beside it is what can be imported"
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedTrial:
-    """One trial of a download: its CSV files, including copies, and its other files' names."""
-
-    experiment: int
-    iteration: int
-    files: list[File] = field(default_factory=list)
-    others: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
 class Download:
-    """A download's contents: its trials in order, and how many runs were training or simulated.
+    """A download's contents.
 
-    ``pages`` are its velocity pages, each with its condition.
+    ``trials`` are experiment, iteration and CSV file of each, in order; ``skipped`` counts the runs
+    that were training or simulated. ``pages`` are its velocity pages, each with its condition.
     """
 
-    trials: list[RecordedTrial]
-    training: int
-    simulated: int
+    trials: list[tuple[int, int, File]]
+    skipped: int
     pages: list[tuple[File, str]]
 
 
 @dataclass(slots=True)
 class Report:
-    """What became of the trials.
+    """The outcome of an import.
 
     ``added`` and ``there`` count the trials added and those already stored; ``differing`` are ids
-    of trials already stored with other values. ``unreadable`` holds file and reason where a trial
-    could not be imported, ``replaced`` where another of its files was read instead.
+    of trials already stored with other values. ``unreadable`` holds file and reason.
     """
 
     added: int = 0
     there: int = 0
     differing: list[str] = field(default_factory=list)
     unreadable: list[tuple[str, str]] = field(default_factory=list)
-    replaced: list[tuple[str, str]] = field(default_factory=list)
 
 
 def sort_files(files: Iterable[File]) -> Download:
     """Tell trials, training and simulated runs by their names; raises UsageError for a bomb."""
-    trials: dict[tuple[int, int], RecordedTrial] = {}
-    training: set[tuple[int, int]] = set()
-    simulated: set[tuple[int, int]] = set()
+    trials: list[tuple[int, int, File]] = []
+    skipped: set[tuple[str, ...]] = set()
     pages: list[tuple[File, str]] = []
     for file in files:
         if (condition := condition_of(file.name)) is not None:
             pages.append((file, condition))
-        found = NAME.fullmatch(PurePath(file.name).name)
-        if found is None:
+        name = NAME.fullmatch(PurePath(file.name).name)
+        if name is None:
             continue
-        what, phase, suffix = (found[group].lower() for group in ("what", "phase", "suffix"))
-        run = (int(found["experiment"]), int(found["number"]))
-        if what == "simulation":
-            simulated.add(run)
-        elif phase == "training":
-            training.add(run)
-        else:
-            trial = trials.setdefault(run, RecordedTrial(*run))
-            if suffix == "csv":
-                trial.files.append(file)
-            else:
-                trial.others.append(file.name)
-    refuse_bombs(file for trial in trials.values() for file in trial.files)
+        *run, suffix = name.group("what", "phase", "experiment", "number", "suffix")
+        if [part.lower() for part in run[:2]] != ["experiment", "iter"]:
+            skipped.add(tuple(run))
+        elif suffix.lower() == "csv":
+            trials.append((int(run[2]), int(run[3]), file))
+    refuse_bombs(file for _, _, file in trials)
     refuse_bombs(file for file, _ in pages)
-    return Download(
-        trials=[trial for _, trial in sorted(trials.items())],
-        training=len(training),
-        simulated=len(simulated),
-        pages=sorted(pages, key=lambda page: page[0].name),
-    )
+    trials.sort(key=lambda trial: trial[:2])
+    return Download(trials, len(skipped), sorted(pages, key=lambda page: page[0].name))
 
 
-def import_trials(trials: Iterable[RecordedTrial], store: Store) -> Report:
-    """Store the trials batch by batch; an error does not undo earlier ones. Raises StoreError."""
-    report = Report()
-    remaining = iter(trials)
-    while batch := list(islice(remaining, BATCH)):
-        records = [record for trial in batch for record in _read(trial, report)]
+def import_trials(trials: Iterable[tuple[int, int, File]], store: Store) -> Report:
+    """Store the trials chunk by chunk; an error does not undo earlier ones. Raises StoreError."""
+    report, remaining = Report(), iter(trials)
+    while chunk := list(islice(remaining, CHUNK)):
+        records = []
+        for experiment, iteration, file in chunk:
+            try:
+                records.append(trial_record(parse_csv(file.read()), experiment, iteration))
+            except Unreadable as exc:
+                report.unreadable.append((file.name, str(exc)))
         _add(records, store, (SPEC_HASH, SPEC), report)
     return report
 
@@ -156,24 +135,3 @@ def _read_page(file: File, condition: str, report: Report) -> Iterator[TrialReco
                 report.unreadable.append((name, str(exc)))
     except Unreadable as exc:
         report.unreadable.append((file.name, str(exc)))
-
-
-def _read(trial: RecordedTrial, report: Report) -> list[TrialRecord]:
-    """The trial from each of its CSV files; what cannot be read is reported."""
-    records: list[TrialRecord] = []
-    failed: list[tuple[str, str]] = []
-    for file in trial.files:
-        try:
-            trace = parse_csv(file.read())
-            records.append(trial_record(trace, trial.experiment, trial.iteration))
-        except Unreadable as exc:
-            failed.append((file.name, str(exc)))
-    if records:
-        report.replaced += failed
-    elif failed:
-        report.unreadable += failed
-    else:
-        name = trial.others[0]
-        form = PurePath(name).suffix[1:].upper()
-        report.unreadable.append((name, f"it exists only as {form}: {NOT_READ}"))
-    return records

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from math import inf
 
-from merge_runner.llm.content_hashes import canonical_json, spec_hash
-from merge_runner.records import SIDES, Side, StateRow, Status, TrialRecord, TrialSpec
-from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS, Condition
+from merge_runner.records import (
+    SIDES,
+    Side,
+    StateRow,
+    Status,
+    TrialRecord,
+    TrialSpec,
+    canonical_json,
+    spec_hash,
+)
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.data.imported_humans import VELOCITY_PAGES
 from merge_runner_analysis.data.reference_data import HUMAN_DOI, PAIRS
@@ -92,24 +101,20 @@ def _status(trace: Trace) -> Status:
 
 
 def _condition(trace: Trace) -> str:
+    """The condition from whose start the first sample is within the tolerances."""
+    firsts = [(trace.positions_m[side][0], trace.velocities_mps[side][0]) for side in SIDES]
     for name, condition in HUMAN_CONDITIONS.items():
-        if _starts_like(condition, trace):
+        starts = zip(condition.starts_m(TRACK), condition.speeds_mps, strict=True)
+        if all(
+            abs(at_m - start_m) <= START_TOLERANCE_M and abs(mps - speed_mps) <= START_TOLERANCE_MPS
+            for (at_m, mps), (start_m, speed_mps) in zip(firsts, starts, strict=True)
+        ):
             return name
-    starts = (
-        f"{side} at {trace.positions_m[side][0]:.2f} m with {trace.velocities_mps[side][0]:.2f} m/s"
-        for side in SIDES
+    shown = (
+        f"{side} at {at_m:.2f} m with {mps:.2f} m/s"
+        for side, (at_m, mps) in zip(SIDES, firsts, strict=True)
     )
-    raise Unreadable(f"it starts like none of the conditions: {', '.join(starts)}")
-
-
-def _starts_like(condition: Condition, trace: Trace) -> bool:
-    return all(
-        abs(trace.positions_m[side][0] - start_m) <= START_TOLERANCE_M
-        and abs(trace.velocities_mps[side][0] - speed_mps) <= START_TOLERANCE_MPS
-        for side, start_m, speed_mps in zip(
-            SIDES, condition.starts_m(TRACK), condition.speeds_mps, strict=True
-        )
-    )
+    raise Unreadable(f"it starts like none of the conditions: {', '.join(shown)}")
 
 
 def _control_start(trace: Trace) -> int:
@@ -122,39 +127,31 @@ def _control_start(trace: Trace) -> int:
 
 def _merged_first(trace: Trace) -> Side | None:
     arrivals = {side: _arrival(trace.positions_m[side]) for side in SIDES}
-    merged = {side: arrival for side, arrival in arrivals.items() if arrival is not None}
-    if not merged:
-        return None
-    return min(merged, key=merged.__getitem__)
+    first = min(arrivals, key=arrivals.__getitem__)
+    return first if arrivals[first] < inf else None
 
 
-def _arrival(positions_m: list[float]) -> float | None:
-    """When a vehicle reaches the merge point, in steps from the first sample; None: never."""
+def _arrival(positions_m: list[float]) -> float:
+    """When a vehicle reaches the merge point, in steps from the first sample; inf: never."""
     for step, (before, now) in enumerate(pairwise(positions_m)):
         if before < TRACK.merge_point_m <= now:
             return step + (TRACK.merge_point_m - before) / (now - before)
-    return None
+    return inf
 
 
 def _states(trace: Trace, start: int) -> tuple[StateRow, ...]:
-    vehicles = [
-        zip(
-            trace.positions_m[side],
-            trace.velocities_mps[side],
-            _accelerations(trace.velocities_mps[side], trace.step_s),
-            strict=True,
-        )
-        for side in SIDES
-    ]
-    steps = range(-start, len(trace.positions_m["left"]) - start)
-    # Rounded, because a product like 3 * 0.05 is not exactly 0.15 in binary.
-    times_s = [round(step * trace.step_s, 9) for step in steps]
-    return tuple(
-        StateRow(step, time_s, side, *values)
-        for step, time_s, *sample in zip(steps, times_s, *vehicles, strict=True)
-        for side, values in zip(SIDES, sample, strict=True)
-    )
-
-
-def _accelerations(velocities_mps: list[float], step_s: float) -> list[float]:
-    return [0.0, *((now - before) / step_s for before, now in pairwise(velocities_mps))]
+    states = []
+    for sample in range(len(trace.positions_m["left"])):
+        # Rounded, because a product like 3 * 0.05 is not exactly 0.15 in binary.
+        step, time_s = sample - start, round((sample - start) * trace.step_s, 9)
+        for side in SIDES:
+            velocities = trace.velocities_mps[side]
+            changed_mps = velocities[sample] - velocities[max(sample - 1, 0)]
+            position_m, acceleration_mps2 = (
+                trace.positions_m[side][sample],
+                changed_mps / trace.step_s,
+            )
+            states.append(
+                StateRow(step, time_s, side, position_m, velocities[sample], acceleration_mps2)
+            )
+    return tuple(states)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import inf
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -79,15 +81,22 @@ def contrast_cells(both: Cells) -> Difference:
 
 
 def interaction_of_rates(one: Cells, other: Cells) -> Difference:
-    """Return how far two differences of rates differ; p is the level at which 0 is excluded."""
-    rates = (*one.rates, *reversed(other.rates))
+    """Return how far two differences of rates differ."""
+    return difference_of_rates([*one.rates, *reversed(other.rates)])
+
+
+def difference_of_rates(rates: Sequence[tuple[float, float]]) -> Difference:
+    """Return a difference of rates, (rate, trials) each, with the interval of ``newcombe``.
+
+    Its p is the level at which that interval leaves 0 out.
+    """
     value = sum(rate if place % 2 == 0 else -rate for place, (rate, _) in enumerate(rates))
 
     def excludes_zero_by(z: float) -> float:
         low, high = newcombe(rates, z)
         return low if value > 0 else -high
 
-    largest = 40.0  # of this quantile p is 0 to 300 digits
+    largest = 30.0  # of this quantile p is 0 to 190 digits
     z = 0.0
     if value:
         ends = excludes_zero_by(largest)
@@ -132,49 +141,31 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class Within:
-    """The measures of two groups, less the mean of their condition.
+class Slope(NamedTuple):
+    """The first mean minus the second, its standard error, and the degrees of freedom."""
 
-    ``group`` is 1 for those of the first group and else 0, less its mean in the condition.
+    value: float
+    se: float
+    freedom: int
+
+
+def slope_within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Slope | None:
+    """Return how two means differ, by least squares with a level for each condition.
+
+    None where the groups share no condition, or have too few trials for an error.
     """
-
-    value: NDArray[np.float64]
-    group: NDArray[np.float64]
-    conditions: int
-
-    @property
-    def weight(self) -> float:
-        """What of the groups is left within conditions; 0 where no condition has both."""
-        weight = float((self.group**2).sum())
-        return weight if weight > 1e-12 else 0.0
-
-    @property
-    def difference(self) -> float:
-        """The first mean minus the second, by least squares with a level for each condition."""
-        # Of what is left of both within conditions, the slope is that of the whole model (Frisch
-        # and Waugh 1933; Lovell 1963).
-        return float((self.group * self.value).sum()) / self.weight
-
-    @property
-    def error(self) -> tuple[float, int] | None:
-        """Its standard error with the degrees of freedom; None without any."""
-        freedom = len(self.value) - self.conditions - 1
-        if freedom <= 0:
-            return None
-        variance = float(((self.value - self.difference * self.group) ** 2).sum()) / freedom
-        return float(np.sqrt(variance / self.weight)), freedom
-
-
-def within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Within:
-    """Return the measures of two groups within conditions."""
     both = pd.concat([first.assign(_first=1.0), second.assign(_first=0.0)]).dropna(subset=[measure])
-    by_condition = both.groupby("condition")
-    return Within(
-        (both[measure].astype(float) - by_condition[measure].transform("mean")).to_numpy(float),
-        (both["_first"] - by_condition["_first"].transform("mean")).to_numpy(float),
-        by_condition.ngroups,
-    )
+    both = both.assign(_value=both[measure].astype(float))
+    conditions = both.groupby("condition")[["_first", "_value"]]
+    # Of what is left of both within conditions, the slope is that of the whole model (Frisch and
+    # Waugh 1933; Lovell 1963).
+    group, value = (both[["_first", "_value"]] - conditions.transform("mean")).to_numpy(float).T
+    weight, freedom = float(group @ group), len(both) - conditions.ngroups - 1
+    if weight <= ROUNDING or freedom <= 0:
+        return None
+    slope = float(group @ value) / weight
+    residual = value - slope * group
+    return Slope(slope, float(np.sqrt(residual @ residual / freedom / weight)), freedom)
 
 
 def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Difference | None:
@@ -182,12 +173,12 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> D
 
     Difference, interval and Student's t are those of a linear model with a level for each
     condition, so that another mix of conditions, as when one group collides more in some, makes no
-    difference. None where the groups share no condition, or have too few trials for an error.
+    difference. None where ``slope_within`` is.
     """
-    both = within(first, second, measure)
-    if not (both.weight and both.error):
+    fit = slope_within(first, second, measure)
+    if fit is None:
         return None
-    value, (se, freedom) = both.difference, both.error
+    value, se, freedom = fit
     # Equal but for rounding is equal; where nothing varies, any other difference is sure.
     statistic = 0.0 if abs(value) < ROUNDING else value / se if se else inf
     p = two_sided_p(statistic, freedom)
@@ -196,11 +187,11 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> D
     )
 
 
-def interaction_of_means(one: Within, other: Within) -> Difference | None:
+def interaction_of_means(one: Slope | None, other: Slope | None) -> Difference | None:
     """Return how far two differences of means differ, by Welch's test; None without errors."""
-    if not (one.weight and other.weight and one.error and other.error):
+    if one is None or other is None:
         return None
-    return difference(one.difference - other.difference, one.error, other.error)
+    return difference(one.value - other.value, one[1:], other[1:])
 
 
 def corrected(p: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

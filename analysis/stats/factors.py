@@ -17,7 +17,7 @@ from merge_runner_analysis.stats.contrasts import (
     interaction_of_means,
     interaction_of_rates,
     shared_cells,
-    within,
+    slope_within,
 )
 from merge_runner_analysis.stats.intervals import Difference
 from merge_runner_analysis.stats.measures import trials_of, undecided
@@ -93,9 +93,10 @@ def difference(study: Study, level: Level, first: Level, metric: Metric) -> Diff
     None where these are of several studies, share no cell or have undecided trials; and for
     medians, which have no test.
     """
-    if metric.estimator == "median" or not _comparable(study, metric, level, first):
+    frames = _in_shared_cells(study, metric, level, first)
+    if frames is None or metric.estimator == "median":
         return None
-    one, other = _by_cell(metric, level, first)
+    one, other = frames
     if metric.rate:
         both = shared_cells(one, other, metric.column)
         return contrast_cells(both) if both else None
@@ -104,9 +105,10 @@ def difference(study: Study, level: Level, first: Level, metric: Metric) -> Diff
 
 def difference_of_medians(study: Study, level: Level, first: Level, metric: Metric) -> float | None:
     """A level's median minus that of the first one, in the cells that both have."""
-    if not _comparable(study, metric, level, first):
+    frames = _in_shared_cells(study, metric, level, first)
+    if frames is None:
         return None
-    one, other = (each[metric.column].median() for each in _in_shared_cells(metric, level, first))
+    one, other = (frame[metric.column].median() for frame in frames)
     return None if isnan(one) or isnan(other) else float(one - other)
 
 
@@ -117,32 +119,32 @@ def interaction(
 
     It is taken in the cells that all four have; None as in ``difference``.
     """
-    every = (*pair, *others)
-    if metric.estimator == "median" or not _comparable(study, metric, *every):
+    frames = _in_shared_cells(study, metric, *pair, *others)
+    if frames is None or metric.estimator == "median":
         return None
-    a, b, c, d = _in_shared_cells(metric, *every)
+    a, b, c, d = frames
     if metric.rate:
-        one, other = (shared_cells(*each, metric.column) for each in ((a, b), (c, d)))
+        one, other = shared_cells(a, b, metric.column), shared_cells(c, d, metric.column)
         return interaction_of_rates(one, other) if one and other else None
-    return interaction_of_means(within(a, b, metric.column), within(c, d, metric.column))
+    return interaction_of_means(
+        slope_within(a, b, metric.column), slope_within(c, d, metric.column)
+    )
 
 
-def _comparable(study: Study, metric: Metric, *levels: Level) -> bool:
+def _in_shared_cells(study: Study, metric: Metric, *levels: Level) -> list[pd.DataFrame] | None:
+    """The trials of each level that have a measure, in the cells that all have, as conditions.
+
+    None where these are of several studies or have undecided trials.
+    """
     groups = [level.pooled for level in levels]
-    return in_one_study(study, *groups) and not any(undecided(group, metric) for group in groups)
-
-
-def _by_cell(metric: Metric, *levels: Level) -> list[pd.DataFrame]:
-    """The trials of each level that have a measure, with their cell as condition."""
-    frames = (trials_of(level.pooled, metric).dropna(subset=[metric.column]) for level in levels)
-    return [frame.assign(condition=frame["cell"]) for frame in frames]
-
-
-def _in_shared_cells(metric: Metric, *levels: Level) -> list[pd.DataFrame]:
-    """The same in the cells that all levels have."""
-    frames = _by_cell(metric, *levels)
-    shared = set.intersection(*(set(frame["condition"]) for frame in frames))
-    return [frame[frame["condition"].isin(shared)] for frame in frames]
+    if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
+        return None
+    frames = [trials_of(group, metric).dropna(subset=[metric.column]) for group in groups]
+    shared = set.intersection(*(set(frame["cell"]) for frame in frames))
+    return [
+        frame[frame["cell"].isin(shared)].assign(condition=lambda rows: rows["cell"])
+        for frame in frames
+    ]
 
 
 def balance(levels: list[Level]) -> str:

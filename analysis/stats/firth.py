@@ -1,162 +1,146 @@
-"""Firth's penalised logit of many data sets at once, and where data are separated.
+"""Firth's penalised logit of counts by row of a design, and where a logit is separated.
 
-A data set is counts per row of a design. It is finite under separation (Firth 1993; Heinze and
-Schemper 2002).
+It is finite under separation (Firth 1993; Heinze and Schemper 2002).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.optimize import linprog
+from scipy.optimize import brentq, linprog
 from scipy.special import expit
 
 Array = NDArray[np.float64]
-Holds = NDArray[np.bool_]
 
 STEPS = 60
 HALVINGS = 8
+# Near separation a Newton step can leave the region where the information is regular.
+LONGEST_STEP = 5.0
+CONVERGED = 1e-8
 # Of a log-likelihood: what is smaller than this is no loss.
 ROUNDING = 1e-11
+WIDENINGS = 40
 
 
-def tested_fits(
-    design: Array, n: Array, left: Array, tested: tuple[int, ...]
-) -> tuple[Array, Array, Holds]:
-    """Firth's coefficients (sets, terms), p-values of the ``tested`` (else 1), and where they are.
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The coefficients ``b`` (terms,) where the penalised log-likelihood ``best`` is maximal."""
 
-    ``n`` and ``left`` are counts of the shape (sets, rows of the design).
-    """
-    alive = identified(design, n)
-    every = tuple(range(design.shape[1]))
-    full, b, found = _fit(design, n, left, alive, every)
-    p = np.ones_like(b)
-    for column in tested:
-        without = tuple(other for other in every if other != column)
-        constrained, _, settled = _fit(design, n, left, alive, without)
-        found &= settled
-        p[:, column] = stats.chi2.sf(2 * (full - constrained), 1)
-    return b, p, found
+    b: Array
+    best: float
 
 
-def signed_roots(
-    design: Array, n: Array, left: Array, column: int, estimate: float, at: Array
-) -> Array:
-    """The signed roots of twice what the profile likelihood of one data set loses, (k,).
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """Rows of a ``design`` (rows, terms) with ``n`` trials each, ``chosen`` of them a success."""
 
-    ``estimate`` is the coefficient of ``column``, which is held at each of the values ``at`` (k,).
-    """
-    values = np.append(at, estimate)
-    start = np.zeros((len(values), design.shape[1]))
-    start[:, column] = values
-    free = tuple(other for other in range(design.shape[1]) if other != column)
-    some, firsts = np.tile(n, (len(values), 1)), np.tile(left, (len(values), 1))
-    # Far out the last steps are small and many: what they add to the likelihood is less than seen.
-    best, _, _ = _fit(design, some, firsts, np.ones(len(values), bool), free, start)
-    loss = np.maximum(best[-1] - best[:-1], 0.0)
-    return np.asarray(np.sign(at - estimate) * np.sqrt(2 * loss))
+    design: Array
+    n: Array
+    chosen: Array
 
+    def fit(
+        self, held: Mapping[int, float] | None = None, start: Array | None = None
+    ) -> Fit | None:
+        """Return the fit with some coefficients ``held``, or None where it does not converge.
 
-def _fit(
-    design: Array,
-    n: Array,
-    left: Array,
-    alive: Holds,
-    free: tuple[int, ...],
-    start: Array | None = None,
-) -> tuple[Array, Array, Holds]:
-    """Maximal penalised log-likelihoods (sets,), coefficients (sets, terms), and convergence.
+        Newton steps on Firth's score with the whole design's information, halved where they do not
+        increase the penalised likelihood (Heinze and Schemper 2002).
+        """
+        held = held or {}
+        free = [term for term in range(self.design.shape[1]) if term not in held]
+        b = np.zeros(self.design.shape[1]) if start is None else start.copy()
+        b[[*held]] = [*held.values()]
+        best = self._penalised(b)
+        for _ in range(STEPS):
+            try:
+                step = self._step(b, free)
+            except np.linalg.LinAlgError:
+                return None
+            for _ in range(HALVINGS):
+                reached = self._penalised(b + step)
+                if reached >= best - ROUNDING:
+                    b, best = b + step, max(reached, best)
+                    break
+                step /= 2
+            else:
+                return Fit(b, best)  # no direction is uphill but for rounding
+            if np.abs(step).max(initial=0) < CONVERGED:
+                return Fit(b, best)
+        return None
 
-    Only the ``free`` coefficients differ from 0, or from those of ``start``.
+    def p(self, fit: Fit, term: int) -> float | None:
+        """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""
+        without = self.fit({term: 0.0})
+        return None if without is None else float(stats.chi2.sf(2 * (fit.best - without.best), 1))
 
-    Newton steps on Firth's score with the whole design's information, halved where they do not
-    increase the penalised likelihood (Heinze and Schemper 2002).
-    """
-    b = np.zeros((len(n), design.shape[1])) if start is None else start.copy()
-    best = np.zeros(len(n))
-    rows = np.flatnonzero(alive)  # a data set that has converged is left as it is
-    best[rows] = _penalised(design, n[rows], left[rows], b[rows])
-    for _ in range(STEPS):
-        some, firsts = n[rows], left[rows]
-        step = _step(design, some, firsts, b[rows], free)
-        for _ in range(HALVINGS):
-            tried = _penalised(design, some, firsts, b[rows] + step)
-            worse = tried < best[rows] - ROUNDING
-            if not worse.any():
-                break
-            step[worse] /= 2
-        step[worse] = 0
-        b[rows] += step
-        best[rows] = np.maximum(tried, best[rows])
-        rows = rows[np.abs(step).max(axis=1) >= 1e-8]
-        if not len(rows):
-            break
-    settled = alive.copy()
-    settled[rows] = False
-    return best, b, settled
+    def errors(self, fit: Fit) -> Array:
+        """Return Wald's standard errors, (terms,)."""
+        p = expit(self.design @ fit.b)
+        return np.sqrt(np.diag(np.linalg.inv(self._information(self.n * p * (1 - p)))))
 
+    def interval(self, fit: Fit, term: int, level: float) -> tuple[float, float] | None:
+        """Return the profile interval: what the penalised likelihood ratio does not reject.
 
-def _penalised(design: Array, n: Array, left: Array, b: Array) -> Array:
-    """Log-likelihoods of the coefficients ``b`` (sets, terms) with Firth's penalty.
+        None where no bound is found.
+        """
+        lost = stats.chi2.ppf(level, 1) / 2
 
-    It is half the logarithm of the determinant of the information: Jeffreys' prior (Firth 1993).
-    """
-    linear = b @ design.T
-    p = expit(linear)
-    determinant = np.linalg.det(information(design, n * p * (1 - p)))
-    fit = (left * linear - n * np.logaddexp(0, linear)).sum(axis=1)
-    return np.asarray(fit + np.log(np.maximum(determinant, 1e-300)) / 2)
+        def excess(value: float) -> float:
+            profile = self.fit({term: value}, fit.b)
+            return np.nan if profile is None else float(fit.best - profile.best - lost)
 
+        bounds = []
+        for sign in (-1, 1):
+            inside, width = float(fit.b[term]), sign * float(self.errors(fit)[term])
+            for _ in range(WIDENINGS):
+                outside = inside + width
+                if not excess(outside) < 0:
+                    break
+                inside, width = outside, 2 * width
+            if not excess(outside) >= 0:
+                return None
+            bounds.append(float(brentq(excess, inside, outside, xtol=1e-9)))
+        return bounds[0], bounds[1]
 
-def _step(design: Array, n: Array, left: Array, b: Array, free: tuple[int, ...]) -> Array:
-    """A Newton step (sets, terms) of the ``free`` coefficients from ``b``."""
-    alive = np.ones(len(b), bool)
-    p = expit(b @ design.T)
-    weights = n * p * (1 - p)
-    covariance, _ = inverse(design, weights, alive)
-    # Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were split,
-    # and half of its leverage had gone either way (Heinze and Schemper 2002).
-    leverage = weights * (covariance.reshape(-1, design.shape[1] ** 2) @ _products(design).T)
-    score = (left - n * p + leverage * (0.5 - p)) @ design
-    step = np.zeros_like(b)
-    step[:, free] = np.einsum(
-        "bjk,bk->bj", inverse(design[:, free], weights, alive)[0], score[:, free]
-    )
-    # Near separation a Newton step can leave the region where the information is regular.
-    return np.clip(step, -5, 5)
+    def infinite(self) -> NDArray[np.bool_]:
+        """Return which coefficients have no finite maximum likelihood estimate, (terms,).
 
+        Separation is a direction in which no row's outcome becomes less likely; the linear program
+        of Konis (2007) finds the one that gains most.
+        """
+        signed = np.vstack([self.design[self.chosen > 0], -self.design[self.chosen < self.n]])
+        found = linprog(
+            -signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1)
+        )
+        return np.asarray(np.abs(found.x) > 1e-4)
 
-def inverse(design: Array, weights: Array, alive: Holds) -> tuple[Array, Holds]:
-    """(X' W X)^-1 for each row of ``weights``, and where it exists; elsewhere the identity."""
-    of_each, size = information(design, weights), design.shape[1]
-    sound = alive & (np.linalg.det(of_each) > 1e-12)
-    return np.linalg.inv(np.where(sound[:, None, None], of_each, np.eye(size))), sound
+    def _information(self, weights: Array) -> Array:
+        return np.asarray((self.design.T * weights) @ self.design)
 
+    def _penalised(self, b: Array) -> float:
+        """Return the log-likelihood of ``b`` with Firth's penalty.
 
-def identified(design: Array, n: Array) -> Holds:
-    """In which data sets the conditions with trials tell all terms apart."""
-    played = information(design, (n > 0).astype(float))
-    return np.asarray(np.linalg.matrix_rank(played) == design.shape[1])
+        It is half the logarithm of the determinant of the information: Jeffreys' prior.
+        """
+        linear = self.design @ b
+        p = expit(linear)
+        determinant = np.linalg.det(self._information(self.n * p * (1 - p)))
+        likelihood = self.chosen @ linear - self.n @ np.logaddexp(0, linear)
+        return float(likelihood + np.log(max(determinant, 1e-300)) / 2)
 
-
-def information(design: Array, weights: Array) -> Array:
-    """X' W X for each row of ``weights`` (sets, conditions)."""
-    size = design.shape[1]
-    return np.asarray((weights @ _products(design)).reshape(-1, size, size))
-
-
-def _products(design: Array) -> Array:
-    """The products of each two regressors, (conditions, regressors squared)."""
-    return np.asarray((design[:, :, None] * design[:, None, :]).reshape(len(design), -1))
-
-
-def infinite_coefficients(design: Array, n: Array, left: Array) -> Holds:
-    """Which coefficients of a logit have no finite maximum likelihood estimate, (terms,).
-
-    ``n`` and ``left`` are counts by row of the design. Separation is a direction in which no row's
-    outcome becomes less likely; the linear program of Konis (2007) finds the one that gains most.
-    """
-    signed = np.vstack([design[left > 0], -design[left < n]])
-    found = linprog(-signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1))
-    return np.asarray(np.abs(found.x) > 1e-4)
+    def _step(self, b: Array, free: list[int]) -> Array:
+        """Return a Newton step of the ``free`` coefficients, (terms,)."""
+        p = expit(self.design @ b)
+        weights = self.n * p * (1 - p)
+        information = self._information(weights)
+        # Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
+        # split, and half of its leverage had gone either way (Heinze and Schemper 2002).
+        leverage = weights * ((self.design @ np.linalg.inv(information)) * self.design).sum(axis=1)
+        score = (self.chosen - self.n * p + leverage * (0.5 - p)) @ self.design
+        step = np.zeros_like(b)
+        step[free] = np.linalg.solve(information[np.ix_(free, free)], score[free])
+        return np.clip(step, -LONGEST_STEP, LONGEST_STEP)

@@ -10,13 +10,7 @@ from functools import cache
 
 from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.stats.ceiling import (
-    Ceiling,
-    Population,
-    ceiling,
-    imported_humans,
-    published_humans,
-)
+from merge_runner_analysis.stats.ceiling import Ceiling, ceiling
 from merge_runner_analysis.stats.indicators import INDICATORS, PAPER, ROBUST, Verdict, verdicts
 from merge_runner_analysis.stats.likeness import piecewise_constant
 from merge_runner_analysis.stats.regressions import (
@@ -53,14 +47,10 @@ def fits(group: Group) -> Fits:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """A group's verdicts by both rules, with I5 in both, and what to draw its ceiling from.
-
-    ``sizes`` are its trials per condition.
-    """
+    """A group's verdicts by both rules, with I5 in both; ``sizes`` are its trials per condition."""
 
     paper: dict[str, Verdict]
     robust: dict[str, Verdict]
-    humans: Population
     sizes: tuple[int, ...]
 
     @property
@@ -71,7 +61,7 @@ class Score:
     @property
     def ceiling(self) -> Ceiling:
         """The human ceiling for the group's size."""
-        return ceiling(self.humans, self.sizes)
+        return ceiling(self.sizes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,10 +109,4 @@ def score(study: Study, group: Group) -> Score:
     else:
         # The paper judged by eye: there is no rule to apply, whatever is driven.
         paper["I5"], robust["I5"] = Verdict(None), piecewise_constant(study, group)
-    return Score(paper, robust, population(study), group.sizes)
-
-
-@cache
-def population(study: Study) -> Population:
-    """The human trials that the ceilings are drawn from."""
-    return imported_humans(study.human.ended) if study.complete else published_humans()
+    return Score(paper, robust, group.sizes)

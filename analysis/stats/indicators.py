@@ -20,11 +20,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, Regression, VelocityPair
+from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, Regression, Term, VelocityPair
 
 ALPHA = 0.05
 # Equivalence margin of I4: how far relative velocity alone may move the gap.
@@ -41,22 +39,36 @@ INDICATORS = {
     "I5": "Conflicts are resolved with intermittent, piecewise-linear velocity profiles.",
 }
 
-# One number, or an array of one for each of many fits.
-Numbers = float | NDArray[np.float64]
-Holds = NDArray[np.bool_]
+
+def equivalence_p(b: float, se: float, freedom: float) -> float:
+    """The p-value of |difference| < GAP_MARGIN_M, by two one-sided t tests (Schuirmann 1987).
+
+    It is the larger of the two, that against the nearer margin. A difference without an error, as
+    of a driver without spread, is sure: it lies within the margin or it does not.
+    """
+    inside = GAP_MARGIN_M - abs(b)
+    if se == 0:
+        return float(inside <= 0)
+    return float(stats.t.sf(inside / se, freedom))
+
+
+def _increases(term: Term, freedom: float) -> bool:
+    return term.b > 0 and term.p < ALPHA
+
+
+def _decreases(term: Term, freedom: float) -> bool:
+    return term.b < 0 and term.p < ALPHA
 
 
 @dataclass(frozen=True, slots=True)
 class Criterion:
-    """Which term decides an indicator, and how; of APART each difference has to.
+    """Which term decides an indicator, and whether it ``holds``; of APART each difference has to.
 
-    ``holds`` takes the term's b, standard error, p and degrees of freedom, and returns whether the
-    indicator holds. It judges one fit like many: the same lines decide a verdict and the human
-    ceiling.
+    ``holds`` takes the term and the degrees of freedom of its fit.
     """
 
     term: str
-    holds: Callable[[Numbers, Numbers, Numbers, Numbers], Holds]
+    holds: Callable[[Term, float], bool]
 
     @property
     def of_who_first(self) -> bool:
@@ -64,43 +76,17 @@ class Criterion:
         return self.term in WHO_FIRST_TERMS
 
 
-def _increases(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Holds:
-    return (np.asarray(b) > 0) & (np.asarray(p) < ALPHA)
-
-
-def _decreases(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Holds:
-    return _increases(-b, se, p, freedom)
-
-
-def _not_significant(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Holds:
-    return np.asarray(p) >= ALPHA
-
-
-def _equivalent(b: Numbers, se: Numbers, p: Numbers, freedom: Numbers) -> Holds:
-    return equivalence_p(b, se, freedom) < ALPHA
-
-
-def equivalence_p(b: Numbers, se: Numbers, freedom: Numbers) -> NDArray[np.float64]:
-    """The p-value of |difference| < GAP_MARGIN_M, by two one-sided t tests (Schuirmann 1987).
-
-    It is the larger of the two, that against the nearer margin. A difference without an error, as
-    of a driver without spread, is sure: it lies within the margin or it does not.
-    """
-    inside, se = GAP_MARGIN_M - np.abs(b), np.asarray(se)
-    sure = np.where(inside > 0, np.inf, -np.inf)
-    statistic = np.where(se > 0, inside / np.where(se > 0, se, 1.0), sure)
-    return np.asarray(stats.t.sf(statistic, freedom))
-
-
 PAPER = {
     "I1": Criterion("projected_headway", _increases),
     "I2": Criterion("relative_velocity", _decreases),
     "I3": Criterion("abs_projected_headway", _increases),
-    "I4": Criterion("abs_relative_velocity", _not_significant),
+    "I4": Criterion("abs_relative_velocity", lambda term, _: term.p >= ALPHA),
 }
 # The same rules for better tests; only I4 differs: a large p shows nothing, so that the absence
 # of an effect has to be shown.
-ROBUST = PAPER | {"I4": Criterion(APART, _equivalent)}
+ROBUST = PAPER | {
+    "I4": Criterion(APART, lambda term, freedom: equivalence_p(term.b, term.se, freedom) < ALPHA)
+}
 TESTED = tuple(PAPER)
 
 
@@ -134,9 +120,7 @@ def judged(criterion: Criterion, fit: Regression) -> Verdict:
     if criterion.term == APART and not fit.apart:
         return Verdict(None, NONE_APART)
     tested = fit.apart.values() if criterion.term == APART else [fit.terms[criterion.term]]
-    return Verdict(
-        all(bool(criterion.holds(term.b, term.se, term.p, fit.freedom)) for term in tested)
-    )
+    return Verdict(all(criterion.holds(term, fit.freedom) for term in tested))
 
 
 def furthest_apart(fit: Regression) -> VelocityPair:
@@ -144,7 +128,7 @@ def furthest_apart(fit: Regression) -> VelocityPair:
     return max(
         fit.apart,
         key=lambda pair: (
-            float(equivalence_p(fit.apart[pair].b, fit.apart[pair].se, fit.freedom)),
+            equivalence_p(fit.apart[pair].b, fit.apart[pair].se, fit.freedom),
             abs(fit.apart[pair].b),
         ),
     )

@@ -15,7 +15,6 @@ from typing import Protocol
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from merge_runner_analysis.stats import firth, intervals
 
@@ -153,28 +152,62 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
     return Regression(len(left), _terms(WHO_FIRST_TERMS, fit))
 
 
-def who_first_firth(trials: pd.DataFrame) -> Regression:
-    """The same by Firth's penalised likelihood, with penalised likelihood-ratio tests.
+@dataclass(frozen=True, slots=True)
+class Penalised:
+    """Firth's fit of who merged first: finite under separation (Firth 1993).
 
-    It is finite under separation (Firth 1993; Heinze and Schemper 2002).
+    ``first`` is the column of the design that holds the first of the terms.
+    """
+
+    n: int
+    counts: firth.Counts
+    fit: firth.Fit
+    first: int = 0
+
+    @property
+    def terms(self) -> dict[str, Term]:
+        """Return the terms with penalised likelihood-ratio tests (Heinze and Schemper 2002)."""
+        errors = self.counts.errors(self.fit)
+        terms = {}
+        for place, name in enumerate(WHO_FIRST_TERMS, start=self.first):
+            if (p := self.counts.p(self.fit, place)) is not None:
+                terms[name] = Term(float(self.fit.b[place]), float(errors[place]), None, p)
+        return terms
+
+    def interval(self, term: str) -> tuple[float, float] | None:
+        """Return the profile interval of a term, which agrees with its test."""
+        place = self.first + WHO_FIRST_TERMS.index(term)
+        return self.counts.interval(self.fit, place, intervals.LEVEL)
+
+
+def penalised(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Penalised | str:
+    """Return Firth's fit to trials, or why there is none.
+
+    Its terms are the coefficients of ``trials``, less those of other trials where these are given:
+    then it is one model of both in which every term may differ.
     """
     design, left = who_first_data(trials)
-    problem = _unidentified(design, left, vehicles(trials))
+    n, problem = len(left), _unidentified(design, left, vehicles(trials))
+    if less is not None:
+        rest, rest_left = who_first_data(less)
+        problem = problem or _unidentified(rest, rest_left, vehicles(less))
+        design = np.block([[rest, 0 * rest], [design, design]])
+        left = np.concatenate([rest_left, left])
     if problem:
-        return Regression(len(left), {}, problem)
-    cells, n, lefts = _cells(design, left)
-    (estimates,), (p_values,), found = firth.tested_fits(cells, n[None], lefts[None], (0, 1, 2))
-    if not found:
-        return Regression(len(left), {}, "Firth's penalised fit does not converge")
-    p = expit(cells @ estimates)
-    errors = np.sqrt(np.diag(np.linalg.inv(cells.T @ (cells * (n * p * (1 - p))[:, None]))))
-    return Regression(
-        len(left),
-        {
-            name: Term(float(b), float(se), None, float(p))
-            for name, b, se, p in zip(WHO_FIRST_TERMS, estimates, errors, p_values, strict=True)
-        },
-    )
+        return problem
+    counts = _cells(design, left)
+    fit = counts.fit()
+    if fit is None:
+        return "Firth's penalised fit does not converge"
+    return Penalised(n, counts, fit, 0 if less is None else len(WHO_FIRST_TERMS))
+
+
+def who_first_firth(trials: pd.DataFrame) -> Regression:
+    """The same by Firth's penalised likelihood, with penalised likelihood-ratio tests."""
+    fit = penalised(trials)
+    if isinstance(fit, str):
+        return Regression(len(who_first_data(trials)[1]), {}, fit)
+    return Regression(fit.n, fit.terms)
 
 
 def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = False) -> Regression:
@@ -276,7 +309,7 @@ def _unidentified(design: Array, left: Array, called: tuple[str, str]) -> str:
 
 
 def _separated(design: Array, left: Array) -> str:
-    infinite = firth.infinite_coefficients(*_cells(design, left))
+    infinite = _cells(design, left).infinite()
     if not infinite.any():
         return ""
     # The level comes last, as it is said.
@@ -284,10 +317,10 @@ def _separated(design: Array, left: Array) -> str:
     return f"separation: no finite estimate of {', '.join(named)}; see Firth's fit"
 
 
-def _cells(design: Array, left: Array) -> tuple[Array, Array, Array]:
-    """Trials of equal regressors as one binomial: design (k, 3), trials (k,), left-first (k,)."""
+def _cells(design: Array, left: Array) -> firth.Counts:
+    """Trials of equal regressors as one binomial."""
     cells, place, trials = np.unique(design, axis=0, return_inverse=True, return_counts=True)
-    return cells, trials.astype(float), np.bincount(place, weights=left).astype(float)
+    return firth.Counts(cells, trials.astype(float), np.bincount(place, weights=left).astype(float))
 
 
 def _too_few(n: int, what: str) -> str:

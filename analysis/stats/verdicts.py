@@ -1,44 +1,41 @@
 """Drivers beside the humans: estimate, interval and test of each measure from one model.
 
-- Who goes first: Firth's penalised logit of left-first on h and dv, with profile likelihood
-  intervals, finite also under separation (Heinze and Schemper 2002).
+- Who goes first: Firth's penalised logit of left-first on h and dv, finite also under separation,
+  with profile likelihood intervals and likelihood-ratio tests (Heinze and Schemper 2002); of a
+  difference one model of both, in which every term may differ.
 - Collisions: rates with Wilson's interval, the humans' with the weights of the driver's conditions.
 - The mean gap: Student's t over trials, the humans' over their nine pairs; Welch's test.
 - Slopes of the gap: least squares with HC3 errors, the humans' as published or by pairs.
 - I5: how far accelerations are held, in human standard deviations (see ``likeness``).
 
-A difference of slopes of a logit, and of rates, has the interval that both intervals give (MOVER:
-Zou and Donner 2008; of rates it is Newcombe's of 1998), and its p is the level at which that
-interval leaves 0 out.
+A difference of rates has Newcombe's interval (1998), and its p is the level at which that interval
+leaves 0 out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from math import asin, hypot, inf, sin, sqrt
+from math import asin, inf, sin, sqrt
 
 import numpy as np
-import pandas as pd
-from scipy import interpolate, optimize
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.reference_data import HUMAN_GAP_PAIR_SD_M, PAIRS, published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import BOXES
-from merge_runner_analysis.stats import firth, intervals, likeness
-from merge_runner_analysis.stats.contrasts import corrected
+from merge_runner_analysis.stats import intervals, likeness
+from merge_runner_analysis.stats.contrasts import corrected, difference_of_rates
 from merge_runner_analysis.stats.group_scores import fits, score
 from merge_runner_analysis.stats.indicators import Verdict
-from merge_runner_analysis.stats.intervals import Difference, Z, two_sided_p, wilson
+from merge_runner_analysis.stats.intervals import Difference, newcombe, wilson
 from merge_runner_analysis.stats.measures import counts, undecided, undecided_note
 from merge_runner_analysis.stats.regressions import (
     GAP_TERMS,
     MIN_PAIRS,
-    WHO_FIRST_TERMS,
     by_pairs,
     gap_ols,
+    penalised,
     who_first_data,
 )
 from merge_runner_analysis.verdict_words import (
@@ -58,34 +55,29 @@ SLOPES = {
     "gap-headway": ("abs_projected_headway", 1.0, "I3"),
     "gap-velocity": ("abs_relative_velocity", 0.8, "I4"),
 }
-# How far from an estimate its profile is followed, in standard errors, and at how many points.
-REACH, POINTS = 30.0, 61
-Limits = Callable[[float], tuple[float, float]]
+WHO_FIRST = ("headway", "velocity")
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value of ``n`` trials with its interval at any quantile z, and with its standard error.
+    """A value of ``n`` trials with its 95 % interval ``ci``, and with its standard error.
 
-    ``freedom`` is that of Student's t. ``problem`` says why there is no value, ``remark`` what to
-    know of it. A rate counts ``k`` trials; with ``undecided`` ones it has no value, and the limits
-    hold whether none or all of them count (Manski 1989).
+    ``freedom`` is that of Student's t. ``rate`` is a rate as a share, and the trials that it is as
+    good as. ``problem`` says why there is no value, ``remark`` what to know of it. A rate counts
+    ``k`` trials; with ``undecided`` ones it has no value, and the interval holds whether none or
+    all of them count (Manski 1989).
     """
 
     value: float | None
     n: int
-    limits: Limits | None = None
+    ci: tuple[float, float] | None = None
     se: float | None = None
     freedom: float = inf
+    rate: tuple[float, float] | None = None
     problem: str = ""
     remark: str = ""
     k: int | None = None
     undecided: int = 0
-
-    @property
-    def ci(self) -> tuple[float, float] | None:
-        """The 95 % interval."""
-        return None if self.limits is None else self.limits(Z)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +114,11 @@ def _compared(study: Study, group: Group, measure: Measure) -> Comparison:
     # Conditions that no human drove would pass for another behaviour.
     alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
     own, human = _own(study, alike, measure.name), _human(study, alike, measure.name)
-    difference = None if measure.name == "held" else _difference(own, human)
+    difference = _difference(own, human)
     if own.undecided:
         difference = _of_worst_cases(own, human)
+    elif measure.name in WHO_FIRST:
+        difference = _of_slopes(alike, study.human, SLOPES[measure.name][0])
     verdict = score(study, group).robust.get(SLOPES[measure.name][2]) if measure.is_slope else None
     state = _state(measure, own, human, difference, verdict)
     notes = [own.problem, human.problem]
@@ -166,9 +160,10 @@ def _of_worst_cases(own: Estimate, human: Estimate) -> Difference | None:
 
     Its value is the one nearer to 0.
     """
-    if own.k is None or human.value is None:
+    if own.k is None or human.rate is None:
         return None
-    cases = [_mover(_rate(k / own.n, own.n, own.n), human) for k in (own.k, own.k + own.undecided)]
+    n = float(own.n)
+    cases = [_of_rates((k / n, n), human.rate) for k in (own.k, own.k + own.undecided)]
     least, most = cases
     nearest = min(cases, key=lambda one: abs(one.value))
     return replace(nearest, low=least.low, high=most.high, p=max(one.p for one in cases))
@@ -176,48 +171,35 @@ def _of_worst_cases(own: Estimate, human: Estimate) -> Difference | None:
 
 def _difference(own: Estimate, human: Estimate) -> Difference | None:
     """The driver's value less the humans'; None where one of them, or every error, is missing."""
-    if own.value is None or human.value is None or own.limits is None or human.limits is None:
+    if own.value is None or human.value is None:
+        return None
+    if own.rate and human.rate:
+        return _of_rates(own.rate, human.rate)
+    if own.se is None or human.se is None:
         return None
     value = own.value - human.value
-    if own.se is not None and human.se is not None and human.freedom < inf:
-        return intervals.difference(value, (own.se, own.freedom), (human.se, human.freedom))
-    return _mover(own, human)
+    return intervals.difference(value, (own.se, own.freedom), (human.se, human.freedom))
 
 
-def _mover(own: Estimate, human: Estimate) -> Difference:
-    """The difference from the limits of both, and the level at which these leave 0 out."""
-    assert own.value is not None
-    assert human.value is not None
-    assert own.limits is not None
-    assert human.limits is not None
-    value, of_own, of_humans = own.value - human.value, own.limits, human.limits
-    middle, other = own.value, human.value
-
-    def ends(z: float) -> tuple[float, float]:
-        (low, high), (human_low, human_high) = of_own(z), of_humans(z)
-        return (
-            value - hypot(middle - low, human_high - other),
-            value + hypot(high - middle, other - human_low),
-        )
-
-    def beyond(z: float) -> float:
-        low, high = ends(z)
-        return low if value > 0 else -high
-
-    largest = 30.0  # of this quantile p is 0 to 190 digits
-    z = 0.0
-    if value:
-        sure = beyond(largest) > 0
-        z = largest if sure else float(optimize.brentq(beyond, 0.0, largest))
-    low, high = ends(Z)
-    if own.se is None or human.se is None:
-        least = _detectable_rate(own.n, human.n, other)
-    else:
-        least = intervals.detectable(hypot(own.se, human.se))
-    return Difference(value, low, high, two_sided_p(z), least)
+def _of_slopes(group: Group, human: Group, term: str) -> Difference | None:
+    """How a slope of who goes first differs, by Firth's fit of one model of both."""
+    fit = penalised(group.outcomes, less=human.outcomes)
+    bounds = None if isinstance(fit, str) else fit.interval(term)
+    if isinstance(fit, str) or bounds is None or term not in fit.terms:
+        return None
+    slope = fit.terms[term]
+    return Difference(slope.b, *bounds, slope.p, intervals.detectable(slope.se))
 
 
-def _detectable_rate(n: int, m: int, percent: float) -> float:
+def _of_rates(own: tuple[float, float], human: tuple[float, float]) -> Difference:
+    """How two rates differ, in percent."""
+    found = difference_of_rates([own, human])
+    low, high = newcombe([own, human])
+    least = _detectable_rate(own[1], human[1], 100 * human[0])
+    return Difference(100 * found.value, 100 * low, 100 * high, found.p, least)
+
+
+def _detectable_rate(n: float, m: float, percent: float) -> float:
     """How many points above ``percent`` of m trials a rate of n must lie to be found (80 %).
 
     By the arcsine of the square root, whose variance is 1 / 4n (Cohen 1988).
@@ -245,7 +227,7 @@ def _human(study: Study, group: Group, name: str) -> Estimate:
         return _standardised(human, group)
     if name == "held":
         return Estimate(0.0, len(human.finished))
-    if name in ("headway", "velocity"):
+    if name in WHO_FIRST:
         return _slope(human, name)
     if study.imported and not study.imported.contradicting and _pairs(human) >= MIN_PAIRS:
         return _gap_of_pairs(human, group) if name == "gap" else _gap_slope_of_pairs(human, name)
@@ -256,12 +238,12 @@ def _human(study: Study, group: Group, name: str) -> Estimate:
 def _slope(group: Group, name: str) -> Estimate:
     """A slope of who goes first by Firth's fit, or of the gap with HC3 errors."""
     term, factor, _ = SLOPES[name]
-    if term in WHO_FIRST_TERMS:
-        fit = fits(group).firth
-        if fit.problem:
-            return Estimate(None, fit.n, problem=fit.problem)
-        limits = _profile(group.outcomes, term, fit.terms[term].b, fit.terms[term].se)
-        return Estimate(fit.terms[term].b, fit.n, limits, fit.terms[term].se)
+    if name in WHO_FIRST:
+        model = penalised(group.outcomes)
+        if isinstance(model, str):
+            return Estimate(None, len(who_first_data(group.outcomes)[1]), problem=model)
+        slope = model.terms[term]
+        return Estimate(slope.b, model.n, model.interval(term), slope.se)
     fit = fits(group).hc3
     if fit.problem:
         return Estimate(None, fit.n, problem=fit.problem)
@@ -270,40 +252,8 @@ def _slope(group: Group, name: str) -> Estimate:
 
 def _by_t(value: float, se: float, freedom: float, n: int, remark: str = "") -> Estimate:
     """An estimate with Student's t."""
-
-    def limits(z: float) -> tuple[float, float]:
-        return intervals.interval(value, se, freedom, 1 - two_sided_p(z))
-
-    return Estimate(value, n, limits, se, freedom, remark=remark)
-
-
-def _profile(trials: pd.DataFrame, term: str, value: float, se: float) -> Limits:
-    """The interval of a slope by Firth's profile likelihood, at any quantile.
-
-    The signed root of twice the loss of penalised likelihood is followed over the slope, the other
-    terms fitted anew at each point, and inverted by a monotone interpolation.
-    """
-    design, left = who_first_data(trials)
-    cells, place, trials_of = np.unique(design, axis=0, return_inverse=True, return_counts=True)
-    n, lefts = trials_of.astype(float), np.bincount(place, weights=left).astype(float)
-    at = value + se * np.sinh(np.linspace(-np.arcsinh(REACH), np.arcsinh(REACH), POINTS))
-    roots = firth.signed_roots(cells, n, lefts, WHO_FIRST_TERMS.index(term), value, at)
-    # Far out a fit may stop early: the root must rise all the way.
-    sound = np.isfinite(roots) & (np.maximum.accumulate(np.nan_to_num(roots, nan=-np.inf)) == roots)
-    at, roots = at[sound], roots[sound]
-    keep = np.flatnonzero(np.diff(roots, prepend=-np.inf) > 0)
-    at, roots = at[keep], roots[keep]
-    inside = interpolate.PchipInterpolator(roots, at)
-    first, last = np.diff(at[:2]) / np.diff(roots[:2]), np.diff(at[-2:]) / np.diff(roots[-2:])
-
-    def place_of(root: float) -> float:
-        if root < roots[0]:
-            return float(at[0] + (root - roots[0]) * first[0])
-        if root > roots[-1]:
-            return float(at[-1] + (root - roots[-1]) * last[0])
-        return float(inside(root))
-
-    return lambda z: (place_of(-z), place_of(z))
+    ci = intervals.interval(value, se, freedom)
+    return Estimate(value, n, ci, se, freedom, remark=remark)
 
 
 def _collided(group: Group) -> Estimate:
@@ -319,17 +269,13 @@ def _collided(group: Group) -> Estimate:
     assert most.ci is not None
     ends = least.ci[0], most.ci[1]
     note = undecided_note(group, BOXES)
-    return Estimate(None, n, lambda _: ends, problem=note, k=k, undecided=cut_off)
+    return Estimate(None, n, ends, problem=note, k=k, undecided=cut_off)
 
 
 def _rate(rate: float, as_good_as: float, n: int) -> Estimate:
     """A rate in percent with Wilson's interval of so many trials."""
-
-    def limits(z: float) -> tuple[float, float]:
-        low, high = wilson(rate, as_good_as, z) if z else (rate, rate)
-        return 100 * low, 100 * high
-
-    return Estimate(100 * rate, n, limits)
+    low, high = wilson(rate, as_good_as)
+    return Estimate(100 * rate, n, (100 * low, 100 * high), rate=(rate, as_good_as))
 
 
 def _standardised(human: Group, group: Group) -> Estimate:
@@ -362,9 +308,7 @@ def _held(study: Study, group: Group) -> Estimate:
     if found is None or found.value is None:
         why = "too few human recordings are imported" if not study.calibrated else "no trial acted"
         return Estimate(None, len(group.finished), problem=f"I5 is not compared: {why}")
-    ends = found.bounds()
-    limits = (lambda _: ends) if ends else None  # its limits are wanted at 95 % alone
-    return Estimate(found.value, found.n, limits)
+    return Estimate(found.value, found.n, found.bounds())
 
 
 def _pairs(human: Group) -> int:

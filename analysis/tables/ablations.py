@@ -85,7 +85,7 @@ def ablation_qualitative(study: Study) -> Table:
         (
             RULES,
             *(f"{name}: {text}" for name, text in INDICATORS.items()),
-            *ceiling_notes(study),
+            *ceiling_notes(),
             *intermittency_notes(study),
             *sample_notes(study, study.groups),
         ),

@@ -85,7 +85,7 @@ def indicators(study: Study) -> Table:
             RULES,
             *(f"{name}: {text}" for name, text in INDICATORS.items()),
             RULES_NOTE,
-            *ceiling_notes(study),
+            *ceiling_notes(),
             *intermittency_notes(study),
             *sample_notes(study, study.baselines),
         ),

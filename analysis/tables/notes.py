@@ -12,7 +12,6 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.intermittency import RANDOM_SECONDS, STEADY_MPS, random_gain
 from merge_runner_analysis.data.reference_data import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.stats import ceiling
 from merge_runner_analysis.tables.model import Table
 
 
@@ -180,23 +179,20 @@ def _human_notes(study: Study, pooled: bool) -> tuple[str, ...]:
 
 def no_ceiling(group: Group) -> str:
     """Why a group has no human ceiling; empty where it has one."""
-    if sum(group.sizes):
+    if min(group.sizes):
         return ""
+    if any(group.sizes):
+        return "not all conditions of the humans were played: no ceiling"
     played = len(group.ended_outcomes)
     return f"{'no human drove its conditions' if played else 'no trial ended'}: no ceiling"
 
 
-def ceiling_notes(study: Study) -> list[str]:
+def ceiling_notes() -> list[str]:
     """What the human ceiling is drawn from."""
-    source = (
-        "whole trials are resampled from the imported recordings"
-        if study.complete
-        else "outcomes from the published counts, gaps from the published regression with "
-        f"residuals of SD {HUMAN_GAP_SD_M} m"
-    )
     return [
-        f"humans pass: share of {ceiling.DATA_SETS} human data sets with as many trials per "
-        f"condition as the row has (seed {ceiling.SEED}; {source}); at the score: I1 to I4 "
+        "humans pass: share of 1000 human data sets with as many trials in each condition as the "
+        "row has in that with the fewest; outcomes from the published counts, gaps from the "
+        f"published regression with residuals of SD {HUMAN_GAP_SD_M} m; at the score: I1 to I4 "
         "together. So often a perfect copy of the humans passes"
     ]
 

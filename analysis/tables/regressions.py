@@ -162,7 +162,7 @@ def _gap_row(group: Group, term: str) -> Row:
     # tested (Schuirmann 1987); HC3 errors (MacKinnon and White 1985) hold for unequal variances.
     if term == "abs_relative_velocity" and fit.hc3.apart:
         furthest = fit.hc3.apart[furthest_apart(fit.hc3)]
-        values["equivalence_p"] = float(equivalence_p(furthest.b, furthest.se, fit.hc3.freedom))
+        values["equivalence_p"] = equivalence_p(furthest.b, furthest.se, fit.hc3.freedom)
         values["velocity_p"] = fit.hc3.velocity_p
     return row_of(group, values, _problems(fit.ols, fit.hc3), item=term, counts=WITH_GAP)
 

@@ -10,7 +10,6 @@ import pytest
 
 from merge_runner_analysis.commands import main
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.stats.ceiling import ceiling
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import ANSWERS, Said, write_study, yielding
 from tests.harness import CONFIGURING
@@ -52,16 +51,6 @@ def in_process(tmp_path, monkeypatch):
         return ended.value.code
 
     return run
-
-
-@pytest.fixture
-def few_draws(monkeypatch):
-    """For tests that look at no chance: never with the studies that others read."""
-    monkeypatch.setattr("merge_runner_analysis.stats.ceiling.DATA_SETS", 20)
-    # What is kept of the published humans has another number of draws.
-    ceiling.cache_clear()
-    yield
-    ceiling.cache_clear()
 
 
 @pytest.fixture(scope="session")

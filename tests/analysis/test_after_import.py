@@ -15,16 +15,13 @@ from merge_runner_analysis.figures.gallery import figure_2
 from merge_runner_analysis.figures.variant_figure import figure_2_variants
 from merge_runner_analysis.human.archive import open_files
 from merge_runner_analysis.human.load import import_trials, sort_files
-from merge_runner_analysis.stats.ceiling import published_humans
-from merge_runner_analysis.stats.group_scores import population, score
+from merge_runner_analysis.stats.group_scores import score
 from merge_runner_analysis.stats.indicators import Verdict
 from merge_runner_analysis.stats.intervals import mean
 from merge_runner_analysis.stats.likeness import gains
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding
-
-pytestmark = pytest.mark.usefixtures("few_draws")
 
 
 @pytest.fixture(scope="module")
@@ -158,11 +155,6 @@ def test_the_speeds_of_humans_are_judged_without_the_simulators_resistance(impor
         resisted = measure_profiles(of_group(speeds, group, group.trials))
         assert len(resisted) == 2 * len(group.trials)
         assert resisted.equals(imported.profiles_of(group)) == (group is imported.human)
-
-
-def test_ceilings_are_drawn_from_the_published_humans_while_some_are_missing(imported):
-    assert not imported.complete
-    assert population(imported) is published_humans()
 
 
 def test_nothing_says_any_more_that_recordings_are_missing(imported):

@@ -149,7 +149,6 @@ def test_a_proportion_of_all_ended_trials_counts_those_of_which_it_is_known(adde
     assert counts(Study(db).models[0], slow) == (5, 10)
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_a_rate_is_compared_and_a_median_is_not(added, db):
     rate = {"estimator": "proportion", "value": "joint"}
     added(name="a_percent", label="a", human=HumanReference(40.0, "X (2026)", n=50), **rate)
@@ -160,7 +159,6 @@ def test_a_rate_is_compared_and_a_median_is_not(added, db):
     assert not any(name.endswith("c_mps") for name in rows)
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_a_published_human_value_stands_in_the_tables_with_its_interval_and_source(added, db):
     known = HumanReference(0.5, "X (2026)", low=0.4, high=0.6)
     added(name="a_mps", label="a", phrase="a", human=known)

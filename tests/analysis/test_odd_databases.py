@@ -130,7 +130,7 @@ def forked(prepare, emulator_url, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws", "forked")
+@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_report_of_an_odd_database_says_what_is_true_of_it(kind, tmp_path):
     study = Study(made(tmp_path, kind))

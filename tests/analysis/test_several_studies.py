@@ -18,8 +18,6 @@ from merge_runner_analysis.report.design import design
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import changed
 
-pytestmark = pytest.mark.usefixtures("few_draws")
-
 MOOD = """
 description = "Does the mood matter?"
 models = ["human-odds"]

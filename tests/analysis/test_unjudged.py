@@ -51,7 +51,6 @@ def test_pages_that_are_made_of_tables_show_it_without_a_value(mixed):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_tables_show_it_without_a_value_and_the_rest_as_if_it_were_not_there(
     mixed, drives, tmp_path
 ):

@@ -128,7 +128,6 @@ def test_the_list_is_filtered_by_account_and_downloaded_with_it(client):
 def test_the_page_of_a_trial_says_why_it_went_so(client, account, heading):
     text = client.get(address(account)).text
     assert f"<summary>{heading}</summary>" in text
-    assert "When each would have reached the merge point" in text
 
 
 def test_where_there_is_nothing_to_explain_nothing_is_explained(client):

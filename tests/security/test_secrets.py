@@ -140,8 +140,6 @@ async def test_no_key_and_no_account_id_is_in_anything_that_a_sweep_leaves(
         runs.append(await merge_runner("sql", "FROM calls", "--format", "json", **env))
         runs.append(await merge_runner("recording", "info", "o3.parquet", **env))
     assert [run.code for run in runs] == [0] * len(runs), runs
-    # What chance draws is of no interest here.
-    monkeypatch.setattr("merge_runner_analysis.stats.ceiling.DATA_SETS", 20)
     results = tmp_path / "results"
     report = write_report(
         results / "merge.duckdb", None, results / "report.html", tmp_path / "files"

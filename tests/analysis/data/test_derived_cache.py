@@ -79,7 +79,6 @@ def test_a_table_reads_the_same_after_it_was_a_text(tables, name, form):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_tables_are_made_once_and_then_read(db, made):
     first = finished_tables(db, None, ["gap", "attempts"])
     assert made == ["gap", "attempts"]

@@ -22,8 +22,6 @@ from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import value_rows
 from tests.analysis.studies import changed, write_study, yielding
 
-pytestmark = pytest.mark.usefixtures("few_draws")
-
 
 @pytest.fixture
 def db(tmp_path):

@@ -25,8 +25,6 @@ from merge_runner_analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST
 from merge_runner_analysis.stats.measures import counts, known
 from merge_runner_analysis.tables import make_tables
 
-pytestmark = pytest.mark.usefixtures("few_draws")
-
 
 def published_trials() -> pd.DataFrame:
     """The 990 published outcomes as trials of nine pairs."""

@@ -20,8 +20,6 @@ from merge_runner_analysis.stats.regressions import who_first_logit
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import write_study, yielding
 
-pytestmark = pytest.mark.usefixtures("few_draws")
-
 DRIVERS = """
 from merge_runner.drivers.registry import PROGRAMS, Program
 

@@ -208,7 +208,6 @@ def written_words(figure):
     }
 
 
-@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize("name", FIGURES)
 def test_no_name_is_cut_and_none_lies_over_another(name, long_names):
     with mpl.rc_context(SETTINGS):
@@ -222,7 +221,6 @@ def test_no_name_is_cut_and_none_lies_over_another(name, long_names):
         assert not box.padded(-1).overlaps(another.padded(-1)), (one, other)
 
 
-@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure_says_who_is_a_stand_in_and_names_its_variant(name, long_names):
     figure = FIGURES[name][0](long_names)
@@ -291,7 +289,6 @@ def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize(
     "drives",
     [

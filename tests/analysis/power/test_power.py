@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import json
-import time
 from functools import cache
 
+import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
+from merge_runner.errors import UsageError
 from merge_runner.planted_effect import PlantedEffect
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import SIDES, Slot
@@ -22,38 +22,32 @@ from merge_runner.run.sweep import unsent
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner_analysis.power.study import (
-    BESIDE_HUMANS,
-    OF_AN_ARM,
-    OF_TWO_ARMS,
-    Case,
-    Search,
-    chances,
-)
-from merge_runner_analysis.power.truths import SPEED, Conditions, human, planted
-from merge_runner_analysis.stats.ceiling import ceiling, published_humans
+from merge_runner.study.file import Effect
+from merge_runner_analysis.power.study import HUMANS, Case, chances, human, simulate
+from merge_runner_analysis.stats.ceiling import ceiling
 from merge_runner_analysis.stats.indicators import ROBUST, judged
-from merge_runner_analysis.stats.regressions import who_first_firth
+from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth, who_first_logit
 
-HUMANS = Conditions(
-    tuple(each.projected_headway_m for each in HUMAN_CONDITIONS.values()),
-    tuple(each.relative_velocity_mps for each in HUMAN_CONDITIONS.values()),
-)
-_, SPEED_FOUND, GAP_FOUND, *_ = OF_AN_ARM
 STUDIES = 20
 PLANTED = """
 repetitions = 10
 [factors]
 x_relative_speed = [-3.3, -0.2]
 """
+NAMED = """
+models = ["idm"]
+repetitions = 10
+[factors]
+prompt = ["baseline", "A1"]
+resistance = ["none", "human"]
+[effect]
+prompt = { gap_m = 2.0, relative_velocity = 3.0 }
+resistance = { collided = 0.4 }
+"""
 
 
-def of_an_arm(test, truth, repetitions=10, *other):
-    return Case(test, "", truth.name, truth, repetitions, *other)
-
-
-def with_speed(value):
-    return human().changed("who_first", SPEED, value)
+def chance(case, question, simulations=150):
+    return case.chances(list(HUMAN_CONDITIONS), 1, simulations)[question]
 
 
 @cache
@@ -78,10 +72,12 @@ def emulated(effect: PlantedEffect, repetitions: int, sample_set: int) -> pd.Dat
     return pd.DataFrame(rows, columns=columns)
 
 
-@pytest.mark.parametrize("of_speed", [-0.9, -1.4, -2.2])
+@pytest.mark.slow
+@pytest.mark.parametrize("of_speed", [-0.9, -1.4])
 def test_twenty_planted_studies_find_the_effect_at_the_stated_rate(of_speed):
     effect = PlantedEffect(x_relative_speed=of_speed)
-    stated = Search(HUMANS, 1000, 0).chance(of_an_arm(SPEED_FOUND, planted(effect)), 10)
+    of_humans = human().relative_velocity
+    stated = chance(Case(human().plus(Effect(relative_velocity=of_speed - of_humans)), 10), "I2")
     found = sum(
         bool(judged(ROBUST["I2"], who_first_firth(emulated(effect, 10, study))).passed)
         for study in range(STUDIES)
@@ -91,104 +87,92 @@ def test_twenty_planted_studies_find_the_effect_at_the_stated_rate(of_speed):
     assert 0.2 < stated < 1
 
 
+def test_simulated_trials_scatter_about_their_truth():
+    truth = human()._replace(collided=0.1)
+    trials = simulate(truth, list(HUMAN_CONDITIONS), 2000, np.random.default_rng(1))
+    assert len(trials) == 22_000
+    assert (trials["status"] == "collided").mean() == pytest.approx(0.1, abs=0.01)
+    who_first, gap = who_first_logit(trials), gap_ols(trials)
+    for name, term in who_first.terms.items():
+        assert term.b == pytest.approx(getattr(truth, name), abs=4 * term.se)
+    for value, term in zip(truth[3:7], gap.terms.values(), strict=True):
+        assert term.b == pytest.approx(value, abs=4 * term.se)
+
+
+@pytest.mark.slow
 def test_the_chances_of_humans_are_their_ceiling():
-    search = Search(HUMANS, 1000, 1)
-    shares = ceiling(published_humans(), (10,) * len(HUMAN_CONDITIONS)).robust
-    for name, question in zip((*ROBUST, "I1-I4"), OF_AN_ARM, strict=True):
-        assert search.chance(of_an_arm(question, human()), 10) == pytest.approx(
-            shares[name], abs=0.06
-        )
+    shares = ceiling((10,) * len(HUMAN_CONDITIONS)).robust
+    found = Case(human(), 10).chances(list(HUMAN_CONDITIONS), 1, 150)
+    for name in ROBUST:
+        assert found[name] == pytest.approx(shares[name], abs=0.12)
 
 
 @pytest.mark.slow
 def test_the_chance_to_find_nothing_is_that_of_a_false_alarm():
-    search, truth = Search(HUMANS, 1000, 2), with_speed(0.0)
-    # Two-sided tests at 5 %, of which one side counts; between two arms both do.
-    assert search.chance(of_an_arm(SPEED_FOUND, truth), 10) == pytest.approx(0.025, abs=0.015)
-    gap, collisions = (of_an_arm(test, truth, 10, truth, 10) for test in OF_TWO_ARMS)
-    assert search.chance(gap, 10) == pytest.approx(0.05, abs=0.025)
-    assert search.chance(collisions, 10) < 0.05  # Fisher's test is conservative
+    nothing = 1e-9  # an effect of 0 is no row
+    own = human()._replace(relative_velocity=nothing)
+    assert chance(Case(own, 10), "I2") < 0.08  # one side of a two-sided test at 5 %
+    own = own._replace(gap_m=own.gap_m + nothing, collided=own.collided + nothing)
+    found = Case(own, 10, "first", own._replace(gap_m=own.gap_m - 2 * nothing), 10)
+    assert chance(found, "gap") == pytest.approx(0.05, abs=0.06)
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        of_an_arm(SPEED_FOUND, human()),
-        of_an_arm(GAP_FOUND, human()),
-        of_an_arm(BESIDE_HUMANS[0], human(), 10, human()),
-        of_an_arm(BESIDE_HUMANS[1], human(), 10, human()),
-        of_an_arm(OF_TWO_ARMS[0], human(), 10, human(), 5),
-    ],
-    ids=["speed", "gap slope", "humans", "collisions", "gap of two arms"],
-)
-def test_the_smallest_effect_is_found_with_a_chance_of_80_percent_in_other_studies_too(case):
-    smallest, none = Search(HUMANS, 400, 3).smallest(case), case.test.of(case.other)
-    elsewhere = Search(HUMANS, 1000, 4)
-
-    def chance(part):
-        own = case.own.changed(case.test.field, case.test.at, none + part * smallest)
-        return elsewhere.chance(dataclasses.replace(case, own=own), 10)
-
-    assert chance(1) == pytest.approx(0.8, abs=0.07)
-    assert chance(0.5) < 0.6
+def test_what_is_the_same_has_no_chance_to_be_told_apart():
+    assert Case(human(), 10, "first", human(), 10).effects == {}
+    assert Case(human(), 10, HUMANS, human()).effects == {}
+    braver = human()._replace(gap_m=9.0, collided=0.5)
+    assert list(Case(braver, 10, HUMANS, human()).effects) == ["collisions"]
 
 
-def test_so_many_trials_as_are_said_to_be_enough_are_enough_and_half_of_them_are_not():
-    case = of_an_arm(SPEED_FOUND, with_speed(-1.2))
-    enough = Search(HUMANS, 400, 5).fewest_repetitions(case)
-    assert 10 < enough < 40
-    elsewhere = Search(HUMANS, 1000, 6)
-    assert elsewhere.chance(case, enough) == pytest.approx(0.8, abs=0.06)
-    assert elsewhere.chance(case, enough // 2) < 0.7
-
-
-def test_an_effect_that_four_times_the_trials_do_not_show_is_not_findable():
-    search = Search(HUMANS, 200, 0)
-    weak = of_an_arm(SPEED_FOUND, with_speed(-0.5))
-    assert search.chance(weak, 40) < 0.8
-    assert search.fewest_repetitions(weak) is None
-    # One condition cannot tell the cues apart, however often it is played.
-    alone = Search(Conditions((4.0,), (-0.8,)), 50, 0)
-    assert alone.fewest_repetitions(of_an_arm(SPEED_FOUND, human())) is None
-    assert alone.smallest(of_an_arm(SPEED_FOUND, human())) is None
-
-
-def powered(tmp_path, study, model=(), simulations=60, seed=0):
+def powered(tmp_path, study, model=(), simulations=20):
     plan = make_plan(study, model)
     options = Options(db=tmp_path / "none.duckdb", cache=tmp_path / "none")
     expected = asyncio.run(unsent(plan, options, say=print, whole=True))
-    return chances(plan, expected, [], simulations=simulations, seed=seed)
-
-
-@pytest.mark.slow
-def test_equal_seeds_give_equal_chances_and_other_seeds_others(tmp_path):
-    one, same, other = (
-        powered(tmp_path, "baseline", simulations=20, seed=seed) for seed in (0, 0, 1)
-    )
-    assert one == same
-    assert one != other
+    return [row.values for row in chances(plan, expected.cost_usd, [], simulations)]
 
 
 @pytest.mark.slow
 def test_a_planted_study_is_told_by_what_is_planted(tmp_path):
     (tmp_path / "planted.toml").write_text(PLANTED)
     found = powered(tmp_path, str(tmp_path / "planted.toml"))
-    assert {each.truth for each in found} == {"as planted"}
-    speeds = {each.arms: each for each in found if each.question == SPEED_FOUND.question}
-    strong, weak = speeds["x_relative_speed=-3.3",], speeds["x_relative_speed=-0.2",]
-    assert (strong.effect, weak.effect) == (-3.3, -0.2)
-    assert strong.enough < strong.trials == 110
-    assert weak.enough is None
+    assert {each["truth"] for each in found} == {"as planted"}
+    speeds = {each["arms"]: each for each in found if each["question"] == "I2"}
+    strong, weak = speeds["x_relative_speed=-3.3"], speeds["x_relative_speed=-0.2"]
+    assert (strong["effect"], weak["effect"]) == (-3.3, -0.2)
+    assert strong["enough"] <= strong["trials"] == 110
+    assert weak["enough"] is None
 
 
-@pytest.mark.long
-def test_a_usual_study_takes_less_than_20_seconds_of_one_core(tmp_path):
-    began = time.process_time()
-    found = powered(tmp_path, "ablations", ("o3",), simulations=200)
-    assert time.process_time() - began < 20
-    # Seven ablations of the same size are one row.
-    assert {len(each.arms) for each in found} == {1, 7}
-    assert {each.truth for each in found} == {"human"}
+@pytest.mark.slow
+def test_an_effect_that_the_study_names_beside_a_factor_is_supposed(tmp_path):
+    (tmp_path / "named.toml").write_text(NAMED)
+    found = powered(tmp_path, str(tmp_path / "named.toml"), simulations=2)
+    differ = {
+        (each["arms"], each["question"]): each["effect"]
+        for each in found
+        if each["against"] == "resistance=none baseline"
+    }
+    assert differ == {
+        ("resistance=human baseline", "collisions"): pytest.approx(0.4),
+        ("resistance=none A1", "gap"): pytest.approx(2),
+        ("resistance=none A1", "relative velocity"): pytest.approx(3),
+        ("resistance=human A1", "gap"): pytest.approx(2),
+        ("resistance=human A1", "relative velocity"): pytest.approx(3),
+        ("resistance=human A1", "collisions"): pytest.approx(0.4),
+    }
+    (tmp_path / "odd.toml").write_text(NAMED.replace("resistance = {", "resistence = {"))
+    with pytest.raises(UsageError, match="resistence"):
+        make_plan(str(tmp_path / "odd.toml"), ())
+
+
+@pytest.mark.slow
+def test_equal_arms_share_a_row_and_half_of_the_trials_find_less(tmp_path):
+    found = powered(tmp_path, "ablations", ("o3",), simulations=8)
+    assert {each["arms"].count(",") for each in found} == {0, 6}
+    assert {each["truth"] for each in found} == {"human"}
+    (gap,) = (each for each in found if each["question"] == "gap")
+    assert gap["times_0.5"] < gap["times_4"] == 100
+    assert gap["cost_usd"] > 0
 
 
 @pytest.mark.slow
@@ -203,16 +187,15 @@ async def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(
     few = ("power", "baseline", "--model", "dear", "--reps", 4, "--sims", 20)
     run = await merge_runner(*few)
     assert run.code == 0, run.err
-    assert "the whole study costs about unknown (x0.5), unknown (x1), unknown (x2) USD" in run.out
-    assert "nothing to find" in run.out
+    assert "44 trials, an unknown price; 20 simulated studies" in run.out
     found = json.loads((await merge_runner(*few, "--json")).out)
-    assert found["costs_usd"] == [None] * 3
+    assert found["cost_usd"] is None
     assert {each["trials"] for each in found["chances"]} == {44}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["experiments"]
 
 
 def test_the_odds_of_the_emulator_are_those_that_the_humans_are_supposed_to_have():
-    assert PlantedEffect().coefficients == human().who_first
+    assert PlantedEffect().coefficients == human()[:3]
 
 
 PERSONA = """
@@ -225,8 +208,9 @@ add = [{text = "You are late."}]
 """
 
 
+@pytest.mark.slow
 def test_a_planted_persona_is_supposed_where_the_prompt_contains_it(tmp_path):
     (tmp_path / "persona.toml").write_text(PERSONA)
-    found = powered(tmp_path, str(tmp_path / "persona.toml"), simulations=20)
-    effects = {each.arms[0]: each.effect for each in found if each.question == SPEED_FOUND.question}
+    found = powered(tmp_path, str(tmp_path / "persona.toml"), simulations=2)
+    effects = {each["arms"]: each["effect"] for each in found if each["question"] == "I2"}
     assert effects == {"baseline": -3.3, "hurried": pytest.approx(-1.3)}

@@ -9,7 +9,7 @@ from merge_runner_analysis.stats.group_scores import score
 from merge_runner_analysis.stats.indicators import Verdict
 from merge_runner_analysis.stats.likeness import gains
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_draws")]
+pytestmark = pytest.mark.slow
 PROGRAMS = ("constant", "idm", "projected-order")
 # A trial that starts when the first of the two is under control, and a drag to drive against.
 DRAG = """

@@ -84,7 +84,6 @@ def test_numbers_lead_to_the_trials_behind_them(page):
     assert "merge-runner sql" in page.text
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_factors(tmp_path):
     drives = [*yielding("o3", reps=1)[:3], *yielding("o3", "A1", reps=1)[:3]]
     db = write_study(tmp_path / "t.duckdb", drives, config={"description": "Who is <first>?"})
@@ -111,7 +110,6 @@ def test_equal_results_give_equal_reports(small):
     assert len({rendered(study, "ablation-matrix", "svg") for study in (small, again)}) == 1
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_an_empty_database_concludes_nothing(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", []))
     assert "No language model is judged here." in Page(report_html(study, [], {})).text
@@ -135,14 +133,12 @@ def test_what_went_wrong_stands_at_the_top_before_any_number(page):
         assert said in warnings
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_a_study_in_which_nothing_went_wrong_has_no_warning(tmp_path):
     study = asking(tmp_path, Said(), variant="A1")
     assert alarms(study, provenance(study.db)) == []
     assert "Read this first" not in Page(report_html(study, [], {})).text
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_another_served_model_is_loud_and_its_name_is_shown_as_text(tmp_path):
     study = asking(tmp_path, Said(served="<script>alert(1)</script>"), variant="A1")
     page = Page(report_html(study, [], {}))
@@ -217,7 +213,6 @@ def test_a_call_that_several_trials_used_was_made_and_paid_once(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_the_report_can_write_all_its_parts_as_files(small, tmp_path):
     db = Path(shutil.copy(small.db, tmp_path / "t.duckdb"))
     paths = list(write_report(db, None, tmp_path / "r/report.html", tmp_path / "r/files"))

@@ -16,8 +16,6 @@ from merge_runner_analysis.stats.measures import counts
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
-pytestmark = pytest.mark.usefixtures("few_draws")
-
 # So strong vehicles reach the end of the track within one plan.
 STRONG = ScenarioConfig(max_acceleration_mps2=5.0)
 SIDE_BY_SIDE = (0.0, 0.0, 0.0)

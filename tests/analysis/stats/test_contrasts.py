@@ -21,7 +21,7 @@ from merge_runner_analysis.stats.contrasts import (
     interaction_of_rates,
     rejected,
     shared_cells,
-    within,
+    slope_within,
 )
 
 
@@ -160,7 +160,9 @@ def test_an_interaction_of_rates_is_excluded_at_the_level_of_its_p():
 
 
 def test_an_interaction_of_means_is_the_difference_of_both_differences_with_welchs_test():
-    found = interaction_of_means(within(FIRST, SECOND, "gap_m"), within(SECOND, FIRST, "gap_m"))
+    found = interaction_of_means(
+        slope_within(FIRST, SECOND, "gap_m"), slope_within(SECOND, FIRST, "gap_m")
+    )
     one = contrast_means(FIRST, SECOND, "gap_m")
     assert found.value == pytest.approx(2 * one.value)
     half = (one.high - one.low) / 2 / stats.t.ppf(0.975, 11 - 2 - 1)

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from math import inf
 
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.stats.group_scores import total
 from merge_runner_analysis.stats.indicators import (
-    APART,
     GAP_MARGIN_M,
     INDICATORS,
     NONE_APART,
@@ -25,7 +21,6 @@ from merge_runner_analysis.stats.indicators import (
     Verdict,
     equivalence_p,
     furthest_apart,
-    judged,
     verdicts,
 )
 from merge_runner_analysis.stats.regressions import Regression, Term, gap_design, gap_ols
@@ -207,30 +202,6 @@ def test_equivalence_is_the_larger_p_of_two_one_sided_t_tests(b, freedom):
     not_below = stats.t.sf((b + GAP_MARGIN_M) / se, freedom)  # against at most -1 m
     not_above = stats.t.cdf((b - GAP_MARGIN_M) / se, freedom)  # against at least 1 m
     assert equivalence_p(b, se, freedom) == pytest.approx(max(not_below, not_above))
-
-
-COEFFICIENTS = st.lists(
-    st.tuples(
-        st.floats(-3, 3),
-        st.floats(0.01, 2),
-        st.floats(0, 1),
-        st.one_of(st.integers(1, 500).map(float), st.just(inf)),
-    ),
-    min_size=1,
-)
-
-
-@given(COEFFICIENTS)
-@pytest.mark.parametrize("criteria", [PAPER, ROBUST])
-def test_many_fits_are_judged_like_each_of_them(criteria, rows):
-    together = [np.array(column) for column in zip(*rows, strict=True)]
-    for criterion in criteria.values():
-        holds = criterion.holds(*together)
-        for i, (b, se, alone_p, freedom) in enumerate(rows):
-            term = Term(b, se, None, alone_p)
-            terms = {} if criterion.term == APART else {criterion.term: term}
-            fit = Regression(9, terms, freedom=freedom, apart={(0.0, 0.8, 0.0): term})
-            assert judged(criterion, fit) == Verdict(bool(holds[i]))
 
 
 def test_equivalence_at_the_margin_is_a_coin_toss():

@@ -13,7 +13,12 @@ from scipy import optimize, stats
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.reference_data import human_outcomes
 from merge_runner_analysis.stats import firth
-from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth, who_first_logit
+from merge_runner_analysis.stats.regressions import (
+    gap_ols,
+    penalised,
+    who_first_firth,
+    who_first_logit,
+)
 
 # A library's warning must not reach the user: what it warns of is a problem in words.
 pytestmark = pytest.mark.filterwarnings("error")
@@ -193,10 +198,10 @@ def test_the_penalised_fit_gives_the_published_endometrial_figures():
     assert len(patients) == 79
     design = np.column_stack([np.ones(79), patients[["NV", "PI", "EH"]]])
     left = patients["HG"].to_numpy(float)
-    b, p, found = firth.tested_fits(design, np.ones((1, 79)), left[None], (1, 2, 3))
-    assert found
-    assert b[0] == pytest.approx(ENDOMETRIAL["estimates"], abs=2e-6)
-    assert p[0, 1:] == pytest.approx(ENDOMETRIAL["p"], rel=2e-3)
+    counts = firth.Counts(design, np.ones(79), left)
+    fit = counts.fit()
+    assert fit.b == pytest.approx(ENDOMETRIAL["estimates"], abs=2e-6)
+    assert [counts.p(fit, term) for term in (1, 2, 3)] == pytest.approx(ENDOMETRIAL["p"], rel=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -225,6 +230,42 @@ def test_the_penalised_fit_is_that_of_firthmodels(trials):
     assert [term.statistic for term in fit.terms.values()] == [None] * 3
 
 
+@pytest.mark.parametrize(
+    "trials",
+    [
+        pytest.param(drawn(1, 5, 0.4, 0.6, -1.5), id="unseparated"),
+        pytest.param(
+            ruled(5, lambda h, dv, rep: "left" if h - 3 * dv > 0.1 else "right"), id="separated"
+        ),
+    ],
+)
+def test_profile_intervals_are_those_of_firthmodels_and_agree_with_the_tests(trials):
+    design, left = who_first_arrays(trials)
+    model = FirthLogisticRegression(max_iter=1000, gtol=1e-6, xtol=1e-6).fit(design[:, 1:], left)
+    expected = np.roll(model.conf_int(method="pl"), 1, axis=0)
+    fit = penalised(trials)
+    for (name, term), bounds in zip(fit.terms.items(), expected, strict=True):
+        low, high = fit.interval(name)
+        assert (low, high) == pytest.approx(tuple(bounds), rel=1e-3, abs=1e-3)
+        assert (low <= 0 <= high) == (term.p >= 0.05)
+
+
+def test_a_difference_of_groups_is_the_interaction_of_a_penalised_model_of_both():
+    own, rest = drawn(7, 4, 0.2, 0.9, -1.0), drawn(8, 6, 0.0, 0.5, -2.0)
+    (x, x_left), (y, y_left) = who_first_arrays(own), who_first_arrays(rest)
+    design = np.block([[y, 0 * y], [x, x]])[:, 1:]
+    model = FirthLogisticRegression(max_iter=1000, gtol=1e-6, xtol=1e-6)
+    model.fit(design, np.concatenate([y_left, x_left])).lrt()
+    terms = penalised(own, rest).terms
+    assert [term.b for term in terms.values()] == pytest.approx(model.coef_[2:], rel=1e-3, abs=1e-3)
+    p = model.lrt_pvalues_[2:5]
+    assert [term.p for term in terms.values()] == pytest.approx(p, rel=1e-3)
+    assert penalised(own, rest.iloc[:2]) == (
+        "2 finished trials with a first merger, too few or in too few conditions to tell the terms "
+        "apart"
+    )
+
+
 def test_the_penalised_fit_takes_the_iterations_that_separation_needs():
     counts = [5, 1, 5, 1, 5, 4, 2, 1, 5, 2, 2]
     rows = [
@@ -242,7 +283,7 @@ def test_separation_is_found_where_firthmodels_finds_it():
         trials = drawn(seed, 2, *np.random.default_rng(seed).normal(0, 2, 3))
         design, left = who_first_arrays(trials)
         expected = ~np.roll(detect_separation(design[:, 1:], left).is_finite, 1)
-        infinite = firth.infinite_coefficients(design, np.ones(len(left)), left)
+        infinite = firth.Counts(design, np.ones(len(left)), left).infinite()
         assert infinite.tolist() == expected.tolist()
         separated += infinite.any()
     assert 10 < separated < 50

@@ -17,7 +17,6 @@ from merge_runner_analysis.tables.against import DRIVERS, against, in_paper
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding
 
-pytestmark = pytest.mark.usefixtures("few_draws")
 TABLE_VII = "ablation-quantitative"
 
 

@@ -211,7 +211,6 @@ def test_a_table_that_the_paper_has_not_says_so(tables):
     assert "no such table" in against(tables["words"], "paper").notes[-1]
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_prompts_are_contrasted_without_one_that_is_called_baseline(tmp_path):
     drives = [*yielding("o3", "hurry"), *yielding("o3", "calm")]
     config = {"levels": {"model": ["o3"], "prompt": ["hurry", "calm"]}}
@@ -248,7 +247,6 @@ TROUBLE = {
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 @pytest.mark.parametrize("case", TROUBLE)
 def test_trouble_gives_tables_with_a_stated_reason(case, tmp_path, recwarn):
     drives, reason = TROUBLE[case]
@@ -263,7 +261,6 @@ def test_trouble_gives_tables_with_a_stated_reason(case, tmp_path, recwarn):
     assert [str(w.message) for w in recwarn.list] == []
 
 
-@pytest.mark.usefixtures("few_draws")
 def test_where_no_human_drove_there_is_no_ceiling_but_a_note(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
     study = changed(db, "UPDATE trials SET condition = 'own_' || condition")
@@ -291,7 +288,6 @@ def test_a_model_under_two_specs_makes_two_rows_that_tell_themselves_apart(tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_another_task_leaves_a_baseline_and_its_variants_together(tmp_path):
     """A baseline that was also run with drag must not tear the ablation study apart."""
     db = write_study(tmp_path / "t.duckdb", [*yielding("o3", reps=2), *yielding("o3", "A1", 2)])
