@@ -245,11 +245,6 @@ class Calls(NamedTuple):
     others: list[Pair]
 
 
-def rows(frame: pd.DataFrame) -> list[Any]:
-    """The rows of a frame as tuples."""
-    return list(frame.itertuples(index=False, name=None))
-
-
 def load_calls(db: Path | str = DEFAULT_DB) -> Calls:
     """Read what became of the calls."""
     with read_database(Path(db)) as connection:

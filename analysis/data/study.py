@@ -356,11 +356,6 @@ class Study:
         return [group for group in self.groups if group.setting in {"", BASELINE}]
 
     @property
-    def compared(self) -> list[Group]:
-        """The drivers' baselines that are set against the humans."""
-        return [group for group in self.models if group.setting == BASELINE and not group.caution]
-
-    @property
     def measured(self) -> list[Group]:
         """The groups whose speeds are known: all, but for humans before an import."""
         return [group for group in self.groups if group.measured]
