@@ -39,7 +39,7 @@ def sample_notes(
     notes += _pooled_notes(study, [group for group in shown if group.setting])
     if study.human in study.groups:
         notes += [*_human_notes(study, pooled), *_own_notes(study, shown)]
-    return [*notes, *repeated_notes(shown), *equal_notes(shown), *pair_notes(shown)]
+    return [*notes, *_repeated_notes(shown), *equal_notes(shown), *pair_notes(shown)]
 
 
 def _failed(group: Group) -> str:
@@ -110,7 +110,7 @@ def footnoted(table: Table, study: Study) -> Table:
     return replace(table, rows=rows, notes=(*table.notes, *notes))
 
 
-def repeated_notes(groups: Iterable[Group]) -> list[str]:
+def _repeated_notes(groups: Iterable[Group]) -> list[str]:
     """Say which deterministic drivers repeat their trials."""
     counts = [f"{g.id}: {g.repeated} of {len(g.stored.trials)}" for g in groups if g.repeated]
     if not counts:
