@@ -155,7 +155,7 @@ def tally(study: Study, group: Group) -> Counter[str]:
     """
     trials = of_group(study.calls.trials, group, group.trials)
     counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
-    failures = Counter(trials["failures"].explode().dropna())
+    failures = Counter("\n".join(trials["failures"].dropna()).splitlines())
     return Counter(
         dict(failures)
         | counts
