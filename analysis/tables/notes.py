@@ -37,7 +37,7 @@ def sample_notes(
             f"{study.db} holds no trial of a model; `merge-runner sweep baseline` plays some"
         )
     notes += _pooled_notes(study, [group for group in shown if group.setting])
-    if study.human in study.groups:
+    if study.human in shown:
         notes += [*_human_notes(study, pooled), *_own_notes(study, shown)]
     return [*notes, *_repeated_notes(shown), *equal_notes(shown), *pair_notes(shown)]
 

@@ -41,7 +41,7 @@ WITH_MERGER = "status = 'finished' AND merged_first IS NOT NULL"
 WITH_GAP = "gap_m IS NOT NULL"
 TESTED_ELSEWHERE = (
     "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
-    "table differences tests it"
+    "table verdicts tests it"
 )
 RANDOM_INTERCEPT = "random intercept per pair"
 KEYS = (
