@@ -23,6 +23,7 @@ LONGEST_STEP = 5.0
 CONVERGED = 1e-8
 # Of a log-likelihood: what is smaller than this is no loss.
 ROUNDING = 1e-11
+UNSEEN = 1e-9
 WIDENINGS = 40
 
 
@@ -47,6 +48,8 @@ class Counts:
     ) -> Fit | None:
         """Return the fit with some coefficients ``held``, or None where it does not converge.
 
+        From a ``start`` on it is a profile, of which the likelihood alone counts.
+
         Newton steps on Firth's score with the whole design's information, halved where they do not
         increase the penalised likelihood (Heinze and Schemper 2002).
         """
@@ -63,14 +66,14 @@ class Counts:
             for _ in range(HALVINGS):
                 reached = self._penalised(b + step)
                 if reached >= best - ROUNDING:
-                    b, best = b + step, max(reached, best)
                     break
                 step /= 2
             else:
                 return Fit(b, best)  # no direction is uphill but for rounding
-            if np.abs(step).max(initial=0) < CONVERGED:
+            gained, b, best = reached - best, b + step, max(reached, best)
+            if np.abs(step).max(initial=0) < CONVERGED or (start is not None and gained < UNSEEN):
                 return Fit(b, best)
-        return None
+        return Fit(b, best) if held else None  # the last small steps change no likelihood
 
     def p(self, fit: Fit, term: int) -> float | None:
         """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""

@@ -162,8 +162,7 @@ def _of_worst_cases(own: Estimate, human: Estimate) -> Difference | None:
     """
     if own.k is None or human.rate is None:
         return None
-    n = float(own.n)
-    cases = [_of_rates((k / n, n), human.rate) for k in (own.k, own.k + own.undecided)]
+    cases = [_of_rates((k / own.n, own.n), human) for k in (own.k, own.k + own.undecided)]
     least, most = cases
     nearest = min(cases, key=lambda one: abs(one.value))
     return replace(nearest, low=least.low, high=most.high, p=max(one.p for one in cases))
@@ -174,7 +173,7 @@ def _difference(own: Estimate, human: Estimate) -> Difference | None:
     if own.value is None or human.value is None:
         return None
     if own.rate and human.rate:
-        return _of_rates(own.rate, human.rate)
+        return _of_rates(own.rate, human)
     if own.se is None or human.se is None:
         return None
     value = own.value - human.value
@@ -191,11 +190,12 @@ def _of_slopes(group: Group, human: Group, term: str) -> Difference | None:
     return Difference(slope.b, *bounds, slope.p, intervals.detectable(slope.se))
 
 
-def _of_rates(own: tuple[float, float], human: tuple[float, float]) -> Difference:
+def _of_rates(own: tuple[float, float], human: Estimate) -> Difference:
     """How two rates differ, in percent."""
-    found = difference_of_rates([own, human])
-    low, high = newcombe([own, human])
-    least = _detectable_rate(own[1], human[1], 100 * human[0])
+    assert human.rate is not None
+    found = difference_of_rates([own, human.rate])
+    low, high = newcombe([own, human.rate])
+    least = _detectable_rate(own[1], human.n, 100 * human.rate[0])
     return Difference(100 * found.value, 100 * low, 100 * high, found.p, least)
 
 
