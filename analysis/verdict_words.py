@@ -52,6 +52,8 @@ class Measure:
 
 
 MERGED = "status = 'finished' AND merged_first IS NOT NULL"
+# Those that are undecided count, too; what the first part names is a share with a numerator.
+ENDED = "(collided_boxes IS NOT NULL OR status <> 'failed')"
 WITH_GAP = "status = 'finished' AND gap_m IS NOT NULL"
 MEASURES = {
     measure.name: measure
@@ -82,7 +84,7 @@ MEASURES = {
             "Collisions by the humans' rule",
             "collisions",
             "% of trials",
-            "collided_boxes IS NOT NULL",
+            ENDED,
             "the difference excludes 0",
             "collides in {of} % of trials, humans in {humans} %",
             (0.0, 30.0),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from statistics import NormalDist
 
 
 def draw(*what: object) -> float:
@@ -20,8 +19,3 @@ def draw_index(count: int, *what: object) -> int:
 def draw_between(low: float, high: float, *what: object) -> float:
     """A uniform number between two bounds."""
     return low + (high - low) * draw(*what)
-
-
-def draw_normal(*what: object) -> float:
-    """A standard normal number."""
-    return NormalDist().inv_cdf(draw_between(1e-12, 1 - 1e-12, *what))

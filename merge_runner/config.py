@@ -6,15 +6,13 @@ import ipaddress
 import os
 import re
 import tomllib
-from base64 import b64encode
 from collections.abc import Container, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import date
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
-from urllib.parse import SplitResult, unquote, urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from pydantic import (
     BaseModel,
@@ -33,7 +31,6 @@ from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-PROXY_VARIABLES = ("http_proxy", "https_proxy", "all_proxy")
 # A shorter key is a dummy, and may occur in any text.
 SHORTEST_SECRET = 8
 UNNAMED = "default"
@@ -496,11 +493,9 @@ def normalised_url(url: str, named: str = "base_url") -> str:
             "there can be, without spaces, a user name, a password or a part after ? or # (write "
             "other letters than ASCII as xn--..., and a key into the provider's variable)"
         )
-    name = parts.hostname or ""
-    host = f"[{name}]" if ":" in name else name
-    default_port = 443 if parts.scheme == "https" else 80
-    port = "" if parts.port in (None, default_port) else f":{parts.port}"
-    return f"{parts.scheme}://{host}{port}{parts.path.rstrip('/')}"
+    default_port = ":443" if parts.scheme == "https" else ":80"
+    host = parts.netloc.lower().removesuffix(default_port).removesuffix(":")
+    return f"{parts.scheme}://{host}{parts.path.rstrip('/')}"
 
 
 def http_url(url: str) -> SplitResult | None:
@@ -517,15 +512,6 @@ def http_url(url: str) -> SplitResult | None:
     except ValueError:
         return None
     return parts if is_host and parts.scheme in ("http", "https") else None
-
-
-def proxy_secrets(env: Mapping[str, str] = os.environ) -> Iterator[str]:
-    """Yield the user info of the proxies' URLs and its password, as given, decoded and as sent."""
-    for url in (env[variable] for variable in env if variable.lower() in PROXY_VARIABLES):
-        with suppress(ValueError):  # it is no URL, and nothing goes there
-            info = urlsplit(url if "://" in url else f"//{url}").netloc.rpartition("@")[0]
-            for given in {info, unquote(info)}:
-                yield from (given, given.partition(":")[2], b64encode(given.encode()).decode())
 
 
 def state_folder(env: Mapping[str, str] = os.environ) -> Path:

@@ -21,10 +21,10 @@ from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
 from merge_runner.registry import Registry
-from merge_runner.run import summary
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
-from merge_runner.run.sweep import unsent
+from merge_runner.run.summary import as_lines, estimate_lines
+from merge_runner.run.sweep import play, unsent
 from merge_runner.study.crossing import level_text
 from merge_runner.text_safety import say
 
@@ -63,7 +63,6 @@ class StudyOutcome:
     """
 
     facts: dict[str, Any]
-    text: str
 
     def __post_init__(self) -> None:
         self.exit_code: int = self.facts["exit_code"]
@@ -74,7 +73,8 @@ class StudyOutcome:
 
     def __repr__(self) -> str:
         """The summary, and what went wrong, for a reader."""
-        return "\n".join([self.text, *(f"error: {message}" for message in self.messages)])
+        errors = (f"error: {message}" for message in self.messages)
+        return "\n".join([*as_lines(self.facts), *errors])
 
     def trials(self) -> pd.DataFrame:
         """One row a trial, with its measures in SI units and a column for each factor.
@@ -177,7 +177,7 @@ class Study:
 
         def agree(expected: Estimate) -> None:
             if not yes:
-                lines = "; ".join(summary.estimate_lines(expected))
+                lines = "; ".join(estimate_lines(expected))
                 raise UsageError(f"this run spends money; yes=True goes ahead: {lines}")
 
         if not _playing.acquire(blocking=False):
@@ -186,9 +186,7 @@ class Study:
             plan = self.plan(first=first, grid=grid)
             options = Options(self.db, self.cache, **how)
             whole = any(self._wanted.get(each) is not None for each in PARTS)
-            return StudyOutcome(
-                *await summary.play(plan, options, whole=whole, say=say, agree=agree)
-            )
+            return StudyOutcome(await play(plan, options, whole=whole, say=say, agree=agree))
         finally:
             _playing.release()
 

@@ -48,13 +48,17 @@ def error_process(
 
 
 class Eyes:
-    """The eyes of one driver in one trial, which ``look`` at each step of the world.
+    """The eyes of one driver in one trial, which ``observe`` the truth at a step of the world.
 
     ``seed`` is that of the driver's seat, so that a slot has the same errors whoever drives.
     """
 
     def __init__(
-        self, perception: Perception, seed: int, step_s: float, start: Observation
+        self,
+        perception: Perception,
+        seed: int,
+        step_s: float,
+        observe: Callable[[int], Observation],
     ) -> None:
         self._perception, self._seed, self._step_s = perception, seed, step_s
         self._distance, self._speed, self._own_distance, self._own_speed = (
@@ -66,16 +70,12 @@ class Eyes:
                 ("own speed", perception.speed_sd_mps * perception.own),
             )
         )
-        self._truth = [start]
+        self._observe, start = observe, observe(0)
         self._received = replace(start, other_seen=self._in_sight(start))
 
-    def look(self, truth: Observation) -> None:
-        """Take in the next step."""
-        self._truth.append(truth)
-
-    def told(self) -> Observation:
-        """What the driver is told at the last step."""
-        now_s, truth = (len(self._truth) - 1) * self._step_s, self._truth[-1]
+    def told(self, step: int) -> Observation:
+        """What the driver is told at a step, the present one."""
+        now_s, truth = step * self._step_s, self._observe(step)
         if draw(self._seed, "received", round(1000 * now_s)) >= self._perception.dropout:
             self._received = self._perceived(now_s - self._perception.delay_s)
         own_speed_mps = max(0.0, truth.own_speed_mps + self._own_speed(now_s))
@@ -128,8 +128,8 @@ class Eyes:
         """The truth at a time; before the start of control both cruised."""
         step = round(time_s / self._step_s)
         if step >= 0:
-            return self._truth[step]
-        start = self._truth[0]
+            return self._observe(step)
+        start = self._observe(0)
         ahead_m = (start.other_speed_mps - start.own_speed_mps) * time_s
         return replace(
             start,

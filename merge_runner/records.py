@@ -279,12 +279,16 @@ class TrialRecord:
     failed_calls: tuple[FailedCall, ...] = ()
 
     @property
+    def calls(self) -> list[ChatReply | FailedCall]:
+        """All calls of its drivers."""
+        replies = (row.decision.reply for row in self.decisions if row.decision.reply)
+        return [*replies, *self.failed_calls]
+
+    @property
     def scripted(self) -> bool:
         """Whether a scripted stand-in drove on a side, or answered any call."""
-        replies = (row.decision.reply for row in self.decisions if row.decision.reply)
-        calls: tuple[ChatReply | FailedCall, ...] = (*replies, *self.failed_calls)
         return self.spec.scripted or any(
-            is_scripted(call.request, attempt) for call in calls for attempt in call.attempts
+            is_scripted(call.request, attempt) for call in self.calls for attempt in call.attempts
         )
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections import ChainMap
-from collections.abc import Iterator, Mapping
+from collections.abc import ItemsView, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -45,9 +45,10 @@ class Catalogue:
 
 def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
     """The thing of this name; raises UsageError."""
-    if name not in things:
-        raise unknown_name(kind, name, things, hint)
-    return things[name]
+    try:
+        return things[name]
+    except KeyError:
+        raise unknown_name(kind, name, things, hint) from None
 
 
 class Registry(Mapping[str, T]):
@@ -93,6 +94,10 @@ class Registry(Mapping[str, T]):
 
     def __getitem__(self, name: str) -> T:
         return self._all[name]
+
+    def items(self) -> ItemsView[str, T]:
+        """All names and things, looked up at once."""
+        return self._all.items()
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._all)

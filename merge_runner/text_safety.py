@@ -12,7 +12,7 @@ from typing import Any, TextIO
 
 def printable(text: str, kept: str = "\n\t") -> str:
     """A text that cannot speak to a terminal: what a model or a server wrote may hold any code."""
-    if text.isprintable():
+    if text.translate(dict.fromkeys(map(ord, kept))).isprintable():
         return text  # as most are, and some are long
     return "".join(c if c.isprintable() or c in kept else "?" for c in text)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import partial
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Driver
@@ -37,40 +37,32 @@ async def play_trial(
     Drivers are asked at once, or ``in_turn`` where their answers are there already. Raises
     UsageError for a decision that cannot be driven.
     """
-    world = World(scenario, CONDITIONS.require(spec.condition), TRACK)
     # Each side starts as its own driver says, or else as the other's does.
     given = {side: d.starts for side, d in drivers.items() if hasattr(d, "starts")}
-    if given:
-        some = next(iter(given.values()))
-        world.start_at({side: given.get(side, some)[side] for side in SIDES})
-    seats = {side: _Seated(drivers[side]) for side in SIDES}
-    for side in SIDES:
-        perception, seed = scenario.perception(side), drivers[side].seat.seed
-        if not perception.is_perfect:
-            start = world.observe(side)
-            seats[side].eyes = Eyes(perception, seed, scenario.step_s, start)
+    starts = {side: given.get(side, other)[side] for other in given.values() for side in SIDES}
+    world = World(scenario, CONDITIONS.require(spec.condition), TRACK, starts)
+    seats = [_Seated(drivers[side], side, scenario, world) for side in SIDES]
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}
-    while world.status is None:
-        due = [side for side in SIDES if seats[side].is_due(world) and world.in_control(side)]
+    failed_calls: list[FailedCall] = []
+    while world.status is None and not failures:
+        due = [seat for seat in seats if seat.is_due()]
         if in_turn or len(due) < 2:  # both
-            answers = [await _answer(seats[side], world) for side in due]
+            answers = [await seat.ask() for seat in due]
         else:
-            answers = await asyncio.gather(*(_answer(seats[side], world) for side in due))
-        for side, answer in zip(due, answers, strict=True):
+            answers = await asyncio.gather(*(seat.ask() for seat in due))
+        for seat, answer in zip(due, answers, strict=True):
+            number, side = world.step // seat.interval, seat.side
             if isinstance(answer, CallFailed):
                 failures[side] = answer
-                continue
-            seat = seats[side]
-            seat.take(answer, world.step)
-            number = seat.number(world.step)
-            decisions.append(DecisionRow(number, world.time_s, side, answer, seat.told))
-        if failures:
-            break
-        world.advance({side: seats[side].action(world.step) for side in SIDES})
-        for side, seat in seats.items():
-            if seat.eyes:
-                seat.eyes.look(world.observe(side))
+                missed = isinstance(answer, ReplayMiss)
+                call = answer.request, answer.attempts, answer.earlier
+                failed_calls.append(FailedCall(number, side, *call, missed=missed))
+            else:
+                seat.take(answer)
+                decisions.append(DecisionRow(number, world.time_s, side, answer, seat.told))
+        if not failures:
+            world.advance({seat.side: seat.action() for seat in seats})
     return TrialRecord(
         spec=spec,
         status=world.status or "failed",
@@ -79,66 +71,53 @@ async def play_trial(
         error="; ".join(f"{side}: {exc}" for side, exc in failures.items()) or None,
         states=world.states(),
         decisions=tuple(decisions),
-        failed_calls=tuple(
-            FailedCall(
-                seats[side].number(world.step),
-                side,
-                exc.request,
-                exc.attempts,
-                exc.earlier,
-                missed=isinstance(exc, ReplayMiss),
-            )
-            for side, exc in failures.items()
-        ),
+        failed_calls=tuple(failed_calls),
     )
 
 
-@dataclass(slots=True)
 class _Seated:
     """A driver in its trial: what it decided last, and at which step of the world.
 
     It has ``eyes`` where its perception is imperfect, and was ``told`` what they saw.
     """
 
-    driver: Driver
-    eyes: Eyes | None = None
-    told: Observation | None = None
-    decision: Decision | None = None
-    decided_at: int = 0
+    def __init__(self, driver: Driver, side: Side, scenario: ScenarioConfig, world: World) -> None:
+        self.driver, self.side, self._world = driver, side, world
+        self._pace = driver.seat.pace
+        self.interval = self._pace.interval_steps
+        perception, self.eyes = scenario.perception(side), None
+        if not perception.is_perfect:
+            observe = partial(world.observe, side)
+            self.eyes = Eyes(perception, driver.seat.seed, scenario.step_s, observe)
+        self.told: Observation | None = None
+        self._applied: tuple[float, ...] | None = None
+        self._decided_at = 0
 
-    def is_due(self, world: World) -> bool:
+    def is_due(self) -> bool:
         """Whether it decides now: its instants count from the start of the trial."""
-        return world.step % self.driver.seat.pace.interval_steps == 0
+        return self._world.step % self.interval == 0 and self._world.in_control(self.side)
 
-    def number(self, step: int) -> int:
-        """The number of its decision at a step, or of the last one before."""
-        return step // self.driver.seat.pace.interval_steps
+    async def ask(self) -> Decision | CallFailed:
+        """Ask the driver; where its call fails, the other's answer is still awaited."""
+        self.told = self.eyes.told(self._world.step) if self.eyes else None
+        observation = self.told or self._world.observe(self.side)
+        try:
+            return await self.driver.decide(observation, self._world.step // self.interval)
+        except CallFailed as failure:
+            return failure
 
-    def take(self, decision: Decision, step: int) -> None:
+    def take(self, decision: Decision) -> None:
         """Drive by a decision from now on; raises UsageError for one that cannot be driven."""
-        seat = self.driver.seat
-        if len(decision.applied) != seat.pace.executed_actions or not all(
-            -1 <= action <= 1 for action in decision.applied
-        ):
+        applied, wanted = decision.applied, self._pace.executed_actions
+        if len(applied) != wanted or not all(-1 <= action <= 1 for action in applied):
             raise UsageError(
-                f"the {seat.side} driver decided on {decision.applied}, and is to drive "
-                f"{seat.pace.executed_actions} actions from -1 to 1"
+                f"the {self.side} driver decided on {applied}, and is to drive {wanted} actions "
+                "from -1 to 1"
             )
-        self.decision, self.decided_at = decision, step
+        self._applied, self._decided_at = applied, self._world.step
 
-    def action(self, step: int) -> float | None:
+    def action(self) -> float | None:
         """What is driven in a step; None: nothing is decided yet, and the vehicle cruises."""
-        if self.decision is None:
+        if self._applied is None:
             return None
-        driven = (step - self.decided_at) // self.driver.seat.pace.action_steps
-        return self.decision.applied[driven]
-
-
-async def _answer(seated: _Seated, world: World) -> Decision | CallFailed:
-    """Ask a driver; where its call fails, the other's answer is still awaited."""
-    seated.told = seated.eyes.told() if seated.eyes else None
-    observation = seated.told or world.observe(seated.driver.seat.side)
-    try:
-        return await seated.driver.decide(observation, seated.number(world.step))
-    except CallFailed as failure:
-        return failure
+        return self._applied[(self._world.step - self._decided_at) // self._pace.action_steps]

@@ -18,7 +18,7 @@ from merge_runner.emulator.server import HOST
 from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
 from merge_runner.registry import GROUP
 from merge_runner.run.plan import Options, Plan
-from merge_runner.run.sweep import Outcome, open_sweep
+from merge_runner.run.sweep import open_sweep
 from tests.mock_server import application
 
 PROJECT = Path(__file__).parent.parent
@@ -71,7 +71,7 @@ def environment(**changes: str) -> dict[str, str]:
     return {**kept, **changes}
 
 
-async def run_sweep(plan: Plan, options: Options, *, say: Callable[[str], None]) -> Outcome:
+async def run_sweep(plan: Plan, options: Options, *, say: Callable[[str], None]) -> dict:
     """Play a plan in this process."""
     async with open_sweep(plan, options, say=say) as sweep:
         return await sweep.run()

@@ -1,6 +1,7 @@
 """What a driver is told where its perception is imperfect."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from math import exp
 from random import Random
@@ -54,11 +55,10 @@ def drive(pairs, condition="L_4_-8", scenario=None, steps=5):
 
 def watched(perception, truths, seed=1, step_s=0.2):
     """What the eyes tell at each step of what is to be seen."""
-    eyes = Eyes(Perception(**perception), seed, step_s, truths[0])
-    yield eyes.told()
-    for truth in truths[1:]:
-        eyes.look(truth)
-        yield eyes.told()
+    truths = list(truths)
+    eyes = Eyes(Perception(**perception), seed, step_s, truths.__getitem__)
+    for step in range(len(truths)):
+        yield eyes.told(step)
 
 
 def truths(side="left", pairs=((0.4, -0.2), (-0.7, 0.9), (0.1, 0.3)), **options):
@@ -321,8 +321,8 @@ async def test_the_first_decision_of_a_program_at_20_hz_is_seen_as_the_first_of_
         task = ScenarioConfig(perception_left=noisy)
         seat = take_seat(task, spec, "left", program_pace(task, rate_hz))
         assert isinstance(seat, Seat)
-        start = World(task, CONDITIONS["N_0_0"], TRACK).observe("left")
-        seen.append(Eyes(task.perception("left"), seat.seed, task.step_s, start).told())
+        observe = partial(World(task, CONDITIONS["N_0_0"], TRACK).observe, "left")
+        seen.append(Eyes(task.perception("left"), seat.seed, task.step_s, observe).told(0))
     assert seen[0] == seen[1]
 
 

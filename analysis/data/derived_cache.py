@@ -94,9 +94,11 @@ def options_text(
     file: str | None = None,
     by: str | None = None,
     without_fallbacks: bool = False,
+    sweep: str = "",
+    condition: str = "",
 ) -> str:
     """What a table depends on besides the results; the path, since its notes name the database."""
-    return json.dumps([str(db), models, where, file, by, without_fallbacks])
+    return json.dumps([str(db), models, where, file, by, without_fallbacks, sweep, condition])
 
 
 def present_state(db: Path) -> str:

@@ -74,6 +74,7 @@ SELECT trial_id, spec_hash, driver, factor, value FROM trial_levels
 JOIN trial_drivers USING (trial_id, spec_hash)
 SEMI JOIN (FROM trials WHERE source = 'seat') USING (trial_id, spec_hash) ORDER BY ALL
 """
+OF_SWEEP = "SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = {sweep}"
 NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
@@ -224,19 +225,24 @@ class Study:
         file: str | None = None,
         by: str | None = None,
         without_fallbacks: bool = False,
+        sweep: str = "",
+        condition: str = "",
     ) -> None:
         """Read the trials; ``models`` keeps these drivers alone, ``where`` these levels of factors.
 
         ``file`` keeps the trials of this study, and ``by`` is the factor at whose levels the table
         ``factors`` shows the others. ``without_fallbacks`` leaves out trials in which a decision
-        had no valid plan. Raises UsageError.
+        had no valid plan. ``sweep`` keeps the drivers' trials of this sweep, by its id, and
+        ``condition`` all trials of one condition. Raises UsageError.
         """
         self.db = Path(db)
         self.chosen = models
         self.where = where
         self.by = by
         self.without_fallbacks = without_fallbacks
-        self.options = options_text(self.db, models, where, file, by, without_fallbacks)
+        self.options = options_text(
+            self.db, models, where, file, by, without_fallbacks, sweep, condition
+        )
         self.state = present_state(self.db)
         self.studies = read_studies(self.db)
         self.source = None if file is None else read_study(file)
@@ -251,6 +257,11 @@ class Study:
         self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
         found = load_each({"levels": LEVELS, "asked": ASKED, "decisions": ASKED_DECISIONS}, self.db)
         driven = trials[~recorded]
+        if sweep:
+            driven = driven.merge(self._read(OF_SWEEP.format(sweep=quoted(sweep))))
+        if condition:
+            driven = driven[driven["condition"] == condition]
+            self.human = self.human.part(lambda rows: rows["condition"] == condition)
         every = _model_groups(
             driven[self.is_of_file(driven)], specs, found["decisions"], part=bool(self.file)
         )

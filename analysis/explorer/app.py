@@ -34,6 +34,7 @@ from merge_runner_analysis.explorer.pages import (
     ablations,
     comparing,
     conditions,
+    drivers,
     home,
     notes,
     sql,
@@ -92,6 +93,11 @@ def _sweep_routes(site: Site) -> list[Route]:
     one = page(lambda r: sweep.sweep_page(site, r.path_params["sweep"], _seen(r)))
     return [
         Route("/", page(lambda r: home.home_page(site, r.query_params))),
+        Route("/drivers", page(lambda r: drivers.drivers_page(site, r.query_params))),
+        Route(
+            "/drivers/{name:path}",
+            page(lambda r: drivers.driver_page(site, r.path_params["name"], r.query_params)),
+        ),
         Route("/sweeps", page(lambda r: sweep.sweeps_page(site, _seen(r)))),
         Route("/sweeps/{sweep:path}", one),
     ]

@@ -33,7 +33,8 @@ from merge_runner_analysis.explorer.urls import query_of
 MOST = 1_000  # trials of drivers; of humans there are at most 990
 # The pages of an export by the first part of their path, with what their addresses may ask for.
 FOLLOWED: dict[str, Collection[str]] = {
-    "": ("by",),
+    "": (),
+    "drivers": ("prompt",),
     "trials": ("spec", "page", *FACETS),
     "conditions": ("by",),
     "discordant": ("model", "variant", "by"),

@@ -5,13 +5,11 @@ Only the replay draws in the browser, since it moves.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from math import ceil, floor, log10
-from statistics import quantiles
-from typing import Any
 
 from merge_runner.records import SIDES
 from merge_runner_analysis.explorer.reading import Row
@@ -130,36 +128,6 @@ class Axis:
     def y(self, value: float) -> float:
         """Where a value is drawn."""
         return round(self.scale(value), 1)
-
-    def placed(self, found: Mapping[str, Any], arrow: float) -> dict[str, Any]:
-        """Where an estimate is drawn, and the ends of its interval.
-
-        Where that goes on beyond the axis there are arrows, so far from the edge.
-        """
-        at, low, high = {"y": self.y(found["value"])}, found["low"], found["high"]
-        if low is None:
-            return {**at, "ends": None, "arrows": []}
-        arrows = [("down", self.scale.from_ - arrow)] if low < self.scale.low else []
-        arrows += [("triangle", self.scale.to + arrow)] if high > self.scale.high else []
-        return {**at, "ends": (self.y(low), self.y(high)), "arrows": arrows}
-
-
-def reach(estimates: Sequence[Mapping[str, Any]], printed: Sequence[float]) -> tuple[float, float]:
-    """What an axis has to show: every value, and of the intervals what is not far out.
-
-    Far out is what lies further than 1.5 times the distance of the quartiles beyond them (Tukey's
-    fences, Exploratory Data Analysis, 1977): an interval of two or three trials may be ten times as
-    long as the others.
-    """
-    values = [*printed, *(found["value"] for found in estimates)]
-    ends = [found[end] for found in estimates for end in ("low", "high") if found[end] is not None]
-    if len(values) < 2:
-        return min([*values, *ends], default=0.0), max([*values, *ends], default=1.0)
-    first, _, third = quantiles([*values, *ends], n=4, method="inclusive")
-    beyond = 1.5 * (third - first)
-    low = max(min([*values, *ends]), first - beyond)
-    high = min(max([*values, *ends]), third + beyond)
-    return min([low, *values]), max([high, *values])
 
 
 def ends_and_ticks(

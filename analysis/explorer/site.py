@@ -30,9 +30,10 @@ from merge_runner_analysis.metrics import METRICS
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {
     "Study": HOME,
-    "Runs": "sweeps",
+    "Drivers": "drivers",
     "Trials": "trials",
     "Words": "words",
+    "Runs": "sweeps",
     "Notes": "notes",
     "Tables": "tables",
     "Ablations": "ablations",

@@ -67,6 +67,10 @@ class Links:
         """All trials of a condition in one picture."""
         return f"/conditions/{quote(name)}" + query_of(state)
 
+    def driver(self, name: str, **state: object) -> str:
+        """A driver's page."""
+        return f"/drivers/{quote(name)}" + query_of(state)
+
     def static(self, name: str) -> str:
         """A script or a style."""
         return f"/static/{name}"

@@ -121,7 +121,7 @@ def _compared(study: Study, group: Group, measure: Measure) -> Comparison:
         difference = _of_slopes(alike, study.human, SLOPES[measure.name][0])
     verdict = score(study, group).robust.get(SLOPES[measure.name][2]) if measure.is_slope else None
     state = _state(measure, own, human, difference, verdict)
-    notes = [own.problem, human.problem, own.remark, human.remark]
+    notes = [own.problem, human.problem]
     if measure.name in SLOPES and verdict and verdict.passed is None and not own.problem:
         notes.append(verdict.why)
     return Comparison(measure, own, human, difference, state, "; ".join(filter(None, notes)))

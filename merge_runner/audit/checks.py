@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -58,8 +57,7 @@ JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
-SHOWN = 10
-"""Findings of each kind."""
+SHOWN = 20
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 
@@ -103,20 +101,14 @@ class Audit:
         return {**asdict(self), "ok": self.ok}
 
     def lines(self) -> Iterator[str]:
-        """The audit for a reader; of each kind the first findings."""
+        """The audit for a reader, with the first findings."""
         number = len(self.findings)
         yield f"{self.subject}: " + (f"{number} findings" if number else "all holds")
         yield "  checked: " + ", ".join(f"{n} {name}" for name, n in self.counts.items())
-        for text in self.notes:
-            yield f"  note: {text}"
-        shown: Counter[str] = Counter()
-        for finding in self.findings:
-            shown[finding.kind] += 1
-            if shown[finding.kind] <= SHOWN:
-                yield f"  {finding}"
-        for kind, count in shown.items():
-            if count > SHOWN:
-                yield f"  {kind}: and {count - SHOWN} more, all of them with --json"
+        yield from (f"  note: {text}" for text in self.notes)
+        yield from (f"  {finding}" for finding in self.findings[:SHOWN])
+        if number > SHOWN:
+            yield f"  and {number - SHOWN} more, all of them with --json"
 
 
 @contextmanager
@@ -280,8 +272,8 @@ def _fill(connection: duckdb.DuckDBPyConnection, entries: Iterator[CachedCall]) 
                 *(trial, spec, None, "llm", None, None, None, slot.condition, 0.0, 0.0),
                 *(slot.repetition, slot.sample_set, "finished", None, 0.0, None, False),
             )
-            place = (trial, spec, slot.side, slot.decision, request)
-            rows += [call_row(*place, attempt, cached=True) for attempt in entry.attempts]
+            attempts = entry.attempts
+            rows += [call_row((trial, spec), request, each, cached=True) for each in attempts]
         append(connection, "calls", rows)
     append(connection, "specs", specs.items())
     append(connection, "trials", trials.values())

@@ -6,7 +6,6 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -22,11 +21,9 @@ from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import say
 
 if TYPE_CHECKING:
-    from merge_runner.llm.ledger import Ledger, Spending
+    from merge_runner.llm.ledger import Ledger
 
-CACHE = "Also compare every attempt with this cache folder."
-COLUMNS = ("name", "provider", "key", "usd_per_m_in", "usd_per_m_out", "shutdown", "id", "prices")
-
+CACHE = "Replay from this cache folder, not from the stored replies."
 SWEEP = "A sweep_id, which may be repeated; the newest sweep if none is given."
 Form = Literal["text", "csv", "json"]
 RecordingFile = Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.parquet).")]
@@ -44,7 +41,7 @@ def sql(
 ) -> None:
     """Query the results; also while a sweep runs. Nothing can be changed."""
     from merge_runner.results.database import fetched, names_of
-    from merge_runner.results.query_output import write_csv, write_json, write_table
+    from merge_runner.results.export import write_csv, write_json, write_table
     from merge_runner.results.store import answer
 
     writers = {"text": write_table, "csv": write_csv, "json": write_json}
@@ -168,7 +165,7 @@ def recording_verify(file: RecordingFile) -> None:
     from merge_runner.results.recording import summarise
 
     found = summarise(file)
-    say(f"{file} is whole: {found.calls} calls, as they were exported")
+    say(f"{file} is whole: {found['calls']} calls, as they were exported")
 
 
 @recording_app.command("info")
@@ -179,7 +176,7 @@ def recording_info(
     """Verify a recording and print what it holds, as JSON."""
     from merge_runner.results.recording import summarise
 
-    print_out(json.dumps(asdict(summarise(file)), indent=2, ensure_ascii=False))
+    print_out(json.dumps(summarise(file), indent=2, ensure_ascii=False))
 
 
 def ledger(
@@ -193,6 +190,7 @@ def ledger(
     """Show what each sweep has spent, and what is set aside."""
     from merge_runner.llm.cache import ResponseCache
     from merge_runner.llm.ledger import Ledger, scopes
+    from merge_runner.run.summary import as_table
 
     with closing(ResponseCache(cache, read_only=True)) as opened:
         names = scopes(opened)
@@ -201,18 +199,18 @@ def ledger(
                 raise unknown_name("sweep", release, names, f"with a ledger in {cache}")
             _release(Ledger(opened, release), yes=yes)
             names = [release]
-        accounts = {
-            name: (each.read(), each.reasons())
-            for name, each in ((name, Ledger(opened, name)) for name in names)
-        }
-    if as_json:
+        ledgers = [Ledger(opened, name) for name in names]
         rows = [
-            {"sweep": n, **asdict(s), "reasons": reasons} for n, (s, reasons) in accounts.items()
+            {"sweep": each.scope, **asdict(each.read()), "reasons": each.reasons()}
+            for each in ledgers
         ]
+    if as_json:
         print_out(json.dumps(rows, ensure_ascii=False))
-    else:
-        lines = [line for name, each in accounts.items() for line in _account_lines(name, *each)]
-        print_out("\n".join(lines) or "No sweep has spent anything.")
+        return
+    reasons = [{"sweep": row["sweep"], **reason} for row in rows for reason in row.pop("reasons")]
+    print_out(as_table(rows) or "No sweep has spent anything.")
+    if reasons:
+        print_out(f"What is set aside, and why:\n{as_table(reasons)}")
 
 
 def _release(ledger: Ledger, *, yes: bool) -> None:
@@ -232,24 +230,6 @@ def _release(ledger: Ledger, *, yes: bool) -> None:
     ledger.release()
 
 
-def _account_lines(name: str, spending: Spending, reasons: list[dict[str, Any]]) -> Iterator[str]:
-    yield (
-        f"{name}: {spending.spent_usd:.4f} USD spent, {spending.reserved_usd:.4f} set aside for "
-        f"{spending.open_attempts} attempts whose cost is not known"
-    )
-    for each in reasons:
-        killed = " now, or when a run was killed" if each["outcome"] == "in flight" else ""
-        yield (
-            f"  {each['usd']:.4f} USD for {each['attempts']} attempts of {each['driver']}: "
-            f"{each['outcome']}{killed}, {each['first']} to {each['last']} (as {each['slot']})"
-        )
-    if spending.overrun_usd:
-        yield (
-            f"  {spending.overrun_usd:.4f} of what is spent is what replies cost more than their "
-            f"worst case: {spending.dearest}"
-        )
-
-
 def models(as_json: cli.JsonOption = False) -> None:
     """List the models and programs that can drive."""
     from merge_runner.config import Price, key_status
@@ -257,25 +237,37 @@ def models(as_json: cli.JsonOption = False) -> None:
     from merge_runner.llm.ledger import cost_usd
     from merge_runner.llm.models import load_models, shutdown_notes
     from merge_runner.records import Usage
-    from merge_runner.results.query_output import write_json, write_table
+    from merge_runner.run.summary import as_table
 
     entries = load_models()
-    rows: list[tuple[object, ...]] = []
+    rows: list[dict[str, Any]] = []
     for name, entry in entries.items():
         # A thousand tokens each: more may have a price of their own.
         costs = (cost_usd(entry, Usage(n, output_tokens=1000 - n)) for n in (1000, 0))
         usd = ["unknown" if cost is None else round(cost * 1000, 6) for cost in costs]
-        source = entry.price.source if isinstance(entry.price, Price) else entry.price
-        closes, key = str(entry.shutdown or ""), key_status(entry)
-        rows.append((name, entry.provider, key, *usd, closes, entry.id, source, entry.note))
+        rows.append(
+            {
+                "name": name,
+                "provider": entry.provider,
+                "key": key_status(entry),
+                "usd_per_m_in": usd[0],
+                "usd_per_m_out": usd[1],
+                "shutdown": str(entry.shutdown or ""),
+                "id": entry.id,
+                "prices": entry.price.source if isinstance(entry.price, Price) else entry.price,
+                "note": entry.note,
+            }
+        )
     for name, program in PROGRAMS.items():
-        rows.append((name, "program", "not needed", 0, 0, "", "", "", program.described))
+        needs = {"provider": "program", "key": "not needed", "usd_per_m_in": 0, "usd_per_m_out": 0}
+        rows.append(
+            {**dict.fromkeys(rows[0], ""), **needs, "name": name, "note": program.described}
+        )
     if as_json:
-        write_json([*COLUMNS, "note"], rows, sys.stdout)
+        print_out(json.dumps(rows, indent=2, ensure_ascii=False))
     else:
-        shown = [tuple(f"{v:g}" if isinstance(v, float) else v for v in r[:-1]) for r in rows]
-        write_table(list(COLUMNS), shown, sys.stdout)
-        print_out("\n".join(["", *(f"{name}: {note}" for name, *_, note in rows if note)]))
+        notes = [f"{row['name']}: {note}" for row in rows if (note := row.pop("note"))]
+        print_out("\n".join([as_table(rows), *notes]))
     for note in shutdown_notes(entries, datetime.now(UTC).date()):
         say(note)
 

@@ -171,8 +171,8 @@ def _play(
     import asyncio
 
     from merge_runner.llm.models import shutdown_notes
-    from merge_runner.run import summary
-    from merge_runner.run.sweep import INTERRUPTED, unsent
+    from merge_runner.run import sweep as running
+    from merge_runner.run.summary import as_lines, estimate_lines
 
     if plan.is_rehearsal:
         say(f"REHEARSAL: the emulator answers as {plan.driver}; nobody else is asked, or charges")
@@ -181,13 +181,13 @@ def _play(
         for note in shutdown_notes(asked, datetime.now(UTC).date()):
             say(note)
     if dry_run:
-        expected = asyncio.run(unsent(plan, options, say=say))
-        lines = "\n".join(summary.estimate_lines(expected))
+        expected = asyncio.run(running.unsent(plan, options, say=say))
+        lines = "\n".join(estimate_lines(expected))
         print_out(json.dumps(asdict(expected)) if as_json else f"{lines}\nNothing was sent.")
         return 0
 
     def leave(expected: Estimate) -> None:
-        lines = "\n".join(summary.estimate_lines(expected))
+        lines = "\n".join(estimate_lines(expected))
         by_asyncio = signal.signal(signal.SIGINT, signal.default_int_handler)
         try:  # Ctrl-C is an answer, too
             agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
@@ -195,11 +195,12 @@ def _play(
             signal.signal(signal.SIGINT, by_asyncio)
 
     try:
-        facts, text = asyncio.run(summary.play(plan, options, whole=whole, say=say, agree=leave))
+        facts = asyncio.run(running.play(plan, options, whole=whole, say=say, agree=leave))
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
-        return INTERRUPTED
-    print_out(json.dumps(facts, ensure_ascii=False) if as_json else text)
+        return running.INTERRUPTED
+    as_text = json.dumps(facts, ensure_ascii=False) if as_json else "\n".join(as_lines(facts))
+    print_out(as_text)
     for message in facts["messages"]:
         say(f"error: {message}")
     return int(facts["exit_code"])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from math import inf, isfinite
 from pkgutil import iter_modules
-from typing import TYPE_CHECKING, Protocol, TypeGuard
+from typing import Any, TypeGuard
 
 from merge_runner import drivers
 from merge_runner.config import ScenarioConfig
@@ -19,29 +19,10 @@ from merge_runner.records import SIDES, Side, TrialSpec, other_side
 from merge_runner.registry import Registry, require
 from merge_runner.source import source_digest
 
-if TYPE_CHECKING:
-    from duckdb import DuckDBPyConnection
-
 EMULATOR = "emulator"
 MOCKS = frozenset({EMULATOR, "random"})
 """The models of our own, under whose names no other is expected to answer."""
 SET = "set"  # the parameter that names a set of others
-
-
-class HumanTrials(Protocol):
-    """Imported human trials that a program drives again; ``digest`` is their hash."""
-
-    digest: str
-
-    def read(self, connection: DuckDBPyConnection | None) -> None:
-        """Take the human trials of a database; None: there is no database yet."""
-        ...
-
-    def check(
-        self, program: Program, config: ScenarioConfig, condition: str, repetitions: int
-    ) -> None:
-        """Raise UsageError where a program has too few trials of a condition to replay."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +34,12 @@ class Program:
     program reads its parameters from its seat, so that a study can set them. ``sets`` are named
     sets of further parameters, of which the parameter ``set`` chooses one. ``check`` raises
     UsageError for parameters that cannot be, ``check_clock`` for a clock in s (the time between two
-    decisions) that cannot be beside them. ``data`` are human trials that it replays. ``chance``
-    declares that it draws by the seed of its seat: the analysis counts equal trials of drivers that
-    do not once. ``based_on`` names the program that a study has given other parameters or another
-    clock.
+    decisions) that cannot be beside them. ``data`` are imported human trials that it replays: an
+    object with their hash as ``digest``, whose ``read`` takes those of an open database (None:
+    there is none yet), and whose ``check`` raises UsageError where a program has too few trials of
+    a condition for a scenario and so many repetitions. ``chance`` declares that it draws by the
+    seed of its seat: the analysis counts equal trials of drivers that do not once. ``based_on``
+    names the program that a study has given other parameters or another clock.
     """
 
     driver: Callable[[ProgramSeat], Driver]
@@ -67,7 +50,7 @@ class Program:
     sets: Mapping[str, Mapping[str, Parameter]] = field(default_factory=dict)
     check: Callable[[Mapping[str, Parameter]], None] | None = None
     check_clock: Callable[[Mapping[str, Parameter], float], None] | None = None
-    data: HumanTrials | None = None
+    data: Any = None
     chance: bool = False
     based_on: str = ""
 
@@ -113,11 +96,6 @@ class Program:
         """
         if changes and not self.settable:
             raise UsageError(f"the parameters of {name} stand in its source and cannot be set")
-        if clock_s is not None and self.rate_hz is not None and clock_s < 1 / self.rate_hz:
-            raise UsageError(
-                f"clock = {clock_s:g} is too fast: {name} decides every {1 / self.rate_hz:g} s, "
-                "and a clock can only slow it down"
-            )
         values, given = self.values, dict(self.parameters)
         # Which other parameters there are depends on the set, so that it comes first.
         for each in sorted(changes, key=lambda each: each != SET):
@@ -150,7 +128,7 @@ class Program:
         return self.driver(self.seat(scenario, spec, side))
 
     def seat(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> ProgramSeat:
-        """Return the seat of one side of a trial."""
+        """Return what that driver is given."""
         pace = program_pace(scenario, self.rate_hz)
         seeds = {each: take_seat(scenario, spec, each, pace).seed for each in SIDES}
         return ProgramSeat(

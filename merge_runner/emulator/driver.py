@@ -14,8 +14,9 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from statistics import NormalDist
 
-from merge_runner.chance import draw, draw_between, draw_index, draw_normal
+from merge_runner.chance import draw, draw_between, draw_index
 from merge_runner.planted_effect import PlantedEffect
 from merge_runner.prompts.state_lines import NOT_SEEN
 from merge_runner.records import FAR_BEHIND_M, Slot
@@ -73,37 +74,45 @@ class Seen:
         return (self.own_speed - self.other_speed) * min(own, other) - self.relative_distance
 
 
-@dataclass(frozen=True, slots=True)
-class Draws:
-    """The draws of a trial: who goes first, the gap aimed at, and the leader's share in it.
-
-    ``misjudges`` says that this driver goes first although the other does. The ``wobble`` of its
-    hand, in m/s^2, and its ``opening`` words are drawn for each decision.
-    """
-
-    goes_first: bool
-    misjudges: bool
-    target_gap_m: float
-    leader_share: float
-    wobble: float
-    opening: str
-
-
 def answer(prompt: str, slot: Slot | None, effect: PlantedEffect | None = None) -> str:
     """Return the reply's text for a prompt; without a slot it depends on the prompt alone."""
     seen = read_prompt(prompt)
     if isinstance(seen, str):
         return seen
-    draws = _draws(seen, prompt, slot, None if effect is None else effect.before(prompt))
+    planted = None if effect is None else effect.before(prompt)
+    trial: tuple[object, ...] = ()
+    if slot is not None:
+        trial = (slot.condition, slot.repetition, slot.sample_set)
+        if planted is not None:  # trials with another effect are drawn independently
+            trial += (planted.model_dump_json(),)
+    goes_first, misjudges = _order(seen, slot, planted or HUMAN, trial)
     if not seen.other_seen:
         action, why = 0.0, "I do not see the other car, and keep my speed."
     elif seen.distance_to_merge is None:
         action, why = _on_straight(seen)
+    elif seen.other_distance_to_merge <= 0 and goes_first:
+        action = 0.0
+        why = "The other car is through already, so I keep my speed and stay behind it."
+    elif seen.other_distance_to_merge <= 0:
+        action, why = _on_straight(seen)
     else:
-        action, why = _approach(seen, draws)
+        decision = (prompt,) if slot is None else tuple(slot.as_dict().values())
+        opening = OPENINGS[draw_index(len(OPENINGS), "words", *decision)]
+        if misjudges:
+            action, why = _catch_up(seen)
+        else:
+            gap_m = draw_between(1.8, 6.5, "gap", *trial) + (planted or HUMAN).x_gap_m
+            share = draw_between(0.1, 0.7, "share", *trial)
+            action, why = _open_gap(seen, gap_m, share, goes_first=goes_first)
+            # The level of the previous plan is held unless the need has moved away from it.
+            held = None if seen.previous is None else seen.previous * MAX_ACCELERATION_MPS2
+            if held is None or abs(action - held) >= 0.25:
+                held = action + draw_between(-0.05, 0.05, "wobble", *decision)
+            action = held
+        why = f"{opening} {why}"
     normalised = round(min(1.0, max(-1.0, action / MAX_ACCELERATION_MPS2)), 2) + 0.0
     plan = ", ".join([f"{normalised:.2f}"] * seen.plan_actions)
-    token = ("M\n\n" if draws.goes_first else "Y\n\n") if seen.asks_tactical else ""
+    token = ("M\n\n" if goes_first else "Y\n\n") if seen.asks_tactical else ""
     return f"{token}{why}\n\n```python\n[{plan}]\n```"
 
 
@@ -154,32 +163,24 @@ def read_prompt(prompt: str) -> Seen | str:
     )
 
 
-def _draws(seen: Seen, prompt: str, slot: Slot | None, effect: PlantedEffect | None) -> Draws:
-    """Return the draws; without a slot the projected order decides who goes first."""
-    goes_first, misjudges = seen.projected_lead_m > 0, False
-    trial: tuple[object, ...] = ()
-    decision: tuple[object, ...] = (prompt,)
-    if slot is not None:
-        trial = (slot.condition, slot.repetition, slot.sample_set)
-        decision = tuple(slot.as_dict().values())
-        if effect is not None:  # trials with another effect are drawn independently
-            trial += (effect.model_dump_json(),)
-        chance = _chance_left_first(effect or HUMAN, slot.condition, draw_normal("noise", *trial))
-        goes_first = (slot.side == "left") == (draw("who first", *trial) < chance)
-        # In one human condition of every third repetition.
-        turn = draw_index(3, "misjudge turn", slot.sample_set)
-        names = list(HUMAN_CONDITIONS)
-        chosen = draw_index(len(names), "misjudged condition", slot.repetition, slot.sample_set)
-        here = slot.repetition % 3 == turn and names[chosen] == slot.condition
-        misjudges = not goes_first and here
-    return Draws(
-        goes_first=goes_first or misjudges,
-        misjudges=misjudges,
-        target_gap_m=draw_between(1.8, 6.5, "gap", *trial) + (effect or HUMAN).x_gap_m,
-        leader_share=draw_between(0.1, 0.7, "share", *trial),
-        wobble=draw_between(-0.05, 0.05, "wobble", *decision),
-        opening=OPENINGS[draw_index(len(OPENINGS), "words", *decision)],
-    )
+def _order(
+    seen: Seen, slot: Slot | None, effect: PlantedEffect, trial: tuple[object, ...]
+) -> tuple[bool, bool]:
+    """Whether this driver goes first, and whether it does so by a misjudgement: as the other does.
+
+    Without a slot the projected order decides.
+    """
+    if slot is None:
+        return seen.projected_lead_m > 0, False
+    noise = NormalDist().inv_cdf(draw_between(1e-12, 1 - 1e-12, "noise", *trial))
+    chance = _chance_left_first(effect, slot.condition, noise)
+    goes_first = (slot.side == "left") == (draw("who first", *trial) < chance)
+    # In one human condition of every third repetition.
+    turn = draw_index(3, "misjudge turn", slot.sample_set)
+    names = list(HUMAN_CONDITIONS)
+    chosen = draw_index(len(names), "misjudged condition", slot.repetition, slot.sample_set)
+    here = slot.repetition % 3 == turn and names[chosen] == slot.condition
+    return goes_first or here, here and not goes_first
 
 
 def _chance_left_first(effect: PlantedEffect, condition: str, noise: float) -> float:
@@ -196,43 +197,35 @@ def _chance_left_first(effect: PlantedEffect, condition: str, noise: float) -> f
     return 1 / (1 + math.exp(-max(logit, -700.0)))  # exp of more than 709 overflows
 
 
-def _approach(seen: Seen, draws: Draws) -> tuple[float, str]:
-    """Return the acceleration before the merge point, and the reason for it."""
-    other_distance = seen.other_distance_to_merge
-    if other_distance <= 0 and draws.goes_first:
-        return 0.0, "The other car is through already, so I keep my speed and stay behind it."
-    if other_distance <= 0:
-        return _on_straight(seen)
-    lead = seen.projected_lead_m if draws.goes_first else -seen.projected_lead_m
-    if draws.misjudges:
-        catch_up = _even_acceleration(-lead, seen.distance_to_merge, seen.own_speed)
-        return min(MAX_ACCELERATION_MPS2, max(0.0, seen.other_acceleration + catch_up)), (
-            f"{draws.opening} I take the gap: with enough speed I reach the merge point before the "
-            "other car, which should let me in. I keep an eye on it."
-        )
+def _catch_up(seen: Seen) -> tuple[float, str]:
+    """Return the acceleration of a driver that misjudges, and the reason for it."""
+    catch_up = _even_acceleration(-seen.projected_lead_m, seen.distance_to_merge, seen.own_speed)
+    return min(MAX_ACCELERATION_MPS2, max(0.0, seen.other_acceleration + catch_up)), (
+        "I take the gap: with enough speed I reach the merge point before the "
+        "other car, which should let me in. I keep an eye on it."
+    )
+
+
+def _open_gap(seen: Seen, gap_m: float, share: float, *, goes_first: bool) -> tuple[float, str]:
+    """Return the acceleration that opens a gap before the merge point, and the reason for it.
+
+    Of what lacks the ``share`` is the leader's.
+    """
+    lead = seen.projected_lead_m if goes_first else -seen.projected_lead_m
     # What the leader's projected lead lacks; a leader from behind acts at once.
-    lacking = draws.target_gap_m + seen.vehicle_length - lead + max(0.0, 1.0 - lead)
-    if draws.goes_first:
-        metres = draws.leader_share * lacking
-        push = _even_acceleration(metres, seen.distance_to_merge, seen.own_speed)
-        action = min(HARDEST_PUSH_MPS2, max(0.0, push))
-        why = (
+    lacking = gap_m + seen.vehicle_length - lead + max(0.0, 1.0 - lead)
+    if goes_first:
+        push = _even_acceleration(share * lacking, seen.distance_to_merge, seen.own_speed)
+        return min(HARDEST_PUSH_MPS2, max(0.0, push)), (
             f"At present speeds I would be {lead:.1f} m ahead at the merge point. I go first and "
             "make the gap clear by my speed, and hold this acceleration."
         )
-    else:
-        metres = (1 - draws.leader_share) * lacking
-        brake = -_even_acceleration(metres, other_distance, seen.other_speed)
-        action = min(0.0, max(HARDEST_BRAKING_MPS2, brake))
-        why = (
-            f"The other car will be about {lead:.1f} m ahead at the merge point if nobody acts. I "
-            "let it go first and slow down evenly to leave a safe gap."
-        )
-    # The level of the previous plan is held unless the need has moved away from it.
-    held = None if seen.previous is None else seen.previous * MAX_ACCELERATION_MPS2
-    if held is None or abs(action - held) >= 0.25:
-        held = action + draws.wobble
-    return held, f"{draws.opening} {why}"
+    metres = (1 - share) * lacking
+    brake = -_even_acceleration(metres, seen.other_distance_to_merge, seen.other_speed)
+    return min(0.0, max(HARDEST_BRAKING_MPS2, brake)), (
+        f"The other car will be about {lead:.1f} m ahead at the merge point if nobody acts. I "
+        "let it go first and slow down evenly to leave a safe gap."
+    )
 
 
 def _on_straight(seen: Seen) -> tuple[float, str]:

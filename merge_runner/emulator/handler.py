@@ -18,7 +18,7 @@ import httpx
 
 from merge_runner.chance import draw_index
 from merge_runner.config import validated
-from merge_runner.emulator import Behaviour, driver
+from merge_runner.emulator import driver
 from merge_runner.errors import UsageError
 from merge_runner.planted_effect import PlantedEffect, planted_fields
 from merge_runner.records import (
@@ -33,23 +33,10 @@ from merge_runner.records import (
 MODEL, RANDOM_MODEL = "scripted-driver", "random-driver"
 # What anything but a chat request can raise: refused with 400.
 UNREADABLE = (ValueError, TypeError, AttributeError, KeyError, IndexError, RecursionError)
-# The faults that are errors of the provider, beside a rate limit.
-ERRORS = {"server_error": 500, "overloaded": 503}
-PROSE = "M\n\nI would rather describe my plan in words than write a list of numbers."
-
-
+# How OpenAI, Gemini and Anthropic name it.
+REFUSAL = {"type": "invalid_request_error", "code": 400, "status": "INVALID_ARGUMENT"}
 CREATED = 1_760_000_000
 Body = dict[str, Any]
-# What OpenAI, Gemini and Anthropic call an error of a status.
-ERROR_NAMES = {
-    400: ("invalid_request_error", "INVALID_ARGUMENT", "invalid_request_error"),
-    404: ("not_found", "NOT_FOUND", "not_found_error"),
-    408: ("timeout", "DEADLINE_EXCEEDED", "timeout_error"),
-    409: ("conflict", "ABORTED", "conflict_error"),
-    429: ("rate_limit_exceeded", "RESOURCE_EXHAUSTED", "rate_limit_error"),
-    500: ("server_error", "INTERNAL", "api_error"),
-    503: ("server_is_overloaded", "UNAVAILABLE", "overloaded_error"),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,15 +60,13 @@ class ServedFormat:
 
     ``path`` is a regular expression. A request has its messages in the member ``turns``, or is one
     text there, and the text of a message in ``content``; ``parameters_in`` names the member with
-    its parameters, if they do not stand at the top. ``error`` makes a body and its headers from a
-    status, a message and a delay in s.
+    its parameters, if they do not stand at the top.
     """
 
     path: str
     turns: str
     content: str
     answer: Callable[[Completion], Body]
-    error: Callable[[int, str, float], tuple[Body, dict[str, str]]]
     parameters_in: str | None = None
 
     def prompt(self, body: Body) -> str:
@@ -171,45 +156,16 @@ def _message(said: Completion) -> Body:
     }
 
 
-def _openai_error(status: int, message: str, delay_s: float) -> tuple[Body, dict[str, str]]:
-    """Tell the delay in the message alone."""
-    name = ERROR_NAMES[status][0]
-    if delay_s:
-        message = f"{message} Please try again in {delay_s * 1000:.0f}ms."
-    error = {"message": message, "type": name, "param": None, "code": name}
-    return {"error": error}, {"x-ratelimit-remaining-requests": "0"} if delay_s else {}
-
-
-def _gemini_error(status: int, message: str, delay_s: float) -> tuple[Body, dict[str, str]]:
-    """Tell the delay in the message and in the details."""
-    details: list[Body] = []
-    if delay_s:
-        message = f"{message} Please retry in {delay_s:.9f}s."
-        kind = "type.googleapis.com/google.rpc.RetryInfo"
-        details = [{"@type": kind, "retryDelay": f"{delay_s:.9f}s"}]
-    name = ERROR_NAMES[status][1]
-    error = {"code": status, "message": message, "status": name, "details": details}
-    return {"error": error}, {}
-
-
-def _anthropic_error(status: int, message: str, delay_s: float) -> tuple[Body, dict[str, str]]:
-    """Tell the delay in a header."""
-    error = {"type": ERROR_NAMES[status][2], "message": message}
-    body = {"type": "error", "error": error, "request_id": "req_emulated"}
-    return body, {"retry-after": str(delay_s)} if delay_s else {}
-
-
-CHAT = ServedFormat("/v1/chat/completions", "messages", "content", _chat, _openai_error)
-RESPONSES = ServedFormat("/v1/responses", "input", "content", _response, _openai_error)
+CHAT = ServedFormat("/v1/chat/completions", "messages", "content", _chat)
+RESPONSES = ServedFormat("/v1/responses", "input", "content", _response)
 GEMINI = ServedFormat(
     r"/v1\w*/models/(?P<model>[^/]+?):generateContent",
     "contents",
     "parts",
     _content,
-    _gemini_error,
     parameters_in="generationConfig",
 )
-MESSAGES = ServedFormat("/v1/messages", "messages", "content", _message, _anthropic_error)
+MESSAGES = ServedFormat("/v1/messages", "messages", "content", _message)
 SERVED = (CHAT, RESPONSES, GEMINI, MESSAGES)
 
 
@@ -239,10 +195,14 @@ class Asked:
 
 
 class Emulator:
-    """Answers chat requests of every format in SERVED."""
+    """Answers chat requests of every format in SERVED.
 
-    def __init__(self, behaviour: Behaviour | None = None) -> None:
-        self.behaviour = behaviour or Behaviour()
+    Every answer takes ``latency_s``, and has about ``output_tokens`` with its reasoning, or a few
+    hundred.
+    """
+
+    def __init__(self, latency_s: float = 0.0, output_tokens: int | None = None) -> None:
+        self.latency_s, self._output_tokens = latency_s, output_tokens
         self._asked: Counter[str] = Counter()
 
     def transport(self) -> httpx.MockTransport:
@@ -265,14 +225,11 @@ class Emulator:
                     request.headers.get(SLOT_HEADER),
                     request.headers.get(ATTEMPT_HEADER, ""),
                 )
-                attempt = self.attempt(asked)
-                fault = self.behaviour.fault(asked.where, attempt)
                 try:
-                    answer = self.answer(asked, attempt, fault)
+                    return await self.reply(asked, self.attempt(asked))
                 except UsageError as exc:
-                    return as_error(wire, 400, str(exc))
-                await asyncio.sleep(self.behaviour.latency_s)
-                return await self.deliver(asked, fault, answer)
+                    error = {**REFUSAL, "message": str(exc)}
+                    return as_json({"type": "error", "error": error, SCRIPTED_FIELD: True}, 400)
         return as_response(b"404: Not Found", 404, {"content-type": "text/plain"})
 
     def attempt(self, asked: Asked) -> int:
@@ -281,7 +238,13 @@ class Emulator:
         is_number = re.fullmatch("[0-9]{1,6}", asked.attempt)
         return int(asked.attempt) if is_number else self._asked[asked.where]
 
-    def answer(self, asked: Asked, attempt: int, fault: str | None) -> Body:
+    async def reply(self, asked: Asked, attempt: int) -> httpx.Response:
+        """Return the response to a chat request; raises UsageError where it is none."""
+        answer = self.answer(asked, attempt)
+        await asyncio.sleep(self.latency_s)
+        return as_json(answer)
+
+    def answer(self, asked: Asked, attempt: int) -> Body:
         """Return the body of an answer; raises UsageError where the request is none."""
         try:
             body = json.loads(asked.raw)
@@ -293,16 +256,14 @@ class Emulator:
         except UNREADABLE as exc:
             raise UsageError("The body is not valid.") from exc
         effect = validated(PlantedEffect, planted, "the emulator") if planted else None
-        if fault == "malformed":
-            text = PROSE
-        elif model == RANDOM_MODEL:
+        if model == RANDOM_MODEL:
             text = driver.random_answer(prompt, slot)
         else:
             text = driver.answer(prompt, slot, effect)
         # A token is about four bytes.
         tokens_in, visible = len(prompt.encode()) // 4, len(text.encode()) // 4
         reasoning = 200 + draw_index(600, "reasoning", prompt)
-        if typical := self.behaviour.output_tokens:
+        if typical := self._output_tokens:
             drawn = typical // 2 + draw_index(typical, "reasoning", prompt)
             reasoning = max(0, drawn - visible)
         # Only the same attempt at the same request gets the same id: the audit takes one that
@@ -313,14 +274,6 @@ class Emulator:
         request = {"body_sha256": asked.body_sha256, "slot": slot and slot.as_dict()}
         return {**asked.wire.answer(said), ANSWERED_FIELD: request, SCRIPTED_FIELD: True}
 
-    async def deliver(self, asked: Asked, fault: str | None, answer: Body) -> httpx.Response:
-        """Return the response with an answer, or the error that takes its place."""
-        if fault == "rate_limit":
-            return as_error(asked.wire, 429, "Rate limit reached.", self.behaviour.delay_s)
-        if fault in ERRORS:
-            return as_error(asked.wire, ERRORS[fault], "An emulated fault.")
-        return as_json(answer)
-
 
 def as_response(body: bytes, status: int, headers: Mapping[str, str]) -> httpx.Response:
     """Return a response that says that a mock model made it, even an error or what is no JSON."""
@@ -329,15 +282,7 @@ def as_response(body: bytes, status: int, headers: Mapping[str, str]) -> httpx.R
     return httpx.Response(status, headers={**headers, SCRIPTED_HEADER: "true"}, stream=stream)
 
 
-def as_json(
-    body: Body, status: int = 200, headers: Mapping[str, str] | None = None
-) -> httpx.Response:
+def as_json(body: Body, status: int = 200) -> httpx.Response:
     """Return a response of JSON."""
     sent = json.dumps(body, ensure_ascii=False).encode()
-    return as_response(sent, status, {"content-type": "application/json", **(headers or {})})
-
-
-def as_error(wire: ServedFormat, status: int, message: str, delay_s: float = 0.0) -> httpx.Response:
-    """Return an error in a provider's form."""
-    body, headers = wire.error(status, message, delay_s)
-    return as_json({**body, SCRIPTED_FIELD: True}, status, headers)
+    return as_response(sent, status, {"content-type": "application/json"})

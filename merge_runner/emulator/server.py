@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 
 import httpx
 from aiohttp import web
@@ -23,6 +23,12 @@ def application(emulator: Emulator | None = None) -> web.Application:
     answering = emulator or Emulator()
 
     async def respond(request: web.Request) -> web.StreamResponse:
+        assert request.transport is not None
+        port = request.transport.get_extra_info("sockname")[1]
+        # A web page whose own name resolves to loopback (DNS rebinding) asks by that name.
+        if request.headers.get("host", "").lower().removesuffix(f":{port}") not in OWN_NAMES:
+            text = f"This is the emulator of merge-runner: ask for {HOST}:{port}."
+            return web.Response(status=403, text=text)
         headers, body = list(request.headers.items()), await request.read()
         response = await answering.respond(
             httpx.Request(request.method, str(request.url), headers=headers, content=body)
@@ -33,24 +39,9 @@ def application(emulator: Emulator | None = None) -> web.Application:
             answer.headers[ID_HEADER] = request.headers[ID_HEADER]
         return answer
 
-    app = web.Application(client_max_size=MOST_BYTES, middlewares=[_only_by_own_name])
+    app = web.Application(client_max_size=MOST_BYTES)
     app.router.add_route("*", "/{path:.*}", respond)
     return app
-
-
-@web.middleware
-async def _only_by_own_name(
-    request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
-) -> web.StreamResponse:
-    """Refuse a web page whose own name resolves to loopback (DNS rebinding)."""
-    assert request.transport is not None
-    port = request.transport.get_extra_info("sockname")[1]
-    host = request.headers.get("host", "").lower()
-    if host.removesuffix(f":{port}") not in OWN_NAMES:
-        return web.Response(
-            status=403, text=f"This is the emulator of merge-runner: ask for {HOST}:{port}."
-        )
-    return await handler(request)
 
 
 async def serve(port: int, app: web.Application | None = None) -> tuple[web.AppRunner, str]:

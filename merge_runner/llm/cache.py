@@ -4,6 +4,10 @@ An entry is the JSON of a request and every attempt, the answering one last, beh
 It is durable before anyone sees it: each batch of writes is one synchronous SQLite transaction.
 Beside the entries lie the attempts of calls that have no answer yet, the notes of batches, and
 damaged entries in quarantine.
+
+Anybody may have written the file of a folder, and diskcache unpickles keys and values, opens and
+removes the files that rows name, and applies the settings that it finds. So ``TextDisk`` takes and
+gives texts alone, and a file with other settings than ours is refused before diskcache opens it.
 """
 
 from __future__ import annotations
@@ -23,23 +27,35 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import diskcache
+from diskcache.core import METADATA, MODE_RAW, UNKNOWN
 from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
 from merge_runner.llm.content_hashes import DAMAGED, check_body, check_call
-from merge_runner.llm.durable import BatchWriter, ModelLocks, Operation, ResultT, connect, making
-from merge_runner.llm.ledger import LedgerFile
-from merge_runner.llm.text_disk import (
-    FILE,
-    FORMAT,
-    FORMAT_KEY,
-    NEW_CACHE,
-    TextDisk,
-    open_texts,
-    refuse_others,
+from merge_runner.llm.durable import (
+    BUSY_S,
+    BatchWriter,
+    ModelLocks,
+    Operation,
+    ResultT,
+    connect,
+    making,
 )
+from merge_runner.llm.ledger import LedgerFile
 from merge_runner.records import Attempt, ChatRequest
+from merge_runner.text_safety import one_line
 
+FILE = "cache.db"
+FORMAT_KEY, FORMAT = "format", "5"
+NEW_CACHE = "`merge-runner recording import FILE --cache NEW` makes one from a recording"
+SETTINGS = diskcache.DEFAULT_SETTINGS | {
+    "eviction_policy": "none",
+    "cull_limit": 0,
+    "size_limit": 2**62,
+    "sqlite_synchronous": 2,  # FULL: an acknowledged reply survives a power cut
+    "disk_min_file_size": 2**40,  # everything in the one SQLite file
+    "sqlite_mmap_size": 0,  # what is mapped counts as this process's memory
+}
 CHECKSUM_LENGTH = 32
 BATCH = 1_000
 Attempts = tuple[Attempt, ...]
@@ -57,6 +73,65 @@ SELECT rowid FROM Cache NOT INDEXED WHERE typeof(key) != 'text' OR raw IS NOT 1
 OR length(CAST(key AS BLOB)) = 64 AND NOT instr(key, ' ')
 """
 _CALL = "SELECT key, raw, mode, filename, value FROM Cache WHERE rowid = ?"
+
+
+class TextDisk(diskcache.Disk):  # type: ignore[misc] # diskcache ships no types
+    """Texts alone: nothing is unpickled, and no file that a row names is opened or removed."""
+
+    def put(self, key: object) -> tuple[str, bool]:
+        """Return the key as it is stored; raises TypeError unless it is a text."""
+        if not isinstance(key, str):
+            raise TypeError("the cache has texts alone as keys")
+        return key, True
+
+    def get(self, key: object, raw: object) -> str:
+        """Return a stored key; raises RecordingError unless it is a text."""
+        if not (raw and isinstance(key, str)):
+            raise RecordingError("the cache holds a key that is no text: it is not ours")
+        return key
+
+    def store(self, value: object, read: bool, key: object = UNKNOWN) -> tuple[int, int, None, str]:
+        """Return a row's size, mode, file name and value; raises TypeError unless it is a text."""
+        if not isinstance(value, str):
+            raise TypeError("the cache stores texts alone")
+        return 0, MODE_RAW, None, value
+
+    def fetch(self, mode: object, filename: object, value: object, read: bool = False) -> str:
+        """Return the text of a row; raises RecordingError unless it holds one."""
+        if filename is not None or mode != MODE_RAW:
+            raise RecordingError("the cache holds a pickle or names a file: it is not ours")
+        if not isinstance(value, str):
+            raise RecordingError("the recorded reply is damaged: it is no text")
+        return value
+
+    def remove(self, file_path: object) -> None:
+        """Leave a file that a row names where it is: we wrote none."""
+
+
+def open_texts(folder: Path) -> diskcache.Cache:
+    """Return the diskcache of a folder, whose file is made if there is none."""
+    return diskcache.Cache(str(folder), timeout=BUSY_S, disk=TextDisk, **SETTINGS)
+
+
+def refuse_others(folder: Path) -> None:
+    """Raise UsageError for settings that we do not write, and for the file of another version.
+
+    diskcache would obey such settings; the first version left no mark.
+    """
+    sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
+    with contextlib.closing(connect(folder / FILE)) as connection:
+        settings = connection.rows("SELECT key, value FROM Settings")
+        ((mark,),) = connection.rows(sql, FORMAT_KEY) or [(b"1",)]
+    for key, value in settings:
+        if key not in METADATA and (key not in SETTINGS or value != SETTINGS[key]):
+            name = one_line(repr(key))[:40]
+            raise UsageError(f"{folder / FILE} has the setting {name} of another program")
+    # Where the mark is damaged, each entry is checked all the same.
+    if mark is not None and mark.isascii() and mark != FORMAT.encode():
+        raise UsageError(
+            f"the cache {folder} has format {one_line(mark.decode()[:9])}, and this merge-runner "
+            f"has format {FORMAT}: {NEW_CACHE}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,9 +212,8 @@ class ResponseCache:
 
     async def put(self, entry: CachedCall) -> CachedCall:
         """Keep an entry durably; returns what is kept, another one where an import was first."""
-        while (kept := await self.write(partial(self._keep, entry))) is None:
-            self.set_damage_aside(entry.request.key)
-        return kept
+        self.set_damage_aside(entry.request.key)
+        return await self.write(partial(self._keep, entry))
 
     def put_now(
         self, entries: Iterable[CachedCall], tried: Iterable[tuple[str, Attempts]] = ()
@@ -244,13 +318,14 @@ class ResponseCache:
                         left_out.append(str(exc))
         yield from self._overlay.values()
 
-    def recorded(self, fits: Callable[[ChatRequest], bool]) -> Iterator[ChatRequest]:
-        """Yield the requests that fit and have a reply: the recording's, else the folder's."""
+    def recorded(self, **fields: str) -> Iterator[ChatRequest]:
+        """Yield the requests with these values and a reply: the recording's, else the folder's."""
         for entries in (self._overlay.values(), self.entries()):
             found = False
-            for request in filter(fits, (each.request for each in entries)):
-                found = True
-                yield request
+            for request in (entry.request for entry in entries):
+                if all(getattr(request, name) == value for name, value in fields.items()):
+                    found = True
+                    yield request
             if found:
                 return
 
@@ -262,15 +337,13 @@ class ResponseCache:
         if self._texts is not None:
             self._texts.close()
 
-    def _keep(self, entry: CachedCall) -> CachedCall | None:
-        """Keep an entry unless there is one; None where that is damaged; an operation."""
+    def _keep(self, entry: CachedCall) -> CachedCall:
+        """Keep an entry unless there is one, and return what is kept; an operation."""
         key = entry.request.key
-        if self._texts.add(key, _behind_checksum(entry.to_json())):
-            self._texts.delete(_UNANSWERED + key)
-            return entry
-        with contextlib.suppress(RecordingError):
-            return self._kept(key)
-        return None
+        if not self._texts.add(key, _behind_checksum(entry.to_json())):
+            return self._kept(key) or entry
+        self._texts.delete(_UNANSWERED + key)
+        return entry
 
     def _keep_tried(self, key: str, attempts: Attempts) -> None:
         self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())

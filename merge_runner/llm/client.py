@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -27,27 +26,21 @@ from merge_runner.errors import (
     ReplayMiss,
     SweepStopped,
 )
-from merge_runner.llm.budget import Budget, PaidAttempt
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.content_hashes import make_request, reply_object
-from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.base import WireFormat
+from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.http_outcome import (
-    NOBODY_S,
     AttemptOutcome,
-    Deadline,
-    FirstCall,
-    OutOfTime,
-    RawReply,
     TransportFailure,
     TryAgain,
     backoff_s,
     if_nobody,
     judge,
     may_be_charged,
+    next_wait_s,
     why_refused,
 )
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Ledger, cost_usd
+from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Budget, Ledger, PaidAttempt, cost_usd
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -64,6 +57,8 @@ if TYPE_CHECKING:
     from merge_runner.llm.batch.rounds import Batch, Rounds
     from merge_runner.llm.http import HttpTransport
 
+# For how long connections may be refused at the first call of a run.
+NOBODY_S = 5.0
 # A shorter wait is over before a note of it is read.
 LONG_WAIT_S = 5.0
 # How often a format that knows empty answers as a fault is asked again after one; and how many
@@ -73,13 +68,12 @@ EMPTY_RETRIES, SEVERAL = 2, 3
 
 @dataclass(frozen=True, slots=True)
 class Wait:
-    """Who waits for what, and until when (UTC); None: until it happens.
+    """What a call waits for, and until when (UTC); None: until it happens.
 
     It is ``idle`` where what it waits for does not happen by itself: an answer that makes room, or
     that is somebody else's.
     """
 
-    who: str
     what: str
     until: datetime | None = None
     idle: bool = False
@@ -90,21 +84,21 @@ class Call:
     """A call that somebody waits for.
 
     ``asked`` names it for a reader and bounds the cost of an attempt, ``worst`` bounds its tokens.
-    ``attempts`` are all that were made, the first ``earlier`` of them by earlier runs. ``began_s``
-    is when the first attempt was due, on the event loop's clock. While the call waits, ``wait``
-    says for what; otherwise it is in flight, or being saved. A call that is ``stopping`` waits for
-    nothing any more. ``task`` makes it. ``asking`` counts those who wait for its answer. It goes
-    ``singly`` where a batch brought no answer, and ``open`` says in which batch it waits already.
+    ``left_s`` is what its attempts and the waits between them may take yet; standing in the queue
+    of the limiter is no fault of the provider. ``attempts`` are all that were made, the first
+    ``earlier`` of them by earlier runs. While the call waits, ``wait`` says for what; otherwise it
+    is in flight, or being saved. ``task`` makes it. ``asking`` counts those who wait for its
+    answer. It goes ``singly`` where a batch brought no answer, and ``open`` says in which batch it
+    waits already.
     """
 
     request: ChatRequest
     order: int
     asked: Asked
     worst: Usage
-    stopping: bool
+    left_s: float
     attempts: list[Attempt] = field(default_factory=list)
     earlier: int = 0
-    began_s: float = 0.0
     wait: Wait | None = None
     asking: int = 0
     singly: bool = False
@@ -121,23 +115,10 @@ class Call:
         """The reason why the last attempt brought no answer."""
         return self.attempts[-1].error or self.attempts[-1].outcome
 
-    @contextmanager
-    def waiting(
-        self, what: str, until: datetime | None = None, *, idle: bool = False
-    ) -> Iterator[Wait]:
-        """Mark the call as waiting, so that it can be given up: nothing of it is in flight."""
-        if self.stopping:
-            raise CallFailed("the sweep was stopped", self.request)
-        self.wait = wait = Wait(f"{self.asked.driver}: {self.asked.slot}", what, until, idle)
-        try:
-            yield wait
-        finally:
-            self.wait = None
-
 
 @dataclass(slots=True)
 class Meter:
-    """Counts of calls, attempts, tokens and cost.
+    """Counts of calls, attempts and cost.
 
     ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name; ``damaged``
     are the keys of recorded replies that could not be read.
@@ -145,7 +126,6 @@ class Meter:
 
     calls_live: int = 0
     calls_cached: int = 0
-    tokens: int = 0
     cost_usd: float = 0.0
     cost_unknown: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
@@ -159,7 +139,6 @@ class Meter:
         self.outcomes[attempt.outcome] += 1
         self.cost_usd += attempt.cost_usd or 0.0
         self.cost_unknown += attempt.cost_usd is None
-        self.tokens += (attempt.usage.input_tokens or 0) + (attempt.usage.output_tokens or 0)
 
     def add(self, other: Meter) -> None:
         """Add what another meter has counted."""
@@ -169,14 +148,15 @@ class Meter:
 
 @dataclass(slots=True)
 class LlmClient:
-    """Answers prompts of one model.
+    """Answers prompts of one model, called ``driver``; see ``driver_name``.
 
     ``endpoint`` is the identity that enters the keys. ``budget`` is None for a model that costs
-    nothing. ``first`` is the run's first call to the endpoint, which goes alone. ``sealed`` says
-    that nothing may be asked anew, so that there is no ``transport``; ``strict`` that an answer of
-    another model stops the sweep. In ``rounds``, which know it as ``model``, its name in the
-    registry, it may be asked at ``batch_price`` as a share of the plain one, or its calls may wait
-    already. ``driver`` is its name, with the endpoint where that is not the provider's own.
+    nothing. Until the endpoint has ``passed``, by an answer in its format, the calls of a run go
+    alone: a wrong key, URL or parameter costs one call. It is ``known`` where it ever has answered,
+    and ``_refused`` counts the requests that it has refused before. Without a ``transport`` nothing
+    may be asked anew. ``strict`` says that an answer of another model stops the sweep. In
+    ``rounds``, which know it as ``model``, its name in the registry, it may be asked at
+    ``batch_price`` as a share of the plain one, or its calls may wait already.
 
     ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
     its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
@@ -190,9 +170,9 @@ class LlmClient:
     transport: HttpTransport | None
     limiter: Limiter
     budget: Budget | None = None
-    sealed: bool = False
     strict: bool = False
-    first: FirstCall = field(default_factory=lambda: FirstCall(passed=True))
+    passed: bool = True
+    known: bool = False
     rounds: Rounds | None = None
     model: str = ""
     batch_price: float = 1.0
@@ -202,6 +182,8 @@ class LlmClient:
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
     money: Budget = field(init=False)
+    _refused: int = 0
+    _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
     _stopping: bool = False
 
     def __post_init__(self) -> None:
@@ -210,6 +192,11 @@ class LlmClient:
         self._wire = FORMATS[self.entry.format]
         self._own_names = frozenset({None, self.entry.id, *self.entry.aliases})
         self.money = self.budget or Budget(Ledger(self.cache, ""))  # a ledger that keeps nothing
+
+    @property
+    def sealed(self) -> bool:
+        """Whether nothing may be asked anew."""
+        return self.transport is None
 
     async def ask(self, prompt: str, slot: Slot, *, order: int = 0) -> ChatReply:
         """Return the model's reply for a slot; lower ``order`` is served first.
@@ -255,7 +242,6 @@ class LlmClient:
         self._stopping = True
         calls = self._calls
         for call in calls:
-            call.stopping = True
             # What is in flight may be charged whether or not anybody takes the answer: it goes on.
             if call.wait is not None:
                 call.task.cancel()
@@ -280,6 +266,19 @@ class LlmClient:
     def _calls(self) -> list[Call]:
         """The calls of this client that are under way."""
         return [call for call in self.under_way.values() if call.asked.driver == self.driver]
+
+    @contextmanager
+    def _waiting(
+        self, call: Call, what: str, until: datetime | None = None, *, idle: bool = False
+    ) -> Iterator[None]:
+        """Mark a call as waiting, so that it can be given up: nothing of it is in flight."""
+        if self._stopping:
+            raise CallFailed("the sweep was stopped", call.request)
+        call.wait = Wait(what, until, idle)
+        try:
+            yield
+        finally:
+            call.wait = None
 
     def _known(self, request: ChatRequest) -> ChatReply | None:
         """Return the recorded reply; a damaged one is None, and in a replay raises CallFailed."""
@@ -313,7 +312,7 @@ class LlmClient:
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
         asked = Asked(self.driver, str(request.slot), cost_usd(self.entry, worst) or 0.0)
-        call = Call(request, order, asked, worst, self._stopping)
+        call = Call(request, order, asked, worst, self.entry.deadline_s)
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call
 
@@ -330,15 +329,14 @@ class LlmClient:
         opened = self.rounds is not None and self.rounds.open_batch(call.request.key) is not None
         if opened:
             self.money.begin_anew(call.order)
-        with call.waiting("for trials before it to end, under --max-cost", idle=True):
+        with self._waiting(call, "for trials before it to end, under --max-cost", idle=True):
             await self.money.admit(call.order)
-        first = self.first
-        alone = not first.passed and not opened  # nobody waits for an answer that may take hours
+        alone = not self.passed and not opened  # nobody waits for an answer that may take hours
         if alone:
-            with call.waiting(f"for the first answer of {self.driver}"):
-                await first.alone.acquire()
-            if first.passed:  # answered meanwhile: nobody goes alone any more
-                first.alone.release()
+            with self._waiting(call, f"for the first answer of {self.driver}"):
+                await self._alone.acquire()
+            if self.passed:  # answered meanwhile: nobody goes alone any more
+                self._alone.release()
                 alone = False
         try:
             self._resume(call)
@@ -348,7 +346,7 @@ class LlmClient:
             raise
         finally:
             if alone:
-                first.alone.release()
+                self._alone.release()
 
     def _resume(self, call: Call) -> None:
         """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
@@ -370,65 +368,111 @@ class LlmClient:
 
     async def _attempts(self, call: Call) -> ChatReply:
         """Make attempts until one brings an answer, which is kept together with all of them."""
-        call.began_s = asyncio.get_running_loop().time()
-        deadline = Deadline(self.entry.deadline_s)
-
-        async def sleep(seconds: float) -> None:
-            until = datetime.now(UTC) + timedelta(seconds=seconds)
-            with call.waiting(f"after {call.last_failure}", until) as wait:
-                if seconds >= LONG_WAIT_S:
-                    line = f"{wait.who} waits until {until:%H:%M:%S} UTC {wait.what}"
-                    self.meter.notes.append(line)
-                await asyncio.sleep(seconds)
-
+        failed: list[TryAgain] = []
         try:
-            return await deadline.keep(partial(self._attempt, call, deadline), sleep=sleep)
-        except OutOfTime as exc:
-            if self.first.passed:
-                raise self._failed(call, str(exc)) from exc
-            raise ProviderDown(
-                f"{self.driver}: the first call of this run: {exc} ({call.last_failure}): run the "
-                "same command when the service answers again"
-            ) from exc
+            return await self._attempt(call)
+        except TryAgain as exc:
+            failed.append(exc)
+        # Only now, since it costs time and memory that most calls need not spend.
+        from tenacity import AsyncRetrying, retry_if_exception_type
+
+        async def next_attempt() -> ChatReply:
+            if failed:
+                raise failed.pop()
+            return await self._attempt(call)
+
+        again = AsyncRetrying(
+            retry=retry_if_exception_type(TryAgain),
+            wait=next_wait_s,
+            stop=lambda state: state.upcoming_sleep >= call.left_s,
+            sleep=partial(self._sleep, call),
+            reraise=True,
+        )
+        try:
+            return await again(next_attempt)
+        except TryAgain as exc:
+            raise self._out_of_time(call, exc.delay_s or 0.0) from exc
+
+    async def _sleep(self, call: Call, seconds: float) -> None:
+        """Wait before the next attempt of a call."""
+        call.left_s -= seconds
+        until = datetime.now(UTC) + timedelta(seconds=seconds)
+        why = f"after {call.last_failure}"
+        with self._waiting(call, why, until):
+            if seconds >= LONG_WAIT_S:
+                line = f"{self.driver}: {call.asked.slot} waits until {until:%H:%M:%S} UTC {why}"
+                self.meter.notes.append(line)
+            await asyncio.sleep(seconds)
+
+    def _out_of_time(self, call: Call, delay_s: float) -> MergeRunnerError:
+        """Return the error of a call whose deadline would pass before the next attempt."""
+        why = f"no answer within {self.entry.deadline_s:.0f} s"
+        if delay_s >= self.entry.deadline_s:
+            why = (
+                f"the server asks to wait {delay_s:.0f} s, longer than a call's deadline of "
+                f"{self.entry.deadline_s:.0f} s: run the same command again after that"
+            )
+        if self.passed:
+            return self._failed(call, why)
+        return ProviderDown(
+            f"{self.driver}: the first call of this run: {why} ({call.last_failure}): run the same "
+            "command when the service answers again"
+        )
 
     def _failed(self, call: Call, why: str) -> CallFailed:
         why = f"{self.name}: {why} ({call.last_failure}), {len(call.own_attempts)} attempts"
         return CallFailed(why, call.request, tuple(call.attempts), call.earlier)
 
-    async def _attempt(self, call: Call, deadline: Deadline) -> ChatReply:
+    async def _attempt(self, call: Call) -> ChatReply:
         """Make one attempt; return its answer, which is kept, or raise what follows from it."""
-        rounds = self.rounds
-        if rounds and (call.open or (rounds.submits and not call.singly)):
-            return await self._attempt_in_batch(call, rounds)
-        assert self.transport is not None, "a sealed client asks nothing"
-        with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-            paid = await self.money.set_aside(call.order, call.request.key, call.asked)
+        rounds, asked = self.rounds, call.asked
+        singly = rounds is None or (call.open is None and (call.singly or not rounds.submits))
+        if not singly:
+            asked = replace(asked, honest_usd=asked.honest_usd * self.batch_price)
+        who = (call.order, call.request.key, asked)
+        if call.open is None:
+            with self._waiting(call, "for calls in flight to be paid, under --max-cost", idle=True):
+                paid = await self.money.set_aside(*who)
+        else:
+            paid = self.money.going_on(*who)
         with closing(paid):
-            # A turn must be used as soon as it is given, or the limits do not hold.
-            with call.waiting("for a turn under the rate limits"):
-                # As a provider counts when it admits a request: its text, of which about four bytes
-                # make a token, and the whole output cap.
-                estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
-                settle = await self.limiter.acquire(estimate, order=call.order)
-            await paid.begin(call.attempts)
-            started_at, started = datetime.now(UTC), time.perf_counter()
-            with deadline.attempt() as seconds_left:
-                number, timeout_s = len(call.attempts) + 1, min(self.entry.timeout_s, seconds_left)
-                try:
-                    raw = await self.transport.send(
-                        call.request, attempt=number, timeout_s=timeout_s
-                    )
-                    outcome = judge(raw, self._wire)
-                except TransportFailure as exc:
-                    outcome = AttemptOutcome(exc.action, exc.outcome, str(exc), charged=exc.sent)
-            record = replace(
-                self._record(call, outcome),
-                started_at=started_at.isoformat(timespec="milliseconds"),
-                latency_s=round(time.perf_counter() - started, 4),
-            )
-            if record.usage.output_tokens is not None:
-                settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
-            return await self._concluded(call, paid, outcome, record)
+            if rounds is None or singly:
+                outcome, record = await self._send(call, paid)
+                return await self._concluded(call, paid, outcome, record)
+            with self._waiting(call, f"for batches of {self.model}", idle=True):
+                outcome, batch = await rounds.ask(call, paid, self.model)
+            call.open, call.singly = None, True
+            record, raw = self._record(call, outcome, batch.note.submitted_at), outcome.raw
+            usd = record.cost_usd and record.cost_usd * self.batch_price
+            if raw is not None and raw.status != 200 and record.usage == Usage():
+                usd = 0.0  # no line that failed is charged
+            record = replace(record, cost_usd=usd, batch_id=batch.note.batch_id or None)
+            return await self._concluded(call, paid, outcome, record, batch.error)
+
+    async def _send(self, call: Call, paid: PaidAttempt) -> tuple[AttemptOutcome, Attempt]:
+        """Make one attempt as a request of its own."""
+        assert self.transport is not None, "a sealed client asks nothing"
+        # A turn must be used as soon as it is given, or the limits do not hold.
+        with self._waiting(call, "for a turn under the rate limits"):
+            # As a provider counts when it admits a request: its text, of which about four bytes
+            # make a token, and the whole output cap.
+            estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
+            settle = await self.limiter.acquire(estimate, order=call.order)
+        await paid.begin(call.attempts)
+        began, clock_s = datetime.now(UTC), asyncio.get_running_loop().time
+        began_s, timeout_s = clock_s(), min(self.entry.timeout_s, call.left_s)
+        try:
+            number = len(call.attempts) + 1
+            raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
+            outcome = judge(raw, self._wire)
+        except TransportFailure as exc:
+            outcome = AttemptOutcome(exc.action, exc.outcome, str(exc), charged=exc.sent)
+        took_s = clock_s() - began_s
+        call.left_s -= took_s
+        record = self._record(call, outcome, began, took_s)
+        if record.usage.output_tokens is not None:
+            settle((record.usage.input_tokens or 0) + record.usage.output_tokens)
+        return outcome, record
 
     async def _concluded(
         self,
@@ -451,10 +495,9 @@ class LlmClient:
         error = error or self._error(call, outcome)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
-            if kept.attempts[-1] != record:  # an import was first
-                return self._read(kept, call.earlier)
-            text = outcome.reading.text
-            return ChatReply(text, outcome.name, kept.request, kept.attempts, call.earlier)
+            return self._read(
+                kept, call.earlier
+            )  # not what was sent here where an import was first
         if outcome.pause:
             self.limiter.pause(outcome.delay_s or backoff_s(len(call.own_attempts)))
         await paid.settle(call.attempts)  # before the error, which may end the whole run
@@ -462,103 +505,72 @@ class LlmClient:
 
     def _error(self, call: Call, outcome: AttemptOutcome) -> MergeRunnerError | None:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
-        if stop := self._end_of_run(call, outcome):
-            return stop
-        message = outcome.message or outcome.name
-        match outcome.action:
-            case "retry":
-                return TryAgain(message, outcome.delay_s)
-            case "fail":
-                return self._failed(call, "nothing that is asked again would help")
-        self.first.passed = self.first.known = True
+        driver, message = self.driver, outcome.message or outcome.name
+        if outcome.action == "refused" or not self.passed:
+            why = why_refused(self.name, self.entry, outcome)
+            self._refused += why is not None and outcome.action == "fail"
+            # An endpoint that has answered before may mean this prompt alone.
+            sure = outcome.action == "refused" or not self.known or self._refused >= SEVERAL
+            if why is not None and sure:
+                return EndpointRefused(f"{driver}: {why}")
+        # A server that is just starting is waited for, but only for seconds.
+        is_late = self.entry.deadline_s - call.left_s >= NOBODY_S
+        if outcome.name == "no_connection" and not self.passed and is_late:
+            return ProviderDown(f"{driver}: {message}: {if_nobody(self.name, self.entry)}")
+        why, delay_s = None, outcome.delay_s or 0.0
+        if outcome.action == "quota":
+            why = "the account's quota is exhausted"
+        elif outcome.pause and delay_s > self.entry.deadline_s:
+            why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
+        if why is not None:
+            later = "run the same command later to go on"
+            return QuotaExhausted(f"{driver}: {why} ({message}): {later}")
+        if outcome.action == "retry":
+            return TryAgain(message, outcome.delay_s)
+        if outcome.action == "fail":
+            return self._failed(call, "nothing that is asked again would help")
+        self.passed = self.known = True
         empty = sum(attempt.outcome == "empty" for attempt in call.own_attempts)
         if outcome.name == "empty" and self._wire.retries_empty and empty <= EMPTY_RETRIES:
             return TryAgain("empty answer")
         return None
 
-    def _end_of_run(self, call: Call, outcome: AttemptOutcome) -> SweepStopped | None:
-        """Return the error that ends a run whose other calls would fare no better."""
-        first, delay_s, why = self.first, outcome.delay_s or 0.0, None
-        if outcome.action == "refused" or not first.passed:
-            why = why_refused(self.name, self.entry, outcome)
-        if why is not None:
-            first.refused += outcome.action == "fail"
-            # An endpoint that has answered before may mean this prompt alone.
-            if first.known and outcome.action != "refused" and first.refused < SEVERAL:
-                return None
-            return EndpointRefused(f"{self.driver}: {why}")
-        if outcome.name == "no_connection" and not first.passed:
-            # A server that is just starting is waited for, but only for seconds.
-            if asyncio.get_running_loop().time() - call.began_s < NOBODY_S:
-                return None
-            what = if_nobody(self.name, self.entry)
-            return ProviderDown(f"{self.driver}: {outcome.message}: {what}")
-        if outcome.action == "quota":
-            why = "the account's quota is exhausted"
-        elif outcome.pause and delay_s > self.entry.deadline_s:
-            why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
-        else:
-            return None
-        return QuotaExhausted(
-            f"{self.driver}: {why} ({outcome.message}): run the same command later to go on"
-        )
-
-    def _record(self, call: Call, outcome: AttemptOutcome) -> Attempt:
+    def _record(
+        self, call: Call, outcome: AttemptOutcome, began: datetime, took_s: float | None = None
+    ) -> Attempt:
         """Return an attempt as it is recorded."""
-        number, raw = len(call.attempts) + 1, outcome.raw
-        if raw is None:
-            cost = None if outcome.charged and self.entry.price != "free" else 0.0
-            return Attempt(number, outcome.name, error=outcome.message, cost_usd=cost)
+        raw, reading = outcome.raw, outcome.reading
+        scripted = raw is not None and (SCRIPTED_HEADER in raw.headers or says_scripted(raw.body))
         return Attempt(
-            number=number,
+            number=len(call.attempts) + 1,
             outcome=outcome.name,
-            http_status=raw.status,
-            model_served=outcome.reading.model_served,
-            finish_reason=outcome.reading.finish_reason,
-            usage=outcome.reading.usage,
-            reply=raw.body,
+            http_status=raw.status if raw else None,
+            model_served=reading.model_served,
+            finish_reason=reading.finish_reason,
+            usage=reading.usage,
+            reply=raw.body if raw else None,
             error=outcome.message,
-            cost_usd=self._cost_usd(raw, outcome.reading.usage, call.worst),
-            scripted=SCRIPTED_HEADER in raw.headers or says_scripted(raw.body),
+            started_at=began.isoformat(timespec="milliseconds"),
+            latency_s=took_s and round(took_s, 4),
+            cost_usd=self._cost_usd(outcome, call.worst),
+            scripted=scripted,
         )
 
-    def _cost_usd(self, raw: RawReply, usage: Usage, worst: Usage) -> float | None:
-        """Return the cost of a reply by its usage, which an error may have too; None: unknown.
+    def _cost_usd(self, outcome: AttemptOutcome, worst: Usage) -> float | None:
+        """Return the cost of an attempt by its usage, which an error may have too; None: unknown.
 
         Output beyond the cap is charged even where the server does not say what was read.
         """
+        raw, usage = outcome.raw, outcome.reading.usage
         if self.entry.price == "free":
             return 0.0
+        if raw is None:
+            return None if outcome.charged else 0.0
         if usage.input_tokens and usage.output_tokens is not None:
             return cost_usd(self.entry, usage)
         if (usage.output_tokens or 0) > self.entry.max_output_tokens:
             return cost_usd(self.entry, replace(worst, output_tokens=usage.output_tokens))
-        stray = raw.status == 200 and raw.is_web_page and not self.first.known
+        stray = raw.status == 200 and raw.is_web_page and not self.known
         own = is_own_host(self.entry.provider, self.endpoint)
         charged = may_be_charged(raw, self.entry.provider if own else None)
         return None if charged and not stray else 0.0
-
-    async def _attempt_in_batch(self, call: Call, rounds: Rounds) -> ChatReply:
-        """Make one attempt as a line of a batch; see ``_attempt``."""
-        asked = replace(call.asked, honest_usd=call.asked.honest_usd * self.batch_price)
-        who = (call.order, call.request.key, asked)
-        if call.open is None:
-            with call.waiting("for calls in flight to be paid, under --max-cost", idle=True):
-                paid = await self.money.set_aside(*who)
-        else:
-            paid = self.money.going_on(*who, call.open.note.ledger)
-        with closing(paid):
-            with call.waiting(f"for batches of {self.model}", idle=True):
-                outcome, batch = await rounds.ask(call, paid, self.model)
-            call.open, call.singly = None, True
-            record, raw = self._record(call, outcome), outcome.raw
-            usd = record.cost_usd
-            if raw is not None and raw.status != 200 and record.usage == Usage():
-                usd = 0.0  # no line that failed is charged
-            record = replace(
-                record,
-                started_at=batch.note.submitted_at.isoformat(timespec="milliseconds"),
-                cost_usd=None if usd is None else usd * self.batch_price,
-                batch_id=batch.note.batch_id or None,
-            )
-            return await self._concluded(call, paid, outcome, record, batch.error)

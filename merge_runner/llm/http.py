@@ -7,10 +7,12 @@ import itertools
 import re
 import select
 import ssl
-from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping
-from contextlib import asynccontextmanager
+from base64 import b64encode
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
-from urllib.request import getproxies, proxy_bypass
+from urllib.parse import unquote, urlsplit
+from urllib.request import getproxies_environment, proxy_bypass
 from uuid import uuid4
 from weakref import WeakSet
 
@@ -18,10 +20,10 @@ import aiohttp
 import httpx
 from httpx_aiohttp import AiohttpTransport
 
-from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url, proxy_secrets
+from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.llm.formats.base import as_dict, as_dicts, as_text
+from merge_runner.llm.formats import as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import RawReply, TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
 
@@ -94,6 +96,7 @@ class HttpTransport:
         carrier: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._endpoint = endpoint
+        self._tells_slot = endpoint.is_emulator
         self._base = httpx.URL(endpoint.base_url)
         self._urls: dict[str, httpx.URL] = {}
         self._most_bytes = most_bytes
@@ -116,7 +119,7 @@ class HttpTransport:
     async def send(self, request: ChatRequest, *, attempt: int, timeout_s: float) -> RawReply:
         """Post the hashed bytes; raises TransportFailure."""
         headers = request.headers
-        if self._endpoint.is_emulator:
+        if self._tells_slot:
             slot = canonical_json(request.slot.as_dict())
             headers = {**headers, SLOT_HEADER: slot, ATTEMPT_HEADER: str(attempt)}
         body = request.body.encode()
@@ -135,29 +138,6 @@ class HttpTransport:
         """Ask for anything; raises TransportFailure."""
         async with self._exchange(method, path, headers, body, timeout_s) as (reply, _):
             return await self._read(reply, most_bytes or self._most_bytes)
-
-    async def lines(
-        self, path: str, headers: Mapping[str, str], *, timeout_s: float
-    ) -> AsyncGenerator[str | RawReply]:
-        """Get a body of lines; where the status is not 200, the whole reply instead.
-
-        No part of it may take longer than ``timeout_s``. A line of more than ``most_bytes`` is cut.
-        Raises TransportFailure.
-        """
-        loop, line = asyncio.get_running_loop(), bytearray()
-        async with self._exchange("GET", path, headers, b"", timeout_s) as (reply, limit):
-            if reply.status_code != 200:
-                yield await self._read(reply, self._most_bytes)
-                return
-            async for chunk in reply.aiter_bytes():
-                limit.reschedule(loop.time() + timeout_s)
-                *ended, last = chunk.split(b"\n")
-                for part in ended:
-                    line += part[: self._most_bytes - len(line)]
-                    yield self._text(line)
-                    line.clear()
-                line += last[: self._most_bytes - len(line)]
-            yield self._text(line)
 
     @asynccontextmanager
     async def _exchange(
@@ -270,7 +250,7 @@ class HttpTransport:
                 cookie_jar=aiohttp.DummyCookieJar(),  # one would tie independent samples together
             )
 
-        proxies = getproxies()
+        proxies = getproxies_environment()
         named = proxies.get(url.scheme) or proxies.get("all")
         proxy = None
         if named and url.host not in LOOPBACK and not proxy_bypass(url.netloc.decode()):
@@ -309,6 +289,15 @@ class Connections(aiohttp.TCPConnector):
             if not (handler.should_close or arrived.poll(0) or self._transport.one_each):
                 return connection
             connection.close()
+
+
+def proxy_secrets() -> Iterator[str]:
+    """Yield the user info of the proxies' URLs and its password, as given, decoded and as sent."""
+    for url in getproxies_environment().values():
+        with suppress(ValueError):  # it is no URL, and nothing goes there
+            info = urlsplit(url if "://" in url else f"//{url}").netloc.rpartition("@")[0]
+            for given in {info, unquote(info)}:
+                yield from (given, given.partition(":")[2], b64encode(given.encode()).decode())
 
 
 async def listed_models(endpoint: Endpoint) -> list[str]:

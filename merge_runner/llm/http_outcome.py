@@ -1,41 +1,41 @@
 """What a raw HTTP reply means: an answer, something to try again, or a reason to stop.
 
 ``judge`` says what a reply is by itself; what follows for its call and its run, the client decides.
-The loop of attempts is tenacity's. Ours are the wait, which no server can shorten, and the
-deadline.
 """
 
 from __future__ import annotations
 
-import asyncio
 import json
 import random
 import re
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from functools import cached_property
 from math import inf
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal
 from urllib.parse import urlsplit
 
 from merge_runner.config import PROVIDERS, ModelEntry
 from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.formats import PASSED_ON
-from merge_runner.llm.formats.base import Reading, ServerError, WireFormat, as_dict, read_error
+from merge_runner.llm.formats import (
+    Reading,
+    ServerError,
+    WireFormat,
+    as_dict,
+    known_delay_s,
+    known_meaning,
+    read_error,
+)
 
 if TYPE_CHECKING:
     from tenacity import RetryCallState
 
-T = TypeVar("T")
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
-NOTHING_READ = Reading("error")
 REGISTRY = "experiments/models.toml"
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
-# For how long connections may be refused at the first call of a run.
-NOBODY_S = 5.0
 # The statuses of a refusal that names the request.
 REQUEST_ITSELF = (200, 400, 413, 422, 429)
 # Azure charges for a prompt that it has looked at, also where it then refuses it.
@@ -67,19 +67,12 @@ ACTIONS: dict[str, Action] = {
     **dict.fromkeys(("server_error", "overloaded", "server_timeout"), "retry"),
 }
 
-# The seconds of a unit by its first letter; milliseconds apart.
-_UNIT_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
-# 1.574s and 5m, but also 5 minutes.
-_PART = (
-    r"(\d+(?:\.\d+)?)\s*"
-    r"(ms|milliseconds?|s|secs?|seconds?|m|mins?|minutes?|h|hrs?|hours?|d|days?)(?![a-z])"
-)
-_PARTS = re.compile(_PART, re.I)
-_IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ({_PART}(?:(?:,|\s|and)*{_PART})*)", re.I)
+_UNIT_S = {"ms": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+# 1.574s and 6m0s, but also 5 minutes.
+_PART = r"(\d+(?:\.\d+)?) ?(ms|[smhd])(?:ec|econd|in|inute|our|ay)?s?(?![a-z])"
+_IN_TEXT = re.compile(rf"(?:try again|retry) (?:in|after) ((?:{_PART} ?)+)", re.I)
 # A header that is sent several times has all its values in one, and a date has a comma of its own.
-_LISTED = re.compile(r"(?:(?:mon|tue|wed|thu|fri|sat|sun)[a-z]*,)?[^,]+", re.I)
-# A server that asks for longer means for ever, and dates end somewhere.
-MOST_S = 366 * 86400.0
+_LISTED = re.compile("[A-Z][a-z]{2}, [^,]+|[^,]+")
 
 
 @dataclass(frozen=True)
@@ -92,24 +85,22 @@ class RawReply:
 
     @cached_property
     def payload(self) -> object:
-        """The body as JSON, read once; None where it is none."""
+        """The body as JSON, read once; None where it is none.
+
+        An error is taken out of the list into which Gemini may wrap it.
+        """
         try:
             payload: object = json.loads(self.body)
         except (ValueError, RecursionError):  # the latter: nested beyond any honest reply
             return None
+        if self.status != 200 and isinstance(payload, list):
+            return payload[0] if payload else None
         return payload
 
     @cached_property
     def error(self) -> ServerError:
         """The body as an error."""
-        return read_error(self.status, self.headers, self.body, self.first)
-
-    @property
-    def first(self) -> object:
-        """The body without the list into which Gemini wraps its errors where it streams."""
-        if isinstance(self.payload, list):
-            return self.payload[0] if self.payload else None
-        return self.payload
+        return read_error(self.status, self.headers, self.body, self.payload)
 
     @property
     def is_web_page(self) -> bool:
@@ -147,7 +138,7 @@ class AttemptOutcome:
     action: Action
     name: str
     message: str | None = None
-    reading: Reading = NOTHING_READ
+    reading: Reading = Reading("error")  # noqa: RUF009 # frozen
     delay_s: float | None = None
     pause: bool = False
     of_prompt: bool = False
@@ -167,27 +158,25 @@ def may_be_charged(raw: RawReply, provider: str | None) -> bool:
     if raw.status < 500:
         return provider is None and bool(raw.error.names & CHARGED_ERRORS)
     members = PROVIDERS[provider].error_members if provider else frozenset()
-    return not members or not members <= as_dict(as_dict(raw.first).get("error")).keys()
+    return not members or not members <= as_dict(as_dict(raw.payload).get("error")).keys()
 
 
 def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     """Classify a reply by the rules of docs/reference/providers.md."""
-    if raw.status != 200:
-        outcome = judge_error(raw.error, wire)
-        # The usage that an error states is billed.
-        usage = wire.read(as_dict(raw.first)).usage
-        return replace(outcome, reading=replace(outcome.reading, usage=usage), raw=raw)
-    if not isinstance(raw.payload, dict):
+    if raw.status == 200 and not isinstance(raw.payload, dict):
         return AttemptOutcome("retry", "bad_body", "the body is not a JSON object", raw=raw)
-    reading = wire.read(raw.payload)
+    body = as_dict(raw.payload)
+    reading = wire.read(body)
+    if raw.status != 200:
+        reading = Reading("error", usage=reading.usage)  # which is billed
+        return replace(judge_error(raw.error, wire), reading=reading, raw=raw)
     if reading.outcome == "error":
         error = replace(raw.error, status=status_within(raw.error))
         return replace(judge_error(error, wire), reading=reading, raw=raw)
-    if reading.outcome == "empty":
-        parts = [raw.payload.get(name) for name in wire.members]
-        if all(part in (None, [], {}) for part in parts):
-            why = "the body has nothing of an answer"
-            return AttemptOutcome("retry", "bad_body", why, reading, raw=raw)
+    nothing: tuple[object, ...] = (None, [], {})
+    if reading.outcome == "empty" and all(body.get(name) in nothing for name in wire.members):
+        why = "the body has nothing of an answer"
+        return AttemptOutcome("retry", "bad_body", why, reading, raw=raw)
     return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)
 
 
@@ -203,62 +192,51 @@ def status_within(error: ServerError) -> int:
 
 def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
     """Classify an error, whatever was asked for."""
-    # What a format knows of an error, else what a format knows that gateways pass on.
-    told = filter(None, (each.meaning(error) for each in (wire, *PASSED_ON)))
-    name = next(told, None) or STATUSES.get(error.status, "bad_request")
+    name = wire.meaning(error) or known_meaning(error) or STATUSES.get(error.status, "bad_request")
     action = ACTIONS.get(name, "fail")
     of_prompt = name == "bad_prompt"
     return AttemptOutcome(
         action,
         "bad_request" if of_prompt else name,
         f"HTTP {error.status}: {error.message}",
-        Reading(name) if name == "refusal" else NOTHING_READ,
-        server_delay_s(error, (wire, *PASSED_ON)) if action == "retry" else None,
-        pause=action == "retry" and name == "rate_limited",
+        delay_s=server_delay_s(error, wire) if action == "retry" else None,
+        pause=name == "rate_limited",
         of_prompt=of_prompt,
     )
 
 
 def server_delay_s(
-    error: ServerError, formats: Iterable[WireFormat], now: datetime | None = None
+    error: ServerError, wire: WireFormat, now: datetime | None = None
 ) -> float | None:
     """Return the delay in s that a failed reply asks for, None if it says nothing usable.
 
     Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), a member of the
-    error that one of the ``formats`` knows, and "try again in 1.574s" or "retry after 5 minutes" in
-    the message. Of several values of a header the longest counts, and of a delay a year at most.
+    error, and "try again in 1.574s" or "retry after 5 minutes" in the message. Of several values of
+    a header the longest counts.
     """
-    in_text = _IN_TEXT.search(error.message)
+    told = _IN_TEXT.search(error.message)
+    parts = re.findall(_PART, told[1], re.I) if told else []
     candidates = (
-        _longest_s(error.headers.get("retry-after-ms", ""), 0.001, now),
-        _longest_s(error.headers.get("retry-after", ""), 1, now),
-        *(wire.delay_s(error) or 0.0 for wire in formats),
-        _duration_s(in_text[1]) if in_text else 0.0,
+        _longest_s(error.headers.get("retry-after-ms", ""), now) / 1000,
+        _longest_s(error.headers.get("retry-after", ""), now),
+        wire.delay_s(error) or known_delay_s(error) or 0.0,
+        sum(float(number) * _UNIT_S[unit.lower()] for number, unit in parts),
     )
-    return next((min(delay, MOST_S) for delay in candidates if 0 < delay < inf), None)
+    return next((delay for delay in candidates if 0 < delay < inf), None)
 
 
-def _longest_s(header: str, unit_s: float, now: datetime | None) -> float:
+def _longest_s(header: str, now: datetime | None) -> float:
     """Return the longest usable delay among the values of a header, 0 if there is none."""
     delays = [0.0]
     for text in _LISTED.findall(header):
         with suppress(ValueError):
-            delays.append(float(text) * unit_s)
+            delays.append(float(text))
             continue
         with suppress(ValueError, OverflowError):  # the latter: beyond the first or last date
             moment = parsedate_to_datetime(text)
             aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
             delays.append((aware - (now or datetime.now(UTC))).total_seconds())
     return max(delay for delay in delays if 0 <= delay < inf)
-
-
-def _duration_s(text: str) -> float:
-    """Return the seconds of ``6m0s``, ``1h30m``, ``120ms`` or ``5 minutes``."""
-    parts = [(float(number), unit.lower()) for number, unit in _PARTS.findall(text)]
-    return sum(
-        number * (0.001 if unit.startswith(("ms", "milli")) else _UNIT_S[unit[0]])
-        for number, unit in parts
-    )
 
 
 class TryAgain(MergeRunnerError):
@@ -269,83 +247,13 @@ class TryAgain(MergeRunnerError):
         self.delay_s = delay_s
 
 
-class OutOfTime(MergeRunnerError):
-    """A call's deadline would pass before the next attempt."""
-
-
 def backoff_s(attempts: int) -> float:
     """Return the wait in s after so many failed attempts, without jitter."""
     # The exponent is bounded: after a thousand attempts the power would fit in no float.
     return float(min(FIRST_BACKOFF_S * 2 ** min(attempts - 1, 10), LONGEST_BACKOFF_S))
 
 
-class Deadline:
-    """How long a call may take: its attempts and the waits between them.
-
-    The wait for a turn does not count: standing in the limiter's queue is no fault of the provider.
-    """
-
-    def __init__(self, seconds: float) -> None:
-        self._seconds = self._left_s = seconds
-
-    @contextmanager
-    def attempt(self) -> Iterator[float]:
-        """Count the time within this; yields the seconds that are left for it."""
-        loop = asyncio.get_running_loop()
-        began = loop.time()
-        try:
-            yield self._left_s
-        finally:
-            self._left_s -= loop.time() - began
-
-    async def keep(
-        self,
-        attempt: Callable[[], Awaitable[T]],
-        *,
-        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
-    ) -> T:
-        """Return the result of the first attempt that does not raise TryAgain.
-
-        The wait before the next one is the backoff, or longer where the server asks for it. Raises
-        OutOfTime where it would pass the deadline.
-        """
-        try:
-            return await attempt()
-        except TryAgain as exc:
-            failed = [exc]
-        # Only now, since it costs time and memory that most calls need not spend.
-        from tenacity import AsyncRetrying, retry_if_exception_type
-
-        async def next_attempt() -> T:
-            if failed:
-                raise failed.pop()
-            return await attempt()
-
-        async def wait(seconds: float) -> None:
-            self._left_s -= seconds
-            await sleep(seconds)
-
-        again = AsyncRetrying(
-            retry=retry_if_exception_type(TryAgain),
-            wait=_wait_s,
-            stop=lambda state: state.upcoming_sleep >= self._left_s,
-            sleep=wait,
-            reraise=True,
-        )
-        try:
-            return await again(next_attempt)
-        except TryAgain as exc:
-            # Where the server's own wish made the wait too long, that is what to tell.
-            why = f"no answer within {self._seconds:.0f} s"
-            if exc.delay_s is not None and exc.delay_s >= self._seconds:
-                why = (
-                    f"the server asks to wait {exc.delay_s:.0f} s, longer than a call's deadline "
-                    f"of {self._seconds:.0f} s: run the same command again after that"
-                )
-            raise OutOfTime(why) from exc
-
-
-def _wait_s(state: RetryCallState) -> float:
+def next_wait_s(state: RetryCallState) -> float:
     """Return the wait in s after a failed attempt: the backoff, or the server's longer one."""
     error = state.outcome.exception() if state.outcome else None
     assert isinstance(error, TryAgain)
@@ -354,20 +262,6 @@ def _wait_s(state: RetryCallState) -> float:
     return max(
         error.delay_s or 0, min(backoff_s(state.attempt_number) + jitter_s, LONGEST_BACKOFF_S)
     )
-
-
-@dataclass(slots=True)
-class FirstCall:
-    """The first live call of a run goes ``alone``: a wrong key, URL or parameter costs one call.
-
-    ``passed`` says that the endpoint has answered in this run, in its format, ``known`` that it
-    ever has; ``refused`` counts the requests that it has refused before.
-    """
-
-    passed: bool = False
-    known: bool = False
-    refused: int = 0
-    alone: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
 def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | None:

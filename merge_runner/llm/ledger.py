@@ -1,35 +1,52 @@
-"""The money of sweeps: what attempts cost, and a reservation for each whose cost is not known.
+"""The money of sweeps: what attempts cost, what is reserved, and a cap that holds over all runs.
 
 What tokens cost is told by the registry's figures, or by the table of genai-prices.
 
-Before each attempt at a paid call its worst case is reserved, in one transaction that sums what is
-spent and open. A process that dies leaves its reservations: each attempt counts with its worst case
-until a user releases it, and stands in the call's list of attempts with an unknown outcome.
+The worst case of an attempt is reserved when it queues for its turn, and durably, in one
+transaction that sums what is spent and open, right before it is sent; see PaidAttempt. A process
+that dies leaves its reservations: each attempt counts with its worst case until a user releases it,
+and stands in the call's list of attempts with an unknown outcome.
+
+So that money finishes trials instead of beginning ever more of them, a trial begins only where what
+it is expected to cost fits beside what the trials that have begun are still expected to cost.
+Expectations err, so an attempt leaves room for what older trials need, and for no younger one's:
+the oldest trial is suspended only where all the money left does not pay for a single attempt.
+
+A server may ignore the output cap. What a reply cost beyond its worst case is taken from what is
+left, and from then on the worst case is multiplied by as much as that driver's most expensive reply
+exceeded it. Several attempts are in flight only while twice their worst cases fit, so that one
+reply at most, the last one, can pass the cap.
 """
 
 from __future__ import annotations
 
+import asyncio
+import bisect
 import contextlib
 import sqlite3
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 from merge_runner.config import ModelEntry, Price
-from merge_runner.errors import CacheFailed, RecordingError, UsageError
+from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
 from merge_runner.llm.durable import BatchWriter, Connection, Operation, connect, making
 from merge_runner.records import Attempt, Usage
 
 if TYPE_CHECKING:
-    from merge_runner.llm.cache import ResponseCache
+    from merge_runner.llm.cache import CachedCall, ResponseCache
 
 FILE = "ledger.db"
 TOLERANCE_USD = 1e-9  # sums of floats
+# An older trial that has money kept for it may wait for a call of a younger one, which waits for
+# money: after this long, with nothing in flight, it is no longer counted on.
+PATIENCE_S = 90.0
 # The provider names of genai-prices where they differ from ours.
 GENAI_PRICES_PROVIDER = {"gemini": "google"}
 PER_MILLION = Decimal(1_000_000)
@@ -50,22 +67,26 @@ COMMIT;
 PRAGMA journal_mode = wal;
 PRAGMA synchronous = full; -- it survives a power cut
 """
-_SPENT = "SELECT driver, usd, overrun_usd, most_overrun FROM spent WHERE scope = ?"
-_RESERVED = "SELECT total(usd), count(*) FROM open WHERE scope = ?"
+_SPENT = "SELECT driver, usd, overrun_usd, most_overrun FROM spent WHERE scope = ?1"
+# In one statement: what is settled meanwhile is in the one or in the other sum.
+_SUMS = f"SELECT NULL, total(usd), count(*), 0 FROM open WHERE scope = ?1 UNION ALL {_SPENT}"  # noqa: S608
 _OPEN = "INSERT INTO open VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _BEGUN = """
 SELECT since FROM open WHERE call = ? AND attempt > ? AND outcome = 'in flight' ORDER BY attempt
 """
-_IN_FLIGHT = "SELECT call, attempt, driver FROM open WHERE scope = ? AND outcome = 'in flight'"
 _PAY = """
 INSERT INTO spent VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET usd = usd + excluded.usd,
 overrun_usd = overrun_usd + excluded.overrun_usd,
 most_overrun = max(most_overrun, excluded.most_overrun)
 """
+_KEEP = """
+UPDATE open SET outcome = ? WHERE rowid =
+(SELECT max(rowid) FROM open WHERE call = ? AND attempt = ?)
+"""
 _CLOSE = """
 DELETE FROM open WHERE rowid =
-(SELECT max(rowid) FROM open WHERE scope = ? AND call = ? AND attempt = ?)
-RETURNING usd, driver, slot, worst_usd, since
+(SELECT max(rowid) FROM open WHERE call = ? AND attempt = ?)
+RETURNING scope, usd, worst_usd
 """
 _REASONS = """
 SELECT driver, outcome, count(*), sum(usd), min(since), max(since), min(slot) FROM open
@@ -155,9 +176,7 @@ class LedgerFile:
     def spending(self, scope: str, ask: Callable[..., Rows]) -> Spending:
         """Return the sums of a sweep, by ``read`` or ``write``; raises UsageError for odd ones."""
         with self._told():
-            # What is reserved first: what is settled meanwhile counts twice rather than never.
-            ((reserved_usd, attempts),) = ask(_RESERVED, scope) or [(0.0, 0)]
-            spent = ask(_SPENT, scope)
+            (_, reserved_usd, attempts, _), *spent = ask(_SUMS, scope) or [(None, 0.0, 0, 0)]
             spent_usd, overrun_usd = (sum((r[column] for r in spent), 0.0) for column in (1, 2))
             if not (spent_usd >= 0 and reserved_usd >= 0):
                 raise sqlite3.IntegrityError("no sweep can have spent that")
@@ -270,12 +289,6 @@ class Ledger:
             self._money.write(_OPEN, self.scope, key, number, usd, *place)
         return True
 
-    def aside_usd(self, key: str) -> float:
-        """Return the USD reserved for the last attempt at a call; 0 where nothing is."""
-        sql = "SELECT usd FROM open WHERE scope = ? AND call = ? ORDER BY attempt DESC LIMIT 1"
-        rows = self._money.read(sql, self.scope, key)
-        return float(rows[0][0]) if rows else 0.0
-
     async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
         """Settle an attempt at a call; its reservation stays where the cost is unknown."""
         if self.scope:
@@ -283,28 +296,16 @@ class Ledger:
             self.read()
 
     def _settled(self, key: str, attempt: Attempt, driver: str) -> None:
-        place, cost_usd, over = (self.scope, key, attempt.number), attempt.cost_usd, (0.0, 0.0)
-        # It may be gone: a batch may end after its money was released.
-        for row in self._money.write(_CLOSE, *place):
-            if cost_usd is None:  # it may have been charged
-                self._money.write(_OPEN, *place, *row, attempt.outcome)
-            elif cost_usd > row[0] + TOLERANCE_USD:
-                over = (cost_usd - row[0], cost_usd / max(row[3], TOLERANCE_USD))
-        if cost_usd is not None:
-            self._money.write(_PAY, self.scope, driver, cost_usd, *over)
-
-    def settle_kept(self, drivers: Collection[str]) -> None:
-        """Settle attempts that were kept right before their run was killed.
-
-        No other run may ask these drivers meanwhile.
-        """
-        rows = self._money.read(_IN_FLIGHT, self.scope)
-        for key, number, driver in (row for row in rows if row[2] in drivers):
-            with contextlib.suppress(RecordingError):
-                entry = self.cache.get(key)
-                for attempt in entry.attempts if entry else self.cache.unanswered(key):
-                    if attempt.number == number and attempt.outcome != "unknown":
-                        self._money.run_now([partial(self._settled, key, attempt, driver)])
+        usd, over = attempt.cost_usd, (0.0, 0.0)
+        if usd is None:  # it may have been charged
+            self._money.write(_KEEP, attempt.outcome, key, attempt.number)
+            return
+        closed = self._money.write(_CLOSE, key, attempt.number)
+        # None: a user has released it. That of a line is of the sweep that has submitted its batch.
+        scope, aside_usd, honest_usd = closed[0] if closed else (self.scope, usd, usd)
+        if usd > aside_usd + TOLERANCE_USD:
+            over = (usd - aside_usd, usd / max(honest_usd, TOLERANCE_USD))
+        self._money.write(_PAY, scope, driver, usd, *over)
 
     def rows(self) -> tuple[Rows, Rows]:
         """Return the rows of what is spent and of what is open, for ``settle_share``."""
@@ -329,3 +330,215 @@ class Ledger:
         with self._money.transaction():
             self._money.write("DELETE FROM open WHERE scope = ?", self.scope)
         self.read()
+
+
+@dataclass(slots=True)
+class PaidAttempt:
+    """The money of one attempt, from its reservation to ``close``, the end of the attempt.
+
+    ``aside_usd`` is reserved in this process while it is ``queued``, and from ``begin`` on in the
+    ledger. An attempt that ends before ``begin`` (cancelled while waiting, refused by the cap)
+    gives all of it back to its trial. After ``settle`` or ``keep`` it gives back what was not
+    spent, where the cost is known. Otherwise it may have been charged: all of it stays in the
+    ledger until a user releases it.
+    """
+
+    budget: Budget
+    trial: int
+    key: str
+    asked: Asked
+    aside_usd: float
+    queued: bool = True
+    cost_usd: float | None = None
+
+    def __post_init__(self) -> None:
+        self.budget.in_flight += 1
+        self.budget.queued_usd += self.aside_usd if self.queued else 0.0
+        self.budget.charge(self.trial, self.aside_usd)
+
+    async def begin(self, attempts: Sequence[Attempt]) -> None:
+        """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
+        ledger, reserve = self.budget.ledger, partial(self.set_aside, attempts)
+        if ledger.scope and not await ledger.cache.money.writer.write(reserve):
+            raise TrialSuspended("another run spends from the same cap, and has used it up")
+        self.begun()
+
+    def set_aside(self, attempts: Sequence[Attempt]) -> bool:
+        """Do the durable part of ``begin`` in this thread; False if the cap is used up."""
+        number, cap_usd = len(attempts) + 1, self.budget.cap_usd
+        return self.budget.ledger.reserve(self.key, number, self.aside_usd, cap_usd, self.asked)
+
+    def begun(self) -> None:
+        """Count the reservation no longer here: ``set_aside`` has made it durable."""
+        self.queued = False
+        self.budget.queued_usd -= self.aside_usd
+
+    async def settle(self, attempts: Sequence[Attempt]) -> None:
+        """Settle the attempt, the last of these, which brought no answer."""
+        await self.budget.ledger.cache.put_unanswered(self.key, tuple(attempts))
+        await self._pay(attempts[-1])
+
+    async def keep(self, entry: CachedCall) -> CachedCall:
+        """Keep the answer that the attempt brought, then settle what it cost."""
+        kept = await self.budget.ledger.cache.put(entry)
+        await self._pay(entry.attempts[-1])
+        return kept
+
+    async def _pay(self, attempt: Attempt) -> None:
+        await self.budget.ledger.settle(self.key, attempt, self.asked.driver)
+        self.cost_usd = attempt.cost_usd
+
+    def close(self) -> None:
+        """Give back what the attempt, which has ended, did not spend."""
+        self.budget.in_flight -= 1
+        if self.queued:
+            self.budget.queued_usd -= self.aside_usd
+            self.cost_usd = 0.0
+        if self.cost_usd is not None:
+            self.budget.charge(self.trial, self.cost_usd - self.aside_usd)
+        self.budget.wake()
+
+
+class Budget:
+    """Spending under a cap in USD; without one nothing is refused, and all of it recorded.
+
+    A trial is named by its order in the sweep; ``trial_usd`` returns the USD that one is expected
+    to cost. ``in_flight`` counts the attempts that have money, ``queued_usd`` is reserved in this
+    process alone.
+    """
+
+    def __init__(
+        self,
+        ledger: Ledger,
+        cap_usd: float | None = None,
+        trial_usd: Callable[[int], float] = lambda _: 0.0,
+    ) -> None:
+        self.ledger = ledger
+        self.cap_usd = cap_usd
+        self.trial_usd = trial_usd
+        self.in_flight = 0
+        self.queued_usd = 0.0
+        self._largest_usd = 0.0
+        self._spent_before = ledger.spending.committed_usd > 0
+        self._charged_usd: dict[int, float] = {}  # by trial that has begun, with reservations
+        self._left: set[int] = set()
+        # The lowest place first: attempts come before trials that wait to begin, and older trials,
+        # of a lower order, before younger ones.
+        self._queue: list[tuple[tuple[bool, int], asyncio.Event]] = []
+
+    async def admit(self, trial: int) -> None:
+        """Wait until a trial may begin; raises TrialSuspended when no trial's end can let it."""
+        if self.cap_usd is not None and trial not in self._charged_usd:
+            await self._in_turn((True, trial), lambda _: self._begins(trial))
+
+    def begin_anew(self, trial: int) -> None:
+        """Admit a trial at once: it goes on where an earlier run has asked for it."""
+        if self.cap_usd is not None and trial not in self._left:
+            self._charged_usd.setdefault(trial, 0.0)
+
+    def leave(self, trial: int) -> None:
+        """Free the money of a trial that has ended or is suspended."""
+        self._left.add(trial)
+        if self._charged_usd.pop(trial, None) is not None:
+            self.wake()
+
+    async def set_aside(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
+        """Reserve an attempt's worst case, more where its server ignores the output cap.
+
+        Waits while other attempts or older trials may free money, then raises TrialSuspended. The
+        caller closes what is returned.
+        """
+        if self.cap_usd is not None:
+            await self._in_turn((False, trial), partial(self._pays, trial, asked))
+        usd = self._worst_usd(asked)
+        self._largest_usd = max(self._largest_usd, usd)
+        return PaidAttempt(self, trial, key, asked, usd)
+
+    def going_on(self, trial: int, key: str, asked: Asked) -> PaidAttempt:
+        """Return the money of an attempt that an earlier run, perhaps another sweep, has begun."""
+        sql = "SELECT usd FROM open WHERE call = ? ORDER BY attempt"
+        reserved = self.ledger.cache.money.read(sql, key)
+        aside_usd = reserved[-1][0] if reserved else 0.0  # 0: a user has released it
+        return PaidAttempt(self, trial, key, asked, aside_usd, queued=False)
+
+    def charge(self, trial: int, usd: float) -> None:
+        """Count what a trial that has begun spends or sets aside, or gives back."""
+        if trial in self._charged_usd:
+            self._charged_usd[trial] += usd
+
+    def wake(self) -> None:
+        """Let the first in the queue see whether it may go on by now."""
+        if self._queue:
+            self._queue[0][1].set()
+
+    def _begins(self, trial: int) -> bool:
+        """Begin a trial if there is money for it beside all that have begun."""
+        if trial in self._left:
+            raise TrialSuspended("its trial is suspended")
+        if trial in self._charged_usd:  # its other driver stood in the queue, too
+            return True
+        needed_usd, left_usd = self.trial_usd(trial), self._left_usd()
+        if left_usd < needed_usd and not self._charged_usd and not self.in_flight:
+            # The first one that asks begins all the same: it may cost less, and each attempt must
+            # still fit.
+            if self._spent_before or self._largest_usd:
+                raise self._suspended(f"a whole trial may cost {needed_usd:.2f} USD")
+        elif left_usd < needed_usd + self._needed_usd(self._charged_usd):
+            return False
+        self._charged_usd[trial] = 0.0
+        return True
+
+    def _pays(self, trial: int, asked: Asked, waited_s: float) -> bool:
+        """Return whether there is money for an attempt."""
+        left_usd = self._left_usd()  # reads what the worst case is by now
+        worst_usd = self._worst_usd(asked)
+        if left_usd < worst_usd and not self.in_flight:
+            raise self._suspended(f"the next call may cost {worst_usd:.4f} USD")
+        counted_on = self.in_flight or waited_s < PATIENCE_S
+        older = (each for each in self._charged_usd if each < trial and counted_on)
+        # A server that ignores the output cap is known only by its first expensive reply, when the
+        # others are sent already: all in flight may cost twice as much.
+        twice_usd = (self.in_flight + 1) * max(worst_usd, self._largest_usd)
+        return left_usd - worst_usd >= max(
+            self._needed_usd(older), twice_usd if self.in_flight else 0.0
+        )
+
+    def _worst_usd(self, asked: Asked) -> float:
+        """Return the worst case, scaled by this driver's largest observed cost overrun."""
+        return asked.honest_usd * self.ledger.spending.overruns.get(asked.driver, 1.0)
+
+    def _left_usd(self) -> float:
+        assert self.cap_usd is not None
+        return self.cap_usd - self.ledger.read().committed_usd - self.queued_usd + TOLERANCE_USD
+
+    def _needed_usd(self, trials: Iterable[int]) -> float:
+        """Return what these begun trials are still expected to cost."""
+        return sum(max(0.0, self.trial_usd(each) - self._charged_usd[each]) for each in trials)
+
+    async def _in_turn(self, place: tuple[bool, int], may_go: Callable[[float], bool]) -> None:
+        """Wait in the queue until ``may_go``, which is told for how many s this waits, is True."""
+        changed, loop = asyncio.Event(), asyncio.get_running_loop()
+        own, began_s = (place, changed), loop.time()
+        bisect.insort(self._queue, own, key=itemgetter(0))
+        try:
+            while self._queue[0] is not own or not may_go(loop.time() - began_s):
+                changed.clear()
+                # For ever it could be that an older trial waits for a call of ours, or that the run
+                # of another model, which spends under the same cap, frees money.
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(PATIENCE_S):
+                        await changed.wait()
+        finally:
+            self._queue.remove(own)
+            self.wake()
+
+    def _suspended(self, what: str) -> TrialSuspended:
+        """Return the error of a trial that cannot be paid."""
+        spending, kept_usd = self.ledger.spending, self._needed_usd(self._charged_usd)
+        reserved_usd = spending.reserved_usd + self.queued_usd
+        return TrialSuspended(
+            f"{what}, and {spending.spent_usd + reserved_usd:.4f} of {self.cap_usd:g} USD are "
+            f"spent or set aside ({spending.spent_usd:.4f} spent, {reserved_usd:.4f} set aside for "
+            f"{spending.open_attempts} attempts whose cost is not known: `merge-runner ledger`); "
+            f"{kept_usd:.4f} more are kept for the trials that have begun"
+        )

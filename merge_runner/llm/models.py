@@ -27,7 +27,6 @@ from merge_runner.text_safety import one_line
 REGISTRY = "models.toml"
 SOON_DAYS = 30
 CAP, EFFORT = "max_output_tokens", "reasoning_effort"
-HOW_TO_RECORD = "docs/how-to/record-before-shutdown.md"
 
 
 def load_models(beside: Path | None = None) -> dict[str, ModelEntry]:
@@ -82,7 +81,7 @@ def shutdown_notes(entries: Mapping[str, ModelEntry], today: date) -> Iterator[s
         if days <= 0:
             said = f"WARNING: {name} closed on {entry.shutdown}: only a recording answers for it"
         elif days <= SOON_DAYS:
-            said = f"WARNING: {closes}: record it now ({HOW_TO_RECORD})"
+            said = f"WARNING: {closes}: record it now (docs/how-to/record-before-shutdown.md)"
         else:
             said = f"note: {closes}"
         yield said + (f"; its successor is {entry.successor}" if entry.successor else "")
@@ -112,8 +111,7 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
         chosen = {**entry.parameters, **entry.efforts[str(level)]}
         return entry.model_copy(update={"parameters": chosen})
     defaults = entry.applied_defaults
-    unset = parameter not in entry.parameters
-    if unset and parameter in defaults and defaults[parameter] == level:
+    if parameter not in entry.parameters and parameter in defaults and defaults[parameter] == level:
         return entry
     places = FORMATS.require(entry.format).parameters
     takes = {*places, *PROVIDERS.require(entry.provider).parameters, *entry.parameters, CAP}
@@ -126,8 +124,6 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
     *outer, last = places.get(parameter, (parameter,))
     table = parameters
     for each in outer:
-        if not isinstance(table.get(each), dict):
-            table[each] = {}
-        table = table[each]
+        table = table.setdefault(each, {})
     table[last] = level
     return entry.model_copy(update={"parameters": parameters})

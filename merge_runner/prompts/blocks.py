@@ -2,29 +2,110 @@
 
 The paper's own wording is not public: this is a reconstruction from its description. A variant is
 the baseline without some blocks and with some others, so that it changes nothing else.
+
+Numbers have two decimals, in m, s, m/s and m/s^2, or in the unit of their name; lists are those of
+Python. What is about the other car is "not seen" while that is so, and without the unit that a
+template has behind it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import dropwhile
+from statistics import fmean
 from string import Formatter
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.prompts.fields import FIELDS, Situation
-from merge_runner.prompts.state_lines import NOT_SEEN
+from merge_runner.prompts.state_lines import LINES, NOT_SEEN
 from merge_runner.records import Observation, Road
-from merge_runner.registry import Catalogue, Registry, in_use, require
+from merge_runner.registry import Catalogue, Registry, require
 
 OUTPUT_FORMAT = "C5"
 LAST = "the end"
 TO_MERGE = "distance_to_merge"
 _UNIT_OF_NOTHING = re.compile(rf"({NOT_SEEN}) (?:m/s\^2|m/s|km/h|mph|m|s)(?![\w/^])")
+KMH_OF_MPS = 3.6
+MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What a prompt is about; ``plan`` is the rest of the last valid one, None before the first."""
+
+    seen: Observation
+    task: ScenarioConfig
+    plan: Sequence[float] | None
+
+    def of_other(self, value: float) -> str:
+        """A number about the other car, which may be out of sight."""
+        return decimal(value) if self.seen.other_seen else NOT_SEEN
+
+
+def _own_accelerations(now: Situation) -> str:
+    """The means of the world's samples over each action, the last of which ends now."""
+    values, every = now.seen.own_accelerations_mps2, now.task.action_steps
+    starts = range(len(values) % every, len(values), every)
+    return listing(values if every == 1 else [fmean(values[i : i + every]) for i in starts])
+
+
+def _other_speeds(now: Situation) -> str:
+    """One of the world's samples for each action; the last of them is one action before now."""
+    if not now.seen.other_seen:
+        return NOT_SEEN
+    values, every = now.seen.other_speeds_mps, now.task.action_steps
+    return listing(values[len(values) % every :: every])
+
+
+def _remaining_plan(now: Situation) -> str:
+    if now.plan is None:
+        return "none, this is your first decision"
+    return f"{listing(now.plan)}, one value every {now.task.action_s:g} s, next first"
+
+
+def _line(line: Callable[[Observation], str], now: Situation) -> str:
+    return line(now.seen)
+
+
+FIELDS: Mapping[str, Callable[[Situation], str]] = {
+    "vehicle_length": lambda now: f"{now.task.vehicle_length_m:g}",
+    "own_speed": lambda now: decimal(now.seen.own_speed_mps),
+    "other_speed": lambda now: now.of_other(now.seen.other_speed_mps),
+    "own_speed_kmh": lambda now: decimal(now.seen.own_speed_mps * KMH_OF_MPS),
+    "other_speed_kmh": lambda now: now.of_other(now.seen.other_speed_mps * KMH_OF_MPS),
+    "own_speed_mph": lambda now: decimal(now.seen.own_speed_mps * MPH_OF_MPS),
+    "other_speed_mph": lambda now: now.of_other(now.seen.other_speed_mps * MPH_OF_MPS),
+    # Own minus other.
+    "relative_speed": lambda now: now.of_other(now.seen.own_speed_mps - now.seen.other_speed_mps),
+    # How far the other car is ahead, negative if it is behind.
+    "relative_distance": lambda now: now.of_other(now.seen.relative_distance_m),
+    # Before the merge point alone.
+    "distance_to_merge": lambda now: decimal(now.seen.distance_to_merge_m or 0.0),
+    "own_accelerations": _own_accelerations,
+    "other_speeds": _other_speeds,
+    "remaining_plan": _remaining_plan,
+    "memory_s": lambda now: f"{now.task.memory_s:g}",
+    "horizon_s": lambda now: f"{now.task.horizon_s:g}",
+    "step_s": lambda now: f"{now.task.action_s:g}",
+    "prompt_interval_s": lambda now: f"{1 / now.task.prompt_rate_hz:g}",
+    "plan_actions": lambda now: str(now.task.plan_actions),
+    "max_acceleration": lambda now: f"{now.task.max_acceleration_mps2:g}",
+    **{name: partial(_line, line) for name, line in LINES.items()},
+}
+
+
+def decimal(value: float) -> str:
+    """Two decimals, and never a negative zero."""
+    return f"{value:.2f}".replace("-0.00", "0.00")
+
+
+def listing(values: Iterable[float]) -> str:
+    """Values as a Python list of two decimals."""
+    return f"[{', '.join([f'{value:.2f}' for value in values])}]".replace("-0.00", "0.00")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,31 +169,26 @@ def named(template: str) -> list[str]:
 _APPROACHING = """\
 You drive a car towards a merge. Two roads join at a merge point and go on as a single lane. You \
 are on one of the two roads and another car is on the other one. Neither of you has the right of \
-way. You cannot steer and you cannot communicate with the other driver: you control only the \
+way. """
+_MERGED = """\
+You drive a car on a straight road: you have passed a merge point where two roads join to a \
+single lane. Another car comes from the other road and is ahead of you or behind you. """
+_SITUATION = """\
+You cannot steer and you cannot communicate with the other driver: you control only the \
 acceleration of your own car. You are asked for a new plan every {prompt_interval_s} s.
 
 Situation now:
-- Road type: merge
-- Length of each car: {vehicle_length} m
-- Your speed: {own_speed} m/s
-- Speed of the other car: {other_speed} m/s
-- Relative distance (how far the other car is ahead of you along the road; negative if it is \
-behind): {relative_distance} m
-- Your distance to the merge point: {distance_to_merge} m"""
-
-_MERGED = """\
-You drive a car on a straight road: you have passed a merge point where two roads join to a \
-single lane. Another car comes from the other road and is ahead of you or behind you. You cannot \
-steer and you cannot communicate with the other driver: you control only the acceleration of your \
-own car. You are asked for a new plan every {prompt_interval_s} s.
-
-Situation now:
-- Road type: straight
+- Road type: ROAD
 - Length of each car: {vehicle_length} m
 - Your speed: {own_speed} m/s
 - Speed of the other car: {other_speed} m/s
 - Relative distance (how far the other car is ahead of you along the road; negative if it is \
 behind): {relative_distance} m"""
+_DISTANCE_LEFT = "\n- Your distance to the merge point: {distance_to_merge} m"
+_SITUATIONS = (
+    _APPROACHING + _SITUATION.replace("ROAD", "merge") + _DISTANCE_LEFT,
+    _MERGED + _SITUATION.replace("ROAD", "straight"),
+)
 
 
 def _tabled(situation: str) -> str:
@@ -163,7 +239,7 @@ _KMH = "In km/h: your speed is {own_speed_kmh}, the speed of the other car {othe
 _MPH = "In mph: your speed is {own_speed_mph}, the speed of the other car {other_speed_mph}"
 
 _PAPER = (
-    ("C0", "situation", _APPROACHING, _MERGED),
+    ("C0", "situation", *_SITUATIONS),
     ("C1", "history", _HISTORY, _HISTORY),
     ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
     ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
@@ -173,7 +249,6 @@ _PAPER = (
     ("C4", "tactical decision", _TACTICAL, None),
     (OUTPUT_FORMAT, "output format", _SCHEMA, _SCHEMA),
 )
-_TABLES = _tabled(_APPROACHING), _tabled(_MERGED)
 _READY = (
     ("state.projected_headway", "projected headway", _HEADWAY, None),
     ("state.time_to_merge", "times to the merge point", _TIMES, None),
@@ -181,7 +256,7 @@ _READY = (
     ("state.relative_speed", "relative speed in words", _FASTER, _FASTER),
     ("state.kmh", "speeds in km/h", _KMH, _KMH),
     ("state.mph", "speeds in mph", _MPH, _MPH),
-    ("state.table", "situation as a table, in place of C0", *_TABLES),
+    ("state.table", "situation as a table, in place of C0", *map(_tabled, _SITUATIONS)),
 )
 BLOCKS = Registry[Block]("prompt block")
 for _before, _blocks in ((None, _PAPER), ("C1", _READY)):
@@ -189,14 +264,17 @@ for _before, _blocks in ((None, _PAPER), ("C1", _READY)):
         BLOCKS.register(_name, Block(_meaning, _merge, _straight, _before))
 
 VARIANTS = Registry[Variant]("variant")
-VARIANTS.register("baseline", Variant(title="Baseline"))
-VARIANTS.register("A1", Variant(frozenset({"C1"}), title="A1 (-History)"))
-VARIANTS.register("A2", Variant(frozenset({"C2"}), title="A2 (-Prev. acc. plan)"))
-VARIANTS.register("A3", Variant(frozenset({"C3.safety"}), title="A3 (-Safety)"))
-VARIANTS.register("A4", Variant(frozenset({"C3.human"}), title="A4 (-Human)"))
-VARIANTS.register("A5", Variant(frozenset({"C3.distance"}), title="A5 (-Distance)"))
-VARIANTS.register("A6", Variant(frozenset({"C3.reassess"}), title="A6 (-Reassess)"))
-VARIANTS.register("A7", Variant(frozenset({"C4"}), title="A7 (-Tactical plan)"))
+for _name, _removed, _title in (
+    ("baseline", (), "Baseline"),
+    ("A1", ("C1",), "A1 (-History)"),
+    ("A2", ("C2",), "A2 (-Prev. acc. plan)"),
+    ("A3", ("C3.safety",), "A3 (-Safety)"),
+    ("A4", ("C3.human",), "A4 (-Human)"),
+    ("A5", ("C3.distance",), "A5 (-Distance)"),
+    ("A6", ("C3.reassess",), "A6 (-Reassess)"),
+    ("A7", ("C4",), "A7 (-Tactical plan)"),
+):
+    VARIANTS.register(_name, Variant(frozenset(_removed), title=_title))
 
 
 def title_of(variant: str) -> str:
@@ -207,17 +285,17 @@ def title_of(variant: str) -> str:
 
 def blocks_of(variant: str) -> dict[str, Block]:
     """The blocks of a variant by name, in the order of its prompt; raises UsageError."""
-    chosen = VARIANTS.require(variant)
+    chosen, known = VARIANTS.require(variant), dict(BLOCKS.items())
     if chosen.blocks:
         return dict(chosen.blocks)
     for name in sorted(chosen.removes | chosen.adds):
-        BLOCKS.require(name, f"the variant {variant} names it")
-    paper = {name: block for name, block in BLOCKS.items() if block.before is None}
+        require(known, BLOCKS.kind, name, f"the variant {variant} names it")
+    paper = {name: block for name, block in known.items() if block.before is None}
     blocks = {name: block for name, block in paper.items() if name not in chosen.removes}
     # In the order of names, which is that of no import.
     for name in sorted(chosen.adds - blocks.keys()):
-        blocks = with_block(blocks, name, BLOCKS[name])
-    return {name: BLOCKS[name] for name in blocks}
+        blocks = with_block(blocks, name, known[name])
+    return {name: known[name] for name in blocks}
 
 
 def with_block(
@@ -263,7 +341,7 @@ def render_prompt(
     ``remaining_plan`` is the unexecuted rest of the last valid plan (normalised accelerations),
     None before the first.
     """
-    template, names = _template(variant, observation.road, in_use())
+    template, names = _template(variant, observation.road, Registry.catalogue)
     now = Situation(observation, scenario, remaining_plan)
     prompt = template.format_map({name: FIELDS[name](now) for name in names})
     return prompt if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", prompt)

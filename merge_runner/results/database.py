@@ -10,7 +10,8 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -184,8 +185,7 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
 
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:
     """The rows of a result, a few at a time; its connection runs no other query until the end."""
-    while batch := result.fetchmany(ROWS_AT_ONCE):
-        yield from batch
+    return chain.from_iterable(iter(partial(result.fetchmany, ROWS_AT_ONCE), []))
 
 
 def names_of(result: duckdb.DuckDBPyConnection) -> list[str]:

@@ -1,30 +1,23 @@
-"""Every table and view as Parquet and CSV, among them one row a trial with its factors."""
+"""Rows as a table, CSV or JSON, and every table of a database as Parquet and CSV."""
 
 from __future__ import annotations
 
-import shutil
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any, TextIO
 
 import duckdb
 
 from merge_runner.errors import StoreError, UsageError
 from merge_runner.results.database import fetched, names_of, read_database, schema_sql
-from merge_runner.results.query_output import Rows, write_csv
-from merge_runner.text_safety import first_line, quoted
+from merge_runner.text_safety import csv_writer, first_line, in_spreadsheet, printable, quoted
 
-_UNITS = {
-    "mps2": "m/s²",
-    "mps": "m/s",
-    "m": "m",
-    "s": "s",
-    "usd": "USD",
-    "tokens": "tokens",
-    "at": "UTC",
-}
+Rows = Iterable[tuple[Any, ...]]
 # A column without a comment means what the first of its name does.
 _DESCRIBED = """
 WITH relations AS (
@@ -70,21 +63,16 @@ NAME = "trials_wide"
 COMMENT = "One row a trial: trials, trial_drivers, trial_metrics, and a column for each factor."
 DICTIONARY = "dictionary.csv"
 OF_A_FACTOR = "the level of a factor of the study"  # what no other table has
-HEADINGS = ["table", "column", "type", "unit", "meaning"]
+HEADINGS = ["table", "column", "type", "meaning"]
 
 
 @dataclass(frozen=True, slots=True)
 class SchemaColumn:
-    """A column, its type, and what is said of it."""
+    """A column, its type, and what is said of it; its unit is the end of its name."""
 
     name: str
     kind: str
     comment: str
-
-    @property
-    def unit(self) -> str:
-        """As the end of its name says it; empty: it has none."""
-        return _UNITS.get(self.name.rpartition("_")[2], "") if "_" in self.name else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,44 +135,37 @@ def export_tables(db: Path, folder: Path, also: Sequence[tuple[SchemaTable, Path
     Its dictionary says what each column means and, in a row without a column, each table. Raises
     UsageError where the folder is neither empty nor an earlier export's.
     """
-    _refuse_other_content(folder)
+    dictionary, first = folder / DICTIONARY, ",".join(HEADINGS).encode()
+    there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if there and not (dictionary.is_file() and dictionary.read_bytes().startswith(first)):
+        raise UsageError(f"{folder} is there and no earlier export: name another folder")
     try:
         with read_database(db) as connection:
             factors = connection.execute(FACTORS.format(only="")).fetchall()
             connection.execute(f"CREATE OR REPLACE TEMP VIEW {NAME} AS {wide_trials(factors)}")
             connection.execute(f"COMMENT ON VIEW {NAME} IS {quoted(COMMENT)}")
-            stored = described(connection)
-            known = [*stored, *(table for table, _ in also)]
+            queries = [(table, f"FROM {table.name}") for table in described(connection)]
+            queries += [(table, f"FROM read_csv({quoted(file.resolve())})") for table, file in also]
             folder.mkdir(parents=True, exist_ok=True)
-            meanings = []
-            for table in known:
-                otherwise = OF_A_FACTOR if table.name == NAME else ""
-                meanings.append((table.name, "", "", "", table.comment))
-                meanings += [
-                    (table.name, column.name, column.kind, column.unit, column.comment or otherwise)
-                    for column in table.columns
+            meanings = [
+                (table.name, *column)
+                for table, _ in queries
+                for column in [
+                    ("", "", table.comment),
+                    *((c.name, c.kind, c.comment or OF_A_FACTOR) for c in table.columns),
                 ]
-            _write_csv(folder / DICTIONARY, HEADINGS, meanings)
-            for table in stored:
-                query = f"FROM {table.name}"
-                _write_parquet(connection, folder / f"{table.name}.parquet", query)
+            ]
+            _write_csv(dictionary, HEADINGS, meanings)
+            for table, query in queries:
+                parquet = quoted((folder / f"{table.name}.parquet").resolve())
+                options = "FORMAT parquet, COMPRESSION zstd"
+                connection.execute(f"COPY ({query}) TO {parquet} ({options})")
                 result = connection.execute(query)
                 _write_csv(folder / f"{table.name}.csv", names_of(result), fetched(result))
-            for table, file in also:
-                copy = shutil.copyfile(file, folder / f"{table.name}.csv")
-                query = f"FROM read_csv({quoted(copy.resolve())})"
-                _write_parquet(connection, folder / f"{table.name}.parquet", query)
     except OSError as exc:
         raise UsageError(f"{folder} cannot be written: {exc}") from exc
     except duckdb.Error as exc:
         raise StoreError(f"{db} cannot be exported: {first_line(exc)}") from exc
-
-
-def _refuse_other_content(folder: Path) -> None:
-    there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-    dictionary, first = folder / DICTIONARY, ",".join(HEADINGS).encode()
-    if there and not (dictionary.is_file() and dictionary.read_bytes().startswith(first)):
-        raise UsageError(f"{folder} is there and no earlier export: name another folder")
 
 
 def _write_csv(path: Path, names: list[str], rows: Rows) -> None:
@@ -192,6 +173,34 @@ def _write_csv(path: Path, names: list[str], rows: Rows) -> None:
         write_csv(names, rows, out)
 
 
-def _write_parquet(connection: duckdb.DuckDBPyConnection, path: Path, query: str) -> None:
-    options = "FORMAT parquet, COMPRESSION zstd"
-    connection.execute(f"COPY ({query}) TO {quoted(path.resolve())} ({options})")
+def write_csv(names: list[str], rows: Rows, out: TextIO) -> None:
+    """Write CSV in which a spreadsheet finds no formula to run."""
+    csv_writer(out).writerows(map(in_spreadsheet, row) for row in chain((names,), rows))
+
+
+def write_json(names: list[str], rows: Rows, out: TextIO) -> None:
+    """Write an array of objects."""
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise UsageError(f"two columns are named {twice!r}: name them apart with AS")
+    before = "["
+    for row in rows:
+        record = dict(zip(names, row, strict=True))
+        text = json.dumps(record, indent=2, default=str, ensure_ascii=False)
+        out.write(f"{before}\n  " + printable(text.replace("\n", "\n  ")))
+        before = ","
+    out.write("[]\n" if before == "[" else "\n]\n")
+
+
+def write_table(names: list[str], rows: Rows, out: TextIO) -> None:
+    """Write columns as wide as their widest cell; rich would hold all rows in memory at once."""
+    widths = [0] * len(names)
+    with TemporaryFile("w+", encoding="utf-8", errors="surrogatepass") as kept:
+        for row in chain((names,), rows):
+            cells = ["" if value is None else str(value) for value in row]
+            widths = [max(width, len(cell)) for width, cell in zip(widths, cells, strict=True)]
+            kept.write(json.dumps(cells) + "\n")
+        kept.seek(0)
+        for line in kept:
+            padded = map(str.ljust, json.loads(line), widths)
+            out.write(printable("  ".join(padded).rstrip()) + "\n")

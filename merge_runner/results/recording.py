@@ -17,8 +17,9 @@ import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
-from itertools import chain, islice
+from dataclasses import asdict, dataclass
+from itertools import islice, zip_longest
+from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -28,8 +29,6 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     JsonValue,
-    TypeAdapter,
-    ValidationError,
     field_validator,
 )
 
@@ -43,7 +42,7 @@ from merge_runner.llm.content_hashes import (
     check_call,
 )
 from merge_runner.paths import refuse_another_kind
-from merge_runner.records import SIDES, ChatRequest, Slot, is_scripted
+from merge_runner.records import ChatRequest, is_scripted
 from merge_runner.results.database import Settings, append, fetched, in_memory
 from merge_runner.results.rows import Row
 from merge_runner.text_safety import first_line, one_line, quoted
@@ -70,37 +69,20 @@ COLUMNS = {
 }
 """docs/reference/recordings.md says what they mean."""
 SLOT = ("condition", "repetition", "side", "decision", "sample_set")
-HEADERS = TypeAdapter(dict[str, str])
-ROWS = TypeAdapter(list[dict[str, str]])
 # Far beyond any sweep; a file that claims more was made to do harm.
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """DuckDB hands out this many rows at once, and their texts may have this many bytes."""
 WRITTEN_AT_ONCE = 16
+SHOWN = 70
+# Misses that differ in numbers alone have one cause.
+_NUMBER = re.compile(r"-?\d+(\.\d+)?")
 SETTINGS: Settings = {
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
     "memory_limit": "1GB",  # unpacked bytes count, too
     "threads": 1,
 }
-
-
-@dataclass(slots=True)
-class Summary:
-    """A recording's contents: its calls, how many of them a mock model answered, and so on.
-
-    ``cost_usd`` is what its replies cost when they were made.
-    """
-
-    calls: int = 0
-    scripted: int = 0
-    attempts: int = 0
-    cost_usd: float = 0.0
-    models_requested: dict[str, int] = field(default_factory=dict)
-    models_served: dict[str, int] = field(default_factory=dict)
-    endpoints: dict[str, int] = field(default_factory=dict)
-    outcomes: dict[str, int] = field(default_factory=dict)
-    provenance: dict[str, str] = field(default_factory=dict)
 
 
 class RecordedSweep(BaseModel):
@@ -114,7 +96,7 @@ class RecordedSweep(BaseModel):
 
     name: str
     model: str
-    repetitions: dict[str, int]
+    repetitions: Counter[str]
     conditions: tuple[str, ...]
     sample_set: int
     arms: frozenset[str] = frozenset()
@@ -126,14 +108,6 @@ class RecordedSweep(BaseModel):
         if not isinstance(stored, list):
             return stored
         return [arm.get("label") if isinstance(arm, dict) else arm for arm in stored]
-
-    def __str__(self) -> str:
-        """As a part of a sentence."""
-        variants = ", ".join(f"{n} x {variant}" for variant, n in self.repetitions.items())
-        return one_line(
-            f"{self.name} with {self.model}: {variants} in {len(self.conditions)} conditions "
-            f"({', '.join(self.conditions)}), sample set {self.sample_set}"
-        )
 
 
 def export_recording(
@@ -217,7 +191,7 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
         for number, values in enumerate(fetched(rows), 1):
             try:
                 entry = _entry(dict(zip(COLUMNS, values, strict=True)))
-            except DAMAGED as exc:
+            except (RecordingError, *DAMAGED) as exc:
                 raise RecordingError(f"{file}: row {number} is damaged: {first_line(exc)}") from exc
             if entry.request.key in seen:
                 raise RecordingError(f"{file}: row {number} repeats {entry.request.key}")
@@ -277,24 +251,27 @@ def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
     return cache.add_missing(read_recording(file))
 
 
-def summarise(file: Path) -> Summary:
-    """Verify a recording and count what it holds."""
-    summary = Summary(provenance=read_provenance(file))
+def summarise(file: Path) -> dict[str, Any]:
+    """Verify a recording and count what it holds: its calls, by model, endpoint and outcome.
+
+    Of the calls a mock model answered ``scripted``; ``cost_usd`` is what its replies cost when they
+    were made.
+    """
+    numbers, cost_usd = Counter(calls=0, scripted=0, attempts=0), 0.0
+    names = ("models_requested", "models_served", "endpoints", "outcomes")
+    counts = {name: Counter[str]() for name in names}
+    provenance = read_provenance(file)
     for entry in read_recording(file):
         request, last = entry.request, entry.attempts[-1]
-        summary.calls += 1
-        summary.scripted += is_scripted(request, last)
-        summary.attempts += len(entry.attempts)
-        summary.cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
-        for counts, name in (
-            (summary.models_requested, request.model),
-            (summary.models_served, last.model_served or "unknown"),
-            (summary.endpoints, request.endpoint),
-            (summary.outcomes, last.outcome),
+        scripted, attempts = is_scripted(request, last), len(entry.attempts)
+        numbers.update(calls=1, scripted=scripted, attempts=attempts)
+        cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
+        served = last.model_served or "unknown"
+        for name, value in zip(
+            names, (request.model, served, request.endpoint, last.outcome), strict=True
         ):
-            counts[name] = counts.get(name, 0) + 1
-    summary.cost_usd = round(summary.cost_usd, 6)
-    return summary
+            counts[name][value] += 1
+    return {**numbers, "cost_usd": round(cost_usd, 6), **counts, "provenance": provenance}
 
 
 def _fingerprint(key: str, attempts: str) -> bytes:
@@ -310,22 +287,14 @@ def _provenance_hash(metadata: dict[str, str]) -> str:
 
 def _entry(row: dict[str, Any]) -> CachedCall:
     """Return the entry of a row, which belongs to its key; raises one of DAMAGED."""
-    if empty := [name for name, value in row.items() if value is None]:
-        raise ValueError(f"it has no {', '.join(empty)}")
-    if row["side"] not in SIDES:
-        raise ValueError(f"its side is none of {', '.join(SIDES)}")
     check_body(row["body"])
-    request = ChatRequest(
-        key=row["call_key"],
-        headers=HEADERS.validate_json(row["headers"], strict=True),
-        slot=Slot(*(row[name] for name in SLOT)),
-        **{name: row[name] for name in ("provider", "endpoint", "model", "path", "body")},
-    )
-    attempts = ATTEMPTS.validate_json(row["attempts"], strict=True)
-    if not attempts:
-        raise ValueError("it holds no reply")
-    check_call(request.key, request, attempts)
-    return CachedCall(request, attempts)
+    request = {name: row[name] for name in ("provider", "endpoint", "model", "path", "body")}
+    request |= {"key": row["call_key"], "slot": {name: row[name] for name in SLOT}}
+    request["headers"] = json.loads(row["headers"])
+    call = {"request": request, "attempts": json.loads(row["attempts"])}
+    entry = CachedCall.from_json(json.dumps({"version": 1, "entry": call}))
+    check_call(entry.request.key, entry.request, entry.attempts)
+    return entry
 
 
 @contextmanager
@@ -406,31 +375,11 @@ def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
 def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
     """Return the sweeps as a recording says itself, without those whose configuration is odd."""
     rows, sweeps = [provenance], []
-    with suppress(KeyError, ValidationError):
-        rows = ROWS.validate_json(provenance[SWEEPS])
+    with suppress(*DAMAGED):
+        rows = [*json.loads(provenance[SWEEPS])]
     for row in rows:
-        with suppress(KeyError, TypeError, ValueError, RecursionError):
-            told = {**json.loads(row["config"]), "name": row.get("name", "")}
-            sweeps.append(RecordedSweep(**told))
-    return sweeps
-
-
-def recorded_sweeps(files: Iterable[Path]) -> list[RecordedSweep]:
-    """The sweeps in recordings, less the repetitions and conditions of which no call is there.
-
-    A recording that does not say of what sweep it is has none. Raises RecordingError.
-    """
-    sweeps = []
-    for file in files:
-        with opened(file) as (connection, provenance):
-            counts = "SELECT condition, max(repetition) FROM recording GROUP BY ALL"
-            recorded = dict(connection.execute(counts).fetchall())
-        for sweep in described_sweeps(provenance):
-            conditions = tuple(name for name in sweep.conditions if name in recorded)
-            most = max((recorded[name] for name in conditions), default=0)
-            repetitions = {name: min(n, most) for name, n in sweep.repetitions.items()}
-            changes = {"conditions": conditions, "repetitions": repetitions}
-            sweeps.append(sweep.model_copy(update=changes))
+        with suppress(*DAMAGED):
+            sweeps.append(RecordedSweep(**{**json.loads(row["config"]), "name": row["name"]}))
     return sweeps
 
 
@@ -439,32 +388,104 @@ def recorded_part(
 ) -> RecordedSweep | None:
     """What recordings hold of one sweep: all that several of them, or several runs, hold of it.
 
-    It may have several ``names``.
+    It may have several ``names``. Repetitions and conditions of which no call is there are no part
+    of it. None where no recording says that it is of this sweep. Raises RecordingError.
     """
-    parts = [
-        sweep
-        for sweep in recorded_sweeps(files)
-        if sweep.name in names and (sweep.model, sweep.sample_set) == (model, sample_set)
-    ]
-    if not parts:
-        return None
-    repetitions: Counter[str] = Counter()
-    for part in parts:
-        repetitions |= Counter(part.repetitions)  # the larger number of each
-    conditions = tuple(dict.fromkeys(chain.from_iterable(part.conditions for part in parts)))
-    arms = frozenset(chain.from_iterable(part.arms for part in parts))
-    changes = {"repetitions": dict(repetitions), "conditions": conditions, "arms": arms}
-    return parts[0].model_copy(update=changes)
+    part = None
+    for file in files:
+        with opened(file) as (connection, provenance):
+            counts = "SELECT condition, max(repetition) FROM recording GROUP BY ALL"
+            recorded = dict(connection.execute(counts).fetchall())
+        for sweep in described_sweeps(provenance):
+            if sweep.name not in names or (sweep.model, sweep.sample_set) != (model, sample_set):
+                continue
+            most = max((recorded.get(name, 0) for name in sweep.conditions), default=0)
+            repetitions = Counter({name: min(n, most) for name, n in sweep.repetitions.items()})
+            conditions = tuple(name for name in sweep.conditions if name in recorded)
+            if part is not None:
+                repetitions |= part.repetitions  # the larger number of each
+                conditions = tuple(dict.fromkeys([*part.conditions, *conditions]))
+            changes = {"repetitions": repetitions, "conditions": conditions}
+            arms = sweep.arms | (part.arms if part else frozenset())
+            part = sweep.model_copy(update={**changes, "arms": arms})
+    return part
 
 
 def described(files: Sequence[Path], entries: Iterable[CachedCall]) -> str:
-    """What recordings hold; without files, what a cache holds.
-
-    ``entries`` are all their calls, which are counted where no recording says its sweep.
-    """
-    named = ", ".join(map(str, files)) or "the cache"
-    if sweeps := recorded_sweeps(files):
-        return f"{named} holds {'; '.join(map(str, sweeps))}"
+    """What recordings hold, or a cache without files: how many calls of each model."""
     models = Counter(entry.request.model for entry in entries)
     counts = ", ".join(f"{calls} calls of {model}" for model, calls in sorted(models.items()))
+    named = ", ".join(map(str, files)) or "the cache"
     return one_line(f"{named} holds {counts or 'no call at all'}")
+
+
+@dataclass(frozen=True, slots=True)
+class Miss:
+    """A call that a replay lacked, and the trial that needed it."""
+
+    trial_id: str
+    request: ChatRequest
+
+
+def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
+    """How each miss differs from the nearest request: one text for all that differ in the same way.
+
+    The text names the first trial, side and decision, and how many more there are. The nearest
+    request is one of the same slot, else one of the same place in another repetition, else any;
+    among several of one slot, the one with the fewest differences.
+    """
+    place = attrgetter("condition", "side", "decision")
+    wanted = {miss.request.slot for miss in misses}
+    known: dict[object, list[ChatRequest]] = {}  # by slot, the first by place, the first of all
+    for request in (entry.request for entry in recorded):
+        if request.slot in wanted:
+            known.setdefault(request.slot, []).append(request)
+        for key in (place(request.slot), None):
+            known.setdefault(key, [request])
+    alike: dict[str, list[tuple[Miss, str]]] = {}
+    for miss in misses:
+        keys = (miss.request.slot, place(miss.request.slot), None)
+        near = next((known[key] for key in keys if key in known), [])
+        found = min((_differences(other, miss.request) for other in near), key=len, default=[])
+        text = f"the nearest recorded request differs in {'; '.join(found)}"
+        text = text if found else "nothing is recorded at all"
+        alike.setdefault(_NUMBER.sub("0", text), []).append((miss, text))
+    lines = []
+    for group in alike.values():
+        first, text = group[0]
+        slot, trials = first.request.slot, {miss.trial_id for miss, _ in group}
+        line = f"{first.trial_id}, {slot.side}, decision {slot.decision}: {text}"
+        more = f"; {len(group)} calls of {len(trials)} trials differ like this"
+        lines.append(line + more * (len(group) > 1))
+    return lines
+
+
+def _differences(recorded: ChatRequest, wanted: ChatRequest) -> list[str]:
+    """Return the fields that differ, each with both values; of texts the first lines that do."""
+    old, new, texts = dict(_leaves(recorded)), dict(_leaves(wanted)), []
+    for name in sorted(old.keys() | new.keys()):
+        before, after = old.get(name), new.get(name)
+        if isinstance(before, str) and isinstance(after, str):
+            lines = zip_longest(before.split("\n"), after.split("\n"))
+            before, after = next((pair for pair in lines if pair[0] != pair[1]), (None, None))
+        if before != after:
+            values = ("nothing" if value is None else repr(value) for value in (before, after))
+            was, now = (v if len(v) <= SHOWN else v[:SHOWN] + "..." for v in values)
+            texts.append(f"{name} (recorded {was}, wanted {now})")
+    return texts
+
+
+def _leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
+    """The fields of a request that its key covers, each by its path."""
+    if isinstance(value, ChatRequest):
+        yield from _leaves(asdict(value.slot))
+        yield from _leaves({"endpoint": value.endpoint, "path": value.path})
+        yield from _leaves({"headers": value.headers, "body": json.loads(value.body)})
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _leaves(inner, f"{name}.{key}".lstrip("."))
+    elif isinstance(value, list):
+        for index, inner in enumerate(value):
+            yield from _leaves(inner, f"{name}[{index}]")
+    else:
+        yield name, value

@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from datetime import datetime
+from itertools import chain
 from operator import attrgetter, itemgetter
 from typing import Any
 
@@ -15,11 +17,8 @@ import duckdb
 
 from merge_runner.records import (
     Attempt,
-    ChatReply,
     ChatRequest,
-    FailedCall,
     Observation,
-    Side,
     StateRow,
     TrialRecord,
     TrialSpec,
@@ -35,11 +34,14 @@ TrialKey = tuple[str, str]
 
 SHOWN = 60
 """Characters of a value that differs."""
-AT_ONCE = 16
-"""Trials whose rows are in memory together, without their long texts."""
+AT_ONCE = 32
+"""Trials whose rows are in memory together."""
 
 _OF_THESE = (
     "SEMI JOIN (SELECT unnest(?) AS trial_id, unnest(?) AS spec_hash) USING (trial_id, spec_hash)"
+)
+_SPANS = (
+    "SELECT (trial_id, spec_hash), (min(rowid), max(rowid)) FROM {} GROUP BY trial_id, spec_hash"
 )
 FACTORS = "trial_factors"
 # What identifies a row within a trial.
@@ -49,11 +51,6 @@ PLACES: dict[str, tuple[str, ...]] = {
     "states": ("step", "side"),
     "decisions": ("decision", "side"),
     "calls": ("decision", "side", "attempt"),
-}
-# Texts of any length are compared by their hashes, so that no long text need be read.
-LONG: dict[str, tuple[str, ...]] = {
-    "decisions": ("rationale", "prompt"),
-    "calls": ("request", "reply"),
 }
 # Fields that are columns side by side; dataclasses.astuple would copy each value.
 _state = attrgetter(*(field.name for field in fields(StateRow)))
@@ -77,7 +74,11 @@ def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
         "trial_factors": list(factor_rows(spec)),
         "states": [(*key, *_state(row)) for row in record.states],
         "decisions": list(_decision_rows(record)),
-        "calls": list(_call_rows(record)),
+        "calls": [
+            call_row(key, call.request, attempt, cached=attempt.number <= call.earlier)
+            for call in record.calls
+            for attempt in call.attempts
+        ],
     }
 
 
@@ -113,32 +114,10 @@ def _told(told: Observation | None) -> Row:
     return (*of_itself, *of_the_other, list(told.other_speeds_mps))
 
 
-def _call_rows(record: TrialRecord) -> Iterator[Row]:
-    """Rows of ``calls``: every attempt of every call, including failed calls."""
-    key = (record.spec.trial_id, record.spec.spec_hash)
-    calls: list[tuple[Side, int, ChatReply | FailedCall]] = [
-        (row.side, row.number, row.decision.reply) for row in record.decisions if row.decision.reply
-    ]
-    calls += [(call.side, call.number, call) for call in record.failed_calls]
-    for side, number, call in calls:
-        for attempt in call.attempts:
-            cached = attempt.number <= call.earlier
-            yield call_row(*key, side, number, call.request, attempt, cached=cached)
-
-
-def call_row(
-    trial_id: str,
-    spec_hash: str,
-    side: Side,
-    decision: int,
-    request: ChatRequest,
-    attempt: Attempt,
-    *,
-    cached: bool,
-) -> Row:
+def call_row(key: TrialKey, request: ChatRequest, attempt: Attempt, *, cached: bool) -> Row:
     """The row of an attempt at a decision's call."""
     return (
-        *(request.key, trial_id, spec_hash, side, decision, attempt.number),
+        *(request.key, *key, request.slot.side, request.slot.decision, attempt.number),
         *(request.provider, request.model, attempt.model_served, attempt.http_status),
         *(attempt.outcome, cached),
         attempt.started_at and datetime.fromisoformat(attempt.started_at).replace(tzinfo=None),
@@ -169,42 +148,29 @@ def _as_json(attempt: Attempt) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A column that differs in ``rows`` stored rows of a trial, and the first of these rows.
+    """What differs in ``rows`` stored rows of a trial: ``name`` is TABLE.COLUMN, or the rows.
 
-    If ``column`` is None, rows are missing or superfluous.
+    ``place`` is that of the first of these rows, of which ``text`` tells.
     """
 
-    table: str
-    column: str | None
+    name: str
+    text: str
     place: dict[str, Any]
     rows: int
-    stored: object = None
-    wanted: object = None
-
-    @property
-    def name(self) -> str:
-        """The column's name with its table's."""
-        return f"{self.table}.{self.column}" if self.column else f"rows of {self.table}"
 
     def __str__(self) -> str:
         at = f" at step {self.place['step']}" if "step" in self.place else ""
         more = f", and {self.rows - 1} more in the trial" if self.rows > 1 else ""
-        if self.column is None:
-            return f"{self.name} are missing or too many{at}{more}"
-        if self.column in LONG.get(self.table, ()):
-            return f"{self.name} is not what it is replayed{more}"
-        values = ("NULL" if value is None else str(value) for value in (self.stored, self.wanted))
-        stored, wanted = (text[:SHOWN] for text in values)
-        return f"{self.name}{at} is {stored}, and {wanted} replayed{more}"
+        return f"{self.name}{at} {self.text}{more}"
 
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """Rows of one table by trial, with its columns; hashes are in place of long texts."""
+    """Rows of one table by trial, with its columns."""
 
     table: str
     names: list[str]
-    rows: dict[TrialKey, list[Row]] = field(default_factory=dict)
+    rows: dict[TrialKey, list[Row]]
 
     def named(self, key: TrialKey) -> Iterator[dict[str, Any]]:
         """The rows of a trial, each by the names of its columns."""
@@ -217,62 +183,63 @@ class Stored:
         *,
         ignored: Collection[str] = (),
         tolerance: float = 0.0,
-        part: bool = False,
     ) -> Iterator[Difference]:
-        """The differences of a trial's stored rows from the wanted ones.
-
-        ``part`` says that those are a part of the trial's rows, so that others may be stored.
-        """
-        at = [self.names.index(name) for name in PLACES[self.table]]
-        stored = self.rows.get(key, [])
+        """The differences of a trial's stored rows from the wanted ones."""
+        names, stored = PLACES[self.table], self.rows.get(key, [])
+        at = [self.names.index(name) for name in names]
         old = {tuple(row[i] for i in at): row for row in stored}
-        new = {tuple(row[i] for i in at): self._as_stored(row) for row in wanted}
-        odd = new.keys() - old.keys() if part else old.keys() ^ new.keys()
-        twice = 0 if part else len(stored) - len(old)
-        if odd or twice:
-            place = dict(zip(PLACES[self.table], min(odd or old), strict=True))
-            yield Difference(self.table, None, place, twice + len(odd))
+        new = {tuple(row[i] for i in at): row for row in wanted}
+        odd = new.keys() ^ old.keys()
+        if self.table == FACTORS:  # another study may have other ones for the same trial
+            odd -= old.keys()
+        number = len(odd) + len(stored) - len(old)
+        if number:
+            place = dict(zip(names, min(odd or old), strict=True))
+            text = "are missing or too many"
+            yield Difference(f"rows of {self.table}", text, place, number)
         common = [place for place in new if place in old and old[place] != new[place]]
         for index, name in enumerate(self.names):
             places = [p for p in common if not same_value(old[p][index], new[p][index], tolerance)]
             if places and name not in ignored:
-                place, first = dict(zip(PLACES[self.table], places[0], strict=True)), places[0]
-                values = old[first][index], new[first][index]
-                yield Difference(self.table, name, place, len(places), *values)
-
-    def _as_stored(self, row: Row) -> Row:
-        values = list(row)
-        for index in map(self.names.index, LONG.get(self.table, ())):
-            if values[index] is not None:
-                values[index] = hashlib.sha256(values[index].encode()).hexdigest()
-        return tuple(values)
+                place = dict(zip(names, places[0], strict=True))
+                values = (rows[places[0]][index] for rows in (old, new))
+                texts = ("NULL" if value is None else str(value) for value in values)
+                was, now = (text[:SHOWN] + "..." * (len(text) > SHOWN) for text in texts)
+                text = f"is {was}, and {now} replayed"
+                yield Difference(f"{self.table}.{name}", text, place, len(places))
 
 
 def stored_rows(
-    connection: duckdb.DuckDBPyConnection, table: str, keys: Sequence[TrialKey]
+    connection: duckdb.DuckDBPyConnection,
+    table: str,
+    keys: Sequence[TrialKey],
+    span: tuple[int, int] | None = None,
 ) -> Stored:
-    """The rows of these trials, with hashes in place of long texts."""
-    hashes = ", ".join(f"sha256({name}::VARCHAR) AS {name}" for name in LONG.get(table, ()))
-    columns = f"* REPLACE ({hashes})" if hashes else "*"
-    result = rows_of_trials(connection, columns, table, keys)
-    stored = Stored(table, names_of(result))
-    key = itemgetter(*map(stored.names.index, ("trial_id", "spec_hash")))
+    """The rows of these trials."""
+    result = rows_of_trials(connection, "*", table, keys, span)
+    names, rows = names_of(result), defaultdict[TrialKey, list[Row]](list)
+    key = itemgetter(*map(names.index, ("trial_id", "spec_hash")))
     for row in result.fetchall():
-        stored.rows.setdefault(key(row), []).append(row)
-    return stored
+        rows[key(row)].append(row)
+    return Stored(table, names, rows)
 
 
 def rows_of_trials(
-    connection: duckdb.DuckDBPyConnection, columns: str, table: str, keys: Sequence[TrialKey]
+    connection: duckdb.DuckDBPyConnection,
+    columns: str,
+    table: str,
+    keys: Sequence[TrialKey],
+    span: tuple[int, int] | None = None,
 ) -> duckdb.DuckDBPyConnection:
     """A query for the rows of these trials, to be fetched.
 
-    A trial's rows lie together in the table. Their place is looked up first, so that no other rows
-    are read.
+    A trial's rows lie together in the table. Their place, the ``span`` of their row ids, is looked
+    up first, so that no other rows are read.
     """
     names = [[key[0] for key in keys], [key[1] for key in keys]]
-    sql = f"SELECT min(rowid), max(rowid) FROM {table} {_OF_THESE}"  # noqa: S608 # constants
-    (span,) = connection.execute(sql, names).fetchall()
+    if span is None:
+        sql = f"SELECT min(rowid), max(rowid) FROM {table} {_OF_THESE}"  # noqa: S608 # constants
+        (span,) = connection.execute(sql, names).fetchall()
     return connection.execute(
         f"SELECT {columns} FROM {table} {_OF_THESE} WHERE rowid BETWEEN ? AND ?",  # noqa: S608 # constants
         [*names, *span],
@@ -286,11 +253,15 @@ def in_order(
 
     The rows of a few are read at once, which are one stretch of each table.
     """
-    rows = connection.execute("SELECT trial_id, spec_hash FROM trials ORDER BY rowid").fetchall()
-    stored = [key for key in rows if key in keys]
+    spans: dict[str, dict[TrialKey, tuple[int, int]]] = {
+        table: dict(connection.execute(_SPANS.format(table)).fetchall()) for table in PLACES
+    }
+    stored = sorted(keys & spans["trials"].keys(), key=spans["trials"].__getitem__)
     for first in range(0, len(stored), AT_ONCE):
-        some = stored[first : first + AT_ONCE]
-        tables = {table: stored_rows(connection, table, some) for table in PLACES}
+        some, tables = stored[first : first + AT_ONCE], {}
+        for table, of_trials in spans.items():
+            ends = [*chain.from_iterable(of_trials.get(key, ()) for key in some)] or [0]
+            tables[table] = stored_rows(connection, table, some, (min(ends), max(ends)))
         yield from ((key, tables) for key in some)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -20,6 +20,7 @@ from merge_runner.errors import UsageError, unknown_name
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.registry import require
 from merge_runner.results.database import (
+    PATIENCE_S,
     SCHEMA_VERSION,
     SETTINGS,
     Instance,
@@ -54,11 +55,11 @@ from merge_runner.served_model import other_models
 OF_A_RUN = frozenset({"cached", "started_at", "latency_s"})
 FACTS = Path(__file__).with_name("facts.sql")
 SWEEPS = "FROM sweeps ORDER BY started_at"
-# The trials of some sweeps; those that other sweeps have, too, stay.
+# The trials of some sweeps that no other one has.
 GOING = """
 CREATE OR REPLACE TEMP TABLE going AS
-SELECT trial_id, spec_hash, bool_and(list_contains($ids, sweep_id)) AS goes FROM sweep_trials
-GROUP BY ALL HAVING bool_or(list_contains($ids, sweep_id))
+SELECT trial_id, spec_hash FROM sweep_trials
+GROUP BY ALL HAVING bool_and(list_contains(?, sweep_id))
 """
 # By their slots.
 CALLS_OF = """
@@ -160,34 +161,40 @@ class Store:
             return connection.execute(sql, [list(spec_hashes)]).fetchall()
 
     def write(
-        self, sweep_id: str, records: Sequence[TrialRecord], *, patience_s: float
+        self,
+        sweep_id: str | None,
+        records: Sequence[TrialRecord],
+        specs: Mapping[str, str] | None = None,
+        *,
+        patience_s: float = PATIENCE_S,
     ) -> dict[str, list[str]]:
-        """Store whole trials and link them to a sweep; one already stored is compared instead.
+        """Store whole trials, replacing failed ones; those that had ended are compared instead.
 
-        Returns the ids of those that are stored with other values, and in which columns.
+        They are linked to a sweep, unless they were recorded elsewhere. Returns the ids of those
+        that are stored with other values, and in which columns.
         """
         # Made before the lock is taken, although a trial that is stored already needs none.
-        played = [(record, rows_of(record)) for record in records]
+        played = [(_key(record), record.status, rows_of(record)) for record in records]
         with write_database(self.path, patience_s) as connection:
             merge_small_groups(connection)
-            _, differing = _add_trials(connection, played)
-            keys = map(_key, records)
-            append(connection, "sweep_trials", ((sweep_id, *key) for key in keys))
+            _add_specs(connection, specs or {})
+            differing = _add_trials(connection, played)
+            if sweep_id is not None:
+                append(connection, "sweep_trials", ((sweep_id, *key) for key, *_ in played))
             return differing
 
     def add_recorded(
-        self, records: Sequence[TrialRecord], specs: dict[str, str]
+        self, records: Sequence[TrialRecord], specs: Mapping[str, str]
     ) -> tuple[int, int, list[str]]:
         """Store recorded trials, which belong to no sweep; one already stored stays as it is.
 
         Returns how many were added, how many were stored already, and the ids of those that are
         stored with other values.
         """
-        played = [(record, rows_of(record)) for record in records]
-        with write_database(self.path) as connection:
-            _add_specs(connection, specs)
-            added, differing = _add_trials(connection, played)
-            return added, len(records) - added - len(differing), list(differing)
+        keys = {*map(_key, records)}
+        added = len(keys - self.ended_trials(keys))
+        differing = list(self.write(None, records, specs))
+        return added, len(records) - added - len(differing), differing
 
 
 def query(path: Path, sql: str) -> tuple[list[str], list[tuple[Any, ...]]]:
@@ -228,9 +235,12 @@ def answering(
         "SET temp_directory = ''; SET enable_external_access = false; "
         "SET disabled_filesystems = 'LocalFileSystem'; SET lock_configuration = true"
     )
+    kinds = duckdb.StatementType
     try:
         statements = connection.extract_statements(sql)
-        if len(statements) != 1 or not _reads(statements[0]):
+        # A PIVOT consists of several.
+        reading = (kinds.SELECT, kinds.EXPLAIN, kinds.MULTI)
+        if [each.type in reading for each in statements] != [True]:
             raise UsageError(
                 "one query at a time, and one that only reads: SELECT, FROM, WITH, VALUES, "
                 "PIVOT, SUMMARIZE, DESCRIBE, SHOW or EXPLAIN"
@@ -244,18 +254,8 @@ def answering(
             f"the query needs more than the {SETTINGS['memory_limit']} of memory that it may use: "
             "ask for fewer rows or columns at once; requests and replies are long"
         ) from exc
-    except duckdb.Error as exc:
-        hint = "; cast times with a zone, as in now()::TIMESTAMP" if "pytz" in str(exc) else ""
-        raise UsageError(f"the query failed: {exc}{hint}") from exc
-
-
-def _reads(statement: duckdb.Statement) -> bool:
-    """Whether a statement is a query; a PIVOT consists of several."""
-    kinds = duckdb.StatementType
-    try:
-        return statement.type in (kinds.SELECT, kinds.EXPLAIN, kinds.MULTI)
-    except ValueError:  # a kind that the client library does not know
-        return False
+    except (duckdb.Error, ValueError) as exc:  # or a kind of statement that the client knows not
+        raise UsageError(f"the query failed: {exc}") from exc
 
 
 def results_digest(path: Path) -> tuple[str, int]:
@@ -336,21 +336,18 @@ def to_forget(db: Path, patterns: Sequence[str]) -> tuple[list[str], str]:
             if not matching:
                 raise unknown_name("sweep", pattern, known, f"in {db}; * stands for anything")
             ids += [sweep_id for sweep_id in matching if sweep_id not in ids]
-        connection.execute(GOING, {"ids": ids})
-        counts = "SELECT count(*) FILTER (goes), count(*) FILTER (NOT goes) FROM going"
-        ((trials, staying),) = connection.execute(counts).fetchall()
-    also = f"; {staying} trials that other sweeps have, too, stay" if staying else ""
-    return ids, f"{len(ids)} sweeps ({', '.join(ids)}) and {trials} trials{also}"
+        connection.execute(GOING, [ids])
+        ((trials,),) = connection.execute("SELECT count(*) FROM going").fetchall()
+    return ids, f"{len(ids)} sweeps ({', '.join(ids)}) and the {trials} trials of no other one"
 
 
 def forget(db: Path, ids: Sequence[str]) -> None:
     """Remove sweeps, their trials, and the specs that no trial is left of; see ``to_forget``."""
     with write_database(db) as connection:
-        connection.execute(GOING, {"ids": ids})
+        connection.execute(GOING, [ids])
         for table in PLACES:
             connection.execute(
-                f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN "  # noqa: S608 # our tables
-                "(SELECT trial_id, spec_hash FROM going WHERE goes)"
+                f"DELETE FROM {table} WHERE (trial_id, spec_hash) IN (FROM going)"  # noqa: S608 # our tables
             )
         for table in ("sweep_trials", "sweeps"):
             connection.execute(f"DELETE FROM {table} WHERE list_contains(?, sweep_id)", [ids])  # noqa: S608 # our tables
@@ -367,7 +364,7 @@ def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> 
     append(connection, "trial_factors", (row for row in rows if row[:3] not in there))
 
 
-def _add_specs(connection: duckdb.DuckDBPyConnection, specs: dict[str, str]) -> None:
+def _add_specs(connection: duckdb.DuckDBPyConnection, specs: Mapping[str, str]) -> None:
     sql = "INSERT OR IGNORE INTO specs SELECT unnest(?), unnest(?)"
     connection.execute(sql, [list(specs), list(specs.values())])
 
@@ -394,21 +391,20 @@ def _ended(connection: duckdb.DuckDBPyConnection, keys: Sequence[TrialKey]) -> d
 
 
 def _add_trials(
-    connection: duckdb.DuckDBPyConnection, played: list[tuple[TrialRecord, dict[str, list[Row]]]]
-) -> tuple[int, dict[str, list[str]]]:
+    connection: duckdb.DuckDBPyConnection,
+    played: Sequence[tuple[TrialKey, str, dict[str, list[Row]]]],
+) -> dict[str, list[str]]:
     """Store whole trials, replacing failed ones; compare those that had ended before.
 
-    Returns how many were stored, and the ids of those that had been stored with other values, each
-    with the columns that differ.
+    Returns the ids of those that had been stored with other values, with the columns that differ.
     """
-    stored = _ended(connection, [_key(record) for record, _ in played])
+    stored = _ended(connection, [key for key, *_ in played])
     new: dict[TrialKey, dict[str, list[Row]]] = {}
     again: dict[TrialKey, dict[str, list[Row]]] = {}
-    for record, rows in played:
-        key = _key(record)
+    for key, status, rows in played:
         if not stored.get(key) and key not in new:
             new[key] = rows
-        elif record.status != "failed":
+        elif status != "failed":
             again[key] = rows
     for table in PLACES:
         for key in new.keys() & stored.keys():
@@ -425,4 +421,4 @@ def _add_trials(
         for key, rows in again.items():
             for difference in there.differences(key, rows[table], ignored=OF_A_RUN):
                 differing.setdefault(key[0], []).append(difference.name)
-    return len(new), differing
+    return differing

@@ -6,32 +6,30 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
 from resource import RLIM_INFINITY, RLIMIT_NOFILE, getrlimit, setrlimit
+from typing import TYPE_CHECKING
 
 from merge_runner.config import (
-    driver_name,
     rehearsal_endpoint,
     resolve_endpoint,
 )
-from merge_runner.emulator import Behaviour
 from merge_runner.errors import UsageError
 from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http_outcome import FirstCall
-from merge_runner.llm.ledger import Ledger, cost_usd
+from merge_runner.llm.ledger import Budget, Ledger, cost_usd
 from merge_runner.llm.limiter import WINDOW_S, Limiter, Pause
 from merge_runner.llm.models import load_models
 from merge_runner.records import Usage
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.plan import Options, Plan
 
+if TYPE_CHECKING:
+    from merge_runner.llm.http import HttpTransport
+
 # Time in a rehearsal: answers come so much sooner, and the limits of a minute hold within less.
 SPEED = 10
-# The share of attempts in which something goes wrong, as with providers.
-RATES = {"rate_limit": 0.01, "server_error": 0.005, "overloaded": 0.005, "malformed": 0.005}
 # For the database, the cache, the log and what libraries open for themselves.
 SPARE_FILES = 64
 
@@ -46,7 +44,6 @@ def sealed_clients(plan: Plan, cache: ResponseCache) -> dict[str, LlmClient]:
             cache=cache,
             transport=None,
             limiter=Limiter(),
-            sealed=True,
         )
         for name, entry in plan.entries.items()
     }
@@ -72,68 +69,27 @@ def live_clients(
     registered model go on from earlier clients, and get those that are made. Raises UsageError
     where a key is missing, or a cap could not be enforced.
     """
-    from merge_runner.llm.http import HttpTransport
-
-    for name, entry in plan.entries.items():
-        unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
-        if options.max_cost_usd is not None and unknown:
-            raise UsageError(
-                f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
-                "experiments/models.toml"
-            )
-    if any(entry.price != "free" for entry in plan.entries.values()):
-        ledger.read()  # raises where it is damaged, before anything is spent
-        ledger.settle_kept({driver_name(name, plan.endpoints[name]) for name in plan.entries})
-    costs = trial_costs(plan, earlier, batch=options.batch)
-    budget = Budget(ledger, options.max_cost_usd, costs)
-    # 1,024 by default, and a connection is a file: thousands in flight would fail one by one.
-    wanted, (soft, hard) = options.connections + SPARE_FILES, getrlimit(RLIMIT_NOFILE)
-    try:
-        if wanted > soft != RLIM_INFINITY:
-            setrlimit(RLIMIT_NOFILE, (wanted, hard))
-    except ValueError as exc:
-        raise UsageError(
-            f"{wanted} connections exceed this system's limit of {hard} open files: choose a lower "
-            "--in-flight or raise `ulimit -n`"
-        ) from exc
-    env = {**os.environ, **(urls or {})}
-    in_process = None
-    if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
-        from merge_runner.emulator.handler import Emulator
-
-        in_process = Emulator(_behaviour(plan)).transport()
+    _check_money(plan, options, ledger)
+    _allow_files(options.connections + SPARE_FILES)
+    connect = _connections(plan, options, {**os.environ, **(urls or {})}, rounds)
     limiters = {} if limiters is None else limiters
     # Models at one endpoint share its pauses: a server that is overloaded is so for all of them.
     pauses = {endpoint: Pause() for endpoint in plan.endpoints.values()}
-    transports: dict[str, HttpTransport] = {}
-    clients: dict[str, LlmClient] = {}
+    transports = {}
+    # Connections and limits are those of a model, with whatever parameters it is asked.
+    for model, name in {plan.registered[name]: name for name in plan.entries}.items():
+        transports[model] = connect(name)
+        stack.push_async_callback(transports[model].close)
+        rates = options.rates(plan.entries[name])
+        rpm, tpm = (limit and max(1, int(limit * share)) for limit in rates)
+        window_s = WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S
+        limiter = Limiter(rpm=rpm, tpm=tpm, pause=pauses[plan.endpoints[name]], window_s=window_s)
+        limiters.setdefault(model, limiter)
+    budget = Budget(ledger, options.max_cost_usd, trial_costs(plan, earlier, batch=options.batch))
     under_way: dict[str, Call] = {}  # two names of one model may ask the same
+    clients = {}
     for name, entry in plan.entries.items():
         model, terms = plan.registered[name], batch_terms(entry)
-        if model not in transports:
-            if plan.is_rehearsal:
-                endpoint = rehearsal_endpoint(entry)
-            else:
-                endpoint = resolve_endpoint(name, entry, env)
-            transports[model] = HttpTransport(
-                endpoint,
-                connections=options.connections,
-                most_bytes=int(entry.max_reply_mb * 1e6),
-                carrier=in_process if endpoint.is_emulator else None,
-            )
-            stack.push_async_callback(transports[model].close)
-            # An account's limits are those of a model, with whatever parameters it is asked.
-            rpm, tpm = (limit and max(1, int(limit * share)) for limit in options.rates(entry))
-            limiter = Limiter(
-                rpm=rpm,
-                tpm=tpm,
-                pause=pauses[plan.endpoints[name]],
-                window_s=WINDOW_S / SPEED if plan.is_rehearsal else WINDOW_S,
-            )
-            limiters.setdefault(model, limiter)
-            if rounds is not None and terms is not None:
-                service = SERVICES[entry.format]
-                rounds.services[model] = service(transports[model], endpoint, FORMATS[entry.format])
         clients[name] = LlmClient(
             name=name,
             entry=entry,
@@ -143,11 +99,9 @@ def live_clients(
             limiter=limiters[model],
             budget=None if entry.price == "free" else budget,
             strict=options.strict_model,
-            first=FirstCall(
-                # A round is asked at once: no call of it waits for another one's answer.
-                passed=rounds is not None and rounds.submits,
-                known=name in earlier,
-            ),
+            # A round is asked at once: no call of it waits for another one's answer.
+            passed=rounds is not None and rounds.submits,
+            known=name in earlier,
             rounds=rounds if terms else None,
             model=model,
             batch_price=terms.price_factor if terms else 1.0,
@@ -156,17 +110,69 @@ def live_clients(
     return clients
 
 
-def _behaviour(plan: Plan) -> Behaviour:
-    """How the emulator answers, in a rehearsal in the place of a plan's one model."""
-    if not plan.is_rehearsal:
-        return Behaviour()
-    entry = next(iter(plan.entries.values()))  # the others differ in parameters alone
-    return Behaviour(
-        rates=RATES,
-        latency_s=entry.typical_latency_s / SPEED,
-        delay_s=1.0,
-        output_tokens=entry.typical_output_tokens,
-    )
+def _connections(
+    plan: Plan, options: Options, env: Mapping[str, str], rounds: Rounds | None
+) -> Callable[[str], HttpTransport]:
+    """Return what connects to a model's endpoint, and tells the rounds of its batch mode.
+
+    The emulator answers in this process unless it has a URL.
+    """
+    from merge_runner.llm.http import HttpTransport
+
+    in_process = None
+    if plan.is_rehearsal or (plan.scripted and not env.get("EMULATOR_BASE_URL")):
+        from merge_runner.emulator.handler import Emulator
+
+        emulator = Emulator()
+        if plan.is_rehearsal:  # of one model, whose entries differ in parameters alone
+            entry = next(iter(plan.entries.values()))
+            emulator = Emulator(entry.typical_latency_s / SPEED, entry.typical_output_tokens)
+        in_process = emulator.transport()
+
+    def connect(name: str) -> HttpTransport:
+        entry = plan.entries[name]
+        if plan.is_rehearsal:
+            endpoint = rehearsal_endpoint(entry)
+        else:
+            endpoint = resolve_endpoint(name, entry, env)
+        transport = HttpTransport(
+            endpoint,
+            connections=options.connections,
+            most_bytes=int(entry.max_reply_mb * 1e6),
+            carrier=in_process if endpoint.is_emulator else None,
+        )
+        if rounds is not None and batch_terms(entry) is not None:
+            service = SERVICES[entry.format](transport, endpoint, FORMATS[entry.format])
+            rounds.services[plan.registered[name]] = service
+        return transport
+
+    return connect
+
+
+def _check_money(plan: Plan, options: Options, ledger: Ledger) -> None:
+    """Raise UsageError where a price is unknown under a cap, or what is spent is damaged."""
+    for name, entry in plan.entries.items():
+        unknown = cost_usd(entry, Usage(input_tokens=1, output_tokens=1)) is None
+        if options.max_cost_usd is not None and unknown:
+            raise UsageError(
+                f"the price of {name} is unknown, so --max-cost cannot hold: give it a price in "
+                "experiments/models.toml"
+            )
+    if any(entry.price != "free" for entry in plan.entries.values()):
+        ledger.read()
+
+
+def _allow_files(number: int) -> None:
+    """Let this process open so many files, since a connection is one: by default it may 1,024."""
+    soft, hard = getrlimit(RLIMIT_NOFILE)
+    try:
+        if number > soft != RLIM_INFINITY:
+            setrlimit(RLIMIT_NOFILE, (number, hard))
+    except ValueError as exc:
+        raise UsageError(
+            f"{number} connections exceed this system's limit of {hard} open files: choose a lower "
+            "--in-flight or raise `ulimit -n`"
+        ) from exc
 
 
 def open_rounds(
@@ -190,9 +196,6 @@ def check_batches(plan: Plan, options: Options) -> None:
         return
     if options.replay or options.dask is not None or not plan.entries:
         raise UsageError("--batch asks models from this process: leave it, --replay or --dask out")
-    runs = os.environ.get("EMULATOR_BASE_URL")
-    if not runs and any(entry.provider == "emulator" for entry in plan.entries.values()):
-        raise UsageError("the emulator has no batch mode: leave --batch out")
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         require_batch(plan.registered[name], entry, registry)

@@ -262,9 +262,9 @@ class DaskTasks:
     async def play(self, specs: Iterable[TrialSpec], ended: Ended, room: Room) -> None:
         """Play trials in order; an error raised by ``ended`` or at a worker ends the run."""
         self._ended = ended
-        groups: dict[tuple[object, ...], list[TrialSpec]] = {}
+        groups: dict[tuple[str, int], list[TrialSpec]] = {}
         for spec in specs:  # trials that may ask the same go together, so that one worker asks
-            groups.setdefault((spec.condition, spec.repetition, spec.sample_set), []).append(spec)
+            groups.setdefault((spec.condition, spec.repetition), []).append(spec)
         self._groups.extend(groups.values())
         try:
             while self._groups or self._given:
@@ -358,9 +358,6 @@ class DaskTasks:
         for address in [address for address, (_, work) in self._given.items() if work.done()]:
             task, work = self._given.pop(address)
             played = work.result()[address]
-            if isinstance(played, ImportError):
-                why = f"it cannot load merge-runner ({played}): install the same one for all"
-                played = Played(error=UsageError(why))
             if not isinstance(played, Played):
                 self._lose(task, address, played)
                 continue
@@ -393,7 +390,8 @@ class DaskTasks:
         if self._losses[task.specs[0].order] == MOST_LOSSES:
             raise SweepStopped(
                 f"a task was begun on {MOST_LOSSES} Dask workers, and all died ({error!r}). Look "
-                "at their memory and their logs; run the same command again to go on"
+                "whether they have the same merge-runner, at their memory and their logs; run the "
+                "same command again to go on"
             )
         self._groups.appendleft([*task.specs])
         lost = f"the worker {address} is lost: its {len(task.specs)} trials go to others"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from statistics import fmean
 
-from merge_runner.config import ModelEntry, driver_name
+from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.content_hashes import canonical_json, without_prompt
@@ -16,7 +16,7 @@ from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import cost_usd
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import Usage, is_scripted
-from merge_runner.run.plan import Options, Plan, most_prompts, usual_prompts
+from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
@@ -48,34 +48,23 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
             tokens = answers[name]
             if like[name] == asked and own and read is not None and written is not None:
                 tokens.append((read, written))
-    return {name: _mean(tokens) for name, tokens in answers.items()}
-
-
-def _mean(tokens: Collection[tuple[int, int]]) -> Usage | None:
-    if not tokens:
-        return None
-    read, written = (round(fmean(column)) for column in zip(*tokens, strict=True))
-    return Usage(input_tokens=read, output_tokens=written)
-
-
-@dataclass(frozen=True, slots=True)
-class BatchEstimate:
-    """What a run costs in batches in USD (None: unknown), in how many rounds, usually and at most.
-
-    A round takes as long as its slowest batch.
-    """
-
-    cost_usd: float | None
-    rounds: int
-    most_rounds: int
+    return {
+        name: Usage(
+            input_tokens=round(fmean(read for read, _ in tokens)),
+            output_tokens=round(fmean(written for _, written in tokens)),
+        )
+        if tokens
+        else None
+        for name, tokens in answers.items()
+    }
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """A live run's drivers, trials, calls, tokens, USD (None: a price is unknown) and minutes.
 
-    ``measured`` lists the drivers whose tokens are those of their earlier answers. ``batch`` is
-    what the same takes in batches, where the run is to use them.
+    They are ``measured`` where tokens are those of earlier answers. Calls that are asked singly
+    cost ``singly_usd``; in batches they cost less, and take so many ``rounds`` in place of minutes.
     """
 
     driver: str
@@ -84,59 +73,11 @@ class Estimate:
     input_tokens: int
     output_tokens: int
     cost_usd: float | None
+    singly_usd: float | None
     minutes: float
+    rounds: int
     free: bool
-    measured: list[str]
-    batch: BatchEstimate | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Calls:
-    """The calls of a model in an arm: what each takes, as measured or as listed in the registry.
-
-    In batches a model costs ``price_factor`` of its price.
-    """
-
-    model: str
-    entry: ModelEntry
-    number: int
-    usage: Usage
-    price_factor: float
-
-    @classmethod
-    def of(
-        cls, plan: Plan, arm: Arm, name: str, number: int, facts: Mapping[str, Usage | None]
-    ) -> _Calls:
-        """Return so many calls of a model."""
-        entry = arm.entries[name]
-        usage = facts.get(name) or Usage(
-            # English has about 4 bytes a token.
-            input_tokens=len(typical_prompt(plan, arm).encode()) // 4,
-            output_tokens=entry.typical_output_tokens,
-        )
-        terms = batch_terms(entry)
-        factor = terms.price_factor if terms else 1.0
-        return cls(plan.registered[name], entry, number, usage, factor)
-
-    def cost_usd(self, *, batch: bool = False) -> float | None:
-        """Return what they cost together; None where the price is unknown."""
-        usd = cost_usd(self.entry, self.usage)
-        return usd and usd * self.number * (self.price_factor if batch else 1.0)
-
-    def limited_s(self, options: Options) -> float:
-        """Return how long the limits stretch the calls, in s.
-
-        Within a minute's window a call counts with its output cap until its reply is in, and with
-        its actual tokens from then on.
-        """
-        rpm, tpm = options.rates(self.entry)
-        waiting = min(self.entry.typical_latency_s / 60, 1.0)
-        written = waiting * self.entry.max_output_tokens
-        written += (1 - waiting) * (self.usage.output_tokens or 0)
-        tokens = (self.usage.input_tokens or 0) + written
-        return max(
-            60 * self.number / (rpm or math.inf), 60 * self.number * tokens / (tpm or math.inf)
-        )
+    measured: bool
 
 
 def estimate(
@@ -152,42 +93,39 @@ def estimate(
     ``calls`` is roughly how many each model has yet to answer, by arm. ``facts`` is what the cache
     knows about each model's earlier answers to similar requests at its endpoint.
     """
-    todo = [
-        _Calls.of(plan, arm, name, round(calls[label][name]), facts)
-        for label, arm in plan.by_label().items()
-        for name in arm.entries
-    ]
-
-    def together_usd(*, batch: bool = False) -> float | None:
-        costs = [each.cost_usd(batch=batch) for each in todo]
-        return None if None in costs else round(sum(filter(None, costs)), 2)
-
-    batch = None
-    if options.batch:
-        batch = BatchEstimate(
-            together_usd(batch=True),
-            rounds=max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0),
-            most_rounds=max(map(most_prompts, plan.arms), default=0),
-        )
-    at_once, minutes = min(options.connections, 2 * max(trials, 1)), 0.0
-    for model in {each.model for each in todo}:
-        own = [each for each in todo if each.model == model]
-        in_turn_s = (
-            math.ceil(sum(each.number for each in own) / at_once) * own[0].entry.typical_latency_s
-        )
-        limited_s = sum(each.limited_s(options) for each in own)
-        minutes = max(minutes, round(max(in_turn_s, limited_s) / 60, 1))
+    number = read = written = 0
+    usd = singly_usd = 0.0
+    in_turn_s: defaultdict[str, float] = defaultdict(float)
+    limited_s: defaultdict[str, float] = defaultdict(float)
+    at_once = min(options.connections, 2 * max(trials, 1))
+    for label, arm in plan.by_label().items():
+        for name, entry in arm.entries.items():
+            asked, usage = round(calls[label][name]), _usage(plan, arm, name, facts)
+            price = cost_usd(entry, usage)
+            call_usd = math.nan if price is None else price
+            number += asked
+            read += asked * (usage.input_tokens or 0)
+            written += asked * (usage.output_tokens or 0)
+            singly_usd += asked * call_usd
+            usd += asked * call_usd * _price_factor(entry, options.batch)
+            # An account's limits are those of a model, with whatever parameters it is asked.
+            model = plan.registered[name]
+            in_turn_s[model] += asked / at_once * entry.typical_latency_s
+            limited_s[model] += asked * _limited_s(options, entry, usage)
+    longest_s = max([*in_turn_s.values(), *limited_s.values()], default=0.0)
+    rounds = max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0)
     return Estimate(
         plan.driver,
         trials,
-        calls=sum(each.number for each in todo),
-        input_tokens=sum(each.number * (each.usage.input_tokens or 0) for each in todo),
-        output_tokens=sum(each.number * (each.usage.output_tokens or 0) for each in todo),
-        cost_usd=together_usd(),
-        minutes=minutes,
+        calls=number,
+        input_tokens=read,
+        output_tokens=written,
+        cost_usd=None if math.isnan(usd) else round(usd, 2),
+        singly_usd=None if math.isnan(usd) else round(singly_usd, 2),
+        minutes=round(longest_s / 60, 1),
+        rounds=rounds if options.batch else 0,
         free=all(entry.price == "free" for entry in plan.entries.values()),
-        measured=[driver_name(n, plan.endpoints[n]) for n in plan.entries if facts.get(n)],
-        batch=batch,
+        measured=any(map(facts.get, plan.entries)),
     )
 
 
@@ -204,13 +142,37 @@ def trial_costs(
         # No tokeniser makes more tokens than bytes.
         read = int(len(typical_prompt(plan, arm).encode()) * PROMPT_MARGIN)
         for name in filter(arm.entries.get, arm.asked.values()):
-            usual = _Calls.of(plan, arm, name, 1, facts)
-            most = Usage(input_tokens=read, output_tokens=usual.entry.max_output_tokens)
-            usual_usd, worst_usd = (
-                each.cost_usd(batch=batch) or 0.0 for each in (usual, replace(usual, usage=most))
-            )
-            by_arm[arm.label] += TRIAL_MARGIN * usual_prompts(arm) * usual_usd + worst_usd
+            entry = arm.entries[name]
+            usual_usd = cost_usd(entry, _usage(plan, arm, name, facts)) or 0.0
+            worst = Usage(input_tokens=read, output_tokens=entry.max_output_tokens)
+            usd = TRIAL_MARGIN * usual_prompts(arm) * usual_usd + (cost_usd(entry, worst) or 0.0)
+            by_arm[arm.label] += usd * _price_factor(entry, batch)
     return {spec.order: by_arm[spec.arm] for spec in plan.trial_specs()}.__getitem__
+
+
+def _usage(plan: Plan, arm: Arm, name: str, facts: Mapping[str, Usage | None]) -> Usage:
+    """Return the tokens of a call, as measured or as listed in the registry."""
+    read = len(typical_prompt(plan, arm).encode()) // 4  # English has about 4 bytes a token
+    typical = Usage(input_tokens=read, output_tokens=arm.entries[name].typical_output_tokens)
+    return facts.get(name) or typical
+
+
+def _price_factor(entry: ModelEntry, batch: bool) -> float:
+    terms = batch_terms(entry) if batch else None
+    return terms.price_factor if terms else 1.0
+
+
+def _limited_s(options: Options, entry: ModelEntry, usage: Usage) -> float:
+    """Return how long the limits stretch a call, in s.
+
+    Within a minute's window it counts with its output cap until its reply is in, and with its
+    actual tokens from then on.
+    """
+    rpm, tpm = options.rates(entry)
+    waiting = min(entry.typical_latency_s / 60, 1.0)
+    written = waiting * entry.max_output_tokens + (1 - waiting) * (usage.output_tokens or 0)
+    tokens = (usage.input_tokens or 0) + written
+    return max(60 / (rpm or math.inf), 60 * tokens / (tpm or math.inf))
 
 
 def typical_prompt(plan: Plan, arm: Arm) -> str:

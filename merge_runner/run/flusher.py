@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import sys
 from collections.abc import Callable
 from itertools import accumulate, chain
@@ -25,13 +24,6 @@ AGAIN = (
 )
 
 
-def size_of(record: TrialRecord) -> int:
-    """The bytes of a trial's replies, which are most of it."""
-    replies = (row.decision.reply for row in record.decisions if row.decision.reply)
-    calls = chain((reply.attempts for reply in replies), (c.attempts for c in record.failed_calls))
-    return sum(sys.getsizeof(attempt.reply) for attempt in chain.from_iterable(calls))
-
-
 class Flusher:
     """Collects ended trials and stores them about once a second.
 
@@ -47,19 +39,20 @@ class Flusher:
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
-        self._pending: list[tuple[TrialRecord, int]] = []  # with their sizes
+        self._pending: list[tuple[TrialRecord, int]] = []  # with the bytes of their replies
         self._problem: StoreError | None = None
         self._closing = False
-        self._awake = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
     def add(self, record: TrialRecord) -> None:
         """Store this trial with the next batch, or drop it while storing fails."""
-        self._pending.append((record, size_of(record)))
+        replies = (row.decision.reply for row in record.decisions)
+        calls = [reply.attempts for reply in replies if reply]
+        calls += [call.attempts for call in record.failed_calls]
+        size = sum(sys.getsizeof(attempt.reply) for attempt in chain.from_iterable(calls))
+        self._pending.append((record, size))
         if self._problem is not None:
             self._drop_excess()
-        if len(self._pending) >= BATCH or self._bytes >= BATCH_BYTES:
-            self._awake.set()
 
     async def room(self) -> None:
         """Wait while too much is still to be stored, unless storing fails or has ended."""
@@ -88,7 +81,6 @@ class Flusher:
         More trials may be added later, and stored by the next call.
         """
         self._closing = True
-        self._awake.set()
         await self._task
         said = False
         while not await self._flush() or self._pending:
@@ -110,13 +102,14 @@ class Flusher:
         return sum(size for _, size in self._pending)
 
     async def _run(self) -> None:
+        clock_s = asyncio.get_running_loop().time
+        flushed_s = clock_s()
         while not self._closing:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(EVERY_S):
-                    await self._awake.wait()
-            self._awake.clear()
-            while self._pending and not self._closing and await self._flush():
-                continue
+            await asyncio.sleep(POLL_S)
+            is_much = len(self._pending) >= BATCH or self._bytes >= BATCH_BYTES
+            if self._pending and (is_much or clock_s() - flushed_s >= EVERY_S):
+                flushed_s = clock_s()
+                await self._flush()
 
     async def _flush(self) -> bool:
         """Write one batch, which may be empty; False if that did not work."""

@@ -68,8 +68,7 @@ class FirstDecisions:
     @asynccontextmanager
     async def turn(self, models: Collection[str]) -> AsyncIterator[None]:
         """Play a trial when its models have decided validly, or no other trial asks them."""
-        for model in models:
-            self._check(model)
+        self._check()
         alone = {*models} if self._one_by_one else set()
         while alone & self._asked - self._valid:
             self._changed.clear()
@@ -84,11 +83,10 @@ class FirstDecisions:
 
     def count(self, model: str, decision: Decision) -> None:
         """Count a decision; raises NoValidDecision where too many are invalid."""
-        if model in self._valid:
-            return
-        text = decision.reply.text if decision.reply else ""
-        self.add(model, decision.valid, not decision.valid, decision.failure, text)
-        self._check(model)
+        if model not in self._valid:
+            text = decision.reply.text if decision.reply else ""
+            self.add(model, decision.valid, not decision.valid, decision.failure, text)
+            self._check()
 
     def add(
         self, model: str, valid: int, invalid: int, failure: str | None, text: str | None
@@ -103,20 +101,18 @@ class FirstDecisions:
             reply = f'"{shown}" ({(failure or "").replace("_", " ")})'
             self._described.setdefault(model, f"The first reply is {reply}. To mend that {ADVICE}")
 
-    def without_a_valid_one(self) -> list[str]:
-        """A line for each model none of whose decisions is valid."""
+    def without_a_valid_one(self, least: float = 1) -> list[str]:
+        """A line for each model with at least so many decisions none of which is valid."""
         return [
-            f"none of the {number} decisions of {model} is valid. {self._described[model]}"
+            f"none of the first {number} decisions of {model} is valid. {self._described[model]}"
             for model, number in sorted(self._invalid.items())
-            if model not in self._valid
+            if model not in self._valid and number >= least
         ]
 
-    def _check(self, model: str) -> None:
-        if model not in self._valid and self._invalid[model] >= self._most_invalid:
+    def _check(self) -> None:
+        for line in self.without_a_valid_one(self._most_invalid):
             raise NoValidDecision(
-                f"none of the first {self._invalid[model]} decisions of {model} is valid, and "
-                f"nothing else is asked. {self._described[model]}. What was answered is kept; "
-                "--keep-going goes on with such a model"
+                f"{line}. What was answered is kept; --keep-going goes on with such a model"
             )
 
 

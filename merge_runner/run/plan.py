@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from decimal import Decimal
 from itertools import chain, product
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, computed_field
 
@@ -27,7 +27,7 @@ from merge_runner.config import (
     validated,
 )
 from merge_runner.drivers.pace import model_pace
-from merge_runner.drivers.registry import PROGRAMS, HumanTrials, Program
+from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
@@ -187,6 +187,11 @@ class Plan(BaseModel):
     def scripted(self) -> bool:
         """Whether the emulator takes part."""
         return any(map(_is_scripted, self.arms))
+
+    @property
+    def is_free(self) -> bool:
+        """Whether no model costs anything."""
+        return all(entry.price == "free" for entry in self.entries.values())
 
     @property
     def is_rehearsal(self) -> bool:
@@ -406,7 +411,7 @@ def _axis(text: str) -> tuple[str, list[float]]:
     )
 
 
-def _replayed(arm: Arm) -> list[tuple[Program, HumanTrials]]:
+def _replayed(arm: Arm) -> list[tuple[Program, Any]]:
     """Return the programs of an arm that replay human trials, with these."""
     programs = (PROGRAMS[name] for name in {*arm.asked.values()} - {*arm.entries})
     return [(program, program.data) for program in programs if program.data is not None]

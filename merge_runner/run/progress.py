@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -23,10 +24,9 @@ if TYPE_CHECKING:
     from merge_runner.run.cluster import DaskTasks
     from merge_runner.run.local_runner import LocalRunner
 
-PUBLISHED_EVERY_S = 1.0
-LIVE_EVERY_S = 0.25
-PLAIN_EVERY_S = 5.0
 PULSE_S = 0.05
+# In pulses: how often the file and a terminal are written, and plain lines.
+PUBLISHED_EVERY, PLAIN_EVERY = 20, 100
 NOTES_SHOWN = 10
 REASONS_SHOWN = 3
 CLOSE_IT = "you may close this: the same command goes on"
@@ -49,6 +49,7 @@ class Progress:
     cap_usd: float | None = None
     outcome_counts: Counter[str] = field(default_factory=Counter)
     began_at: datetime = field(default_factory=lambda: datetime.now(UTC))
+    ended_at: datetime | None = None
     worst_stall_s: float = 0.0
     doing: Literal["playing", "checking"] = "playing"
     unstored: Callable[[], str] = str  # says why trials are not stored; empty: nothing is wrong
@@ -157,32 +158,30 @@ async def show_progress(
     def publish() -> None:
         write_standing(db, progress.standing(sweep_id))
 
+    async def follow() -> None:
+        """Publish and show it, and measure how late the event loop wakes a task that sleeps."""
+        loop = asyncio.get_running_loop()
+        for pulse in count(1):
+            due = loop.time() + PULSE_S
+            await asyncio.sleep(PULSE_S)
+            progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
+            if pulse % PUBLISHED_EVERY == 0:
+                publish()
+            if pulse % (PLAIN_EVERY if live is None else PUBLISHED_EVERY) == 0:
+                show()
+
     clear_dead(db)
     publish()
-    shown_every_s = PLAIN_EVERY_S if live is None else LIVE_EVERY_S
-    both = ((PUBLISHED_EVERY_S, publish), (shown_every_s, show))
-    tasks = [asyncio.create_task(_repeat(progress, *each)) for each in both]
+    following = asyncio.create_task(follow())
     try:
         yield
     finally:
-        for task in tasks:
-            task.cancel()
+        following.cancel()
         show()
         with suppress(OSError):
             if live is not None:
                 live.stop()
         remove_standing(db, sweep_id)
-
-
-async def _repeat(progress: Progress, every_s: float, do: Callable[[], None]) -> None:
-    """Do it so often, and measure how late the event loop wakes a task that sleeps."""
-    loop = asyncio.get_running_loop()
-    while True:
-        for _ in range(round(every_s / PULSE_S)):
-            due = loop.time() + PULSE_S
-            await asyncio.sleep(PULSE_S)
-            progress.worst_stall_s = max(progress.worst_stall_s, loop.time() - due)
-        do()
 
 
 def terminal_text(progress: Progress) -> Text:
@@ -200,6 +199,6 @@ def _notes(progress: Progress) -> list[str]:
     """The clients' messages since the last call: each once, and the first NOTES_SHOWN."""
     notes: dict[str, None] = {}
     for meter in progress.runner.meters.values():
-        while meter.notes:
-            notes[meter.notes.popleft()] = None
+        notes |= dict.fromkeys(meter.notes)
+        meter.notes.clear()
     return first_of(list(notes), "more like these", NOTES_SHOWN)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, suppress
 from dataclasses import fields, replace
@@ -29,15 +29,7 @@ from merge_runner.llm.http_outcome import RawReply, judge
 from merge_runner.prompts.blocks import blocks_of
 from merge_runner.records import ANSWERS, SIDES, Attempt, Slot, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import in_use, require, use
-from merge_runner.results.database import by_name
-from merge_runner.results.rows import (
-    FACTORS,
-    Stored,
-    in_order,
-    rows_of,
-    rows_of_trials,
-)
-from merge_runner.run.clients import sealed_clients
+from merge_runner.results.rows import Stored, in_order, rows_of
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -78,25 +70,23 @@ def audit_database(
 ) -> list[Audit]:
     """Audit every sweep, oldest first, and then what belongs to none; or one sweep alone.
 
-    A trial that several sweeps have is audited with the newest of them. With a ``cache``, every
-    attempt is compared with its folder, too. Raises UsageError.
+    A trial that several sweeps have is audited with the newest of them. The replies are those of
+    the folder ``cache``, if it is named, and are compared with the stored ones. Raises UsageError.
     """
     with audited_database(path) as connection, ExitStack() as stack:
         sweeps = {row[0]: row for row in connection.execute(SWEEPS).fetchall()}
         if sweep_id is not None:
             oldest_first = dict(reversed(sweeps.items()))
             sweeps = {sweep_id: require(oldest_first, "sweep", sweep_id, f"in {path}")}
-        replies, kept = None, Audit(str(cache), {"trials": 0})
+        recorded = None
         if cache is not None:
-            replies = stack.enter_context(closing(ResponseCache(cache, read_only=True)))
+            recorded = stack.enter_context(closing(ResponseCache(cache, read_only=True)))
         audits = [
-            _audit(connection, name, config, replies, kept, finished=finished)
+            _audit(connection, name, config, recorded, finished=finished)
             for name, config, finished in sweeps.values()
         ]
-        audits.reverse()
-        if sweep_id is None:
-            audits.append(check_rest(connection, path))
-        return [*audits, kept] if cache is not None else audits
+        rest = [check_rest(connection, path)] if sweep_id is None else []
+        return [*reversed(audits), *rest]
 
 
 def _audit(
@@ -104,11 +94,10 @@ def _audit(
     sweep_id: str,
     config: str,
     cache: ResponseCache | None,
-    kept: Audit,
     *,
     finished: bool,
 ) -> Audit:
-    """Audit a sweep; what its trials lack in a cache is added to ``kept``."""
+    """Audit a sweep; its replies are those of a cache, if there is one."""
     problems: list[Finding] = []
     notes: Counter[str] = Counter()
     planned: dict[str, str] = {}
@@ -139,12 +128,7 @@ def _audit(
     if specs:
         specs = _replayable(connection, plan, specs, audit, notes)
         audit.counts["replayed"] = len(specs)
-        audit.findings += _replay(
-            connection, plan, specs, StoredReplies(connection, plan), sweep_id
-        )
-        if cache is not None:
-            kept.counts["trials"] += len(specs)
-            kept.findings += _replay(connection, plan, specs, cache, sweep_id)
+        audit.findings += _replay(connection, plan, specs, cache, sweep_id)
     audit.notes += [f"not replayed: {count} trials, since {why}" for why, count in notes.items()]
     return audit
 
@@ -214,21 +198,21 @@ def _replay(
     connection: duckdb.DuckDBPyConnection,
     plan: Plan,
     specs: Sequence[TrialSpec],
-    replies: StoredReplies | ResponseCache,
+    cache: ResponseCache | None,
     sweep_id: str,
 ) -> list[Finding]:
-    """Play trials by stored replies or those of a cache, and compare their rows."""
-    clients = sealed_clients(plan, cast(ResponseCache, replies))  # of which they only ask ``get``
-    runner = LocalRunner(plan, clients, in_flight=1)
+    """Play trials by the replies of a cache, or else the stored ones, and compare their rows."""
+    stored = StoredReplies(plan)
+    # Of a cache a sealed client only asks ``get``.
+    runner = LocalRunner.sealed(plan, cache or cast(ResponseCache, stored))
     by_key = {(spec.trial_id, spec.spec_hash): spec for spec in specs}
+    kind = "replay" if cache is None else "cache"
 
     async def compared() -> list[Finding]:
         findings: list[Finding] = []
         for key, tables in in_order(connection, by_key):
-            if isinstance(replies, StoredReplies):
-                replies.load(by_key[key])
+            stored.take(by_key[key], tables["calls"].named(key))
             record = await runner.play_one(by_key[key])
-            kind = "replay" if isinstance(replies, StoredReplies) else "cache"
             findings += _findings(record, tables, kind, sweep_id)
         return findings
 
@@ -240,19 +224,16 @@ def _replay(
 class StoredReplies:
     """The replies in the table ``calls``, of one trial at a time, as a client finds them."""
 
-    def __init__(self, connection: duckdb.DuckDBPyConnection, plan: Plan) -> None:
+    def __init__(self, plan: Plan) -> None:
         self.money = None  # the ledger of a sealed client keeps nothing
-        self._connection = connection
         self._plan = plan
         self._spec: TrialSpec
         self._arm: Arm
         self._calls: dict[str, list[dict[str, Any]]] = {}
 
-    def load(self, spec: TrialSpec) -> None:
-        """Read the calls of a trial."""
-        key = (spec.trial_id, spec.spec_hash)
+    def take(self, spec: TrialSpec, rows: Iterable[dict[str, Any]]) -> None:
+        """Take the calls of the trial that is played next."""
         self._spec, self._arm, self._calls = spec, self._plan.by_label()[spec.arm], {}
-        rows = by_name(rows_of_trials(self._connection, "*", "calls", [key]))
         for row in sorted(rows, key=itemgetter("attempt")):
             if self._arm.asked.get(row["side"]) in self._arm.entries:
                 self._calls.setdefault(row["call_key"], []).append(row)
@@ -323,28 +304,21 @@ def _attempt(number: int, row: Mapping[str, Any], entry: ModelEntry) -> Attempt:
 def _findings(
     record: TrialRecord, tables: Mapping[str, Stored], kind: str, sweep_id: str
 ) -> Iterator[Finding]:
-    """Compare a trial as it was played with its stored rows.
-
-    Where a reply is missing, what was played before is compared.
-    """
+    """Compare a trial as it was played with its stored rows, unless it lacks a reply."""
     key = (record.spec.trial_id, record.spec.spec_hash)
     (stored,) = tables["trials"].named(key)
     failed = stored["status"] == "failed"
-    missing = record.failed_calls[0] if record.failed_calls and not failed else None
-    if failed and record.failed_calls and kind == "cache":
+    if record.failed_calls and not failed:
+        text, missing = f"it cannot be replayed: {record.error}", record.failed_calls[0]
+        yield Finding(kind, text, sweep_id, key[0], missing.side, missing.number)
         return
+    if record.failed_calls and kind == "cache":
+        return  # which holds no call without an answer
     ignored = {"cached"} | ({"error"} if failed else set())  # the reason of a failure, in words
     if kind == "replay":
         ignored |= {name.removeprefix("calls.") for name in NOT_REPLAYED}
     for table, rows in rows_of(record).items():
-        # Another study may have other factors for the same trial.
-        part = missing is not None or table == FACTORS
-        if missing is None or table != "trials":
-            for difference in tables[table].differences(
-                key, rows, ignored=ignored, tolerance=TOLERANCE, part=part
-            ):
-                where = (difference.place.get(name) for name in ("side", "decision"))
-                yield Finding(kind, str(difference), sweep_id, key[0], *where)
-    if missing is not None:
-        text = f"it cannot be replayed: {record.error}"
-        yield Finding(kind, text, sweep_id, key[0], missing.side, missing.number)
+        found = tables[table].differences(key, rows, ignored=ignored, tolerance=TOLERANCE)
+        for difference in found:
+            where = (difference.place.get(name) for name in ("side", "decision"))
+            yield Finding(kind, str(difference), sweep_id, key[0], *where)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from merge_runner.audit.checks import Audit, audit_sweep
 from merge_runner.config import (
@@ -32,15 +32,15 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import Meter
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody
-from merge_runner.llm.ledger import Ledger, Spending, scopes
+from merge_runner.llm.ledger import Ledger, scopes
+from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.progress_file import write_standing
 from merge_runner.results.provenance import git_state, versions
-from merge_runner.results.recording import Spilled, described
+from merge_runner.results.recording import Miss, Spilled, described, explain, recorded_part
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
 from merge_runner.run.clients import (
     check_batches,
@@ -53,58 +53,82 @@ from merge_runner.run.flusher import AGAIN, BATCH, Flusher
 from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions, LocalRunner
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, show_progress
-from merge_runner.run.replay_diagnosis import Miss, explain
+from merge_runner.run.summary import as_dict
 from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
 SHOWN = 5
-FROM_PROGRAMS = 16
 
 
-@dataclass(slots=True)
-class Outcome:
-    """What a run of a plan did.
+async def play(
+    plan: Plan,
+    options: Options,
+    *,
+    whole: bool,
+    say: Callable[[str], None],
+    agree: Callable[[Estimate], None],
+) -> dict[str, Any]:
+    """Play what is not stored yet of a plan, and return the summary (``summary.as_dict``).
 
-    ``stored_before`` trials were stored already; ``suspended`` ones wait for money. ``meter``
-    counts the calls of this run, ``spending`` is that of the sweep over all its runs, and
-    ``cache_cost_usd`` that of all sweeps on the cache. ``facts`` and ``audit`` are of what the
-    database holds of the sweep; None where nothing is stored, or its user gave up waiting for it.
-    ``batches`` go on without this run. ``playing_s`` is how long the trials took,
-    ``worst_stall_s`` the longest delay of the event loop.
+    A replay without a recording, or replies of the models in the cache, is of the recording that
+    ships with the program; one that is not ``whole`` plays what its recordings hold. ``agree`` gets
+    an estimate before money is spent, and raises where it is not to be. Raises UsageError.
     """
+    if options.replay:
+        shipped = SHIPPED_RECORDINGS / f"{plan.model}-{plan.study.name}.parquet"
+        # A user's own replies are never mixed with those of somebody else.
+        if not options.recordings and shipped.is_file() and not _has_replies(options.cache, plan):
+            options = replace(options, recordings=(shipped,))
+            say(f"The replies are from the recording that ships with merge-runner: {shipped}")
+        part = plan if whole else _recorded(plan, options.recordings)
+        if part.trials < plan.trials:
+            say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
+        plan = part
+    async with open_sweep(plan, options, say=say) as sweep:
+        expected = None
+        if sweep.todo and not (options.replay or plan.is_free):
+            expected = await sweep.estimate()
+            agree(expected)
+        return await sweep.run(expected)
 
-    plan: Plan
-    sweep_id: str = ""
-    stored_before: int = 0
-    exit_code: int = 0
-    messages: list[str] = field(default_factory=list)
-    meter: Meter = field(default_factory=Meter)
-    suspended: int = 0
-    spending: Spending = field(default_factory=Spending)
-    cache_cost_usd: float = 0.0
-    facts: SweepFacts | None = None
-    audit: Audit | None = None
-    batches: list[str] = field(default_factory=list)
-    playing_s: float = 0.0
-    worst_stall_s: float = 0.0
 
-    def fail(self, exit_code: int, message: str) -> None:
-        """Note a problem; the first one decides the exit code."""
-        self.exit_code = self.exit_code or exit_code
-        self.messages.append(message)
+def _has_replies(folder: Path, plan: Plan) -> bool:
+    """Whether a cache holds replies of the plan's models, or any that cannot be read."""
+    if not (folder / "cache.db").is_file():
+        return False
+    ids = {entry.id for entry in plan.entries.values()}
+    damaged: list[str] = []
+    with closing(ResponseCache(folder, read_only=True)) as cache:
+        models = (entry.request.model for entry in cache.entries(damaged))
+        return not ids.isdisjoint(models) or bool(damaged)
 
-    def fail_by(self, error: BaseException | None) -> None:
-        """Note an error that a user can act on; raises any other one."""
-        if isinstance(error, MergeRunnerError):
-            self.fail(error.exit_code, str(error))
-        elif error is not None:
-            raise error
+
+def _recorded(plan: Plan, recordings: Sequence[Path]) -> Plan:
+    """The part of a plan that recordings of the same sweep hold; all of it if they do not say.
+
+    A sweep's recording holds its first situations, too.
+    """
+    names = {plan.study.name, plan.name}
+    held = recorded_part(recordings, names, plan.model, plan.sample_set)
+    if held is None:
+        return plan
+    arms = tuple(
+        replace(arm, repetitions=min(arm.repetitions, held.repetitions[arm.variant]))
+        for arm in plan.arms
+        if held.repetitions.get(arm.variant) and (not held.arms or arm.label in held.arms)
+    )
+    conditions = tuple(one for one in plan.conditions if one in held.conditions)
+    part = plan.model_copy(update={"arms": arms, "conditions": conditions})
+    return part if part.trials else plan
 
 
 @dataclass
 class Sweep:
-    """One run of a plan (see ``open_sweep``), which plays the trials ``todo``."""
+    """One run of a plan (see ``open_sweep``), which plays the trials ``todo``.
+
+    ``exit_code`` is that of the first problem, ``messages`` are of all.
+    """
 
     _plan: Plan
     _options: Options
@@ -113,57 +137,63 @@ class Sweep:
     todo: list[TrialSpec]
     _say: Callable[[str], None]
     _ledger: Ledger
+    exit_code: int = 0
+    messages: list[str] = field(default_factory=list)
     _misses: list[Miss] = field(default_factory=list)
     _rounds: Rounds | None = None
 
-    async def run(self) -> Outcome:
-        """Play what is missing and store it; what goes wrong is in the outcome."""
-        outcome = Outcome(self._plan, stored_before=len(self._stored))
+    async def run(self, expected: Estimate | None = None) -> dict[str, Any]:
+        """Play what is missing and store it; what goes wrong is in the summary.
+
+        ``expected`` is an estimate that the user has agreed to.
+        """
+        db, sweep_id, checked = self._options.db, "", None
         if self._options.replay and await self._nothing_is_recorded():
-            self._explain(outcome)
+            progress = self._progress(LocalRunner.sealed(self._plan, self._cache))
+            self._explain()
             held = described(self._options.recordings, self._cache.entries())
-            outcome.messages.append(
-                f"nothing of this replay is recorded, and nothing is stored: {held}"
-            )
-            return outcome
-        self._misses.clear()
-        async with AsyncExitStack() as stack:
-            store = Store(self._options.db)
-            runner = await self._runner(store, stack)
-            with unreadable_is_usage():
-                outcome.sweep_id = await self._begin(store)
-            flusher = Flusher(store, outcome.sweep_id, self._say)
-            progress = Progress(
-                plan=self._plan,
-                planned=len(self._stored) + len(self.todo),
-                stored=len(self._stored),
-                runner=runner,
-                ledger=self._ledger,
-                cap_usd=self._options.max_cost_usd,
-                unstored=lambda: flusher.problem,
-                batches=self._rounds.standing if self._rounds else list,
-            )
-            db, sweep_id, quiet = self._options.db, outcome.sweep_id, self._options.quiet
-            await stack.enter_async_context(show_progress(progress, db, sweep_id, quiet=quiet))
-            began = time.perf_counter()
-            try:
-                await self._play(runner, flusher, progress, outcome)
-            finally:
-                outcome.playing_s = time.perf_counter() - began
-                is_stored = await self._store_rest(flusher, outcome)
-            self._explain(outcome)
-            failed = progress.outcome_counts["failed"]
-            if failed and not self._misses:
-                outcome.fail(1, f"{failed} trials failed")
-            for meter in runner.meters.values():
-                outcome.meter.add(meter)
-            outcome.batches, outcome.worst_stall_s = progress.batches(), progress.worst_stall_s
-            self._add_costs(outcome)
-            progress.doing = "checking"
-            write_standing(db, progress.standing(sweep_id))
-            if is_stored:
-                self._check(store, runner.first, outcome)
-        return outcome
+            nothing = f"nothing of this replay is recorded, and nothing is stored: {held}"
+            self.messages.append(nothing)
+        else:
+            self._misses.clear()
+            async with AsyncExitStack() as stack:
+                store = Store(db)
+                progress = self._progress(await self._runner(store, stack))
+                with unreadable_is_usage():
+                    sweep_id = await self._begin(store)
+                shown = show_progress(progress, db, sweep_id, quiet=self._options.quiet)
+                await stack.enter_async_context(shown)
+                is_stored = await self._play(progress, Flusher(store, sweep_id, self._say))
+                progress.doing = "checking"
+                write_standing(db, progress.standing(sweep_id))
+                if is_stored:
+                    checked = self._check(store, sweep_id, progress.runner.first)
+        return as_dict(
+            self._options, progress, expected, checked,
+            sweep_id=sweep_id, exit_code=self.exit_code, messages=self.messages,
+        )  # fmt: skip
+
+    def _progress(self, runner: LocalRunner | DaskTasks) -> Progress:
+        return Progress(
+            plan=self._plan,
+            planned=len(self._stored) + len(self.todo),
+            stored=len(self._stored),
+            runner=runner,
+            ledger=self._ledger,
+            cap_usd=self._options.max_cost_usd,
+            batches=self._rounds.standing if self._rounds else list,
+        )
+
+    def _fail(self, exit_code: int, message: str) -> None:
+        self.exit_code = self.exit_code or exit_code
+        self.messages.append(message)
+
+    def _fail_by(self, error: BaseException | None) -> None:
+        """Note an error that a user can act on; raises any other one."""
+        if isinstance(error, MergeRunnerError):
+            self._fail(error.exit_code, str(error))
+        elif error is not None:
+            raise error
 
     async def estimate(self, *, whole: bool = False) -> Estimate:
         """What a live run takes: plays from recorded replies alone, and counts what is missing.
@@ -205,14 +235,10 @@ class Sweep:
         missed = [call.request for call in record.failed_calls if call.missed]
         self._misses += [Miss(record.spec.trial_id, request) for request in missed]
 
-    def _explain(self, outcome: Outcome) -> None:
-        left_out: list[str] = []
-        for line in explain(self._misses, self._cache.entries(left_out)) if self._misses else ():
-            outcome.fail(ReplayMiss.exit_code, line)
-        if left_out:
-            outcome.messages.append(
-                f"{len(left_out)} rows of the cache are left out, the first: {left_out[0]}"
-            )
+    def _explain(self) -> None:
+        if self._misses:
+            for line in explain(self._misses, self._cache.entries()):
+                self._fail(ReplayMiss.exit_code, line)
 
     async def _begin(self, store: Store) -> str:
         started_at = datetime.now(UTC).replace(tzinfo=None)
@@ -235,7 +261,7 @@ class Sweep:
         """What plays the trials: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if options.sends_nothing or not plan.entries:
-            in_flight = 1 if plan.entries else min(options.in_flight, FROM_PROGRAMS)
+            in_flight = 1 if plan.entries else options.in_flight
             return LocalRunner.sealed(plan, self._cache, in_flight)
         earlier = earlier_answers(plan, self._cache)
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
@@ -259,24 +285,23 @@ class Sweep:
         in_flight = len(self.todo) if options.batch else options.in_flight
         return LocalRunner(plan, clients, in_flight, first, rounds)
 
-    async def _play(
-        self,
-        runner: LocalRunner | DaskTasks,
-        flusher: Flusher,
-        progress: Progress,
-        outcome: Outcome,
-    ) -> None:
-        """Run the trials until all have ended, or the sweep is stopped or interrupted."""
-        suspended: list[TrialSuspended] = []
+    async def _play(self, progress: Progress, flusher: Flusher) -> bool:
+        """Run the trials until all have ended, or the sweep is stopped or interrupted; store them.
+
+        False where Ctrl-C ended the waiting for a database that another program holds.
+        """
+        runner, counts, suspended = progress.runner, progress.outcome_counts, ""
+        progress.unstored = lambda: flusher.problem
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
+            nonlocal suspended
             if isinstance(record, TrialSuspended):
-                progress.outcome_counts["suspended"] += 1
-                suspended.append(record)
-                return
-            progress.outcome_counts[record.status] += 1
-            self._note_misses(record)
-            flusher.add(record)
+                counts["suspended"] += 1
+                suspended = str(record)
+            else:
+                counts[record.status] += 1
+                self._note_misses(record)
+                flusher.add(record)
 
         async def drained() -> None:
             await asyncio.wait([work])
@@ -290,35 +315,42 @@ class Sweep:
             work.cancel()  # before anything is written: the terminal may be closed
             self._say(f"Stopping: {runner.unsaved} are saved first; Ctrl-C again drops them.")
 
-        with on_interrupt(interrupted, drain.cancel):
-            await asyncio.wait([drain])
-            await asyncio.wait([work])
-        if work.cancelled():
-            outcome.fail(INTERRUPTED, f"Interrupted. {GO_ON}")
-        else:
-            outcome.fail_by(work.exception())
-        outcome.suspended = len(suspended)
-        if suspended:
-            outcome.fail(
-                TrialSuspended.exit_code,
-                f"{len(suspended)} trials wait for money: {suspended[-1]}. Their replies are kept: "
-                "raise --max-cost, or the study's budget, and run the same command again",
-            )
+        try:
+            with on_interrupt(interrupted, drain.cancel):
+                await asyncio.wait([drain])
+                await asyncio.wait([work])
+            if work.cancelled():
+                self._fail(INTERRUPTED, f"Interrupted. {GO_ON}")
+            else:
+                self._fail_by(work.exception())
+            if suspended:
+                self._fail(
+                    TrialSuspended.exit_code,
+                    f"{counts['suspended']} trials wait for money: {suspended}. Their replies are "
+                    "kept: raise --max-cost, or the study's budget, and run the same command again",
+                )
+        finally:
+            progress.ended_at = datetime.now(UTC)
+            is_stored = await self._store_rest(flusher)
+        self._explain()
+        if counts["failed"] and not self._misses:
+            self._fail(1, f"{counts['failed']} trials failed")
+        return is_stored
 
-    async def _store_rest(self, flusher: Flusher, outcome: Outcome) -> bool:
+    async def _store_rest(self, flusher: Flusher) -> bool:
         """Store what is not stored yet; False where Ctrl-C ended the waiting for that."""
         closing = asyncio.create_task(self._store_all(flusher))
         with on_interrupt(closing.cancel, closing.cancel):
             await asyncio.wait([closing])
         if closing.cancelled():
             why = f": {flusher.problem}. {AGAIN}" if flusher.problem else ". " + GO_ON
-            outcome.fail(INTERRUPTED, f"Interrupted{why}")
+            self._fail(INTERRUPTED, f"Interrupted{why}")
             return False
-        outcome.fail_by(closing.exception())
+        self._fail_by(closing.exception())
         if flusher.differing:
             differing = [*flusher.differing.items()][:SHOWN]
             shown = [f"{trial_id} ({', '.join(columns)})" for trial_id, columns in differing]
-            outcome.fail(
+            self._fail(
                 StoreError.exit_code,
                 f"{len(flusher.differing)} trials are stored otherwise in {self._options.db}, "
                 f"which is left as it is: {'; '.join(shown)}. Replay into another --db.",
@@ -340,36 +372,30 @@ class Sweep:
                 flusher.add(await runner.play_one(spec))
             await flusher.close()
 
-    def _add_costs(self, outcome: Outcome) -> None:
-        try:
-            ledgers = (Ledger(self._cache, scope) for scope in scopes(self._cache))
-            outcome.cache_cost_usd = sum(ledger.read().spent_usd for ledger in ledgers)
-            outcome.spending = self._ledger.read()
-        except MergeRunnerError as exc:
-            if self._options.replay:  # which spends nothing
-                outcome.messages.append(str(exc))
-            else:
-                outcome.fail_by(exc)
-
-    def _check(self, store: Store, first: FirstDecisions, outcome: Outcome) -> None:
+    def _check(
+        self, store: Store, sweep_id: str, first: FirstDecisions
+    ) -> tuple[SweepFacts, Audit] | None:
         """Read back what the database holds of the sweep, audit it, and note how it ended."""
-        db, sweep_id = self._options.db, outcome.sweep_id
-        keys = [(spec.trial_id, spec.spec_hash) for spec in self._plan.trial_specs()]
+        keys = [(spec.trial_id, spec.spec_hash) for spec in (*self._stored, *self.todo)]
+        checked = None
         try:
-            outcome.facts = sweep_facts(db, sweep_id)
-            outcome.audit = audit_sweep(db, sweep_id, keys, finished=outcome.exit_code == 0)
-            if not (outcome.exit_code or self._options.sends_nothing or self._options.keep_going):
+            facts = sweep_facts(store.path, sweep_id)
+            audit = audit_sweep(store.path, sweep_id, keys, finished=self.exit_code == 0)
+            checked = facts, audit
+            if not (self.exit_code or self._options.sends_nothing or self._options.keep_going):
                 for line in first.without_a_valid_one():
-                    outcome.fail(NoValidDecision.exit_code, line)
+                    self._fail(NoValidDecision.exit_code, line)
             # Answers from another model are reported elsewhere; only --strict-model stops for them.
-            findings = [f for f in outcome.audit.findings if f.kind != "served"]
+            findings = [f for f in audit.findings if f.kind != "served"]
             if findings:
-                outcome.fail(1, f"the audit found {len(findings)} faults: `merge-runner audit`")
-            outcome.messages += map(str, findings[:SHOWN])
-            ended_at = datetime.now(UTC).replace(tzinfo=None)
-            store.end_sweep(sweep_id, ended_at, outcome.exit_code)
-        except (StoreError, UsageError) as exc:
-            outcome.fail_by(exc)
+                self._fail(1, f"the audit found {len(findings)} faults: `merge-runner audit`")
+            self.messages += map(str, findings[:SHOWN])
+            if not self._options.replay:
+                self._ledger.read()
+            store.end_sweep(sweep_id, datetime.now(UTC).replace(tzinfo=None), self.exit_code)
+        except MergeRunnerError as exc:
+            self._fail_by(exc)
+        return checked
 
 
 @asynccontextmanager
@@ -386,13 +412,7 @@ async def open_sweep(
         options = replace(options, max_cost_usd=plan.study.file.budget.total_usd)
     recorded = partial(Spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
-        entries = {
-            name: await _named(name, entry, options, cache, say)
-            for name, entry in plan.entries.items()
-        }
-        plan = plan.with_entries(entries)
-        endpoints = {name: _endpoint(plan, name, options, cache) for name in entries}
-        plan = plan.model_copy(update={"endpoints": endpoints})
+        plan = await _with_names(plan, options, cache, say)
         specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}
         # A replay derives everything from the recorded replies alone, so it plays every trial.
         with unreadable_is_usage():
@@ -401,25 +421,43 @@ async def open_sweep(
         todo = [spec for key, spec in specs.items() if key not in ended]
         if todo and not options.sends_nothing:
             if options.dask is None and not plan.is_rehearsal:
-                for name, entry in entries.items():
+                for name, entry in plan.entries.items():
                     resolve_endpoint(name, entry)  # raises where its key is missing
             options = _less_what_is_spent(plan, options, cache, say)
-            cache.locks.take({f"{e.id} at {endpoints[name]}" for name, e in entries.items()})
+            asked = plan.entries.items()
+            cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in asked})
         yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger))
 
 
-async def _named(
-    name: str, entry: ModelEntry, options: Options, cache: ResponseCache, say: Callable[[str], None]
-) -> ModelEntry:
-    """The entry with its model's name: as told, as recorded, or as its server says."""
-    found = model_id(entry)
-    if not found and options.sends_nothing:
-        # A server of one's own serves one model, or the recorded replies do not tell which.
-        recorded = {r.model for r in cache.recorded(lambda r: r.provider == entry.provider)}
-        found = recorded.pop() if len(recorded) == 1 else UNNAMED
-    elif not found:
-        found = await _served_name(name, entry, say=say)
-    return entry.model_copy(update={"id": found})
+async def _with_names(
+    plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
+) -> Plan:
+    """The plan with its models' names, and in a replay the endpoints where they are recorded.
+
+    A model's name is as told, as recorded, or as its server says. Raises UsageError.
+    """
+    entries, endpoints = dict(plan.entries), dict(plan.endpoints)
+    for name, entry in entries.items():
+        named = model_id(entry)
+        if not named and options.sends_nothing:
+            # A server of one's own serves one model, or the recorded replies do not tell which.
+            models = {request.model for request in cache.recorded(provider=entry.provider)}
+            named = models.pop() if len(models) == 1 else UNNAMED
+        entries[name] = entry.model_copy(
+            update={"id": named or await _served_name(name, entry, say=say)}
+        )
+        recorded: set[str] = set()
+        if options.replay:
+            recorded = {request.endpoint for request in cache.recorded(model=entries[name].id)}
+        if recorded and endpoints[name] not in recorded:
+            endpoints[name], *others = sorted(recorded)
+            if others:
+                raise UsageError(
+                    f"replies of {name} are recorded from several endpoints: "
+                    f"{', '.join(sorted(recorded))}. Set the base URL variable of its provider to "
+                    "the one to replay."
+                )
+    return plan.with_entries(entries).model_copy(update={"endpoints": endpoints})
 
 
 async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
@@ -430,12 +468,11 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
     driver = driver_name(name, endpoint.identity)
     try:
         listed = await listed_models(endpoint)
+        models = ", ".join(listed) or "no model"
     except TransportFailure as exc:
         if exc.outcome == "no_connection":
             raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
         listed, models = [], f"models that it does not list ({exc})"
-    else:
-        models = ", ".join(listed) or "no model"
     if len(listed) != 1:
         variable = PROVIDERS.require(entry.provider).model_env
         raise UsageError(
@@ -444,22 +481,6 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
         )
     say(f"{driver} serves {listed[0]}, which is asked")
     return listed[0]
-
-
-def _endpoint(plan: Plan, name: str, options: Options, cache: ResponseCache) -> str:
-    """The endpoint's identity: in a replay, the one under which the model is recorded."""
-    entry, configured = plan.entries[name], plan.endpoints[name]
-    if not options.replay:
-        return configured
-    recorded = sorted({r.endpoint for r in cache.recorded(lambda r: r.model == entry.id)})
-    if configured in recorded or not recorded:
-        return configured
-    if len(recorded) > 1:
-        raise UsageError(
-            f"replies of {name} are recorded from several endpoints: {', '.join(recorded)}. "
-            "Set the base URL variable of its provider to the one to replay."
-        )
-    return recorded[0]
 
 
 def _less_what_is_spent(

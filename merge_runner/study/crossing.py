@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import product
@@ -30,9 +30,6 @@ from merge_runner.study.file import BASELINE, EVERY_PROMPT, StudyFile
 
 MODEL, PROMPT, OPPONENT, SELF, DEFAULT = "model", "prompt", "opponent", "self", "default"
 PERCEPTION, PERFECT_ONE = "perception", "perfect"
-_PERCEPTIONS = tuple(f"{PERCEPTION}_{side}" for side in SIDES)
-SET_BY = {PERCEPTION: _PERCEPTIONS, **{name: (name,) for name in _PERCEPTIONS}}
-"""The factors of perception, with the switches of the scenario that each sets."""
 MOST_TRIALS = 1_000_000
 FINEST = 1_000_000  # steps a second: decimals like 0.05 become the fractions that they stand for
 Levels = Mapping[str, JsonValue]
@@ -42,13 +39,12 @@ Levels = Mapping[str, JsonValue]
 class Arm:
     """One crossing of a study's levels, which is played in all its conditions.
 
-    ``model`` is what ids of trials say, ``sides`` who drives, by their names in the registry, and
-    ``asked`` the same, but by the names in ``entries`` of language models with these parameters.
-    ``factors`` are the levels as texts; ``label`` names what sets this arm apart from the others.
-    ``ego`` is the side of the driver whose odds are told (see ``config.ego_side``).
+    ``sides`` says who drives, by their names in the registry, and ``asked`` the same, but by the
+    names in ``entries`` of language models with these parameters. ``factors`` are the levels as
+    texts; ``label`` names what sets this arm apart from the others. ``ego`` is the side of the
+    driver whose odds are told (see ``config.ego_side``).
     """
 
-    model: str
     sides: dict[Side, str]
     asked: dict[Side, str]
     entries: dict[str, ModelEntry]
@@ -60,6 +56,11 @@ class Arm:
     ego: Side = "left"
 
     @property
+    def model(self) -> str:
+        """Who drives, as ids of trials say."""
+        return "+".join(dict.fromkeys(self.sides.values()))
+
+    @property
     def is_mixed(self) -> bool:
         """Whether two different drivers meet."""
         return self.sides["left"] != self.sides["right"]
@@ -68,7 +69,8 @@ class Arm:
     def model_level(self) -> str:
         """The model as results have it, as a factor: of a pair without an opponent, both."""
         ego, other = self.sides[self.ego], self.sides[other_side(self.ego)]
-        return ego if self.factors.get(OPPONENT, SELF) != SELF else _pair(ego, other)
+        alone = not self.is_mixed or self.factors.get(OPPONENT, SELF) != SELF
+        return ego if alone else f"{ego}+{other}"
 
     @property
     def names(self) -> tuple[str, str]:
@@ -79,7 +81,6 @@ class Arm:
         """The same with the drivers' sides changed."""
         return replace(
             self,
-            model=_pair(self.sides["right"], self.sides["left"]),
             sides={side: self.sides[other_side(side)] for side in SIDES},
             asked={side: self.asked[other_side(side)] for side in SIDES},
             label=f"{self.label} mirrored",
@@ -104,23 +105,43 @@ def cross(
     arm is played in so many ``conditions``.
     """
     _check_names(file, registry)
-    factors = {MODEL: models, **{n: each for n, each in file.factors.items() if n != PROMPT}}
-    if PROMPT in file.factors or len(repetitions) > 1:
-        factors[PROMPT] = tuple(repetitions)
+    others = {name: levels for name, levels in file.factors.items() if name != PROMPT}
+    factors = {MODEL: models, **others, PROMPT: tuple(repetitions)}
     axes = {name: _by_text(file, name, levels) for name, levels in factors.items()}
-    varying = [name for name, levels in axes.items() if len(levels) > 1]
+    skip = _skipped(file, axes, only)
+    wanted = {
+        name: [text for text in levels if text in only.get(name, levels)]
+        for name, levels in axes.items()
+    }
+    asked = sum(repetitions[prompt] for prompt in wanted[PROMPT])
+    trials = conditions * asked * math.prod(len(wanted[name]) for name in axes if name != PROMPT)
+    if trials > MOST_TRIALS:
+        raise UsageError(
+            f"these are {trials:,} trials, and at most {MOST_TRIALS:,} can be played: leave out "
+            "levels, conditions or repetitions, in the file or by --only, --conditions or --reps"
+        )
     mirrored = mirror or file.mirror
     arms: dict[tuple[str, ...], Arm] = {}
-    for prompt, chosen in _crossings(file, axes, repetitions, only, conditions):
-        arm = _arm(file, chosen, prompt, repetitions[prompt], registry, varying)
+    for chosen in product(*wanted.values()):
+        texts = dict(zip(wanted, chosen, strict=True))
+        if any(all(texts[name] in levels for name, levels in row.items()) for row in skip):
+            continue
+        arm = _arm(
+            file,
+            {name: axes[name][text] for name, text in texts.items()},
+            texts,
+            repetitions[texts[PROMPT]],
+            registry,
+            [name for name, levels in axes.items() if len(levels) > 1],
+        )
         for each in (arm, arm.turned()) if mirrored and arm.is_mixed else (arm,):
             apart = (f"{n}={t}" for n, t in each.factors.items() if n not in (PROMPT, OPPONENT))
+            # What comes to the same trials, as a pair that is named both ways, is played once.
             twin = arms.setdefault((each.model, each.variant, *apart), each)
-            # One of two mirrored pairs that are each other's mirror image is left out.
-            if twin is not each and not (mirrored and arm.is_mixed and each.asked == twin.asked):
+            if twin.asked != each.asked:
                 raise UsageError(
-                    f"the crossings {twin.label!r} and {each.label!r} are the same trials: leave "
-                    "one out, by skip"
+                    f"the crossings {twin.label!r} and {each.label!r} have the same names, and are "
+                    "asked otherwise: leave one out, by skip"
                 )
     if not arms:
         raise UsageError("nothing is left to play: look at [factors] and skip, and at --only")
@@ -166,14 +187,23 @@ def _by_text(file: StudyFile, factor: str, levels: Iterable[JsonValue]) -> dict[
     return dict(sorted(by_text.items(), key=lambda item: item[0] != reference))
 
 
-def _crossings(
-    file: StudyFile,
-    axes: Mapping[str, Levels],
-    repetitions: Mapping[str, int],
-    only: Mapping[str, Collection[str]],
-    conditions: int,
-) -> Iterator[tuple[str, Levels]]:
-    """Each crossing that is to be played: its prompt and its levels; raises UsageError."""
+def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
+    """Raise UsageError for a factor that there is not, and for a driver's name that is taken."""
+    parameters = sorted(known_parameters(registry.values()))
+    valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
+    for name in (*file.factors, *file.effect):
+        require(valid, "factor", name, "models and skip stand above [factors]")
+    for name in file.drivers.keys() & registry.keys():
+        raise UsageError(f"[drivers.{name}] needs another name: there is one of this name already")
+
+
+def _skipped(
+    file: StudyFile, axes: Mapping[str, Levels], only: Mapping[str, Sequence[str]]
+) -> list[dict[str, set[str]]]:
+    """The levels of each row of skip; raises UsageError for a level that there is not.
+
+    So it does for those of ``only`` and of the file's ``reference``.
+    """
     skip = [
         {n: {*map(level_text, w if isinstance(w, list) else [w])} for n, w in row.items()}
         for row in file.skip
@@ -187,40 +217,25 @@ def _crossings(
             levels = require(there, "factor", name)
             for text in texts:
                 require(levels, f"level of {name}", text)
-    wanted = {
-        name: [text for text in levels if text in only.get(name, levels)]
-        for name, levels in axes.items()
-    }
-    wanted.setdefault(PROMPT, list(repetitions))
-    asked = sum(repetitions[prompt] for prompt in wanted[PROMPT])
-    trials = conditions * asked * math.prod(len(wanted[name]) for name in axes if name != PROMPT)
-    if trials > MOST_TRIALS:
-        raise UsageError(
-            f"these are {trials:,} trials, and at most {MOST_TRIALS:,} can be played: leave out "
-            "levels, conditions or repetitions, in the file or by --only, --conditions or --reps"
-        )
-    for chosen in product(*wanted.values()):
-        texts = dict(zip(wanted, chosen, strict=True))
-        if not any(all(texts[name] in levels for name, levels in row.items()) for row in skip):
-            yield texts[PROMPT], {name: axes[name][texts[name]] for name in axes}
+    return skip
 
 
 def _arm(
     file: StudyFile,
     levels: Levels,
-    prompt: str,
+    texts: Mapping[str, str],
     repetitions: int,
     registry: Mapping[str, ModelEntry],
     varying: Sequence[str],
 ) -> Arm:
-    model, opponent = str(levels[MODEL]), str(levels.get(OPPONENT, SELF))
+    """The arm of these levels, which results name by these ``texts``; raises UsageError."""
+    model, opponent = texts[MODEL], texts.get(OPPONENT, SELF)
     if opponent != SELF and "+" in model:
         raise UsageError(f"{model} is a pair already, and has no other opponent than {SELF}")
     changed = {*both_sides(model).values()}
     sides = both_sides(model if opponent == SELF else f"{model}+{opponent}")
     for name in sides.values():
         require({**registry, **PROGRAMS}, "model", name, "two joined by + drive left and right")
-    programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
     others = {MODEL, PROMPT, OPPONENT, PERCEPTION, *ScenarioConfig.model_fields}
     parameters = {n: x for n, x in levels.items() if n not in others and x != DEFAULT}
     if parameters and not changed & {*registry}:
@@ -231,41 +246,36 @@ def _arm(
             label, entry = name, registry[name]
             for parameter, level in parameters.items() if name in changed else ():
                 before, entry = entry, with_parameter(name, entry, parameter, level)
-                label += "" if entry == before else f" {parameter}={level_text(level)}"
+                label += "" if entry == before else f" {parameter}={texts[parameter]}"
             asked[side], entries[label] = label, entry
-    texts = {name: level_text(level) for name, level in levels.items()}
     labels = (texts[n] if n in (MODEL, PROMPT) else f"{n}={texts[n]}" for n in varying)
+    programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
     return Arm(
-        model=_pair(*sides.values()),
         sides=sides,
         asked=asked,
         entries=entries,
         scenario=_scenario(file, levels, programs),
-        variant=prompt,
+        variant=texts[PROMPT],
         repetitions=repetitions,
         factors={name: text for name, text in texts.items() if name in file.factors},
-        label=" ".join(labels) or prompt,
+        label=" ".join(labels) or texts[PROMPT],
         ego=ego_side(sides, registry, opponent),
     )
 
 
-def _pair(left: str, right: str) -> str:
-    """Who drives, as ids of trials say."""
-    return left if left == right else f"{left}+{right}"
-
-
 def _scenario(file: StudyFile, levels: Levels, programs: Mapping[str, Program]) -> ScenarioConfig:
     """The scenario with the switches of these levels, for these programs; raises UsageError."""
-    fields = ScenarioConfig.model_fields.keys() - SET_BY.keys()
+    sides = [f"{PERCEPTION}_{side}" for side in SIDES]
+    fields = ScenarioConfig.model_fields.keys() - {*sides}
     given = file.scenario.model_dump(exclude_unset=True)
     given |= {name: level for name, level in levels.items() if name in fields}
     given |= _world_step(validated(ScenarioConfig, given, "factors"), programs)
     known = {PERFECT_ONE: PERFECT, **file.perception}
     hint = f"define another one as [{PERCEPTION}.NAME]"
-    for factor in SET_BY.keys() & levels.keys():
+    for factor in [name for name in (PERCEPTION, *sides) if name in levels]:
         level = level_text(levels[factor])
-        perception = require(known, f"level of the factor {factor}:", level, hint)
-        given |= dict.fromkeys(SET_BY[factor], perception.model_dump())
+        perception = require(known, f"level of the factor {factor}:", level, hint).model_dump()
+        given |= dict.fromkeys(sides if factor == PERCEPTION else [factor], perception)
     scenario = validated(ScenarioConfig, given, "factors")
     for name, program in programs.items():
         pace_of(scenario, program.in_spec(name))
@@ -287,19 +297,3 @@ def _world_step(scenario: ScenarioConfig, programs: Mapping[str, Program]) -> di
     step_s = math.gcd(*(int(time * whole) for time in exact)) / whole
     usual = step_s == scenario.step_s
     return {} if usual else {"step_s": step_s, "plan_step_s": scenario.action_s}
-
-
-def _check_names(file: StudyFile, registry: Mapping[str, ModelEntry]) -> None:
-    """Raise UsageError for a factor that there is not, and for a name that is taken."""
-    parameters = sorted(known_parameters(registry.values()))
-    valid = dict.fromkeys((PROMPT, OPPONENT, PERCEPTION, *parameters, *ScenarioConfig.model_fields))
-    for name in (*file.factors, *file.effect):
-        require(valid, "factor", name, "models and skip stand above [factors]")
-    taken = [f"drivers.{name}" for name in file.drivers if name in registry]
-    taken += [f"{PERCEPTION}.{name}" for name in file.perception if name == PERFECT_ONE]
-    if taken:
-        raise UsageError(f"[{taken[0]}] needs another name: there is one of this name already")
-    if PERCEPTION in file.factors and {*_PERCEPTIONS} & file.factors.keys():
-        raise UsageError(
-            f"the factor {PERCEPTION} is of both sides: name it, or {' and '.join(_PERCEPTIONS)}"
-        )

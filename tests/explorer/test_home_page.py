@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from dataclasses import replace
 from html import unescape
-from urllib.parse import parse_qs, urlsplit
 
 import duckdb
 import pytest
 from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
-from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.scenarios.merge.collision import collided
-from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner_analysis.data.human_counts import human_counts
-from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explorer.analysis_process import Computing
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.assets import STATIC, STYLES
-from merge_runner_analysis.explorer.pages.home import Played, account_rows, home_page
+from merge_runner_analysis.explorer.pages.home import home_page
 from merge_runner_analysis.explorer.site import NothingNew, Site
-from merge_runner_analysis.explorer.task_picture import task_picture
 from merge_runner_analysis.figures import SHOWS
 from merge_runner_analysis.figures.gallery import FIGURES as DRAWN
 from merge_runner_analysis.figures.styles import COLOURS
@@ -34,9 +26,15 @@ from merge_runner_analysis.metrics import shown_in
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import render
+from merge_runner_analysis.verdict_words import (
+    MEASURES,
+    by_group,
+    headline,
+    sentence,
+    verdict_word,
+)
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import served
-from tests.explorer.test_charts import import_some
 from tests.explorer.test_tables_pages import Addresses, Awaited, InProcess, listed
 
 HOST = "127.0.0.1:8700"
@@ -80,98 +78,99 @@ def client(own):
     return client_of(own)
 
 
-def test_counts_are_there_before_anything_is_computed_and_lead_to_their_trials(db):
+def test_trials_are_counted_before_anything_is_computed_and_lead_to_them(db):
     site = Site(db)
     site.computing = Computing(db, Never)
     client = client_of(site)
     text = unescape(client.get("/").text)
-    with duckdb.connect(str(db), read_only=True) as connection:
-        counts = dict(
-            connection.execute(
-                "SELECT condition, count(*) FROM trials WHERE status = 'collided' GROUP BY ALL"
-            ).fetchall()
-        )
-    assert counts == {WORST: 4, "N_0_0": 2}
-    assert f"<strong>{WORST}</strong>: 4 of 4 trials (100.0 %) of all drivers" in text
-    table = text.split('id="collisions"')[1].split("</table>")[0]
-    rows = re.findall(r'<th scope="row"[^>]*>(?:<a[^>]*>)?([^<]+)', table)
-    assert rows[:2] == [WORST, "N_0_0"]
-    links = re.findall(r'<a href="(/trials\?[^"]*)">(\d+)</a>', table + text.split('id="costs"')[1])
-    assert len(links) > 40
+    assert "This could not be computed" in text
+    links = re.findall(r'<a href="(/trials\?[^"]*)">(\d+)</a>', text)
+    assert len(links) >= 3
     for link, count in links:
         assert listed(client.get(link).text) == int(count), link
     site.computing.close()
 
 
-@pytest.mark.slow
-def test_points_verdicts_and_values_lead_to_their_trials(client):
+@pytest.fixture(scope="module")
+def verdicts(db):
+    (table,) = make_tables(Study(db), ["verdicts"])
+    return by_group(table.rows)
+
+
+def test_a_row_has_the_sentence_and_the_values_of_the_table(client, verdicts):
     text = unescape(client.get("/").text)
-    point = re.search(r'<a href="([^"]+)"[^>]*aria-label="o3, baseline, L_4_0: 100[^"]*n 3"', text)
-    assert point, text
-    assert listed(client.get(point[1]).text) == 3
-    verdict = re.search(r'<a href="([^"]+)" aria-label="I1 of o3: (.)"', text)
-    assert verdict[2] in "✓✗–"
-    assert parse_qs(urlsplit(verdict[1]).query)["cell"] == ["indicators/o3/baseline/I1:n"]
-    assert re.search(r"humans pass: \d+ %", text)
-    assert "What to keep in mind" in text
+    assert " ".join(headline({"o3": verdicts["o3/baseline"]})) in re.sub(r"</?strong>", "", text)
+    assert sentence(verdicts["o3/baseline"]) in text
+    assert sentence(verdicts["o3/A1"]) not in text
+    assert "Not shown: 1 other prompt." in text
+    cells = re.findall(r'<a href="/drivers/o3\?prompt=baseline#([\w-]+)" title="([^"]+)"', text)
+    told = dict(cells)
+    for name in ("headway", "velocity", "collisions", "gap"):
+        values = verdicts["o3/baseline"][name]
+        assert f"n = {values['n']}" in told[name]
+        assert verdict_word(values) in told[name]
     assert Addresses(text).inline == []
 
 
-def test_a_study_is_grouped_by_any_of_its_factors(client, own):
-    text = client.get("/?by=prompt").text
-    assert '<strong aria-current="true">prompt</strong>' in text
-    heads = text.split('id="collisions"')[1].split("</thead>")[0]
-    assert [name.strip() for name in re.findall(r'<th scope="col">([^<]+)', heads)][2:] == [
-        "humans",
-        "all drivers",
-        "A1",
-        "baseline",
-    ]
-    classes = text.split('id="accounts"')[1].split("</table>")[0]
-    assert re.findall(r'"number">([^<]+)</th>', classes)[2:] == ["A1", "baseline"]
-    links = re.findall(r'<a href="([^"]+variant=baseline[^"]*)">(\d+)</a>', classes)
-    assert links
-    assert [listed(client.get(unescape(link)).text) for link, _ in links] == [
-        int(count) for _, count in links
-    ]
-    assert "grouped by driver and prompt, prompt" in client.get("/?by=mood").text
-    groups = [g["id"] for g in own.computing.ask(("home", "prompt", "0"), (0, 0), wait_s=60)
-              .content["groups"]]  # fmt: skip
-    assert groups == ["human", "prompt=baseline", "prompt=A1"]
-    point = re.search(
-        r'<a href="([^"]+)"[^>]*aria-label="A1, L_4_0:', client.get("/?by=prompt").text
+def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
+    text = unescape(client.get("/?prompt=A1").text)
+    assert '<option value="A1" selected>' in text
+    assert "/drivers/o3?prompt=A1" in text
+    assert "/drivers/o3?prompt=baseline" not in text
+    one = unescape(client.get(f"/?condition={WORST}").text)
+    (link,) = set(re.findall(r'href="(/trials\?[^"]*variant=baseline[^"]*)">3</a>', one)) - set(
+        re.findall(r'href="(/trials\?[^"]*outcome[^"]*)"', one)
     )
-    assert listed(client.get(unescape(point[1])).text) == 1
+    assert listed(client.get(link).text) == 3
+    (part,) = make_tables(Study(db, condition=WORST), ["verdicts"])
+    rows = by_group(part.rows)
+    assert rows["o3/baseline"]["collisions"]["n"] == 3
+    assert rows["human"]["collisions"]["n"] == 90
+    for wrong in ("prompt=A9", "condition=nowhere", "sweep=none", "driver=nobody"):
+        assert client.get(f"/?{wrong}").status_code == 404, wrong
 
 
-def test_levels_of_a_factor_are_groups_with_their_trials(played):
-    site = Site(played.db)
-    site.computing = Computing(played.db, Never)
-    client = client_of(site)
-    costs = unescape(client.get("/?by=temperature").text).split('id="costs"')[1]
-    links = re.findall(r'<a href="(/trials\?[^"]*factor.temperature=[^"]*)">(\d+)</a>', costs)
-    assert len(links) >= 2
-    for link, count in links:
-        assert listed(client.get(link).text) == int(count)
+def test_a_sweep_is_a_scope(db):
+    study = Study(db, sweep="sweep-1")
+    assert sum(len(group.trials) for group in study.played) == 44
+    assert Study(db, sweep="none").played == []
+
+
+def test_a_drivers_page_has_its_verdicts_with_the_trials_behind_them(client, verdicts):
+    text = unescape(client.get("/drivers/o3?prompt=baseline").text)
+    assert sentence(verdicts["o3/baseline"]) in text
+    table = text.split('class="verdicts"')[1].split("</table>")[0]
+    for measure in MEASURES.values():
+        assert measure.trait in table
+    (link, n) = re.findall(r'<a href="([^"]*cell=verdicts[^"]*)">(\d+)</a>', table)[0]
+    assert listed(client.get(link).text) == int(n) == verdicts["o3/baseline"]["headway"]["n"]
+    for link, count in re.findall(r'<a href="(/trials\?[^"]*)">(\d+)</a>', text):
+        assert listed(client.get(link).text) == int(count), link
+    assert client.get("/drivers/nobody").status_code == 404
+    assert "990 trials" in client.get("/drivers/human").text
+
+
+def test_a_driver_stands_beside_another(tmp_path):
+    drives = [*yielding("o3", reps=2), *yielding("o4", reps=2)]
+    site = Site(db := write_study(tmp_path / "t.duckdb", drives))
+    site.computing = Awaited(db, InProcess)
+    text = client_of(site).get("/drivers/o3?with=o4").text
+    assert "<option selected>o4</option>" in text
+    assert text.count('class="o" href="#other"') >= 4
+    assert client_of(site).get("/drivers").text.count('class="n"><a href="/trials') == 2
     site.computing.close()
 
 
-def test_human_counts_are_the_published_ones_and_lead_on_only_when_all_are_imported(
-    db, tmp_path, client
-):
-    assert sum(of.collided for of in human_counts().values()) == 28
-    outcomes = published("human_outcomes").set_index("condition")
-    for name, of in human_counts().items():
-        assert tuple(outcomes.loc[name, list(of._fields)]) == of
-    assert "who=humans" not in client.get("/").text
-    part = shutil.copy(db, tmp_path / "part.duckdb")
-    import_some(part, tmp_path / "recordings")
-    site = Site(part)
-    site.computing = Computing(part, Never)
+def test_a_driver_that_is_not_judged_has_no_verdict(tmp_path):
+    prose = dict.fromkeys(range(99), Said(failure="no_array"))
+    bad = [replace(drive, said=prose, left=(), right=()) for drive in yielding("bad", reps=1)]
+    site = Site(db := write_study(tmp_path / "t.duckdb", [*bad, *yielding("o3", reps=1)]))
+    site.computing = Awaited(db, InProcess)
     text = client_of(site).get("/").text
-    assert "who=humans" not in text
-    # Nor do they join the drivers' counts.
-    assert "4 of 4 trials (100.0 %) of all drivers" in text
+    assert "Not judged: 46 of the 92 decisions of bad are invalid (50.0 %, more than 20 %)." in text
+    assert "/drivers/bad?prompt=baseline#" not in text
+    assert "/drivers/o3?prompt=baseline#" in text
+    assert "Not judged" in client_of(site).get("/drivers/bad").text
     site.computing.close()
 
 
@@ -188,33 +187,13 @@ def test_the_strip_says_what_to_type_and_nothing_twice(db, tmp_path):
     (again,) = re.findall(r'hx-get="(/\?seen=[^"]+)"', text)
     assert client.get(again).status_code == 204
     with pytest.raises(NothingNew):
-        home_page(site, {"seen": again.partition("=")[2]})
+        home_page(site, {"seen": again.partition("=")[2].partition("&")[0]})
     with duckdb.connect(copy) as connection:
         connection.execute("UPDATE sweeps SET exit_code = 0")
     assert (
         "the database holds only" in client.get(again).text or "Finished" in client.get(again).text
     )
     site.computing.close()
-
-
-def test_a_driver_that_is_not_judged_ranks_no_condition(tmp_path):
-    prose = dict.fromkeys(range(99), Said(failure="no_array"))
-    bad = [replace(drive, said=prose, left=(), right=()) for drive in yielding("bad", reps=1)]
-    pages = []
-    for drives in (bad, [*bad, *yielding("o3", reps=1)]):
-        site = Site(db := write_study(tmp_path / f"{len(drives)}.duckdb", drives))
-        site.computing = Computing(db, Never)
-        site.catalogue.refresh()
-        pages.append(client_of(site).get("/").text)
-        site.computing.close()
-    alone, beside = pages
-    reason = (
-        "not judged: 46 of the 92 decisions of bad, baseline are invalid (50.0 %, more than 20 %)"
-    )
-    assert f"<p>{reason}.</p>" in alone
-    assert 'id="collisions"' not in alone
-    assert "No trial of o3, baseline collided." in beside
-    assert f'title="{reason}">not judged</span>' in beside
 
 
 def test_the_study_begins_with_its_description(tmp_path):
@@ -224,61 +203,6 @@ def test_the_study_begins_with_its_description(tmp_path):
     site.computing = Computing(db, Never)
     assert "<h1>Who is &lt;first&gt;?</h1>" in client_of(site).get("/").text
     site.computing.close()
-
-
-def test_classes_of_collisions_stand_beside_the_published_ones():
-    published = {"humans": {"same action": 14, "no action": 5, "other": 4}}
-    o3, unjudged, stand_in = (
-        Played(label, "drivers", {}, cells={account: {"trials": 1}})
-        for label, account in (("o3", "both gave way"), ("o4", None), ("o5", "invalid plan"))
-    )
-    rows = account_rows([o3, unjudged, stand_in], published)
-    assert rows["classes"] == [
-        *("both insisted", "both gave way", "no action", "other", "invalid plan")
-    ]
-    assert (rows["same"], rows["groups"]) == ({"humans": 14}, [o3, stand_in])
-    assert account_rows([unjudged], published) is None
-
-
-def test_the_picture_of_the_task_shows_a_moment_before_the_merge(own):
-    task = task_picture(own.catalogue)
-    left, right = task["vehicles"]
-    assert task["condition"] == "L_4_0"
-    assert left["x"] > right["x"]
-    assert left["y"] < 0 < right["y"]
-    for one in (left, right):
-        assert TRACK.tunnel_exit_m * TRACK.branch_cosine < one["x"] < task["merge_m"]
-    assert not collided(ScenarioConfig(), TRACK, left["x"], right["x"])
-
-
-def of_longer_vehicles(db, folder, whose):
-    """The study with longer vehicles in these trials."""
-    with duckdb.connect(shutil.copy(db, folder / "longer.duckdb")) as connection:
-        connection.execute(
-            f"UPDATE specs SET spec = json_merge_patch(spec, ?) WHERE {whose}",
-            [json.dumps({"scenario": {"vehicle_length_m": 6}})],
-        )
-    site = Site(folder / "longer.duckdb")
-    site.computing = Computing(site.db, Never)
-    return site
-
-
-def test_the_picture_shows_the_studys_own_vehicles(db, tmp_path):
-    site = of_longer_vehicles(db, tmp_path, "true")
-    text = client_of(site).get("/").text
-    assert "50 m before the merge point" in text
-    assert task_picture(site.catalogue)["length_m"] == 6
-    assert text.count('width="6.0" height="1.8"') == 2
-    assert "the commonest" not in text
-    site.close()
-
-
-def test_of_several_sizes_the_commonest_is_shown_and_the_page_says_so(db, tmp_path):
-    site = of_longer_vehicles(db, tmp_path, "spec_hash LIKE '%A1'")
-    text = client_of(site).get("/").text
-    assert text.count('width="4.5" height="1.8"') == 2
-    assert "The vehicles have the commonest of 2 sizes, that of 33 of 44" in text
-    site.close()
 
 
 @pytest.mark.parametrize(("suffix", "form"), [("csv", TableFormat.CSV), ("tex", TableFormat.LATEX)])
@@ -308,29 +232,6 @@ def test_no_head_of_a_table_is_empty(client):
     heads = re.findall(r"<th scope=\"col\"[^>]*>(.*?)</th>", client.get("/tables/indicators").text)
     assert heads
     assert all(re.sub("<[^>]*>", "", head).strip() for head in heads)
-
-
-def test_heads_sort_and_the_address_keeps_it(page):
-    page.goto("/tables")
-    page.goto("/")
-    # What is computed comes into the page, whose rows are sorted anew a moment later.
-    expect(page.locator(".computing")).to_have_count(0)
-    column = page.locator("#costs tbody td:nth-child(2)")
-    page.locator("#costs thead").get_by_role("button", name="trials").click()
-    down = [int(text) for text in column.all_inner_texts()]
-    assert down == sorted(down, reverse=True)
-    assert len(set(down)) > 1
-    expect(page.locator("#costs th[aria-sort=descending]")).to_have_text("trials")
-    expect(page).to_have_url(re.compile("sorted=-costs.1"))
-    page.reload()
-    expect(column).to_have_text(list(map(str, down)))
-    page.locator("#costs thead").get_by_role("button", name="trials").click()
-    expect(column).to_have_text(list(map(str, sorted(down))))
-    expect(page).to_have_url(re.compile("sorted=costs.1"))
-    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
-    page.locator("#copy-link").click()
-    expect(page.locator("#copy-link")).to_have_text("copied")
-    assert page.evaluate("navigator.clipboard.readText()") == page.url
 
 
 def test_every_measure_of_the_ablations_is_explained_above_them(client):
@@ -376,12 +277,6 @@ def test_ablations_are_whole_at_1024_pixels_and_numbers_look_like_links(browser,
 def test_nothing_is_cut_off_at_1024_pixels(page):
     page.set_viewport_size({"width": 1024, "height": 800})
     page.goto("/")
-    expect(page.locator(".multiples").first).to_be_visible()
+    expect(page.locator("tr.humans").first).to_be_visible()
     expect(page.locator(".computing")).to_have_count(0)
-    cut = page.eval_on_selector_all(
-        ".multiples, .multiples svg, .scroll table, main",
-        "all => all.filter(e => e.getBoundingClientRect().right > innerWidth)"
-        ".map(e => e.id || e.tagName)",
-    )
-    assert cut == []
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")

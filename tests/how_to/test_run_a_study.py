@@ -9,8 +9,7 @@ from dataclasses import fields, is_dataclass
 import pytest
 
 from merge_runner.config import ScenarioConfig, model_in
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant, render_prompt
-from merge_runner.prompts.fields import FIELDS
+from merge_runner.prompts.blocks import BLOCKS, FIELDS, VARIANTS, Variant, render_prompt
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.sweep import unsent
 from merge_runner.study.file import StudyFile

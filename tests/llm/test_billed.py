@@ -19,14 +19,12 @@ from aiohttp import web
 
 from merge_runner.config import Endpoint, ModelEntry, Price
 from merge_runner.errors import MergeRunnerError
-from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
-from merge_runner.llm.http_outcome import FirstCall
-from merge_runner.llm.ledger import Ledger, cost_usd
+from merge_runner.llm.ledger import Budget, Ledger, cost_usd
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot, Usage
 from tests.emulator.scenarios import SCENARIOS
@@ -149,7 +147,7 @@ def entry_of(wire, **changes):
     return ModelEntry(**fields | changes)
 
 
-async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
+async def asked(cache, till, faults, *, cap, name, calls=CALLS, passed=True):
     """Ask for samples at once under a cap of so many worst cases; returns client and cap in USD."""
     entry = entry_of(till.wire)
     sent = canonical_json(FORMATS[till.wire].request(entry, PROMPT).body).encode()
@@ -165,7 +163,7 @@ async def asked(cache, till, faults, *, cap, name, calls=CALLS, first=None):
             transport=transport,
             limiter=Limiter(),
             budget=Budget(Ledger(cache, name), cap * worst, each(worst)),
-            first=first or FirstCall(passed=True),
+            passed=passed,
         )
 
         async def ask(number):
@@ -225,7 +223,7 @@ async def test_a_server_that_ignores_the_output_cap_does_not_pass_the_other_one(
     till = Till(wire, tells=False, entry=entry_of(wire), writes=writes())
     name = f"https://endless/{from_now_on}/{wire}"
     client, cap_usd = await asked(
-        cache, till, FaultPlan(), cap=10.5, name=name, calls=60, first=FirstCall()
+        cache, till, FaultPlan(), cap=10.5, name=name, calls=60, passed=False
     )
     spending = client.budget.ledger.read()
     shares[f"output cap ignored, {from_now_on} times, {wire}"] = till.usd / cap_usd
@@ -240,7 +238,7 @@ async def test_a_server_that_ignores_the_output_cap_does_not_pass_the_other_one(
 async def test_the_last_reply_alone_can_pass_the_cap_and_nothing_is_asked_after_it(cache, wire):
     till = Till(wire, tells=False, entry=entry_of(wire), writes=after(3, 64_000))
     name = f"https://at-the-end/{wire}"
-    client, cap_usd = await asked(cache, till, FaultPlan(), cap=1.5, name=name, first=FirstCall())
+    client, cap_usd = await asked(cache, till, FaultPlan(), cap=1.5, name=name, passed=False)
     dearest = till.price(40, 64_000)
     assert cap_usd < till.usd < cap_usd + dearest
     assert client.meter.outcomes.total() == 4

@@ -13,11 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
-from merge_runner.llm.budget import Budget
-from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
-from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.records import Attempt, Slot
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.ledger import Asked, Budget, Ledger
+from merge_runner.records import Attempt
 from tests.harness import each
 
 CAP = 100
@@ -202,7 +200,7 @@ async def test_the_oldest_trial_may_spend_what_is_kept_for_younger_ones(ledger):
 async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_for_its_own(
     ledger, monkeypatch
 ):
-    monkeypatch.setattr("merge_runner.llm.budget.PATIENCE_S", 0.01)
+    monkeypatch.setattr("merge_runner.llm.ledger.PATIENCE_S", 0.01)
     budget = Budget(ledger, 4.0, each(2.0))
     await budget.admit(1)
     await budget.admit(2)
@@ -349,23 +347,6 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
     assert (ledger.spending.spent_usd, ledger.spending.reserved_usd) == (0.5, 0.25)
     assert ledger.spending.overruns[O3.driver] == 2
     cache.close()
-
-
-async def test_an_answer_that_was_kept_right_before_a_kill_is_settled_by_the_next_run(
-    ledger, cache
-):
-    slot = Slot("N_0_0", 1, "left", 0, 0)
-    request = make_request(
-        provider="openai", endpoint="e", model="m", path="/p", headers={}, body={}, slot=slot
-    )
-    for key in (request.key, "another"):
-        ledger.reserve(key, 1, 0.25, None, O3)
-    await cache.put(CachedCall(request, (Attempt(1, "ok", 200, cost_usd=0.125, reply="{}"),)))
-    ledger.settle_kept({"another driver"})
-    assert ledger.read().spent_usd == 0
-    ledger.settle_kept({O3.driver})
-    spending = ledger.read()
-    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.125, 0.25, 1)
 
 
 async def test_nobody_reads_the_ledger_s_file_before_its_tables_are_there(tmp_path):

@@ -17,9 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.cache import CachedCall, ResponseCache, TextDisk
 from merge_runner.llm.content_hashes import make_request
-from merge_runner.llm.text_disk import TextDisk
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage
 
 
@@ -64,7 +63,7 @@ def cache(folder):
 
 
 def endpoints(cache, model):
-    return sorted({each.endpoint for each in cache.recorded(lambda each: each.model == model)})
+    return sorted({each.endpoint for each in cache.recorded(model=model)})
 
 
 def left_out(cache):

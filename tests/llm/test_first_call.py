@@ -8,7 +8,7 @@ import pytest
 
 from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.http_outcome import FirstCall, TransportFailure
+from merge_runner.llm.http_outcome import TransportFailure
 from tests.llm.test_client import (  # noqa: F401 # fixtures
     PRICE,
     Server,
@@ -38,7 +38,7 @@ def begin(make):  # noqa: F811
     """A client whose run begins."""
 
     def begin(*replies, known=False, **changes):
-        return make(*replies, first=FirstCall(known=known), **changes)
+        return make(*replies, passed=False, known=known, **changes)
 
     return begin
 

@@ -4,8 +4,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.base import Reading, WireFormat, WireRequest
+from merge_runner.llm.formats import FORMATS, Reading, WireFormat, WireRequest
 from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
 
 OPENAI_QUOTA = (
@@ -468,7 +467,6 @@ OPENROUTER_FILTER = openrouter(403, "Your input was flagged", flagged_input="PRO
 def test_a_filter_is_a_refusal_and_no_failure(status, body):
     found = judged("openai-chat", status, body)
     assert (found.action, found.name) == ("accept", "refusal")
-    assert found.reading.outcome == "refusal"
     assert found.reading.text == ""
 
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import httpx
 
 from merge_runner.chance import draw, draw_between, draw_index
-from merge_runner.emulator import handler as served
 from merge_runner.emulator.handler import (
     CHAT,
     GEMINI,
@@ -25,20 +24,18 @@ from merge_runner.emulator.handler import (
     UNREADABLE,
     Asked,
     ServedFormat,
-    as_error,
     as_json,
     as_response,
 )
 from merge_runner.errors import UsageError
 from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_FIELD, SLOT_HEADER
+from tests.mock_server.errors import ERRORS, as_error, error_body
 
 if TYPE_CHECKING:
     from tests.mock_server.emulator import FaultyEmulator
 
 ID = "(?P<name>[^/]+?)"
-# The faults that are errors of the provider, beside a rate limit.
-ERRORS = {**served.ERRORS, "request_timeout": 408, "conflict": 409}
 FAILURES = (429, 500, 503)
 GRPC_CODES = {400: 3, 429: 8, 500: 13, 503: 14}
 Handler = Callable[..., httpx.Response]
@@ -233,7 +230,7 @@ class Batches:
             except UsageError as exc:
                 status, message = 400, str(exc)
         if status != 200:
-            body = _marked(asked.wire.error(status, message, 0.0)[0])
+            body = error_body(asked.wire, status, message)
         return Result(line.custom_id, status, body)
 
 

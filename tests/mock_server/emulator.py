@@ -23,16 +23,17 @@ from merge_runner.emulator.handler import (
     RESPONSES,
     Asked,
     Emulator,
-    as_error,
     as_json,
     as_response,
 )
 from merge_runner.records import SCRIPTED_HEADER
-from tests.mock_server.batches import ERRORS, MODES, Batches, BrokenOff
+from tests.mock_server.batches import MODES, Batches, BrokenOff
+from tests.mock_server.errors import ERRORS, as_error
 from tests.mock_server.plans import FaultPlan
 
 BREAKS = ("hang", "reset", "truncated_body")
 REFUSAL = "I cannot help with that."
+PROSE = "M\n\nI would rather describe my plan in words than write a list of numbers."
 # A linger time of zero sends a reset instead of an orderly close.
 RESET_AT_CLOSE = struct.pack("ii", 1, 0)
 
@@ -42,7 +43,7 @@ class FaultyEmulator(Emulator):
 
     def __init__(self, plan: FaultPlan | None = None) -> None:
         self.plan = plan or FaultPlan()
-        super().__init__(self.plan)
+        super().__init__(self.plan.latency_s, self.plan.output_tokens)
         self._answered: Counter[tuple[str, str | None, str | None]] = Counter()
         self._batches = Batches(self)
         self._routes = [route for mode in MODES for route in mode(self._batches).routes()]
@@ -65,21 +66,11 @@ class FaultyEmulator(Emulator):
             for (body, slot, custom_id), count in self._answered.items()
         ]
 
-    def answer(
-        self, asked: Asked, attempt: int, fault: str | None, custom_id: str | None = None
-    ) -> dict[str, Any]:
-        """The body of an answer, which is counted."""
-        body = super().answer(asked, attempt, fault)
-        if fault not in (*ERRORS, *BREAKS, "rate_limit", "bad_gateway"):
-            self._answered[asked.body_sha256, asked.slot, custom_id] += 1
-        if fault in ("empty", "refused"):
-            _say_nothing(asked, body, refused=fault == "refused")
-        return body
-
-    async def deliver(
-        self, asked: Asked, fault: str | None, answer: dict[str, Any]
-    ) -> httpx.Response:
+    async def reply(self, asked: Asked, attempt: int) -> httpx.Response:
         """The response, or what takes its place; raises BrokenOff."""
+        fault = self.plan.fault(asked.where, attempt)
+        answer = self.answer(asked, attempt, fault)
+        await asyncio.sleep(self.latency_s)
         if fault == "hang":
             await asyncio.sleep(self.plan.hang_s)
         if fault in BREAKS:
@@ -87,12 +78,39 @@ class FaultyEmulator(Emulator):
         if fault == "bad_gateway":
             page = b"<html>502 Bad Gateway</html>"
             return as_response(page, 502, {"content-type": "text/plain"})
+        if fault == "rate_limit":
+            return as_error(asked.wire, 429, "Rate limit reached.", self.plan.delay_s)
         if fault in ERRORS:
             return as_error(asked.wire, ERRORS[fault], "An emulated fault.")
-        response = await super().deliver(asked, fault, answer)
+        response = as_json(answer)
         if fault == "truncated_json":
             return as_response((await response.aread())[:-20], 200, response.headers)
         return response
+
+    def answer(
+        self, asked: Asked, attempt: int, fault: str | None = None, custom_id: str | None = None
+    ) -> dict[str, Any]:
+        """The body of an answer, which is counted."""
+        body = super().answer(asked, attempt)
+        if fault not in (*ERRORS, *BREAKS, "rate_limit", "bad_gateway"):
+            self._answered[asked.body_sha256, asked.slot, custom_id] += 1
+        if fault == "malformed":
+            _put_text(asked, body, PROSE)
+        if fault in ("empty", "refused"):
+            _say_nothing(asked, body, refused=fault == "refused")
+        return body
+
+
+def _put_text(asked: Asked, body: dict[str, Any], text: str) -> None:
+    """Put another text in the place of an answer's."""
+    if asked.wire is CHAT:
+        body["choices"][0]["message"]["content"] = text
+    elif asked.wire is RESPONSES:
+        body["output"][1]["content"][0]["text"] = text
+    elif asked.wire is GEMINI:
+        body["candidates"][0]["content"]["parts"][0]["text"] = text
+    elif asked.wire is MESSAGES:
+        body["content"][0]["text"] = text
 
 
 def _say_nothing(asked: Asked, body: dict[str, Any], *, refused: bool) -> None:

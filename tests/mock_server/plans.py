@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from merge_runner.emulator import Behaviour
+from merge_runner.chance import draw
 
 # A sweep with these, which asks again, ends like one without; the others change what it records.
 TRANSIENT = (
@@ -49,11 +50,28 @@ class BatchPlan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FaultPlan(Behaviour):
-    """Rates of any of FAULTS; a hang is silent for ``hang_s``, and then closes."""
+class FaultPlan:
+    """Rates of any of FAULTS per attempt; a hang is silent for ``hang_s``, and then closes.
 
+    Every answer takes ``latency_s``. A rate limit asks to wait ``delay_s``.
+    """
+
+    rates: Mapping[str, float] = field(default_factory=dict)
+    latency_s: float = 0.0
+    delay_s: float = 0.05
+    output_tokens: int | None = None
+    seed: int = 0
     hang_s: float = 30.0
     batch: BatchPlan = field(default_factory=BatchPlan)
+
+    def fault(self, where: str, attempt: int) -> str | None:
+        """What goes wrong with an attempt; ``where`` names the request."""
+        chance = draw("fault", self.seed, where, attempt)
+        for fault, rate in self.rates.items():
+            chance -= rate
+            if chance < 0:
+                return fault
+        return None
 
 
 def transient_faults(rate: float, seed: int) -> FaultPlan:

@@ -229,7 +229,7 @@ def play(tmp_path, monkeypatch):
             outcome = await run_sweep(plan, settings, say=[].append)
             async with httpx.AsyncClient() as client:
                 counts = (await client.get(f"{server.url}/emulator/answered")).json()
-        assert outcome.exit_code == 0, outcome.messages
+        assert outcome["exit_code"] == 0, outcome["messages"]
         return results_digest(db), counts
 
     return run

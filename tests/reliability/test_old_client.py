@@ -67,11 +67,9 @@ def read_by(client: Path, db: Path) -> dict[str, int]:
 async def test_an_old_duckdb_reads_every_table_and_view(merge_runner, tmp_path, old_client):
     played = await merge_runner("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
     assert played.code == 0, played.err
-    kept = await merge_runner("tables", "gap")  # the analysis keeps what it computes there, too
-    assert kept.code == 0, kept.err
     rows = read_by(old_client, tmp_path / "results/merge.duckdb")
     assert rows["trial_metrics"] == rows["trials"] == 1
-    assert min(rows[name] for name in ("states", "attempts", "finished", "geometry")) > 0
+    assert min(rows[name] for name in ("states", "attempts", "geometry")) > 0
 
 
 def test_the_promised_version_is_the_one_that_is_tested():

@@ -39,7 +39,7 @@ async def test_a_forgotten_sweep_takes_only_the_trials_that_no_other_sweep_has(
     db = tmp_path / "results/merge.duckdb"
     gone = await merge_runner("forget", two_sweeps[1], "--yes")
     assert gone.code == 0, gone.err
-    assert "and 2 trials; 2 trials that other sweeps have, too, stay" in gone.err
+    assert "and the 2 trials of no other one" in gone.err
     assert trials(tmp_path) == ["emulator/baseline/L_4_8/rep01", "emulator/baseline/N_0_0/rep01"]
     for table in ("states", "decisions", "calls", "sweep_trials"):
         assert query(db, f"select count(distinct trial_id) from {table}")[1] == [(2,)]
@@ -54,7 +54,7 @@ async def test_the_trials_of_a_forgotten_sweep_are_played_again_without_a_call(
     before = await merge_runner("digest")
     shown = await merge_runner("tables", "who-first", "--format", "csv")
     gone = await merge_runner("forget", two_sweeps[1], "--yes")
-    assert f"removed: 1 sweeps ({two_sweeps[1]}) and 2 trials; 2" in gone.err
+    assert f"removed: 1 sweeps ({two_sweeps[1]}) and the 2 trials of no other one" in gone.err
     assert (await merge_runner("tables", "who-first", "--format", "csv")).out != shown.out
     again = await merge_runner("sweep", *PART, "--reps", 2, "--json")
     assert again.summary["calls"]["live"] == 0

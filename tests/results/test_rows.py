@@ -27,5 +27,5 @@ HALF, PAIR = r'{"said": "\ud83d"}', r'{"said": "\ud83d\ude00"}'
     ],
 )
 def test_an_answer_is_stored_as_it_came_unless_it_holds_half_a_surrogate_pair(reply, stored):
-    row = call_row("t", "s", "left", 0, REQUEST, Attempt(1, "ok", 200, reply=reply), cached=True)
+    row = call_row(("t", "s"), REQUEST, Attempt(1, "ok", 200, reply=reply), cached=True)
     assert row[REPLY] == stored

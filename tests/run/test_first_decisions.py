@@ -52,7 +52,9 @@ async def test_a_run_of_fewer_decisions_says_at_its_end_that_none_is_valid(merge
             decisions = run.summary["decisions"]
             assert run.summary["invalid_decisions"] == decisions < MOST_INVALID
             (message,) = run.summary["messages"]
-            assert message.startswith(f"none of the {decisions} decisions of emulator is valid. ")
+            assert message.startswith(
+                f"none of the first {decisions} decisions of emulator is valid. "
+            )
             assert "(no array). To mend that look at what" in message
         assert (await merge_runner(*part, "--keep-going", **env)).code == 0
 

@@ -167,5 +167,5 @@ def test_the_estimate_is_by_what_was_measured():
     )
     each = (500 * 2 + 1500 * 8) / 1e6
     assert (expected.trials, expected.calls) == (40, 840)
-    assert expected.cost_usd == pytest.approx(840 * each, abs=0.01)
-    assert expected.batch.cost_usd == 5.46
+    assert expected.singly_usd == pytest.approx(840 * each, abs=0.01)
+    assert expected.cost_usd == 5.46

@@ -50,7 +50,6 @@ async def test_a_rehearsal_needs_no_key_and_costs_what_the_model_would(
     assert calls >= 18
     assert run.summary["cost_usd"] == pytest.approx(calls * tokens * price / 1e6, rel=0.25)
     assert run.summary["attempts_of_unknown_cost"] == 0
-    assert run.summary["attempts"]["server_error"] == 1  # which a provider does not charge
     if model == "quick-o3":  # 60 a minute, ten times as fast
         assert (calls - 2) / 10 <= run.summary["playing_s"] < calls - 1
     # Nothing lies where a real run would look for it.

@@ -217,7 +217,7 @@ async def test_a_replay_that_finds_nothing_stores_nothing_and_says_what_is_recor
     assert not (tmp_path / "results").exists()
     assert (
         "nothing of this replay is recorded, and nothing is stored: "
-        f"{RECORDING} holds baseline with emulator: 10 x baseline in 11 conditions"
+        f"{RECORDING} holds 2054 calls of scripted-driver"
     ) in run.err
     cached = await merge_runner("replay", "ablations", "--reps", 1)
     assert cached.code == 4
@@ -345,7 +345,7 @@ def test_a_rewritten_recording_that_is_not_changed_is_whole(small, tmp_path, who
         ("UPDATE calls SET body = replace(body, 'merge', 'marge')", "does not belong to its key"),
         ("UPDATE calls SET side = 'right' WHERE side = 'left'", "does not belong to its key"),
         ("UPDATE calls SET endpoint = 'openai'", "does not belong to its key"),
-        ("UPDATE calls SET attempts = '[]'", "holds no reply"),
+        ("UPDATE calls SET attempts = '[]'", "is damaged"),
         ("UPDATE calls SET attempts = 'import os'", "is damaged"),
         ("INSERT INTO calls FROM calls LIMIT 1", "repeats"),
         ("DELETE FROM calls WHERE condition = 'L_4_8'", "is not as it was exported"),
@@ -382,10 +382,10 @@ def told(prepare, tmp_path_factory):
      "sweep_id", "provenance_sha256", "added"],
 )  # fmt: skip
 def test_a_recording_that_says_something_else_of_its_origin_is_refused(told, tmp_path, name):
-    origin = summarise(told).provenance
+    origin = summarise(told)["provenance"]
     assert name in origin or name == "added"
     changed(told, tmp_path / "same.parquet")
-    assert summarise(tmp_path / "same.parquet").provenance == origin
+    assert summarise(tmp_path / "same.parquet")["provenance"] == origin
     changed(told, tmp_path / "bad.parquet", **{name: origin.get(name, "") + " "})
     with pytest.raises(RecordingError, match="what it says of where it comes from"):
         summarise(tmp_path / "bad.parquet")

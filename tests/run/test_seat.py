@@ -298,7 +298,7 @@ async def test_situations_that_cannot_be_asked_are_refused_before_anything_is(
         )
         tunnel = await merge_runner("sweep", "mine.toml", "--first", **env)
         assert server.requests == 0
-    assert "error: a projected headway of 60 m, a relative velocity of 0 m/s" in near.err
+    assert "error: Condition(projected_headway_m=60.0, relative_velocity_mps=0.0" in near.err
     assert (near.code, "at the merge point before both are driven" in near.err) == (2, True)
     assert (both.code, "takes the place of the conditions" in both.err) == (2, True)
     assert (tunnel.code, 'control_start = "both_exits"' in tunnel.err) == (2, True)

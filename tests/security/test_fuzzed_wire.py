@@ -10,11 +10,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from merge_runner.config import Endpoint
-from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.formats.base import read_error
+from merge_runner.llm.formats import FORMATS, read_error
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import (
-    MOST_S,
     RawReply,
     TransportFailure,
     judge,
@@ -105,8 +103,8 @@ JSON = st.recursive(
 @example({"retry-after": "Mon, 01 Jan 2026 00:00:00 -99999999999999999999"}, None)
 @example({"retry-after": "Wed, 21 Oct 2026 07:28:00 +99999999999"}, None)
 def test_fuzz_of_headers_every_delay_is_one_that_can_be_waited_for(headers, payload):
-    delay_s = server_delay_s(read_error(429, headers, "", payload), FORMATS.values())
-    assert delay_s is None or (0 < delay_s <= MOST_S and math.isfinite(delay_s))
+    delay_s = server_delay_s(read_error(429, headers, "", payload), FORMATS["openai-chat"])
+    assert delay_s is None or (delay_s > 0 and math.isfinite(delay_s))
 
 
 @given(STATUSES, HEADERS, st.text(max_size=80) | JSON.map(str), st.sampled_from(sorted(FORMATS)))

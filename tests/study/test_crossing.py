@@ -181,7 +181,12 @@ def test_plain_sweeps_have_one_arm_for_each_prompt():
             "o3 takes no parameter top_k; valid: max_output_tokens",
         ),
         ("[factors]\nskip = [1]\n", [], "unknown factor 'skip'; valid: prompt, opp"),
-        ('[factors]\nopponent = ["self", "emulator"]\n', [], "are the same trials: leave one out"),
+        (
+            'skip = [{ model = "emulator+random", opponent = "random" }]\n'
+            '[factors]\nseed = [1]\nopponent = ["self", "random"]\n',
+            ["emulator+random", "emulator"],
+            "have the same names, and are asked otherwise: leave one out",
+        ),
         ("[factors]\ntemperature = [0.2]\n", ["o3"], "no parameter temperature but its default"),
         ("[factors]\ntemperature = [0.2]\n", ["constant"], "is a program and takes no temperature"),
         ("[factors]\ntemperature = []\n", ["o3"], "nothing is left to play: look at [factors]"),
@@ -231,11 +236,6 @@ def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
     ("text", "said"),
     [
         ('[factors]\nperception = ["fog"]\n' + FOGGY, "'fog'; valid: perfect, foggy"),
-        (
-            '[factors]\nperception = ["foggy"]\nperception_left = ["foggy"]\n' + FOGGY,
-            "of both sides: name it, or perception_left and perception_right",
-        ),
-        ("[perception.perfect]\ndelay_s = 0.2\n", "needs another name"),
         (
             '[factors]\nperception = ["late"]\n[perception.late]\ndelay_s = 0.3\n',
             "no whole number of 0.2 s: set step_s ",

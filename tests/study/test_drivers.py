@@ -118,7 +118,6 @@ async def test_a_clock_holds_each_action(plan_of):
         (MINE + "set = 1\n", "set of braking is a text, as 'mild'"),
         (MINE + 'set = "soft"\n', "unknown set of the driver Braking 'soft'; valid: mild, hard"),
         (MINE + "strength = 2\n", r"\[drivers\.mine\]: strength is at most 1"),
-        (MINE + "clock = 0.01\n", "braking decides every 0.05 s, and a clock can only slow it"),
         (MINE + "clock = 0\n", "clock: Input should be greater than 0"),
         (
             '[drivers.mine]\nprogram = "cei"\nclock = 0.12\n',

@@ -162,11 +162,11 @@ def test_the_panel_of_a_decision_shows_both_beside_each_other(db):
     assert "situation as a table" in panel("foggy")
 
 
-async def test_what_was_told_is_exported_with_its_units(merge_runner, db, tmp_path):
+async def test_what_was_told_is_exported_with_its_meaning(merge_runner, db, tmp_path):
     done = await merge_runner("export", "out", "--db", db)
     assert done.code == 0, done.err
     with (tmp_path / "out/dictionary.csv").open(newline="", encoding="utf-8") as file:
-        units = {(row["table"], row["column"]): row["unit"] for row in csv.DictReader(file)}
-    assert units["decisions", "told_distance_m"] == units["perceptions", "distance_m"] == "m"
+        meanings = {(row["table"], row["column"]): row["meaning"] for row in csv.DictReader(file)}
+    assert meanings["perceptions", "distance_m"] == "how far ahead the other was"
     with (tmp_path / "out/perceptions.csv").open(newline="", encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) > 100

@@ -16,7 +16,7 @@ from merge_runner import Study
 from merge_runner.config import ModelEntry
 from merge_runner.paths import DEFAULT_DB, home_of
 from merge_runner.results.store import results_digest
-from merge_runner.study.file import FILES, TEMPLATE, write_folder
+from merge_runner.study.file import TEMPLATE, write_folder
 from tests.harness import PROGRAM, watched
 from tests.mock_server import FaultPlan
 
@@ -123,7 +123,8 @@ async def test_init_says_what_to_type_and_refuses_a_folder_that_is_not_empty(
     made = await merge_runner("init", "my study")
     assert (made.code, made.out) == (0, "go on: cd 'my study' && merge-runner sweep study.toml\n")
     names = {path.name for path in (tmp_path / "my study").iterdir()}
-    assert names == {*FILES, ".gitignore"}
+    files = ("study.toml", "models.toml", "plugin.py", "README.md", "CITATION.cff", "Makefile")
+    assert names == {*files, ".gitignore"}
     again = await merge_runner("init", "my study")
     assert (again.code, again.err) == (
         2,

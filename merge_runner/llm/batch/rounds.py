@@ -34,10 +34,10 @@ from merge_runner.errors import (
     RecordingError,
     TrialSuspended,
 )
-from merge_runner.llm.batch.service import BatchFailed, BatchService, BatchStatus
-from merge_runner.llm.budget import PaidAttempt
+from merge_runner.llm.batch.providers import BatchFailed, BatchService, BatchStatus
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
+from merge_runner.llm.ledger import PaidAttempt
 from merge_runner.records import ChatRequest
 
 if TYPE_CHECKING:
@@ -67,12 +67,11 @@ class OpenBatch(BaseModel, frozen=True):
 
     ``mark`` is its name at the provider, ``batch_id`` its id, empty until the provider has told it.
     ``lines`` has the number of the attempt by the key of each call. ``model`` is its name in the
-    registry, ``ledger`` that of the money. ``submitted_at`` is UTC.
+    registry. ``submitted_at`` is UTC.
     """
 
     mark: str
     model: str
-    ledger: str
     submitted_at: AwareDatetime
     lines: dict[str, int]
     batch_id: str = ""
@@ -84,21 +83,14 @@ class Batch:
 
     Then ``ends`` has what became of the lines with a result, by key, until it is taken, and
     ``rest`` what became of all others; None: they go with the next round. An ``error`` ends the
-    sweep. While its work ``sleeps`` nothing of it is on its way.
+    sweep.
     """
 
     note: OpenBatch
     ends: dict[str, AttemptOutcome] = field(default_factory=dict)
     rest: AttemptOutcome | None = None
     error: MergeRunnerError | None = None
-    sleeps: bool = False
     work: asyncio.Task[None] | None = None
-
-    async def sleep(self, seconds: float) -> None:
-        """Wait, while others may go on."""
-        self.sleeps = True
-        await asyncio.sleep(seconds)
-        self.sleeps = False
 
 
 @dataclass(slots=True, eq=False)
@@ -139,22 +131,19 @@ class Rounds:
                 noted.append(OpenBatch.model_validate_json(cache.read(name) or ""))
         noted.sort(key=lambda note: note.submitted_at)
         self.batches = {note.mark: Batch(note) for note in noted if note.model in models}
-        ended = [mark for mark, batch in self.batches.items() if not self._waits(batch)]
+        # Where earlier runs have submitted calls last whose attempts there have not ended.
+        self._waiting: dict[str, Batch] = {}
+        for batch in self.batches.values():
+            self._waiting |= dict.fromkeys(batch.note.lines, batch)
+        self._waiting = {key: b for key, b in self._waiting.items() if not self._ended(key, b)}
+        ended = self.batches.keys() - {batch.note.mark for batch in self._waiting.values()}
         cache.run_now([partial(cache.remove, _BATCH + mark) for mark in ended])
         for mark in ended:
             del self.batches[mark]
 
     def open_batch(self, key: str) -> Batch | None:
-        """Return where a call was submitted last, unless its attempt there has ended."""
-        every = reversed(self.batches.values())
-        batch = next((batch for batch in every if key in batch.note.lines), None)
-        if batch is None:
-            return None
-        with contextlib.suppress(RecordingError):  # damaged: nothing is known of its attempts
-            tried = {each.number: each.outcome for each in self._cache.unanswered(key)}
-            if tried.get(batch.note.lines[key], "unknown") != "unknown":
-                return None
-        return batch
+        """Return where an earlier run has submitted a call, unless its attempt there has ended."""
+        return self._waiting.get(key)
 
     async def ask(self, call: Call, paid: PaidAttempt, model: str) -> tuple[AttemptOutcome, Batch]:
         """Return what became of a call's next attempt, in the next round or where it waits."""
@@ -167,6 +156,7 @@ class Rounds:
             if end is None and not self.submits:
                 end = _no_answer("not_created", "the run ended before", charged=False)
             if end is not None:
+                self._waiting.pop(call.request.key, None)
                 return end, batch
             batch = await self._next_round(call, paid, model)
 
@@ -176,8 +166,7 @@ class Rounds:
             await asyncio.sleep(LOOK_S)
             for _ in range(LOOKS):
                 await asyncio.sleep(0)
-                sleep = all(batch.sleeps for batch in self._open())
-                if not (self._forming and sleep and is_idle()):
+                if not (self._forming and is_idle()):
                     break
             else:
                 self._close_round()
@@ -205,14 +194,11 @@ class Rounds:
             if batch.work and not batch.work.done() and model in (None, batch.note.model)
         ]
 
-    def _waits(self, batch: Batch) -> bool:
-        """Whether a call of a batch waits there yet, and in no later one."""
-        for key in batch.note.lines:
-            with contextlib.suppress(RecordingError):  # damaged: it is asked anew
-                if self._cache.get(key) is not None:
-                    continue
-            if self.open_batch(key) is batch:
-                return True
+    def _ended(self, key: str, batch: Batch) -> bool:
+        with contextlib.suppress(RecordingError):  # damaged: nothing is known of its attempts
+            tried = {each.number: each.outcome for each in self._cache.unanswered(key)}
+            outcome = tried.get(batch.note.lines[key], "unknown")
+            return outcome != "unknown" or self._cache.get(key) is not None
         return False
 
     async def _next_round(self, call: Call, paid: PaidAttempt, model: str) -> Batch:
@@ -221,12 +207,12 @@ class Rounds:
         return await line.batch
 
     def _close_round(self) -> None:
-        groups: defaultdict[tuple[str, str], list[Line]] = defaultdict(list)
+        groups: defaultdict[str, list[Line]] = defaultdict(list)
         for line in self._forming:
             if not line.batch.done():  # somebody waits for it yet
-                groups[line.model, line.paid.ledger.scope].append(line)
+                groups[line.model].append(line)
         self._forming = []
-        for (model, ledger), lines in groups.items():
+        for model, lines in groups.items():
             most = self._most.get(model, MOST_CALLS)
             if model in self._most:
                 now = 0 if self._open(model) else most
@@ -236,7 +222,6 @@ class Rounds:
                 note = OpenBatch(
                     mark=secrets.token_hex(16),
                     model=model,
-                    ledger=ledger,
                     submitted_at=datetime.now(UTC),
                     lines={each.call.request.key: len(each.call.attempts) + 1 for each in part},
                 )
@@ -321,7 +306,7 @@ class Rounds:
             raise BatchFailed("lost", "whether it was created is not known")
         find = partial(service.find, batch.note.mark)
         for pause_s in (0.0, *ARRIVAL_S):
-            await batch.sleep(pause_s)
+            await asyncio.sleep(pause_s)
             if (batch_id := await self._patiently(batch, find)) is not None:
                 await self._note(batch, batch_id)
                 return True
@@ -340,12 +325,12 @@ class Rounds:
         ask = partial(self.services[note.model].status, note.batch_id)
         while (status := await self._patiently(batch, ask)) == BatchStatus():
             age_s = (datetime.now(UTC) - note.submitted_at).total_seconds()
-            await batch.sleep(max(SHORTEST_POLL_S, min(LONGEST_POLL_S, POLL_SHARE * age_s)))
+            await asyncio.sleep(max(SHORTEST_POLL_S, min(LONGEST_POLL_S, POLL_SHARE * age_s)))
         if status.failure:
             await self._not_asked(batch, status.failure, "batch_failed")
             return
         try:
-            await self._patiently(batch, partial(self._read, batch), ENDING_S)
+            await self._patiently(batch, partial(self._read, batch, status), ENDING_S)
         except BatchFailed as exc:
             if exc.kind != "again":
                 raise
@@ -354,14 +339,10 @@ class Rounds:
         if note.model in self._most:
             self._most[note.model] = max(self._most[note.model], 2 * len(note.lines))
 
-    async def _read(self, batch: Batch) -> None:
+    async def _read(self, batch: Batch, status: BatchStatus) -> None:
         """Take the results of a batch; raises BatchFailed where there should be others."""
-        note, service = batch.note, self.services[batch.note.model]
-        status = await service.status(note.batch_id)
-        if status.paths is None:
-            raise BatchFailed("again", "a batch that has ended is said to go on")
-        broken = 0
-        async for key, raw in service.results(status.paths):
+        note, service, broken = batch.note, self.services[batch.note.model], 0
+        async for key, raw in service.results(status.paths or []):
             end = _no_answer("expired", "it was not asked in time", charged=False)
             if raw:  # no limit of single calls is meant, and no call waits for one
                 end = replace(judge(raw, service.wire), pause=False, delay_s=None)
@@ -397,7 +378,7 @@ class Rounds:
                 self._say(f"{model}: {calls} calls go in smaller batches: {exc}")
             self._most[model] = max(1, calls // 2) if is_alone else calls
             # It counts as open, so that no other one is submitted meanwhile.
-            await batch.sleep(exc.delay_s or 1.0)
+            await asyncio.sleep(exc.delay_s or 1.0)
             return
         batch.rest = _no_answer(outcome, str(exc), charged=False)
 
@@ -406,7 +387,7 @@ class Rounds:
         note, service = batch.note, self.services[batch.note.model]
         is_unknown = not (note.batch_id or service.takes_mark)
         # A key that is refused is another account's, perhaps: there the batch goes on.
-        if is_unknown or service.forgets or (not self.submits and exc.kind == "lost"):
+        if is_unknown or (not self.submits and exc.kind == "lost"):
             batch.rest = _no_answer("batch_lost", str(exc))
             return
         raise EndpointRefused(
@@ -433,7 +414,7 @@ class Rounds:
                 if not tries:
                     self._say(f"{batch.note.model}: {exc}; it is asked again until it answers")
                 tries += 1
-                await batch.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
+                await asyncio.sleep(max(exc.delay_s or 0.0, backoff_s(tries)))
 
 
 def _no_answer(name: str, why: str, *, charged: bool = True) -> AttemptOutcome:

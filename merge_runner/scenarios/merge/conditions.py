@@ -37,15 +37,7 @@ class Condition:
 
     def __post_init__(self) -> None:
         if not isfinite(self.projected_headway_m) or not all(v > 0 for v in self.speeds_mps):
-            raise UsageError(f"{self.described} is no condition: both vehicles must drive forwards")
-
-    @property
-    def described(self) -> str:
-        """Its numbers in words."""
-        return (
-            f"a projected headway of {self.projected_headway_m:g} m, a relative velocity of "
-            f"{self.relative_velocity_mps:g} m/s and a mean speed of {self.mean_speed_mps:g} m/s"
-        )
+            raise UsageError(f"{self} is no condition: both vehicles must drive forwards")
 
     @property
     def speeds_mps(self) -> tuple[float, float]:
@@ -68,15 +60,14 @@ class Condition:
     def exit_times_s(self, track: Track) -> tuple[float, float]:
         """When (left, right) leave their tunnels at constant speed, from the start of the run."""
         # In closed form: steps of 0.2 s would overshoot an exit by up to 2 m.
-        (start_left, start_right), (speed_left, speed_right) = self.starts_m(track), self.speeds_mps
-        return (track.tunnel_exit_m - start_left) / speed_left, (
-            track.tunnel_exit_m - start_right
-        ) / speed_right
+        (left_m, right_m), (speed_left, speed_right) = self.starts_m(track), self.speeds_mps
+        exit_m = track.tunnel_exit_m
+        return (exit_m - left_m) / speed_left, (exit_m - right_m) / speed_right
 
     def positions_m(self, time_s: float, track: Track) -> tuple[float, float]:
         """Travelled distances (left, right) at constant speed, ``time_s`` into the run."""
-        (start_left, start_right), (speed_left, speed_right) = self.starts_m(track), self.speeds_mps
-        return start_left + speed_left * time_s, start_right + speed_right * time_s
+        (left_m, right_m), speeds = self.starts_m(track), self.speeds_mps
+        return left_m + speeds[0] * time_s, right_m + speeds[1] * time_s
 
 
 # A name says who has the projected headway advantage (L, R or N), the projected headway in m and

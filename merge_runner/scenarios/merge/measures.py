@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from functools import cache
 from pathlib import Path
 
@@ -22,8 +23,7 @@ def measures_sql() -> str:
 
 def measures_version() -> str:
     """A hash of the definitions without their comments."""
-    lines = (line for line in _definitions().splitlines() if not line.lstrip().startswith("--"))
-    statements = "\n".join(lines).split(";\n")
+    statements = re.sub(r"(?m)^[ \t]*--.*\n", "", _definitions()).rstrip("\n").split(";\n")
     defined = [text for text in statements if not text.lstrip().startswith("COMMENT ON")]
     return hashlib.sha256("\n".join(defined).encode()).hexdigest()
 

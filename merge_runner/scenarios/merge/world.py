@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
@@ -12,45 +13,48 @@ from merge_runner.scenarios.merge.conditions import Condition
 from merge_runner.scenarios.merge.geometry import Track
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration, time_to_reach
 
-Starts = Mapping[Side, tuple[float, float]]
-"""Travelled distance in m and speed in m/s by side."""
+
+@dataclass(slots=True)
+class _Vehicle:
+    """The samples of one vehicle from step 0 on, in SI units, and when it was at the merge point.
+
+    The acceleration of a step stands with the sample at its end.
+    """
+
+    positions: list[float]
+    velocities: list[float]
+    accelerations: list[float] = field(default_factory=lambda: [0.0])
+    merged_s: float | None = None
 
 
 class World:
     """Two vehicles on the track, from the start of control to the end of the trial.
 
-    ``status`` is None while the trial runs. Time 0 is the start of control. Sampled states are
-    kept from step 0 on, in SI units. Raises UsageError for a condition in which a vehicle would
+    ``status`` is None while the trial runs. Time 0 is the start of control. With ``starts`` (in m
+    and m/s) the vehicles start elsewhere than the condition says. Raises UsageError where one would
     be at the merge point before that.
     """
 
-    def __init__(self, config: ScenarioConfig, condition: Condition, track: Track) -> None:
+    def __init__(
+        self,
+        config: ScenarioConfig,
+        condition: Condition,
+        track: Track,
+        starts: Mapping[Side, tuple[float, float]] | None = None,
+    ) -> None:
         exits = condition.exit_times_s(track)
-        start = max(exits) if config.control_start == "both_exits" else min(exits)
+        start_s = max(exits) if config.control_start == "both_exits" else min(exits)
+        positions = condition.positions_m(start_s, track)
+        places = zip(SIDES, zip(positions, condition.speeds_mps, strict=True), strict=True)
         self._config, self._track = config, track
         self.step = 0
-        self.status: Status | None = None
-        self._merge_times: dict[Side, float] = {}
-        self._positions = {
-            side: [position]
-            for side, position in zip(SIDES, condition.positions_m(start, track), strict=True)
+        self._vehicles = {
+            side: _Vehicle([position], [speed])
+            for side, (position, speed) in (starts or dict(places)).items()
         }
-        self._velocities = {
-            side: [speed] for side, speed in zip(SIDES, condition.speeds_mps, strict=True)
-        }
-        self._accelerations: dict[Side, list[float]] = {side: [0.0] for side in SIDES}
-        if max(self._positions["left"][0], self._positions["right"][0]) >= track.merge_point_m:
-            raise UsageError(
-                f"{condition.described}: a vehicle is at the merge point before both are driven"
-            )
-        if self._collided():
-            self.status = "collided"
-
-    def start_at(self, starts: Starts) -> None:
-        """Let the vehicles start elsewhere than the condition says, before the first step."""
-        for side, (position, speed) in starts.items():
-            self._positions[side], self._velocities[side] = [position], [speed]
-        self.status = "collided" if self._collided() else None
+        if max(positions) >= track.merge_point_m:
+            raise UsageError(f"{condition}: a vehicle is at the merge point before both are driven")
+        self.status: Status | None = "collided" if self._collided() else None
 
     @property
     def time_s(self) -> float:
@@ -59,53 +63,59 @@ class World:
 
     def in_control(self, side: Side) -> bool:
         """Whether the vehicle has left its tunnel; until then it cruises by itself."""
-        return self._positions[side][-1] > self._track.tunnel_exit_m - 1e-9
+        return self._vehicles[side].positions[-1] > self._track.tunnel_exit_m - 1e-9
 
-    def advance(self, actions: dict[Side, float | None]) -> None:
+    def advance(self, actions: Mapping[Side, float | None]) -> None:
         """Drive one step with normalised actions in [-1, 1]; None lets a vehicle cruise."""
-        config = self._config
-        for side in SIDES:
-            velocity = self._velocities[side][-1]
-            action = actions[side]
-            acceleration = (
-                0.0
-                if action is None
-                else net_acceleration(
-                    action * config.max_acceleration_mps2, velocity, config.resistance
-                )
-            )
-            self._move(side, acceleration)
+        config, dt = self._config, self._config.step_s
+        for side, vehicle in self._vehicles.items():
+            position, velocity = vehicle.positions[-1], vehicle.velocities[-1]
+            action, acceleration = actions[side], 0.0
+            if action is not None:
+                commanded = action * config.max_acceleration_mps2
+                acceleration = net_acceleration(commanded, velocity, config.resistance)
+            new_position, new_velocity = advance(position, velocity, acceleration, dt)
+            if position < self._track.merge_point_m <= new_position:
+                left_m = self._track.merge_point_m - position
+                vehicle.merged_s = self.time_s + time_to_reach(left_m, velocity, acceleration)
+            vehicle.positions.append(new_position)
+            vehicle.velocities.append(new_velocity)
+            # Where the vehicle stopped within the step, what it executed is less than the command.
+            stopped = velocity + acceleration * dt < 0
+            vehicle.accelerations.append(-velocity / dt if stopped else acceleration)
         self.step += 1
-        self.status = self._end()
+        if self._collided():
+            self.status = "collided"
+        elif max(each.positions[-1] for each in self._vehicles.values()) >= self._track.end_m:
+            self.status = "finished"
+        elif self.step >= config.timeout_steps:
+            self.status = "timeout"
 
     def merged_first(self) -> Side | None:
         """Who reached the merge point first; None after a collision or if nobody did."""
-        if self.status == "collided" or not self._merge_times:
+        times = {s: v.merged_s for s, v in self._vehicles.items() if v.merged_s is not None}
+        if self.status == "collided" or not times:
             return None
-        return min(self._merge_times, key=self._merge_times.__getitem__)
+        return min(times, key=times.__getitem__)
 
-    def observe(self, side: Side) -> Observation:
-        """What the driver of ``side`` sees now, itself as ego."""
-        other = other_side(side)
-        position = self._positions[side][-1]
-        farthest_back = (
-            position
-            if self._config.straight_after == "own"
-            else min(position, self._positions[other][-1])
-        )
+    def observe(self, side: Side, step: int | None = None) -> Observation:
+        """What the driver of ``side`` sees, itself as ego, now or at an earlier step."""
+        own, other = self._vehicles[side], self._vehicles[other_side(side)]
+        now = self.step if step is None else step
+        position, other_position = own.positions[now], other.positions[now]
+        by_own = self._config.straight_after == "own"
+        farthest_back = position if by_own else min(position, other_position)
         straight = farthest_back >= self._track.merge_point_m
         return Observation(
             road="straight" if straight else "merge",
-            own_speed_mps=self._velocities[side][-1],
-            other_speed_mps=self._velocities[other][-1],
-            relative_distance_m=self._positions[other][-1] - position,
+            own_speed_mps=own.velocities[now],
+            other_speed_mps=other.velocities[now],
+            relative_distance_m=other_position - position,
             distance_to_merge_m=None if straight else self._track.merge_point_m - position,
-            own_accelerations_mps2=self._history(self._accelerations[side][1:], 0.0),
-            other_speeds_mps=self._history(
-                self._velocities[other][:-1], self._velocities[other][0]
-            ),
+            own_accelerations_mps2=self._history(own.accelerations[1 : now + 1], 0.0),
+            other_speeds_mps=self._history(other.velocities[:now], other.velocities[0]),
             own_position_m=position,
-            other_acceleration_mps2=self._accelerations[other][-1],
+            other_acceleration_mps2=other.accelerations[now],
         )
 
     def states(self) -> tuple[StateRow, ...]:
@@ -115,38 +125,17 @@ class World:
                 step=step,
                 time_s=_time(step, self._config.step_s),
                 side=side,
-                position_m=self._positions[side][step],
-                velocity_mps=self._velocities[side][step],
-                acceleration_mps2=self._accelerations[side][step],
+                position_m=vehicle.positions[step],
+                velocity_mps=vehicle.velocities[step],
+                acceleration_mps2=vehicle.accelerations[step],
             )
             for step in range(self.step + 1)
-            for side in SIDES
+            for side, vehicle in self._vehicles.items()
         )
 
-    def _move(self, side: Side, acceleration: float) -> None:
-        dt = self._config.step_s
-        position, velocity = self._positions[side][-1], self._velocities[side][-1]
-        new_position, new_velocity = advance(position, velocity, acceleration, dt)
-        if position < self._track.merge_point_m <= new_position:
-            reach = time_to_reach(self._track.merge_point_m - position, velocity, acceleration)
-            self._merge_times[side] = self.time_s + reach
-        self._positions[side].append(new_position)
-        self._velocities[side].append(new_velocity)
-        # Where the vehicle stopped within the step, what it executed is less than the command.
-        stopped = velocity + acceleration * dt < 0
-        self._accelerations[side].append(-velocity / dt if stopped else acceleration)
-
-    def _end(self) -> Status | None:
-        left, right = self._positions["left"][-1], self._positions["right"][-1]
-        if self._collided():
-            return "collided"
-        if max(left, right) >= self._track.end_m:
-            return "finished"
-        return "timeout" if self.step >= self._config.timeout_steps else None
-
     def _collided(self) -> bool:
-        left, right = self._positions["left"][-1], self._positions["right"][-1]
-        return collided(self._config, self._track, left, right)
+        positions = (self._vehicles[side].positions[-1] for side in SIDES)
+        return collided(self._config, self._track, *positions)
 
     def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
         wanted = self._config.memory_samples

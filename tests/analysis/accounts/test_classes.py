@@ -28,8 +28,8 @@ SCENARIOS = {
 def braked(course, condition, side, since, mps2):
     """What the world makes of a side that brakes from a sample on while the other drives on."""
     scenario, other = course.scenario, other_side(side)
-    world = World(scenario, CONDITIONS[condition], TRACK)
-    world.start_at({s: (course.positions_m[s][since], course.speeds_mps[s][since]) for s in SIDES})
+    starts = {s: (course.positions_m[s][since], course.speeds_mps[s][since]) for s in SIDES}
+    world = World(scenario, CONDITIONS[condition], TRACK, starts)
     sample = since
     while world.status is None:
         sample += 1

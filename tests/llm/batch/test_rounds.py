@@ -24,14 +24,13 @@ from merge_runner.errors import (
     ProviderDown,
     QuotaExhausted,
 )
+from merge_runner.llm.batch.providers import BatchFailed, BatchStatus
 from merge_runner.llm.batch.rounds import Rounds
-from merge_runner.llm.batch.service import BatchFailed, BatchStatus
-from merge_runner.llm.budget import Budget
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply
-from merge_runner.llm.ledger import Ledger
+from merge_runner.llm.ledger import Budget, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot
 from tests.virtual_time import in_virtual_time, now_s
@@ -61,7 +60,6 @@ class Memory:
     """
 
     takes_mark = True
-    forgets = False
     wire = FORMATS["openai-chat"]
 
     def __init__(self):
@@ -632,18 +630,6 @@ async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind)
         await run.end()
     (reply,) = await Run(cache, service).ask()
     assert outcomes(reply) == [("ok", "batch-0")]
-
-
-@in_virtual_time
-async def test_a_batch_that_ended_with_its_emulator_is_asked_anew(cache):
-    service = Memory()
-    service.forgets = True
-    await left_behind(cache, service, price="free")
-    service.batches.clear()
-    again = Run(cache, service, price="free")
-    (reply,) = await again.ask()
-    assert [attempt.outcome for attempt in reply.attempts] == ["batch_lost", "ok"]
-    assert again.ledger.read().open_attempts == 0
 
 
 @in_virtual_time

@@ -8,7 +8,7 @@ from collections import Counter
 import httpx
 import pytest
 
-from merge_runner.llm.batch.service import BatchFailed
+from merge_runner.llm.batch.providers import BatchFailed
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import judge
 from tests.llm.batch.conftest import endpoint_at

@@ -1,0 +1,109 @@
+"""Verdicts as marks on an axis: places in percent, so that no picture is stretched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from merge_runner_analysis.verdict_words import (
+    MEASURES,
+    OPEN,
+    SHOWN,
+    STRONGER,
+    UNLIKE,
+    WEAKER,
+    Measure,
+    Values,
+    number,
+    share,
+    verdict_word,
+    with_interval,
+)
+
+SHAPES = {SHOWN: "like", WEAKER: "weaker", STRONGER: "stronger", UNLIKE: "unlike", OPEN: "open"}
+# Decimals of a value in a cell, where they are not one: large shares have none.
+DECIMALS = {"gap-headway": 2}
+LARGE_PERCENT = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """Where a value and its interval lie; ``shape`` is one of SHAPES, ``beyond`` or ``below``."""
+
+    shape: str
+    at: float | None
+    ends: tuple[float, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One verdict as a page shows it; ``words`` is it in full, with what is to be known of it."""
+
+    measure: Measure
+    values: Values
+    mark: Mark | None
+    text: str
+    interval: str
+    verdict: str
+    words: str
+
+
+def place(measure: Measure, value: float) -> float:
+    """The place of a value on a measure's axis in percent; beyond it is its end."""
+    low, high = measure.ends
+    return round(min(max(100 * (value - low) / (high - low), 0.0), 100.0), 2)
+
+
+def mark(measure: Measure, values: Values) -> Mark | None:
+    """The mark of a verdict; None without a value or an interval."""
+    value, ci = values.get("estimate"), values.get("ci")
+    ends = None if ci is None else (place(measure, ci[0]), place(measure, ci[1]))
+    if value is None:
+        return None if ends is None else Mark("", None, ends)
+    shape = SHAPES.get(values.get("state") or "", "plain")
+    low, high = measure.ends
+    if not low <= value <= high:
+        return Mark("beyond" if value > high else "below", place(measure, value), ends)
+    return Mark(shape, place(measure, value), ends)
+
+
+def band(measure: Measure, human: Values) -> dict[str, Any]:
+    """The humans' interval and value on the axis, and 0 where the axis has it inside."""
+    value, ci = human.get("estimate"), human.get("ci")
+    if measure.margin is not None and ci is None and value is not None:
+        ci = value - measure.margin, value + measure.margin
+    low, high = measure.ends
+    return {
+        "at": None if value is None else place(measure, value),
+        "ends": None if ci is None else (place(measure, ci[0]), place(measure, ci[1])),
+        "zero": place(measure, 0.0) if low < 0 < high else None,
+    }
+
+
+def cells(verdicts: dict[str, Values]) -> dict[str, Cell]:
+    """The verdicts of a driver and prompt by measure; empty where it is not judged."""
+    if "" in verdicts:
+        return {}
+    return {name: _cell(MEASURES[name], values) for name, values in verdicts.items()}
+
+
+def _cell(measure: Measure, values: Values) -> Cell:
+    decimals = DECIMALS.get(measure.name, 1)
+    value, ci = values.get("estimate"), values.get("ci")
+    if measure.name == "collisions" and (value or 0.0) >= LARGE_PERCENT:
+        decimals = 0
+    text = "–" if value is None else number(value, decimals)
+    if values.get("undecided"):
+        text = share(values, 0)
+    word = verdict_word(values) if values.get("kind") != "humans" else ""
+    whole = share(values) if values.get("undecided") else with_interval(value, ci, 2)
+    said = [f"{whole} {measure.unit}", word, f"n = {values['n']}", values["note"]]
+    return Cell(
+        measure,
+        values,
+        mark(measure, values),
+        text,
+        "" if ci is None else f"[{number(ci[0], decimals)}, {number(ci[1], decimals)}]",
+        word,
+        "; ".join(filter(None, said)),
+    )

@@ -1,0 +1,444 @@
+"""The wire formats: how a prompt becomes a request body, and a reply's body an answer.
+
+Those of OpenAI and the many servers that speak them, and two more. A package can add others.
+"""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from pydantic import JsonValue
+
+from merge_runner.config import ModelEntry
+from merge_runner.records import Usage
+from merge_runner.registry import Registry
+
+MOST_TOKENS = 2**31 - 1
+# How an error names an exhausted quota: at OpenAI, LiteLLM (the seventh) and Anthropic.
+QUOTA = {
+    *("insufficient_quota", "billing_hard_limit_reached", "credit_balance_exhausted"),
+    *("organization_spend_limit_exceeded", "project_spend_limit_exceeded"),
+    *("organization_usage_limit_exceeded", "budget_exceeded"),
+    *("enforced_spend_limit_reached", "contract_spend_limit_reached"),
+}
+# Anthropic reports these as invalid requests.
+SPENT = ("credit balance is too low", "spend limit")
+# What ends an answer of Gemini that was refused.
+REFUSALS = (
+    *("SAFETY", "RECITATION", "LANGUAGE", "OTHER", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII"),
+    "MODEL_ARMOR",
+)
+# A protobuf Duration as JSON.
+DURATION = re.compile(r"(\d+(?:\.\d+)?)s")
+
+
+@dataclass(frozen=True, slots=True)
+class WireRequest:
+    """A request without its secret: ``headers`` are those that change its meaning."""
+
+    path: str
+    body: dict[str, JsonValue]
+    headers: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What a JSON body of status 200 says.
+
+    ``outcome`` is ``ok``, ``refusal``, ``truncated``, ``empty``, or ``error`` where the body
+    reports a failure after all. ``finish_reason`` is the provider's own word.
+    """
+
+    outcome: str
+    text: str = ""
+    finish_reason: str | None = None
+    model_served: str | None = None
+    usage: Usage = field(default_factory=Usage)
+
+
+@dataclass(frozen=True, slots=True)
+class ServerError:
+    """An error in one shape: servers send nested, flat, listed and string errors.
+
+    ``status`` is that of the reply, or the one that an error within a 200 stands for. ``names``
+    are its type, its code, its status in words and the reasons among its ``details``.
+    """
+
+    status: int
+    headers: Mapping[str, str]
+    body: str
+    message: str
+    names: frozenset[str]
+    details: tuple[dict[str, Any], ...]
+
+
+class WireFormat(ABC):
+    """One format of requests and replies, with all that is particular to it.
+
+    None leaves a question about an error to what is known of all servers: gateways pass on the
+    errors of others, whatever format they speak themselves.
+    """
+
+    parameters: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """Parameters that a study may vary, by common names: where each stands in an entry's own."""
+    members: ClassVar[frozenset[str]]
+    """Members of a body: an answer has at least one of them, whatever it says."""
+    headers: ClassVar[Mapping[str, str]] = {}
+    """Headers that every request to a batch mode has, since they change its meaning."""
+    retries_empty: ClassVar[bool] = False
+    """Whether an empty answer is a known fault of the service that asking again may mend."""
+
+    @abstractmethod
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """Return the request for a prompt."""
+
+    @abstractmethod
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Read a body of status 200; unknown keys and missing ones are normal."""
+
+    def meaning(self, error: ServerError) -> str | None:
+        """Return the meaning of an error whose status does not tell it.
+
+        It is ``refusal``, ``quota_exhausted``, ``unknown_model``, ``not_allowed``,
+        ``rate_limited`` or ``request_too_large``, as in the table of calls, or ``bad_prompt``,
+        which speaks of one prompt alone.
+        """
+        return None
+
+    def delay_s(self, error: ServerError) -> float | None:
+        """Return the delay in s in a member of the error; its words are read for every format."""
+        return None
+
+
+def outcome_of(
+    text: str, *, failed: object = False, truncated: bool = False, refused: bool = False
+) -> str:
+    """Return the outcome of an answer, from its text and what its finish reason means.
+
+    ``failed`` is what the body reports as an error, where it does.
+    """
+    if failed or refused:
+        return "error" if failed else "refusal"
+    if truncated:
+        return "truncated"
+    return "ok" if text.strip() else "empty"
+
+
+def at(value: object, path: str) -> Any:  # noqa: ANN401 # whatever JSON holds there
+    """Return the JSON at a path such as ``choices.0.message``, None where there is none."""
+    for name in path.split("."):
+        if isinstance(value, list):
+            value = value[0] if value and name == "0" else None
+        else:
+            value = as_dict(value).get(name)
+    return value
+
+
+def as_dict(value: object) -> dict[str, Any]:
+    """Return a JSON object, or an empty one for anything else."""
+    return value if isinstance(value, dict) else {}
+
+
+def as_dicts(value: object) -> list[dict[str, Any]]:
+    """Return the objects of a JSON array; anything else counts as an empty one."""
+    return [as_dict(item) for item in value] if isinstance(value, list) else []
+
+
+def as_text(value: object) -> str | None:
+    """Return a JSON string, or None for anything else.
+
+    JSON can spell half of a surrogate pair, which no file can hold: a "?" takes its place.
+    """
+    if not isinstance(value, str):
+        return None
+    return value if value.isascii() else value.encode(errors="replace").decode()
+
+
+def as_count(value: object) -> int | None:
+    """Return a token count, or None for what cannot be one; some servers write 9.0."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return value if type(value) is int and 0 <= value <= MOST_TOKENS else None
+
+
+def joined(parts: Iterable[dict[str, Any]], member: str = "text") -> str:
+    """Return the text of all parts of an answer that have some."""
+    return "".join(as_text(part.get(member)) or "" for part in parts)
+
+
+def read_error(status: int, headers: Mapping[str, str], body: str, payload: object) -> ServerError:
+    """Read an error body of any known shape; one that is no JSON is its own message."""
+    top = as_dict(payload)
+    nested = top.get("error") if top.get("error") is not None else at(top, "choices.0.error")
+    error = as_dict(nested) or ({"message": nested} if isinstance(nested, str) else top)
+    details = as_dicts(error.get("details")) or [as_dict(error.get("details"))]
+    names = [error.get(name) for name in ("type", "code", "status")]
+    names += [detail.get(name) for detail in details for name in ("error_code", "reason")]
+    # It reaches a user as one line; Gemini's has several.
+    message = " ".join((as_text(error.get("message")) or body[:200]).split())
+    known = frozenset(str(name) for name in names if name is not None)
+    return ServerError(status, headers, body, message, known, tuple(details))
+
+
+def known_meaning(error: ServerError) -> str | None:
+    """Return what an error of one of the four services means; see ``WireFormat.meaning``.
+
+    What an added format knows is its own alone: it must not change how others are read.
+    """
+    status, names = error.status, error.names
+    # Azure's content filter, and OpenRouter's moderation.
+    if status == 400 and "content_filter" in names:
+        return "refusal"
+    if status == 403 and "flagged_input" in error.body:
+        return "refusal"
+    # OpenRouter's want of credit while other requests run: it passes when they end.
+    in_flight = status == 402 and "openrouter_in_flight_budget" in error.body
+    if in_flight and "retry-after" in error.headers:
+        return "rate_limited"
+    # Gemini's quota per day has the words of one per minute, and does not pass.
+    violations = [v for detail in error.details for v in as_dicts(detail.get("violations"))]
+    per_day = any("PerDay" in str(violation.get("quotaId")) for violation in violations)
+    spent = status == 400 and any(words in error.message for words in SPENT)
+    if names & QUOTA or spent or (status == 429 and per_day):
+        return "quota_exhausted"
+    if status in (400, 401, 403, 404) and "model_not_found" in names:
+        return "unknown_model"
+    if status == 429 and error.message.startswith("Request too large"):
+        return "request_too_large"
+    if status == 400 and "invalid_prompt" in names:
+        return "bad_prompt"
+    return "not_allowed" if status == 400 and "API_KEY_INVALID" in names else None
+
+
+def known_delay_s(error: ServerError) -> float | None:
+    """Return the delay in s in Gemini's RetryInfo, which is one of the details."""
+    delays = (as_text(detail.get("retryDelay")) or "" for detail in error.details)
+    return next((float(found[1]) for d in delays if (found := DURATION.fullmatch(d))), None)
+
+
+def usage_of(counts: object, **places: str) -> Usage:
+    """Return the tokens that stand in ``counts`` at these places; of several the sum."""
+    told = dict[str, int | None]()
+    for name, paths in places.items():
+        known = [count for p in paths.split() if (count := as_count(at(counts, p))) is not None]
+        told[name] = sum(known) if known else None
+    return Usage(**told)
+
+
+def plain(*names: str) -> dict[str, tuple[str, ...]]:
+    """Return parameters that stand at the top, under their common names."""
+    return {name: (name,) for name in names}
+
+
+class OpenAIChat(WireFormat):
+    """``POST /chat/completions``; the path can be overridden, as Azure's classic form needs."""
+
+    parameters = plain(
+        *("temperature", "top_p", "seed", "presence_penalty", "frequency_penalty"),
+        *("reasoning_effort", "verbosity", "response_format"),
+    )
+    members = frozenset({"choices"})
+
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """Return one user message; the cap covers reasoning and visible tokens."""
+        return WireRequest(
+            path=entry.path or "/chat/completions",
+            body={
+                "model": entry.id,
+                "messages": [{"role": "user", "content": prompt}],
+                entry.cap_field: entry.max_output_tokens,
+                **entry.parameters,
+            },
+        )
+
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Read the first choice."""
+        choice = at(payload, "choices.0")
+        content = at(choice, "message.content")  # a list of parts at some servers
+        text = content if isinstance(content, str) else joined(as_dicts(content))
+        refusal = as_text(at(choice, "message.refusal"))
+        finish = as_text(at(choice, "finish_reason"))
+        # Routers answer 200 and put the failure of a generation into the body.
+        failed = payload.get("error") or at(choice, "error") or finish == "error"
+        refused = finish == "content_filter" or bool(refusal)
+        return Reading(
+            outcome_of(text, failed=failed, truncated=finish == "length", refused=refused),
+            text or refusal or "",
+            finish,
+            as_text(payload.get("model")),
+            usage_of(
+                payload.get("usage"),
+                input_tokens="prompt_tokens",
+                cached_input_tokens="prompt_tokens_details.cached_tokens",
+                output_tokens="completion_tokens",
+                reasoning_tokens="completion_tokens_details.reasoning_tokens",
+            ),
+        )
+
+
+class OpenAIResponses(WireFormat):
+    """``POST /responses``, not stored at the provider."""
+
+    parameters: ClassVar = {
+        **plain("temperature", "top_p"),
+        "reasoning_effort": ("reasoning", "effort"),
+        "verbosity": ("text", "verbosity"),
+    }
+    members = frozenset({"output", "status"})
+
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """Return the prompt as the whole input; the cap covers reasoning and visible tokens."""
+        return WireRequest(
+            path=entry.path or "/responses",
+            body={
+                "model": entry.id,
+                "input": prompt,
+                "max_output_tokens": entry.max_output_tokens,
+                "store": False,
+                **entry.parameters,
+            },
+        )
+
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Join the text parts of all messages; a failed response arrives with status 200."""
+        items = as_dicts(payload.get("output"))
+        messages = [item.get("content") for item in items if item.get("type") == "message"]
+        parts = [part for content in messages for part in as_dicts(content)]
+        text = joined(part for part in parts if part.get("type") == "output_text")
+        refusal = joined((part for part in parts if part.get("type") == "refusal"), "refusal")
+        status = as_text(payload.get("status"))
+        reason = as_text(at(payload, "incomplete_details.reason"))
+        return Reading(
+            outcome_of(
+                text,
+                failed=status == "failed" or payload.get("error"),
+                truncated=status == "incomplete" or reason == "max_output_tokens",
+                refused=reason == "content_filter" or bool(refusal),
+            ),
+            text or refusal,
+            reason or status,
+            as_text(payload.get("model")),
+            usage_of(
+                payload.get("usage"),
+                input_tokens="input_tokens",
+                cached_input_tokens="input_tokens_details.cached_tokens",
+                output_tokens="output_tokens",
+                reasoning_tokens="output_tokens_details.reasoning_tokens",
+            ),
+        )
+
+
+class GeminiGenerateContent(WireFormat):
+    """``POST /v1beta/models/MODEL:generateContent``: the model is in the path alone.
+
+    The parameters are members of ``generationConfig``.
+    """
+
+    parameters: ClassVar = {
+        **plain("temperature", "seed", "responseMimeType", "responseSchema"),
+        "top_p": ("topP",),
+        "top_k": ("topK",),
+        "thinking_budget": ("thinkingConfig", "thinkingBudget"),
+        "thinking_level": ("thinkingConfig", "thinkingLevel"),
+    }
+    # A STOP without content is a known intermittent fault of Gemini 2.5 Pro.
+    retries_empty = True
+    members = frozenset({"candidates", "promptFeedback", "usageMetadata"})
+
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """Return one user turn; the cap covers thoughts and visible tokens."""
+        config = {"maxOutputTokens": entry.max_output_tokens, **entry.parameters}
+        return WireRequest(
+            path=entry.path or f"/v1beta/models/{entry.id}:generateContent",
+            body={
+                "contents": [{"role": "user", "parts": [{"text": prompt}]}],
+                "generationConfig": config,
+            },
+        )
+
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Join the parts of the first candidate that are no thoughts."""
+        parts = as_dicts(at(payload, "candidates.0.content.parts"))
+        text = joined(part for part in parts if not part.get("thought"))
+        finish = as_text(at(payload, "candidates.0.finishReason"))
+        blocked = as_text(at(payload, "promptFeedback.blockReason"))
+        return Reading(
+            outcome_of(
+                text,
+                failed=payload.get("error"),
+                truncated=finish == "MAX_TOKENS",
+                refused=bool(blocked) or finish in REFUSALS,
+            ),
+            text,
+            finish or blocked,
+            as_text(payload.get("modelVersion")),
+            usage_of(
+                payload.get("usageMetadata"),
+                input_tokens="promptTokenCount",
+                cached_input_tokens="cachedContentTokenCount",
+                output_tokens="candidatesTokenCount thoughtsTokenCount",
+                reasoning_tokens="thoughtsTokenCount",
+            ),
+        )
+
+
+class AnthropicMessages(WireFormat):
+    """``POST /v1/messages`` with the API version as a header."""
+
+    parameters: ClassVar = {
+        **plain("temperature", "top_p", "top_k", "thinking"),
+        "reasoning_effort": ("output_config", "effort"),
+    }
+    members = frozenset({"content", "stop_reason"})
+    # The version whose sampling default is temperature 1.0; later ones reject the parameter.
+    headers: ClassVar = {"anthropic-version": "2023-06-01"}
+
+    def request(self, entry: ModelEntry, prompt: str) -> WireRequest:
+        """Return one user message; ``max_tokens`` is required."""
+        return WireRequest(
+            path=entry.path or "/v1/messages",
+            body={
+                "model": entry.id,
+                "max_tokens": entry.max_output_tokens,
+                "messages": [{"role": "user", "content": prompt}],
+                **entry.parameters,
+            },
+            headers=dict(self.headers),
+        )
+
+    def read(self, payload: dict[str, Any]) -> Reading:
+        """Join the text blocks; thinking blocks are left out."""
+        blocks = as_dicts(payload.get("content"))
+        text = joined(block for block in blocks if block.get("type") == "text")
+        finish = as_text(payload.get("stop_reason"))
+        cap = ("max_tokens", "model_context_window_exceeded")
+        return Reading(
+            outcome_of(
+                text,
+                failed=payload.get("type") == "error",
+                truncated=finish in cap,
+                refused=finish == "refusal",
+            ),
+            text,
+            finish,
+            as_text(payload.get("model")),
+            usage_of(
+                payload.get("usage"),
+                # Anthropic counts cached tokens apart; here the input includes them.
+                input_tokens="input_tokens cache_read_input_tokens cache_creation_input_tokens",
+                cached_input_tokens="cache_read_input_tokens",
+                output_tokens="output_tokens",
+                reasoning_tokens="output_tokens_details.thinking_tokens",
+            ),
+        )
+
+
+FORMATS: Registry[WireFormat] = Registry("wire format")
+FORMATS.register("openai-chat", OpenAIChat())
+FORMATS.register("openai-responses", OpenAIResponses())
+FORMATS.register("gemini", GeminiGenerateContent())
+FORMATS.register("anthropic", AnthropicMessages())
