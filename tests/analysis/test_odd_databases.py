@@ -87,7 +87,7 @@ SAID = {
     ),
     "mirrored_chance": (
         [
-            "constant merged first in all 104 trials: nothing to explain",
+            "who merged first is the same in all 104 trials: nothing to explain",
             "95 of 220 trials are undecided, since another collision rule ended them",
         ],
         ["repeat an earlier one"],
