@@ -1,4 +1,4 @@
-"""Where a cell of a table comes from: what it means, the query, and the trials behind it."""
+"""Where a row of a table comes from: the query, and the trials behind it."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from merge_runner.errors import unknown_name
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.data.reference_data import citation
-from merge_runner_analysis.data.study import Group, Study, of_group
-from merge_runner_analysis.metrics import JUDGED, METRICS
+from merge_runner_analysis.data.studies import KEYS
+from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.tables.formats import shown_value
-from merge_runner_analysis.tables.model import Column, Row, Table, Value
+from merge_runner_analysis.tables.model import Column, Row, Table
 
 ACCOUNTS = "attempts"  # the table that counts repetitions of deterministic drivers, too
+SEE_NOTES = "see the notes of the table"
+# What no column of the database holds: the analysis finds it out of each trial.
+FOUND_OUT = re.compile(r"\b(counted_|collided\b|collided_boxes\b)")
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The trials of one group that a cell rests on, and how to list them.
+    """The trials of one group that a row rests on, and how to list them.
 
-    ``numerator``: those of them that a share counts.
+    ``numerator``: those of them that a share or a count counts.
     """
 
     group: str
@@ -36,7 +39,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """A cell with its value as printed, its meaning and its sources."""
+    """A row or a cell with its values as printed, its meaning and its sources."""
 
     cell: str
     value: str
@@ -61,17 +64,21 @@ class Explanation:
 
 
 def explain(study: Study, table: Table, cell: str) -> Explanation:
-    """Explain ``ROW:COLUMN`` of a table, or a whole ROW; raises UsageError."""
-    row_id, _, column_name = cell.rpartition(":")
+    """Explain a ROW of a table, or ``ROW:COLUMN``; raises UsageError."""
+    row_id, _, name = cell.rpartition(":")
     if not row_id or any(row.id == cell for row in table.rows):
-        row_id, column_name = cell, ""
+        row_id, name = cell, ""
     row = _find(table, row_id)
-    column = _column(table, row, column_name) if column_name else None
-    value: Value = row.values.get(column.name) if column else None
+    column = _column(table, row, name) if name else None
+    shown = [column] if column else table.columns
+    values = {c.name: row.values[c.name] for c in shown if row.values.get(c.name) is not None}
+    texts = {
+        c.name: shown_value(c, values.get(c.name)) for c in shown if column or c.name in values
+    }
     return Explanation(
         cell=f"{table.name} {cell}",
-        value=shown_value(column, value) if column else _whole_row(table, row),
-        meaning=f"{table.heading}" + (f": {column.meaning or column.heading}" if column else ""),
+        value=texts[name] if column else ", ".join(f"{n} {text}" for n, text in texts.items()),
+        meaning=table.heading + (f": {column.meaning or column.heading}" if column else ""),
         note=row.note,
         sources=sources_of(study, table, row, column),
         command=sql_command(study),
@@ -88,108 +95,71 @@ def sql_command(study: Study) -> str:
     return "merge-runner sql" + ("" if study.db == DEFAULT_DB else f" --db {study.db}")
 
 
-def sources_of(study: Study, table: Table, row: Row, column: Column | None) -> tuple[Source, ...]:
-    """The trials of each group behind a cell, or behind a row where no column is named."""
+def sources_of(
+    study: Study, table: Table, row: Row, column: Column | None = None
+) -> tuple[Source, ...]:
+    """The trials of each group behind a row, and those of them that a share of it counts."""
     if column is not None and column.name.startswith("ceiling"):
         return (RESAMPLED,)
-    predicate = row.counts or _predicate(table, column)
-    whose = {"own": row.groups, "reference": row.references, "both": (*row.groups, *row.references)}
-    groups = row.groups if column is None or not row.references else whose[column.of]
     known = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
+    groups = [group for group in known if group.id in row.groups]
     if table.name == ACCOUNTS:
-        known = tuple(group.stored for group in known)
+        groups = [group.stored for group in groups]
+    condition = column.counts if column else ""
     return tuple(
-        _published(group, row, column)
-        or (
-            _source(study, group, predicate)
-            if group.measured or not row.note
-            else Source(group.id, f"published: {row.note}", "", ())
-        )
-        for group in known
-        if group.id in groups
+        _source(study, group, row.counts, condition)
+        if row.counts and group.measured
+        else Source(group.id, f"published, not from traces: {row.note or SEE_NOTES}", "", ())
+        for group in groups
     )
-
-
-def _published(group: Group, row: Row, column: Column | None) -> Source | None:
-    """The source of a human value that stays the published one after a part of an import."""
-    if group.setting or column is None or column.name not in row.published:
-        return None
-    if row.cited:
-        return Source(group.id, f"published, not from traces: {citation(row.cited)}", "", ())
-    if group.published_outcomes is None:
-        return None
-    text = f"{len(group.published_outcomes)} published outcomes: {citation('human_outcomes')}"
-    return Source(group.id, text, "", ())
-
-
-def query_of(group: Group, predicate: str) -> str:
-    """The query that lists the trials of a group which a value rests on, with their measures."""
-    for metric in METRICS.values():
-        # A predicate may name the column of a metric, which no table of the database has.
-        if not re.search(named := rf"\b{metric.counts}", predicate):
-            continue
-        judged = metric.value in JUDGED
-        stored = _decided(group, metric.column) if judged else metric.counts_in_database
-        predicate = re.sub(named, stored.replace("\\", r"\\"), predicate)
-    variant = f" AND variant = '{group.setting}'" if group.setting else ""
-    narrowed = f" AND {group.narrowed}" if group.narrowed else ""
-    return (
-        "SELECT trials.trial_id, condition, status, merged_first, "  # noqa: S608 # ours
-        "trial_metrics.* EXCLUDE (trial_id, spec_hash) FROM trials "
-        "JOIN trial_metrics USING (trial_id, spec_hash) "
-        f"WHERE trials.spec_hash {_among(group)}{variant}{narrowed} AND {predicate} "
-        "ORDER BY ALL"
-    )
-
-
-def _among(group: Group) -> str:
-    """Which specs its trials have: several where mean speeds differ, or drivers change sides."""
-    names = [quoted(name) for name in sorted(group.trials["spec_hash"].unique())]
-    return f"IN ({', '.join(names)})" if len(names) > 1 else f"= '{group.spec_hash}'"
-
-
-def _decided(group: Group, column: str) -> str:
-    """Which trials are known to have collided or not, as the database can tell them."""
-    left_open = group.ended.loc[group.ended[column].isna(), "trial_id"]
-    names = ", ".join(map(quoted, left_open))
-    return "status <> 'failed'" + (f" AND trials.trial_id NOT IN ({names})" if names else "")
 
 
 @cache
-def _source(study: Study, group: Group, predicate: str) -> Source:
-    if group.spec_hash is None:
-        text = f"published, not from traces: {citation('human_outcomes')}; see the table's notes"
-        return Source(group.id, text, "", ())
-    share = next((m for m in METRICS.values() if m.rate and m.counts in predicate), None)
-    counted = share.column if share else "NULL"
-    rows = _tables(study, group).sql(
-        f"SELECT trial_id, {counted} FROM trials WHERE {predicate} ORDER BY trial_id"  # noqa: S608 # ours
+def _source(study: Study, group: Group, predicate: str, condition: str) -> Source:
+    rows = _trials(study, group).sql(
+        f"SELECT trial_id, {condition or 'NULL'} FROM trials WHERE {predicate} ORDER BY trial_id"  # noqa: S608 # ours
     )
     found = dict(rows.fetchall())
     trials = tuple(found)
     numerator = tuple(trial for trial, counts in found.items() if counts)
-    if group.seats[1] and trials:  # the database does not know mirrored trials by their images
-        predicate = f"trials.trial_id IN ({', '.join(map(quoted, trials))})"
-    query = query_of(group, predicate)
     text = f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}"
     if group.said:
         text += f"; {group.said}"
-    if share:
-        text += f"; the share counts {len(numerator)} of them"
-    return Source(group.id, text, query, trials, numerator)
+    if group.published_outcomes is not None:
+        text += (
+            "; collisions and who merged first are those of "
+            f"{len(group.published_outcomes)} published outcomes: {citation('human_outcomes')}"
+        )
+    if condition:
+        text += f"; the value counts {len(numerator)} of them"
+    return Source(group.id, text, _query(study, group, predicate, trials), trials, numerator)
+
+
+def _query(study: Study, group: Group, predicate: str, trials: tuple[str, ...]) -> str:
+    """The query that lists these trials of a group, which a predicate is true of."""
+    if not trials:
+        return ""
+    specs = ", ".join(map(quoted, sorted(group.trials["spec_hash"].unique())))
+    conditions = [f"trials.spec_hash IN ({specs})"]
+    if group.setting:
+        conditions.append(f"variant = {quoted(group.setting)}")
+    # The database does not know mirrored trials by their images either.
+    if study.holds_more(group) or group.seats[1] or FOUND_OUT.search(predicate):
+        predicate = f"trials.trial_id IN ({', '.join(map(quoted, trials))})"
+    conditions.append(predicate)
+    return (
+        "SELECT trials.trial_id, condition, status, merged_first, "  # noqa: S608 # ours
+        "trial_metrics.* EXCLUDE (trial_id, spec_hash) FROM trials "
+        f"JOIN trial_metrics USING (trial_id, spec_hash) WHERE {' AND '.join(conditions)} "
+        "ORDER BY ALL"
+    )
 
 
 @cache
-def _tables(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
-    """A group's trials, attempts and decisions as tables, for predicates in SQL."""
+def _trials(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
+    """A connection in which ``trials`` are those of a group, with what became of their calls."""
     connection = _database().cursor()
-    for name, frame in (
-        ("trials", group.trials),
-        ("attempts", of_group(study.calls.attempts, group, group.trials)),
-        ("decisions", of_group(study.calls.decisions, group, group.trials)),
-    ):
-        connection.register("frame", frame)
-        connection.execute(f"CREATE TEMP TABLE {name} AS FROM frame")
+    connection.register("trials", group.trials.merge(study.calls.trials, "left", KEYS))
     return connection
 
 
@@ -213,16 +183,3 @@ def _column(table: Table, row: Row, name: str) -> Column:
             return column
     valid = (c.name for c in table.columns if row.values.get(c.name) is not None)
     raise unknown_name(f"column of {table.name}", name, valid)
-
-
-def _predicate(table: Table, column: Column | None) -> str:
-    chosen = column or next((c for c in table.columns if c.name == "n"), table.columns[-1])
-    return chosen.counts if chosen.counts else "true"
-
-
-def _whole_row(table: Table, row: Row) -> str:
-    return ", ".join(
-        f"{column.name} {shown_value(column, row.values[column.name])}"
-        for column in table.columns
-        if row.values.get(column.name) is not None
-    )

@@ -70,9 +70,8 @@ class Metric:
     and printed in percent. ``trials`` are those that count, unless their value is NULL.
 
     ``label`` and ``unit`` head a column, ``meaning`` says what the number of one trial is, or of
-    what a proportion is the share. ``word`` is how a list in a sentence names it, ``phrase`` what a
-    sentence has as its subject. ``lowest`` and ``highest`` are ends that an axis always has. Raises
-    UsageError where these do not fit together.
+    what a proportion is the share. ``phrase`` is what a sentence has as its subject. ``lowest`` and
+    ``highest`` are ends that an axis always has. Raises UsageError where these do not fit together.
 
     ``human`` is a published value beside those of the paper: ``paper_of_drivers`` and
     ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``. ``humans_from`` says
@@ -88,7 +87,6 @@ class Metric:
     estimator: Estimator = "mean"
     trials: Literal["finished", "ended"] = "finished"
     decimals: int = 2
-    word: str = ""
     phrase: str = ""
     lowest: float | None = None
     highest: float | None = None
@@ -156,14 +154,9 @@ class Metric:
         return f"({self.value})::{'BOOLEAN' if self.rate else 'DOUBLE'}"
 
     @property
-    def in_lists(self) -> str:
-        """How a list in a sentence names it."""
-        return self.word or self.label
-
-    @property
     def in_sentences(self) -> str:
         """What it is as the subject of a sentence."""
-        return self.phrase or f"the {self.in_lists}"
+        return self.phrase or f"the {self.label}"
 
 
 METRICS = Registry[Metric]("metric")
@@ -200,7 +193,6 @@ COLLISIONS = register(
         value="collided",
         estimator="proportion",
         trials="ended",
-        word="collisions",
         phrase="collisions by the scenario's rule",
         lowest=0.0,
         humans_from="all recordings",
@@ -218,7 +210,6 @@ BOXES = register(
         value="collided_boxes",
         estimator="proportion",
         trials="ended",
-        word="collisions",
         phrase="collisions of boxes",
         lowest=0.0,
         humans_from="outcomes",
@@ -274,7 +265,6 @@ JOINT = register(
         meaning="share of finished trials with an RMSE of at least 0.5 m/s on both sides",
         value="joint",
         estimator="proportion",
-        word="joint rate",
         phrase="joint contributions",
         lowest=0.0,
         paper_of_drivers="joint_percent",
@@ -300,6 +290,12 @@ def _criticality(name: str, label: str, unit: str, meaning: str) -> Metric:
     )
 
 
+_criticality(
+    "conflict_resolution_s",
+    "conflict resolution",
+    "s",
+    "until the vehicles are first off a collision course",
+)
 _criticality(
     "time_to_merge_s", "time to merge", "s", "until the first vehicle reaches the merge point"
 )

@@ -14,11 +14,18 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.drivers.language_model import LanguageModel
-from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.limiter import BURST_S, Limiter
 from merge_runner.llm.models import load_models
-from merge_runner.records import SIDES, Attempt, ChatReply, Slot, TrialRecord, TrialSpec
+from merge_runner.records import (
+    SIDES,
+    Attempt,
+    ChatReply,
+    Slot,
+    TrialRecord,
+    TrialSpec,
+    make_request,
+)
 from merge_runner.results.database import schema_sql
 from merge_runner.results.rows import rows_of
 from merge_runner.results.store import Store

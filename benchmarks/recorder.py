@@ -12,7 +12,7 @@ from itertools import islice
 from pathlib import Path
 
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import call_key
+from merge_runner.records import call_key
 
 BATCH = 500
 _ID = re.compile(r'"id": "(\d+)"')

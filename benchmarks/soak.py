@@ -28,8 +28,7 @@ from aiohttp import web
 from benchmarks.cases import Bench, Figures
 from benchmarks.processes import PROJECT, RUNNER
 from merge_runner.emulator.server import HOST
-from merge_runner.llm.content_hashes import call_key
-from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot
+from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot, call_key
 from merge_runner.results.store import results_digest
 from tests.mock_server import FaultPlan, application, transient_faults
 

@@ -26,7 +26,7 @@ from pydantic import (
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import SHIPPED_EXPERIMENTS
 from merge_runner.planted_effect import PARAMETERS as PLANTED
-from merge_runner.records import SIDES, Side
+from merge_runner.records import MOST_STEPS, SIDES, Side
 from merge_runner.registry import Registry
 from merge_runner.text_safety import one_line
 
@@ -36,7 +36,6 @@ SHORTEST_SECRET = 8
 UNNAMED = "default"
 # What stands for the emulator where it takes the place of a provider.
 REHEARSAL = "rehearsal://localhost"
-MOST_STEPS = MOST_REPETITIONS = 100_000
 
 
 # Strict, or else "4" and true would be numbers.
@@ -500,18 +499,17 @@ def normalised_url(url: str, named: str = "base_url") -> str:
 
 def http_url(url: str) -> SplitResult | None:
     """The parts of a URL, or None where no host can be reached at it by HTTP."""
-    if not (url.isascii() and url.isprintable()) or " " in url:
-        return None
     try:
         parts = urlsplit(url)
         name = parts.hostname or ""
-        if ":" in name or re.fullmatch(r"\d+(\.\d+){3}", name):
+        if ":" in name or re.fullmatch(r"[0-9]+(\.[0-9]+){3}", name):
             ipaddress.ip_address(name)
         name.encode("idna")  # raises where a label is empty or too long
         is_host = parts.port != 0 and re.fullmatch(r"[\w.:-]+", name)
     except ValueError:
         return None
-    return parts if is_host and parts.scheme in ("http", "https") else None
+    is_written = re.fullmatch("[!-~]+", url) and parts.scheme in ("http", "https")
+    return parts if is_host and is_written else None
 
 
 def state_folder(env: Mapping[str, str] = os.environ) -> Path:

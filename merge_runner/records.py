@@ -1,12 +1,34 @@
-"""Frozen records that cross layers. SI units; ``left`` and ``right`` are the two branches."""
+"""Frozen records that cross layers, and the hashes under which they are known.
+
+SI units; ``left`` and ``right`` are the two branches. A recorded call may be damaged, or made up:
+it is used only if its content belongs to its key.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Literal
+from datetime import datetime
+from functools import lru_cache
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue
+
+from merge_runner.registry import NAME
+
+KEY_VERSION = 1
+SPEC_VERSION = 2  # since then one valid array in a reply is enough
+# What reading content of others can raise; RecursionError where JSON is nested deeply.
+DAMAGED = (ValueError, TypeError, KeyError, RecursionError)
+LARGEST_STATUS = 999
+_TEXT = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"')
+_CANONICAL = json.JSONEncoder(
+    sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+)
+MOST_STEPS = MOST_REPETITIONS = 100_000
 
 Side = Literal["left", "right"]
 Road = Literal["merge", "straight"]
@@ -28,11 +50,8 @@ SCRIPTED_FIELD = "merge_runner_scripted"
 ANSWERED_FIELD = "merge_runner_request"
 
 # What an attempt can have: a recorded one with other values is damaged, or made up.
-Number = Annotated[int, Field(ge=1, le=2**31 - 1)]
 Amount = Annotated[float, Field(ge=0, le=2**31 - 1)]
 Tokens = Annotated[int, Field(ge=0, le=2**33)]
-HttpStatus = Annotated[int, Field(ge=0, le=999)]
-Outcome = Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,39}$")]
 
 FAR_BEHIND_M = 1000.0
 """Where the other vehicle is put while it is not seen; see Observation."""
@@ -50,11 +69,11 @@ class Slot:
     ``decision`` counts from 0 within a trial, ``repetition`` from 1, ``sample_set`` from 0.
     """
 
-    condition: str
-    repetition: int
+    condition: Annotated[str, Field(pattern=f"^{NAME.pattern}$")]
+    repetition: Annotated[int, Field(ge=1, le=MOST_REPETITIONS)]
     side: Side
-    decision: int
-    sample_set: int
+    decision: Annotated[int, Field(ge=0, le=MOST_STEPS)]
+    sample_set: Annotated[int, Field(ge=0)]
 
     def __str__(self) -> str:
         """The slot for a reader."""
@@ -114,9 +133,9 @@ class Attempt:
     A line has no latency.
     """
 
-    number: Number
-    outcome: Outcome
-    http_status: HttpStatus | None = None
+    number: Annotated[int, Field(ge=1, le=2**31 - 1)]
+    outcome: Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,39}$")]
+    http_status: Annotated[int | None, Field(ge=0, le=999)] = None
     model_served: str | None = None
     finish_reason: str | None = None
     usage: Usage = field(default_factory=Usage)
@@ -128,11 +147,6 @@ class Attempt:
     scripted: bool = False
     # Left out where there is none, so that what is kept of other attempts stays as it was.
     batch_id: Annotated[str | None, Field(exclude_if=lambda value: value is None)] = None
-
-    @property
-    def answered(self) -> bool:
-        """Whether a body of status 200 was read as an answer, which is a JSON object."""
-        return self.http_status == 200 and self.outcome in ANSWERS
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,11 +316,96 @@ def is_scripted(request: ChatRequest, attempt: Attempt) -> bool:
 
 def says_scripted(body: str) -> bool:
     """Whether a body has the field at its top; what a model writes in its answer is no field."""
-    if SCRIPTED_FIELD not in body:
-        return False
-    try:
-        payload = json.loads(body)
-    except (ValueError, RecursionError):
-        return False
-    parts = payload if isinstance(payload, list) else [payload]
-    return any(isinstance(part, dict) and SCRIPTED_FIELD in part for part in parts)
+    if SCRIPTED_FIELD in body:
+        with suppress(ValueError, RecursionError):
+            payload = json.loads(body)
+            parts = payload if isinstance(payload, list) else [payload]
+            return any(isinstance(part, dict) and SCRIPTED_FIELD in part for part in parts)
+    return False
+
+
+def canonical_json(value: object) -> str:
+    """Return the one spelling of a JSON value: sorted keys, no spaces; NaN raises ValueError."""
+    return _CANONICAL.encode(value)
+
+
+def spec_hash(text: str) -> str:
+    """Return the short hash of the canonical JSON that defines a trial."""
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def make_request(
+    *,
+    provider: str,
+    endpoint: str,
+    model: str,
+    path: str,
+    headers: dict[str, str],
+    body: dict[str, JsonValue],
+    slot: Slot,
+) -> ChatRequest:
+    """Return a request with its key."""
+    text = canonical_json(body)
+    key = call_key(endpoint=endpoint, path=path, headers=headers, body=text, slot=slot)
+    return ChatRequest(key, provider, endpoint, model, path, headers, text, slot)
+
+
+def call_key(*, endpoint: str, path: str, headers: dict[str, str], body: str, slot: Slot) -> str:
+    """Return the key of a reply: the SHA-256 of one canonical JSON object of all parts.
+
+    These are the key version, the endpoint's identity, the path, the headers that change the
+    meaning of a request, its exact ``body``, canonical already, and the slot.
+    """
+    # "body" sorts before the other names and "slot" after them, so that the whole is canonical.
+    parts = {"endpoint": endpoint, "headers": headers, "key_version": KEY_VERSION, "path": path}
+    between = canonical_json(parts)[1:-1]
+    text = f'{{"body":{body},{between},"slot":{canonical_json(slot.as_dict())}}}'
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def without_prompt(body: str) -> str:
+    """Return a canonical body without its longest text, which is the prompt."""
+    return body.replace(max(_TEXT.findall(body), key=len, default='""'), '""')
+
+
+def check_call(key: str, request: ChatRequest, attempts: tuple[Attempt, ...]) -> None:
+    """Raise one of DAMAGED unless a call belongs to its key and its attempts are possible.
+
+    The last attempt is the one that was answered.
+    """
+    content = call_key(
+        endpoint=request.endpoint,
+        path=request.path,
+        headers=request.headers,
+        body=request.body,
+        slot=request.slot,
+    )
+    if not key == request.key == content:
+        raise ValueError("its content does not belong to its key")
+    numbers = [attempt.number for attempt in attempts]
+    if numbers != sorted({*numbers}):
+        raise ValueError("its attempts are not numbered one after the other")
+    last = attempts[-1]
+    if last.outcome not in ANSWERS or (last.http_status != 200 and last.outcome != "refusal"):
+        raise ValueError("its last attempt is no answer")
+    for attempt in attempts:
+        if attempt.started_at is not None:
+            datetime.fromisoformat(attempt.started_at)
+        if attempt.http_status == 200 and (attempt.outcome != "bad_body" or attempt is last):
+            reply_object(attempt.reply or "{}")
+
+
+def check_body(body: str) -> None:
+    """Raise one of DAMAGED for the body of a request that we would not send."""
+    value = json.loads(body)
+    if not isinstance(value, dict) or canonical_json(value) != body:
+        raise ValueError("its request is not a canonical JSON object")
+
+
+@lru_cache(maxsize=1)  # who checks a reply reads it next
+def reply_object(text: str) -> dict[str, Any]:
+    """Return the JSON object of a reply, not to be changed; raises one of DAMAGED."""
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise ValueError("a reply is not a JSON object")
+    return value

@@ -121,13 +121,11 @@ def collecting(catalogue: Catalogue) -> Iterator[Catalogue]:
     """Put what is registered meanwhile into a catalogue, and then use the one before again."""
     load_plugins()  # first: a study may build on what is installed
     before = in_use()
-    use(catalogue)
-    Registry.collecting = True
+    Registry.catalogue, Registry.collecting = catalogue, True
     try:
         yield catalogue
     finally:
-        Registry.collecting = False
-        use(before)
+        Registry.catalogue, Registry.collecting = before, False
 
 
 # What the code of somebody else may raise while it is imported.

@@ -16,12 +16,11 @@ from merge_runner.config import Perception, ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import program_pace
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.perception import Eyes, error_process
 from merge_runner.records import FAR_BEHIND_M, SIDES, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner.trial import play_trial
+from merge_runner.trial import Eyes, error_process, play_trial
 
 OTHER = {"left": "right", "right": "left"}
 FOGGY = {

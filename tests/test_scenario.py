@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.llm.content_hashes import canonical_json
+from merge_runner.records import canonical_json
 from merge_runner.study.file import read_study
 
 

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from merge_runner.config import driver_name
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.content_hashes import make_request
-from merge_runner.records import SCRIPTED_FIELD, Attempt, Slot, is_scripted
+from merge_runner.records import SCRIPTED_FIELD, Attempt, Slot, is_scripted, make_request
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.recording import export_recording, read_recording
 from tests.harness import FAST, PROJECT, as_a_model, watched

@@ -36,7 +36,7 @@ WARM = (
     "merge_runner_analysis.report.writer",
     "merge_runner.llm.http",
     "merge_runner.emulator.server",
-    "merge_runner.run.summary",
+    "merge_runner.run.sweep",
     "rich.live",
     "rich.table",
     "matplotlib.backends.backend_agg",

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 from pydantic import BaseModel, JsonValue, ValidationError
@@ -20,7 +19,7 @@ from merge_runner.paths import DEFAULT_DB
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.served_model import ALIASES, PAIRS, Pair, others_among
+from merge_runner.served_model import Pair, other_models, sql_of
 from merge_runner.text_safety import quoted
 
 # A trial that was driven to its end, as its ego sees it (see ``trial_drivers``): one whose ego sat
@@ -158,29 +157,26 @@ LEFT JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash, side)
 ANTI JOIN (FROM specs WHERE spec->>'$.scenario.control_start' = 'own_exit') USING (spec_hash)
 ORDER BY ALL
 """
-# How many calls of a variant's spec share their reply with a baseline's spec.
-SHARED = """
-WITH used AS (
-    SELECT DISTINCT spec_hash, variant, call_key
-    FROM decisions JOIN trials USING (trial_id, spec_hash)
-    WHERE call_key IS NOT NULL AND source <> 'seat'
-), totals AS (SELECT spec_hash, count(*) AS calls FROM used GROUP BY ALL)
-SELECT one.spec_hash, base.spec_hash AS baseline, calls, count(*) AS shared
-FROM used AS one JOIN used AS base USING (call_key) JOIN totals ON totals.spec_hash = one.spec_hash
-WHERE one.variant <> 'baseline' AND base.variant = 'baseline' GROUP BY ALL ORDER BY ALL
-"""
 # Fates of the attempts that were answered, also without a plan.
 ANSWERED = ("driven", "fallback")
-# One row a trial and kind of attempt; a retried attempt has no share in the answer's failure.
-ATTEMPTS = """
-SELECT trial_id, spec_hash, fate, outcome, if(fate = 'retried', NULL, failure) AS failure,
-    model_requested, model_served, count(*) AS attempts
-FROM attempts GROUP BY ALL ORDER BY ALL
-"""
-# One row a trial and kind of decision.
-DECISIONS = """
-SELECT trial_id, spec_hash, fallback, count(*) AS decisions
-FROM decisions GROUP BY ALL ORDER BY ALL
+# One row a trial: what became of its calls and decisions. ``failures`` has the reason of each
+# answer without a valid plan; a retried attempt has no share in that of the answer.
+CALLS = """
+SELECT trial_id, spec_hash, attempts, calls, retried, lost, unknown, other_model, failures,
+    decisions, fallback
+FROM trials LEFT JOIN (
+    SELECT trial_id, spec_hash, count(*) AS attempts,
+        count(*) FILTER (fate <> 'retried') AS calls,
+        count(*) FILTER (fate = 'retried') AS retried,
+        count(*) FILTER (fate = 'lost') AS lost,
+        count(*) FILTER (outcome = 'unknown') AS unknown,
+        count(*) FILTER (fate IN {answered} AND {others}) AS other_model,
+        list(failure) FILTER (fate IN {answered} AND failure IS NOT NULL) AS failures
+    FROM attempts GROUP BY ALL
+) USING (trial_id, spec_hash) LEFT JOIN (
+    SELECT trial_id, spec_hash, count(*) AS decisions, count(*) FILTER (fallback) AS fallback
+    FROM decisions GROUP BY ALL
+) USING (trial_id, spec_hash) ORDER BY ALL
 """
 SPECS = """
 SELECT spec_hash, spec, min(trial_id) AS trial_id
@@ -239,18 +235,14 @@ def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class Calls:
-    """What became of the calls.
+class Calls(NamedTuple):
+    """What became of the calls: the rows of CALLS, and pairs of a model's id and another's.
 
-    ``attempts``: one row a trial and kind of attempt, with the number of these; ``decisions``: one
-    row a trial, its fallbacks apart; ``others``: pairs of a model's id and another model that
-    answered in its place.
+    The other is that of a model which answered in its place.
     """
 
-    attempts: pd.DataFrame
-    decisions: pd.DataFrame
-    others: frozenset[Pair]
+    trials: pd.DataFrame
+    others: list[Pair]
 
 
 def rows(frame: pd.DataFrame) -> list[Any]:
@@ -259,16 +251,10 @@ def rows(frame: pd.DataFrame) -> list[Any]:
 
 
 def load_calls(db: Path | str = DEFAULT_DB) -> Calls:
-    """Read what became of the calls; the columns have their types also where there is none."""
-    found = load_each(
-        {"attempts": ATTEMPTS, "decisions": DECISIONS, "pairs": PAIRS, "aliases": ALIASES}, db
-    )
-    keys = ("trial_id", "spec_hash")
-    texts = (*keys, "fate", "outcome", "failure", "model_requested", "model_served")
-    return Calls(
-        found["attempts"].astype(dict.fromkeys(texts, "string") | {"attempts": int}),
-        found["decisions"].astype(
-            dict.fromkeys(keys, "string") | {"fallback": bool, "decisions": int}
-        ),
-        frozenset(others_among(rows(found["pairs"]), rows(found["aliases"]))),
-    )
+    """Read what became of the calls."""
+    with read_database(Path(db)) as connection:
+        others = other_models(connection)
+        sql = CALLS.format(answered=ANSWERED, others=sql_of(others))
+        trials = frames.frame(connection.execute(sql))
+    counts = [name for name in trials if name not in {"trial_id", "spec_hash", "failures"}]
+    return Calls(trials.fillna(dict.fromkeys(counts, 0)), others)

@@ -6,7 +6,6 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +87,6 @@ DRIVERS = """
 SELECT DISTINCT driver FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE source = 'llm' AND NOT scripted ORDER BY ALL
 """
-# Failures with an own column of the tables; the others are malformed answers.
-ANSWERS = ("refusal", "truncated", "empty")
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +105,7 @@ class Provenance:
 
     ``sweeps``, ``calls``, ``sweep_costs`` and ``model_costs`` are rows of the queries here;
     ``switches`` holds, by driver, variant and spec_hash, the settings of the driving task that
-    differ from the defaults, and ``tasks`` the same by spec_hash, empty where none does;
+    differ from the defaults;
     ``mismatches`` says where another model answered than was asked for. ``alike`` has the drivers
     all of whose answers to a prompt that was asked before are word for word as before, with their
     number. ``sent`` holds what was sent to the models beside the prompt, by spec_hash and side.
@@ -119,44 +116,9 @@ class Provenance:
     sweep_costs: pd.DataFrame
     model_costs: pd.DataFrame
     switches: dict[str, str]
-    tasks: dict[str, str]
     mismatches: list[Mismatch]
     alike: dict[str, int]
     sent: dict[str, dict[str, dict[str, object]]]
-
-
-@dataclass(frozen=True, slots=True)
-class Tally:
-    """What became of the calls of one group of trials.
-
-    A call is asked at one decision, in one or more attempts. ``retried`` attempts were followed by
-    another, ``lost`` calls ended without an answer. ``failures`` counts the answers without a valid
-    plan by reason, ``fallbacks`` the ``decisions`` that were driven from an older plan, or none.
-    ``unknown`` attempts were under way when the run was killed; ``others`` are answers of another
-    model than was asked for.
-    """
-
-    trials: int
-    failed: int
-    calls: int
-    attempts: int
-    retried: int
-    lost: int
-    failures: Counter[str]
-    decisions: int
-    fallbacks: int
-    unknown: int
-    others: int
-
-    @property
-    def answers(self) -> int:
-        """Calls with an answer of any kind."""
-        return self.calls - self.lost
-
-    @property
-    def invalid(self) -> int:
-        """Answers without a valid plan."""
-        return self.failures.total()
 
 
 def provenance(db: Path) -> Provenance:
@@ -184,38 +146,33 @@ def provenance(db: Path) -> Provenance:
             f"{row.driver}/{row.variant} ({row.spec_hash})": _switched(spec) or "defaults"
             for row, spec in specs.items()
         },
-        tasks={row.spec_hash: _switched(spec) for row, spec in specs.items()},
         mismatches=_mismatches(found["served"], found["aliases"]),
         alike=_alike(db),
         sent={row.spec_hash: _sent(spec) for row, spec in specs.items()},
     )
 
 
-@cache
-def tally(study: Study, group: Group) -> Tally:
-    """Count a group's calls, attempts and decisions."""
-    attempts = of_group(study.calls.attempts, group, group.trials)
-    decisions = of_group(study.calls.decisions, group, group.trials)
-    by_fate = Counter(attempts.groupby("fate")["attempts"].sum().to_dict())
-    answered = attempts[attempts["fate"].isin(ANSWERED)]
-    return Tally(
-        trials=len(group.trials),
-        failed=len(group.trials) - len(group.ended),
-        calls=by_fate.total() - by_fate["retried"],
-        attempts=by_fate.total(),
-        retried=by_fate["retried"],
-        lost=by_fate["lost"],
-        failures=Counter(answered.groupby("failure")["attempts"].sum().to_dict()),
-        decisions=int(decisions["decisions"].sum()),
-        fallbacks=int(decisions.loc[decisions["fallback"], "decisions"].sum()),
-        unknown=int(attempts.loc[attempts["outcome"] == "unknown", "attempts"].sum()),
-        others=int(answered.loc[_other_model(study, answered), "attempts"].sum()),
+def tally(study: Study, group: Group) -> Counter[str]:
+    """Count a group's trials, calls, attempts, decisions, and what went wrong with them.
+
+    A call is asked at one decision, in one or more attempts. ``retried`` attempts were followed by
+    another, ``lost`` calls ended without an answer; of the ``answers``, ``invalid`` ones have no
+    valid plan, for a reason that has a count of its own, too. ``fallback`` counts the ``decisions``
+    that were driven from an older plan, or none.
+    """
+    trials = of_group(study.calls.trials, group, group.trials)
+    counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
+    failures = Counter(trials["failures"].explode().dropna())
+    return Counter(
+        dict(failures)
+        | counts
+        | {
+            "trials": len(group.trials),
+            "failed": len(group.trials) - len(group.ended),
+            "answers": counts["calls"] - counts["lost"],
+            "invalid": failures.total(),
+        }
     )
-
-
-def _other_model(study: Study, answered: pd.DataFrame) -> list[bool]:
-    pairs = zip(answered["model_requested"], answered["model_served"], strict=True)
-    return [pair in study.calls.others for pair in pairs]
 
 
 def _switched(spec: Mapping[str, Any]) -> str:

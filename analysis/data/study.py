@@ -10,15 +10,14 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
 from merge_runner.audit.checks import ASKED_DECISIONS, not_judged
 from merge_runner.errors import UsageError, unknown_name
-from merge_runner.llm.content_hashes import canonical_json, spec_hash
 from merge_runner.paths import DEFAULT_DB
-from merge_runner.records import SIDES, Side
+from merge_runner.records import SIDES, Side, canonical_json, spec_hash
 from merge_runner.registry import require
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF, listed_levels
@@ -44,7 +43,6 @@ from merge_runner_analysis.data.load import (
     EGO_SPEEDS,
     FIRST_ACTIONS,
     PLANS,
-    SHARED,
     SPEEDS,
     TRACES,
     WORDS,
@@ -54,27 +52,27 @@ from merge_runner_analysis.data.load import (
     load_specs,
 )
 from merge_runner_analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
-from merge_runner_analysis.data.studies import Order, Studies, read_studies, study_name
+from merge_runner_analysis.data.studies import KEYS, Order, Studies, read_studies, study_name
 from merge_runner_analysis.names import BASELINE, HUMAN
 
 # What tells groups apart, and is no measure.
 COLUMNS_OF_GROUPS = [
-    "driver", "image", "task", "usual", "mark", "apart", "shared", "trace", "left_scripted",
+    "driver", "image", "task", "usual", "mark", "apart", "trace", "left_scripted",
     "right_scripted",
 ]  # fmt: skip
 MEAN_SPEED = "mean_speed_mps"
 # Factors that every study has, and levels that others are compared with.
 FIRST = (MODEL, PROMPT)
 USUAL = (BASELINE, DEFAULT, SELF)
-LEVELS = "FROM trial_levels"
 ONLY_ASKED = " [asked]"  # ends the name of a driver that was only asked
-# One row a trial and factor of drivers that were only asked.
-ASKED = """
-SELECT trial_id, spec_hash, driver, factor, value FROM trial_levels
-JOIN trial_drivers USING (trial_id, spec_hash)
-SEMI JOIN (FROM trials WHERE source = 'seat') USING (trial_id, spec_hash) ORDER BY ALL
-"""
 OF_SWEEP = "SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = {sweep}"
+SPEC = ["spec_hash", "variant"]
+QUERIES = {
+    "asked": ASKED_TRIALS,
+    "decisions": ASKED_DECISIONS,
+    "levels": "FROM trial_levels",
+    "traces": TRACES,
+}
 NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
@@ -97,8 +95,6 @@ class Group:
     deterministic driver are distinct, and ``whole`` is the group with their repetitions; ``equal``
     counts the trials of a language model that went as an earlier one.
     ``unjudged`` says why nothing is concluded from them, and is empty where something is.
-    ``narrowed`` is what tells the trials in SQL from others of their spec and variant, empty where
-    there are none.
     ``published_outcomes`` stand in the place of the trials' outcomes where these are a part of the
     published ones.
     """
@@ -119,7 +115,6 @@ class Group:
     whole: Group | None = None
     equal: int = 0
     unjudged: str = ""
-    narrowed: str = ""
     published_outcomes: pd.DataFrame | None = None
     levels: Mapping[str, str] = field(default_factory=dict)
 
@@ -214,7 +209,9 @@ class Study:
     """The groups of a database, humans first, and what is computed from their traces once.
 
     ``played`` are those of drivers, and ``models`` the ones of them that something is concluded
-    from. ``state`` is that of the results before they were read: rows may be stored meanwhile.
+    from, as ``unjudged`` are the others; ``asked`` and ``unjudged_asked`` are the same of drivers
+    that were only asked what they do first, each marked so by its name. ``state`` is that of the
+    results before they were read: rows may be stored meanwhile.
     """
 
     def __init__(
@@ -237,7 +234,6 @@ class Study:
         """
         self.db = Path(db)
         self.chosen = models
-        self.where = where
         self.by = by
         self.without_fallbacks = without_fallbacks
         self.options = options_text(
@@ -247,76 +243,49 @@ class Study:
         self.studies = read_studies(self.db)
         self.source = None if file is None else read_study(file)
         self.file, self.order = _chosen(self.db, self.studies, self.source)
-        self.specs = specs = load_specs(self.db)
-        trials = trials_with_metrics(self.db).merge(
-            self._read(TRACES), on=["trial_id", "spec_hash"], how="left"
-        )
-        trials = judged(self.db, trials)
+        self.specs = load_specs(self.db)
+        found = load_each(QUERIES, self.db)
+        trials = judged(self.db, trials_with_metrics(self.db))
         recorded = trials["source"] == HUMAN
-        self.imported = _imported(trials[recorded], specs) if recorded.any() else None
+        self.imported = _imported(trials[recorded], self.specs) if recorded.any() else None
         self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
-        found = load_each({"levels": LEVELS, "asked": ASKED, "decisions": ASKED_DECISIONS}, self.db)
         driven = trials[~recorded]
         if sweep:
             driven = driven.merge(self._read(OF_SWEEP.format(sweep=quoted(sweep))))
         if condition:
             driven = driven[driven["condition"] == condition]
             self.human = self.human.part(lambda rows: rows["condition"] == condition)
-        every = _model_groups(
-            driven[self.is_of_file(driven)], specs, found["decisions"], part=bool(self.file)
-        )
-        every = [
-            self._kept_trials(replace(group, levels=_levels(found["levels"], group)))
-            for group in every
-        ]
-        asked = found["asked"][self.is_of_file(found["asked"])]
-        drivers = [*(group.driver for group in every), *asked["driver"].unique()]
-        valid = list(dict.fromkeys([HUMAN, *drivers]))
+        played, asked = self._groups(driven, found), found["asked"]
+        every = pd.concat([trials[SPEC], asked[SPEC]])
+        self._sizes = every.value_counts(dropna=False).reset_index(name="trials")
+        asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED), found)
+        # Those that were only asked are chosen by the names of their models.
+        names = {group: group.driver for group in played}
+        names |= {group: group.name.removesuffix(ONLY_ASKED) for group in asked}
+        valid = list(dict.fromkeys([HUMAN, *names.values()]))
         wanted = valid if models is None else list(models)
         for name in wanted or [""]:
             if name not in valid:
                 raise unknown_name("driver", name, valid, f"in {db}")
-        self.empty = not every
-        self.played = _at(
-            where or {},
-            [group for group in every if group.driver in wanted],
-            asked[asked["driver"].isin(wanted)],
-            self.db,
-            self.order,
-        )
-        self.models = [group for group in self.played if not group.unjudged]
+        kept = [group for group, name in names.items() if name in wanted]
+        if where:
+            kept = _at(where, kept, self.db, self.order)
+        self.empty = not played
+        self.played = [group for group in played if group in kept]
+        self.models, self.unjudged = _by_judgement(self.played)
+        self.asked, self.unjudged_asked = _by_judgement([g for g in asked if g in kept])
         self.groups = [self.human, *self.models] if HUMAN in wanted else self.models
 
-    @property
-    def asked(self) -> list[Group]:
-        """The drivers that were only asked what they do first, each marked so by its name."""
-        return [group for group in self._asked if not group.unjudged]
-
-    @property
-    def unjudged(self) -> list[Group]:
-        """The groups of drivers that nothing is concluded from."""
-        return [group for group in self.played if group.unjudged]
-
-    @property
-    def unjudged_asked(self) -> list[Group]:
-        """The same of drivers that were only asked."""
-        return [group for group in self._asked if group.unjudged]
-
-    @cached_property
-    def _asked(self) -> list[Group]:
-        trials = self._read(ASKED_TRIALS).merge(
-            self._read(TRACES), on=["trial_id", "spec_hash"], how="left"
-        )
-        trials = trials[self.is_of_file(trials)]
-        if self.chosen is not None:
-            trials = trials[trials["driver"].isin(self.chosen)]
-        levels, decisions = self._read(LEVELS), self._read(ASKED_DECISIONS)
-        trials = trials.assign(driver=trials["driver"] + ONLY_ASKED)
-        groups = _model_groups(trials, self.specs, decisions, part=bool(self.file))
-        return _kept(
-            self.where or {},
-            [self._kept_trials(replace(group, levels=_levels(levels, group))) for group in groups],
-        )
+    def _groups(self, trials: pd.DataFrame, found: Mapping[str, pd.DataFrame]) -> list[Group]:
+        """The groups of these trials that were played for the study, if one was chosen."""
+        if self.file:
+            trials = trials[self.studies.holds(self.file, trials)]
+        trials = trials.merge(found["traces"], on=KEYS, how="left")
+        groups = _model_groups(trials, self.specs, found["decisions"])
+        return [
+            self._kept_trials(replace(group, levels=_levels(found["levels"], group)))
+            for group in groups
+        ]
 
     def _kept_trials(self, group: Group) -> Group:
         """The group, perhaps without its trials that had a fallback; it is judged by all."""
@@ -325,17 +294,19 @@ class Study:
         kept = group.part(lambda trials: ~trials["trial_id"].isin(self._with_fallbacks(group)))
         if kept.trials.empty:
             return replace(group, unjudged=group.unjudged or "every trial had a fallback")
-        return replace(kept, narrowed=_among(kept.trials))
+        return kept
+
+    def holds_more(self, group: Group) -> bool:
+        """Whether the database has other trials with the specs and the prompt of a group."""
+        sizes = self._sizes
+        alike = sizes["spec_hash"].isin(group.trials["spec_hash"])
+        if group.setting:
+            alike &= sizes["variant"] == group.setting
+        return int(sizes.loc[alike, "trials"].sum()) > len(group.trials)
 
     def _with_fallbacks(self, group: Group) -> set[str]:
-        decisions = of_group(self.calls.decisions, group, group.trials)
-        return set(decisions.loc[decisions["fallback"], "trial_id"])
-
-    def is_of_file(self, trials: pd.DataFrame) -> pd.Series:
-        """Whether each of these trials was played for the study that was chosen, if any was."""
-        if not self.file:
-            return pd.Series(True, index=trials.index)
-        return self.studies.holds(self.file, trials)
+        trials = of_group(self.calls.trials, group, group.trials)
+        return set(trials.loc[trials["fallback"] > 0, "trial_id"])
 
     @property
     def reference(self) -> str:
@@ -420,11 +391,6 @@ class Study:
         """What became of the calls, by trial."""
         return load_calls(self.db)
 
-    @cached_property
-    def shared(self) -> pd.DataFrame:
-        """One row a variant: how many of its calls share their reply with the baseline."""
-        return self._read(SHARED)
-
     def _read(self, sql: str) -> pd.DataFrame:
         return load_each({"rows": sql}, self.db)["rows"]
 
@@ -435,10 +401,9 @@ def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.Data
 
 
 def _of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
-    keys = trials[["trial_id", "spec_hash"]]
     # To join all rows takes longer than to leave out those of other groups first.
-    near = frame["spec_hash"].isin(keys["spec_hash"].unique())
-    return frame[near].merge(keys, on=["trial_id", "spec_hash"])
+    near = frame["spec_hash"].isin(trials["spec_hash"].unique())
+    return frame[near].merge(trials[KEYS], on=KEYS)
 
 
 def _imported(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> Imported:
@@ -449,7 +414,6 @@ def _imported(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> I
 def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
     if known is None:
         return _published_group()
-    pairs = ", ".join(quoted(pair) for pair in sorted(trials["pair"].unique()))
     return Group(
         HUMAN,
         "",
@@ -458,7 +422,6 @@ def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
         label=known.label,
         models=(HUMAN,),
         name=HUMAN,
-        narrowed=f"pair IN ({pairs})" if known.left_out else "",
         published_outcomes=None if known.complete else outcomes_with_metrics(),
     )
 
@@ -528,111 +491,71 @@ def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str
 
 
 def _at(
-    where: Mapping[str, Sequence[str]],
-    groups: list[Group],
-    asked: pd.DataFrame,
-    db: Path,
-    order: Order,
+    where: Mapping[str, Sequence[str]], groups: list[Group], db: Path, order: Order
 ) -> list[Group]:
-    """The groups at these levels.
+    """The groups that have one of these levels of each factor.
 
-    Raises UsageError where nothing was driven there or ``asked``, or there is no such level.
+    Raises UsageError where there is none, or no such level.
     """
     there = levels_of(groups, order)
-    for factor, found in asked.groupby("factor")["value"]:
-        there[factor] = list(dict.fromkeys([*there.get(factor, ()), *found]))
     for factor, levels in where.items():
         known = require(there, "factor", factor)
         for level in levels:
             require(dict.fromkeys(known), f"level of {factor}", level)
-    kept = _kept(where, groups)
-    if where and not kept and not _asked_at(where, asked):
+    kept = [
+        group
+        for group in groups
+        if all(group.levels.get(factor) in levels for factor, levels in where.items())
+    ]
+    if not kept:
         named = " and ".join(f"{factor}={'|'.join(levels)}" for factor, levels in where.items())
         raise UsageError(f"{db} holds no trial with {named}: there are some with each alone")
     return kept
 
 
-def _kept(where: Mapping[str, Sequence[str]], groups: Iterable[Group]) -> list[Group]:
-    """The groups that have one of these levels of each factor."""
-    return [
-        group
-        for group in groups
-        if all(group.levels.get(factor) in levels for factor, levels in where.items())
-    ]
+def _by_judgement(groups: list[Group]) -> tuple[list[Group], list[Group]]:
+    """Those that something is concluded from, and the others."""
+    judged_ones = [group for group in groups if not group.unjudged]
+    return judged_ones, [group for group in groups if group.unjudged]
 
 
-def _asked_at(where: Mapping[str, Sequence[str]], asked: pd.DataFrame) -> bool:
-    """Whether a trial has a level of each of these factors."""
-    pairs = zip(asked["factor"], asked["value"], strict=True)
-    meant = [value in where.get(factor, ()) for factor, value in pairs]
-    there = asked[pd.Series(meant, index=asked.index, dtype=bool)]
-    return bool((there.groupby(["trial_id", "spec_hash"]).size() == len(where)).any())
+class _Seen(NamedTuple):
+    """A spec as the ego sees it: with the ego's driver on the left.
+
+    ``image`` is its hash, ``usual`` its hash at the usual mean speed. ``task`` is a hash of what
+    it covers beside the prompt and the mean speed: equal for all prompts and conditions of a study.
+    """
+
+    spec: Mapping[str, Any]
+    image: str
+    usual: str
+    task: str
+
+
+def _seen(specs: Mapping[str, Mapping[str, Any]], name: str, ego: str) -> _Seen:
+    spec = specs.get(name)
+    if spec is None:
+        return _Seen({}, name, name, name[:8])
+    image = usual = name
+    if ego == "right" and {*SIDES} <= spec.keys():
+        spec = {**spec, "left": spec["right"], "right": spec["left"]}
+        image = usual = spec_hash(canonical_json(spec))
+    if MEAN_SPEED in spec:
+        usual = spec_hash(canonical_json(_without(spec, MEAN_SPEED)))
+    text = json.dumps(_without(spec, "prompt_blocks", MEAN_SPEED), sort_keys=True)
+    return _Seen(spec, image, usual, hashlib.sha256(text.encode()).hexdigest()[:8])
 
 
 def _without(spec: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {name: value for name, value in spec.items() if name not in names}
 
 
-def _tasks(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Spec hash to a hash of what it covers beside the prompt and the mean speed.
-
-    It is equal for all variants and conditions of one study.
-    """
-    tasks = {}
-    for name, spec in specs.items():
-        text = json.dumps(_without(spec, "prompt_blocks", MEAN_SPEED), sort_keys=True)
-        tasks[name] = hashlib.sha256(text.encode()).hexdigest()[:8]
-    return tasks
-
-
-def with_images(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """The trials with their ``image``: the hash of the spec that has the ego on the left."""
-    turned = trials["ego"] == "right"
-    images = _mirrored(specs, trials.loc[turned, "spec_hash"].unique())
-    return trials.assign(
-        image=trials["spec_hash"].mask(turned, trials["spec_hash"].replace(images))
-    )
-
-
-def _mirrored(specs: Mapping[str, Mapping[str, Any]], names: Iterable[str]) -> dict[str, str]:
-    """The spec hashes by which the mirror images of these specs go."""
-    return {
-        name: spec_hash(canonical_json(_turned(specs[name])))
-        for name in names
-        if {*SIDES} <= specs.get(name, {}).keys()
-    }
-
-
-def _turned(spec: Mapping[str, Any]) -> dict[str, Any]:
-    return {**spec, "left": spec["right"], "right": spec["left"]}
-
-
-def _usual(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> pd.Series:
-    """What each trial's ``image`` would be at the usual mean speed.
-
-    It stays as it is where a condition was driven at several mean speeds: these must not be mixed.
-    """
-    others = {
-        name: spec_hash(canonical_json(_without(spec, MEAN_SPEED)))
-        for name, spec in specs.items()
-        if MEAN_SPEED in spec
-    }
-    usual = trials["image"].replace(others)
-    speeds = trials.groupby([usual, "condition"])["image"].transform("nunique")
-    mixed = usual.isin(usual[speeds > 1])
-    return usual.mask(mixed, trials["image"])
-
-
 def _model_groups(
     trials: pd.DataFrame,
     specs: Mapping[str, Mapping[str, Any]],
     decisions: pd.DataFrame,
-    *,
-    part: bool,
 ) -> list[Group]:
-    """Groups by driver and variant, scripted stand-ins last, of all trials or of a ``part``.
-
-    ``decisions`` are ASKED_DECISIONS.
+    """Groups by driver and variant, scripted stand-ins last; ``decisions`` are ASKED_DECISIONS.
 
     Where a driver was run under several settings of the task, all but the most frequent carry a
     mark, the same for a baseline and its variants; likewise where a prompt was changed, and where
@@ -640,47 +563,45 @@ def _model_groups(
     """
     if trials.empty:
         return []
-    images = _mirrored(specs, trials.loc[trials["ego"] == "right", "spec_hash"].unique())
-    keyed = with_images(trials, specs)
-    specs = {**specs, **{images[name]: _turned(specs[name]) for name in images}}
-    tasks = _tasks(specs)
-    keyed["task"] = keyed["image"].map(lambda name: tasks.get(name, name[:8]))
-    keyed["usual"] = _usual(keyed, specs)
+    pairs = [*zip(trials["spec_hash"], trials["ego"], strict=True)]
+    seen = {pair: _seen(specs, *pair) for pair in {*pairs}}
+    keyed = trials.assign(
+        **{name: [getattr(seen[pair], name) for pair in pairs] for name in ("image", "usual")},
+        task=[seen[pair].task for pair in pairs],
+    )
+    # A condition that was driven at several mean speeds must not be mixed.
+    speeds = keyed.groupby(["usual", "condition"])["image"].transform("nunique")
+    mixed = keyed["usual"].isin(keyed.loc[speeds > 1, "usual"])
+    keyed["usual"] = keyed["usual"].mask(mixed, keyed["image"])
     keyed["mark"] = _marks(keyed, ["driver"], "task")
     keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "usual")
     keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
-    # Two names of one model have equal specs, as under two prices.
-    shared = keyed.groupby(["spec_hash", "variant"])["driver"].transform("nunique") > 1
-    keyed["shared"] = shared | part
     keys = ["driver", "mark", "apart", "scripted", "variant", "usual"]
-    groups = [_model_group(rows, specs, decisions) for _, rows in keyed.groupby(keys)]
-    return sorted(
-        groups,
-        key=lambda group: (
-            group.scripted,
-            group.driver,
-            group.setting != BASELINE,
-            group.setting,
-        ),
-    )
+    groups = [
+        _model_group(
+            rows, seen[rows["spec_hash"].iloc[0], rows["ego"].iloc[0]].spec, specs, decisions
+        )
+        for _, rows in keyed.groupby(keys)
+    ]
+    return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
 
 
 def _model_group(
-    rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]], decisions: pd.DataFrame
+    rows: pd.DataFrame,
+    spec: Mapping[str, Any],
+    specs: Mapping[str, Mapping[str, Any]],
+    decisions: pd.DataFrame,
 ) -> Group:
-    """The group of these trials, which have equal keys."""
+    """The group of these trials, which have equal keys; ``spec`` is theirs as the ego sees it."""
     first = rows.iloc[0]
     scripted = bool(first["scripted"])
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
-    spec = specs.get(first["image"], {})
     posing = stand_in(language_models(models, spec), sides or SIDES) if scripted else ""
     caution = unresponsive(spec)
     said = "; ".join(filter(None, (posing, caution)))
     seats = rows["ego"].value_counts()
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
-    narrowed = [f"scripted = {str(scripted).lower()}"] if first["apart"] else []
-    by_name = [_among(rows)] if rows["shared"].any() else []
     again = _again(rows)
     group = Group(
         driver,
@@ -697,18 +618,10 @@ def _model_group(
         caution=caution,
         equal=len(again) if first["source"] != "driver" else 0,
         unjudged=_unjudged(decisions, rows),
-        narrowed=" AND ".join(narrowed + by_name),
     )
     if again.empty or not _is_deterministic(rows, specs):
         return group
-    trials = group.trials.drop(index=again)
-    return replace(
-        group, trials=trials, whole=group, narrowed=" AND ".join([*narrowed, _among(trials)])
-    )
-
-
-def _among(rows: pd.DataFrame) -> str:
-    return f"trials.trial_id IN ({', '.join(map(quoted, rows['trial_id']))})"
+    return replace(group, trials=group.trials.drop(index=again), whole=group)
 
 
 def _unjudged(decisions: pd.DataFrame, rows: pd.DataFrame) -> str:
@@ -737,15 +650,7 @@ def _again(rows: pd.DataFrame) -> pd.Index:
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:
     """`` [mark]`` for all but the most frequent value of ``what`` within equal names."""
-    counts = keyed.groupby([*within, what]).size().reset_index(name="n")
-    ordered = counts.sort_values(
-        [*within, "n", what], ascending=[True] * len(within) + [False, True]
-    )
-    usual = ordered.drop_duplicates(within).set_index(within)[what]
-    keys = pd.MultiIndex.from_frame(keyed[within]) if len(within) > 1 else keyed[within[0]]
-    expected = usual.reindex(keys).to_numpy()
-    marks = [
-        "" if found == usually else f" [{found[:8]}]"
-        for found, usually in zip(keyed[what], expected, strict=True)
-    ]
-    return pd.Series(marks, index=keyed.index)
+    sizes = keyed.groupby([*within, what])[what].transform("size")
+    ordered = keyed.assign(rarity=-sizes).sort_values(["rarity", what])
+    usual = ordered.groupby(within)[what].transform("first").reindex(keyed.index)
+    return (" [" + keyed[what].str[:8] + "]").mask(keyed[what] == usual, "")

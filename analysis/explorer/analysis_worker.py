@@ -131,7 +131,7 @@ class Numbers:
                     "group": source.group,
                     "text": source.text,
                     "query": source.query,
-                    "trials": self._keys(source),
+                    "trials": self._keys(source, numerator=bool(column.counts)),
                 }
                 for source in sources_of(self.study, table, row, column)
             ],
@@ -142,9 +142,10 @@ class Numbers:
 
         return rendered(self.study, name, "svg").decode()
 
-    def _keys(self, source: Source) -> list[tuple[str, str]]:
-        """The (trial, spec) of a source's trials."""
-        return [(name, self._specs[source.group][name]) for name in source.trials]
+    def _keys(self, source: Source, *, numerator: bool) -> list[tuple[str, str]]:
+        """The (trial, spec) of a source's trials, or of its ``numerator``."""
+        names = source.numerator if numerator else source.trials
+        return [(name, self._specs[source.group][name]) for name in names]
 
     @cached_property
     def _specs(self) -> dict[str, dict[str, str]]:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
 from merge_runner.config import both_sides, pair_name
 from merge_runner.drivers.registry import EMULATOR
-from merge_runner.results.progress_file import Standing, read_standing
+from merge_runner.run.progress import Standing, read_standing
 from merge_runner.study.crossing import MODEL, PROMPT
 from merge_runner.study.file import study_files
 from merge_runner_analysis.data.driver_words import stand_in

@@ -5,8 +5,16 @@ from __future__ import annotations
 from itertools import pairwise
 from math import inf
 
-from merge_runner.llm.content_hashes import canonical_json, spec_hash
-from merge_runner.records import SIDES, Side, StateRow, Status, TrialRecord, TrialSpec
+from merge_runner.records import (
+    SIDES,
+    Side,
+    StateRow,
+    Status,
+    TrialRecord,
+    TrialSpec,
+    canonical_json,
+    spec_hash,
+)
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.data.imported_humans import VELOCITY_PAGES

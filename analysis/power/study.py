@@ -206,7 +206,7 @@ def power_table(title: str, rows: Sequence[Row]) -> Table:
         "with the [effect] that the study names; without one, an arm leaves 1 m more than the "
         "first, and collides twice as often",
     )
-    return Table("power", title, COLUMNS, rows, notes)
+    return Table("power", COLUMNS, rows, notes, title=title)
 
 
 def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, Case]]:

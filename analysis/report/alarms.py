@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from merge_runner.drivers.registry import MOCKS
 from merge_runner_analysis.data.provenance import Mismatch, Provenance, tally
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.tables.notes import equal_note
+from merge_runner_analysis.tables.notes import equal_notes
 
 # The share of a group's decisions above which an alarm is raised: a convention.
 MANY_FALLBACKS = 0.05
@@ -51,7 +51,7 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
         ),
         (
             "Some trials are equal",
-            [f"{group.id}: {equal_note(group)}" for group in study.models if group.equal],
+            equal_notes(study.models),
             "Where a cache on the way answered, or the temperature is 0, they are no samples, and "
             "intervals and tests claim too much.",
         ),
@@ -76,8 +76,8 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
         (
             "Many fallbacks",
             list(_fallbacks(study)),
-            "There the older plan was driven, or none: the table fallbacks shows whether that "
-            "changes the results.",
+            "There the older plan was driven, or none: tables --without-fallbacks shows whether "
+            "that changes the results.",
         ),
         (
             "Attempts of unknown fate",
@@ -123,17 +123,17 @@ def _fallbacks(study: Study) -> Iterator[str]:
     for group in study.models:
         # Without decisions both sides are 0, and there is no share to take.
         found = tally(study, group)
-        if found.fallbacks > MANY_FALLBACKS * found.decisions:
-            share = 100 * found.fallbacks / found.decisions
-            yield (
-                f"{found.fallbacks} of {found.decisions} decisions of {group.id} ({share:.1f} %)"
-            )
+        fallbacks, decisions = found["fallback"], found["decisions"]
+        if fallbacks > MANY_FALLBACKS * decisions:
+            share = 100 * fallbacks / decisions
+            yield f"{fallbacks} of {decisions} decisions of {group.id} ({share:.1f} %)"
 
 
 def _unknown(study: Study) -> Iterator[str]:
     for group in study.played:
-        if unknown := tally(study, group).unknown:
-            yield f"{unknown} of {tally(study, group).attempts} of {group.id}"
+        found = tally(study, group)
+        if found["unknown"]:
+            yield f"{found['unknown']} of {found['attempts']} of {group.id}"
 
 
 def _mixed(study: Study) -> Iterator[str]:

@@ -25,21 +25,21 @@ from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.verdict_words import TABLE, sentences
 
 TEMPLATES = Path(__file__).with_name("templates")
-# At most so many trials are listed for a cell: a page with all of them would be unwieldy.
+# At most so many trials are listed for a row: a page with all of them would be unwieldy.
 LISTED = 300
 LIBRARIES = ("statsmodels", "scipy", "numpy", "pandas", "matplotlib")
 
 
 @dataclass
 class Links:
-    """The sources of all cells, numbered; cells with equal sources share a number."""
+    """The sources of all rows, numbered; rows with equal sources share a number."""
 
     study: Study
     found: dict[tuple[Source, ...], int] = field(default_factory=dict)
 
-    def to(self, table: Table, row: Row, column: Column) -> int:
-        """The number under which the sources of a cell are listed."""
-        sources = sources_of(self.study, table, row, column)
+    def to(self, table: Table, row: Row, _column: Column) -> int:
+        """The number under which the sources of a row are listed."""
+        sources = sources_of(self.study, table, row)
         return self.found.setdefault(sources, len(self.found) + 1)
 
 

@@ -163,11 +163,11 @@ def balance(levels: list[Level]) -> str:
             for name, cells in lacking.items()
             if cells
         )
-        return f"not balanced, so that pooled values are confounded: {'; '.join(said)}"
+        return f"not balanced, so that values over all trials are confounded: {'; '.join(said)}"
     if any(len({cells[cell] for cells in found.values()}) > 1 for cell in every):
         return (
             f"every level has all {len(every)} cells, but not equally many trials in each, so that "
-            "pooled values weigh these differently"
+            "values over all trials weigh these differently"
         )
     return f"balanced: every level has the same {len(every)} cells equally often"
 

@@ -25,84 +25,58 @@ if TYPE_CHECKING:
 
 
 class Listed(NamedTuple):
-    """A table as lists show it: the module of its maker, what it shows, its number in the paper."""
+    """A table as lists show it: the module of its maker, its title, its number in the paper."""
 
     module: str
-    shows: str
+    title: str
     number: str = ""
 
+    @property
+    def about(self) -> str:
+        """Number and title."""
+        return f"{self.number}: {self.title}" if self.number else self.title
 
-# A module is imported only when its table is computed, so that a table stored in the database can
-# be shown without waiting for pandas.
+
+# A module is imported only when its table is computed, so that a table that is kept can be shown
+# without waiting for pandas.
 TABLES = {
-    "verdicts": Listed(
-        "verdicts",
-        "every driver and prompt beside the humans: estimate, difference and verdict for who goes "
-        "first, collisions, the gap and I5",
-    ),
+    "verdicts": Listed("verdicts", "What drivers show beside the humans"),
     "who-first": Listed(
-        "regressions",
-        "logit of left-first on projected headway h (m) and relative velocity Δv (m/s), both left "
-        "minus right, of every driver and variant",
-        "Table III",
+        "regressions", "Logistic regression of which driver merged first (1: left)", "Table III"
     ),
     "gap": Listed(
         "regressions",
-        "least squares of the gap (m) on |h|, |Δv| and the signed product h·Δv, of every driver "
-        "and variant",
+        "Linear regression of the gap at the merge point (m, net of the vehicle length)",
         "Table IV",
     ),
     "indicators": Listed(
         "indicators",
-        "I1 to I5, the score, and the quantitative measures",
+        "Qualitative and quantitative indicators of behaviour during merging conflicts",
         "Table V",
     ),
     "ablation-qualitative": Listed(
         "ablations",
-        "I1 to I5 of every driver and variant",
+        "Alignment with qualitative indicators of human behaviour across prompt ablations",
         "Table VI",
     ),
     "ablation-quantitative": Listed(
-        "ablations",
-        "collisions, gap, RMSE and joint rate of every driver and variant",
-        "Table VII",
+        "ablations", "Quantitative measures across prompt ablations", "Table VII"
     ),
-    "contrasts": Listed(
-        "contrasts",
-        "every prompt against its driver's reference",
-    ),
+    "contrasts": Listed("contrasts", "Differences between prompts"),
     "factors": Listed(
-        "factors",
-        "the levels of each factor of a study, of models and of prompts, pooled over all other "
-        "factors: every metric with its interval, and the difference from the reference",
+        "factors", "Each factor's levels: every metric, and the difference from the reference"
     ),
     "velocity-profiles": Listed(
-        "profiles",
-        "the numbers behind I5, and by how much plans are revised",
-    ),
-    "conflict-resolution": Listed(
-        "conflicts",
-        "quartiles of the conflict resolution time, by condition",
+        "profiles", "Piecewise-linear velocity profiles (I5) and plan revisions"
     ),
     "criticality": Listed(
-        "conflicts",
-        "time to merge, post-encroachment time, time to collision, largest acceleration",
+        "conflicts", "When conflicts are resolved, and how close the vehicles come"
     ),
-    "attempts": Listed(
-        "attempts",
-        "what became of the calls of every driver and variant: retried, lost, refused, truncated, "
-        "empty, invalid by reason, fallbacks, attempts whose fate is unknown, answers of another "
-        "model",
-    ),
+    "attempts": Listed("attempts", "What became of the calls"),
     "first-action": Listed(
-        "first_action",
-        "net acceleration at the first decision by own relative velocity, for every driver and "
-        "prompt, beside the humans'",
+        "first_action", "Net acceleration (m/s²) at the first decision, by own relative velocity"
     ),
-    "words": Listed(
-        "words",
-        "how often M is followed by yielding and Y by going, and what the first word follows",
-    ),
+    "words": Listed("words", "Words and deeds: what follows M (merge first) and Y (yield)"),
 }
 # The table that also has drivers that were only asked.
 OF_ASKED = "first-action"
@@ -199,4 +173,4 @@ def _valid(names: Sequence[str]) -> Sequence[str]:
 def _made(name: str, study: Study) -> Table:
     module = import_module(f"merge_runner_analysis.tables.{TABLES[name].module}")
     maker: Callable[[Study], Table] = getattr(module, name.replace("-", "_"))
-    return replace(maker(study), number=TABLES[name].number)
+    return replace(maker(study), title=TABLES[name].title, number=TABLES[name].number)

@@ -20,7 +20,15 @@ from merge_runner_analysis.tables.indicators import (
     verdict_note,
     verdict_values,
 )
-from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.model import (
+    ENDED,
+    GROUP_COLUMNS,
+    Column,
+    Row,
+    Table,
+    Value,
+    row_of,
+)
 from merge_runner_analysis.tables.notes import (
     ceiling_notes,
     intermittency_notes,
@@ -29,15 +37,7 @@ from merge_runner_analysis.tables.notes import (
     sample_notes,
 )
 
-KEYS = (
-    *GROUP_COLUMNS,
-    Column("n", "n", "count", 0, "trials that ended", "status <> 'failed'"),
-)
-# Columns that rest on who merged first: before a complete import the published outcomes of humans
-# fill these, while the others rest on the imported trials.
-OF_OUTCOMES = tuple(
-    f"{name}_{rule}" for name in ("i1", "i2") for rule in ("paper", "robust", "differ")
-)
+KEYS = (*GROUP_COLUMNS, Column("n", "n", "count", 0, "trials that ended"))
 
 
 def ablation_qualitative(study: Study) -> Table:
@@ -80,7 +80,6 @@ def ablation_qualitative(study: Study) -> Table:
     ]
     return Table(
         "ablation-qualitative",
-        "Alignment with qualitative indicators of human behaviour across prompt ablations",
         columns,
         [_qualitative_row(study, group) for group in study.groups],
         (
@@ -98,7 +97,6 @@ def ablation_quantitative(study: Study) -> Table:
     metrics = shown_in("tables")
     return Table(
         "ablation-quantitative",
-        "Quantitative measures across prompt ablations",
         [*KEYS, *(column for metric in metrics for column in _metric_columns(metric))],
         [_quantitative_row(group) for group in study.groups],
         (
@@ -110,17 +108,17 @@ def ablation_quantitative(study: Study) -> Table:
 
 
 def _metric_columns(metric: Metric) -> tuple[Column, Column]:
-    counts, digits = metric.counts, metric.decimals
+    digits, counts = metric.decimals, metric.column if metric.rate else ""
     return (
         Column(metric.name, metric.heading, metric.kind, digits, metric.meaning, counts),
-        Column(f"{metric.name}_ci", "95 % CI", "interval", digits, "", counts, optional=True),
+        Column(f"{metric.name}_ci", "95 % CI", "interval", digits, optional=True),
     )
 
 
 def _denominators(metrics: list[Metric]) -> str:
     """Which trials count for which metrics: ``collisions over all ended trials; gap over ...``."""
     ended, finished = (
-        listed(list(dict.fromkeys(one.in_lists for one in metrics if one.trials == trials)))
+        listed([metric.in_sentences for metric in metrics if metric.trials == trials])
         for trials in ("ended", "finished")
     )
     return f"{ended} over all ended trials; {finished} over finished ones"
@@ -142,7 +140,7 @@ def _qualitative_row(study: Study, group: Group) -> Row:
     else:
         values |= ceiling_values(found, "I1-I4")
     remarks.append(no_ceiling(group))
-    return row_of(group, values, *remarks, published=("n", *OF_OUTCOMES))
+    return row_of(group, values, *remarks, counts=ENDED)
 
 
 def _quantitative_row(group: Group) -> Row:
@@ -172,24 +170,10 @@ def _quantitative_row(group: Group) -> Row:
     if missing:
         remarks.append(f"no trial with {', '.join(missing)}")
     remarks += [_shipped_note(found, source) for source, found in shipped.items()]
-    return row_of(
-        group,
-        values,
-        *remarks,
-        printed=tuple(metric.name for found in shipped.values() for metric in found),
-        published=(
-            "n",
-            *(
-                name
-                for metric in metrics
-                if metric.humans_from == "outcomes"
-                for name in (metric.name, f"{metric.name}_ci")
-            ),
-        ),
-    )
+    return row_of(group, values, *remarks, counts=ENDED)
 
 
 def _shipped_note(metrics: list[Metric], source: str) -> str:
-    names = listed([metric.in_lists for metric in metrics])
+    names = listed([metric.in_sentences for metric in metrics])
     what = "is a published value" if len(metrics) == 1 else "are published values"
     return f"{names} {what}, no human traces are imported ({source})"

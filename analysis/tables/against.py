@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
-
-import pandas as pd
+from typing import TypeGuard
 
 from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
@@ -19,26 +18,17 @@ from merge_runner_analysis.tables.model import Column, Row, Table, Value
 PAPER = "paper"
 # The drivers that have rows in the paper.
 DRIVERS = ("human", "o3", "gemini-2.5-pro")
-METRICS_FILE = "paper_ablation_quantitative"
-INDICATORS_FILE = "paper_ablation_qualitative"
-# Maps each table to the file of its published values.
+# The files of the tables that the paper prints. Table V has values of Tables VI and VII.
+QUALITATIVE, QUANTITATIVE = "paper_ablation_qualitative", "paper_ablation_quantitative"
 FILES = {
-    "who-first": "paper_who_first",
-    "gap": "paper_gap",
-    "ablation-qualitative": INDICATORS_FILE,
-    "ablation-quantitative": METRICS_FILE,
+    "who-first": ("paper_who_first",),
+    "gap": ("paper_gap",),
+    "indicators": (QUALITATIVE, QUANTITATIVE),
+    "ablation-qualitative": (QUALITATIVE,),
+    "ablation-quantitative": (QUANTITATIVE,),
 }
-# Maps our columns to those of the file; for metrics the registry does this (_metric_columns).
-COLUMNS = {
-    "who-first": {c: c for c in ("n", "b", "se", "z", "p")},
-    "gap": {c: c for c in ("n", "b", "se", "t", "p")},
-    "ablation-qualitative": {
-        **{f"i{i}_paper": f"i{i}" for i in range(1, 6)},
-        "score_paper": "score",
-    },
-}
-# Rows of Table V are columns of the files of Tables VI and VII.
-INDICATOR_ROWS = {**{f"I{i}": f"i{i}" for i in range(1, 6)}, "score": "score"}
+# Driver, setting and item, the rest of a row's id.
+Key = tuple[str, str, str]
 
 
 def placed(table: Table, study: Study) -> Table:
@@ -57,175 +47,139 @@ def _placed(row: Row, group: Group) -> Row:
     # same driver: it only draws other samples.
     (asked, *others) = group.models
     sample_set = "" if group.name == asked else f"/set{group.trials['sample_set'].iloc[0]}"
-    apart = group.scripted or group.unjudged
-    own = not others and group.name == asked + sample_set and not apart
+    own = asked in DRIVERS and not others and group.name == asked + sample_set
+    beside = asked if own and not group.unjudged else ""
     # A mock model under its own name misleads nobody.
     posing = group.scripted and not MOCKS.issuperset(group.models)
-    return replace(
-        row,
-        beside=asked if own and asked in DRIVERS else "",
-        stand_in_for=group.models if posing else (),
-        printed=_printed(row, group),
-    )
-
-
-def _printed(row: Row, group: Group) -> tuple[str, ...]:
-    """The columns that rest on published values, which a comparison with those cannot test."""
-    of_outcomes = not group.measured or group.published_outcomes is not None
-    return (*row.printed, *row.published) if of_outcomes else row.printed
+    # A comparison of published values with themselves would test nothing.
+    printed = not group.measured or group.published_outcomes is not None
+    return replace(row, beside=None if posing else beside, printed=printed)
 
 
 def against(table: Table, reference: str, driver: str | None = None) -> Table:
     """A table with published values and differences.
 
     Each row is compared with the paper's row of the same name. With ``driver``, the rows of all
-    drivers are compared with that driver's, except for stand-ins that answered in its name. Raises
-    UsageError for any other reference, and for a driver that is not in the paper.
+    drivers are compared with that driver's, except for stand-ins that answered in a model's name.
+    Raises UsageError for any other reference, and for a driver that is not in the paper.
     """
     if reference != PAPER:
         raise UsageError(f"--against {reference}: valid is {PAPER}")
     if driver is not None and driver not in DRIVERS:
         raise UsageError(f"--as {driver}: the paper has {', '.join(DRIVERS)}")
-    if table.name == "indicators":
-        columns, rows = _indicators(table, driver)
-        files = [INDICATORS_FILE, METRICS_FILE]
-    elif table.name in FILES:
-        columns, rows = _beside(table, driver)
-        files = [FILES[table.name]]
-    else:
+    if not in_paper(table):
         return replace(table, notes=(*table.notes, "the paper has no such table"))
-    cited = [f"paper: {citation(name)}" for name in files]
-    found = any(row.values.get(c.name) is not None for row in rows for c in columns if _added(c))
-    absent = [] if found else ["the paper has none of these drivers and variants"]
-    notes = (*table.notes, *cited, *_placements(table, driver), *absent)
-    return replace(table, columns=columns, rows=rows, notes=notes)
-
-
-def _placements(table: Table, driver: str | None) -> list[str]:
-    """Notes on rows that are compared with another driver's, and on those kept from comparison."""
-    names = [name for name in DRIVERS if driver in {None, name}]
-    kept_off = [
-        (row.values["driver"], name)
-        for row in table.rows
-        for name in names
-        if name in row.stand_in_for
+    paper = _paper(table.name)
+    named = {column for values in paper.values() for column in values}
+    columns = [
+        added
+        for column in table.columns
+        for added in (column, *(_columns(column) if column.name in named else ()))
     ]
-    return [
+    found = [paper.get(_key(row, driver), {}) for row in table.rows]
+    notes = [
+        *table.notes,
+        *(f"paper: {citation(name)}" for name in FILES[table.name]),
         *([] if driver is None else [f"every driver stands beside the paper's {driver}"]),
-        *(
-            f"{label} does not stand beside the paper's {name}"
-            for label, name in dict(kept_off).items()
-        ),
+        *([] if any(found) else ["the paper has none of these drivers and variants"]),
     ]
+    rows = [_beside(row, values) for row, values in zip(table.rows, found, strict=True)]
+    return replace(table, columns=columns, rows=rows, notes=notes)
 
 
 def in_paper(table: Table) -> bool:
     """Whether the paper prints this table."""
-    return table.name in {*FILES, "indicators"}
+    return table.name in FILES
 
 
-def _beside(table: Table, named: str | None) -> tuple[list[Column], list[Row]]:
-    of_humans, of_drivers = _theirs(table.name, HUMAN), _theirs(table.name, "")
-    columns: list[Column] = []
-    for column in table.columns:
-        columns.append(column)
-        if column.name in of_humans | of_drivers:
-            columns += _columns(column)
-    rows = []
-    for row in table.rows:
-        driver, setting, term = _key(row, named)
-        printed = _row(published(FILES[table.name]), driver, setting, term)
-        values = dict(row.values)
-        pairs = of_humans if driver == HUMAN else of_drivers
-        for ours, theirs in pairs.items():
-            values |= _compared(row, ours, printed, theirs)
-        rows.append(replace(row, values=values))
-    return columns, rows
-
-
-def _indicators(table: Table, named: str | None) -> tuple[list[Column], list[Row]]:
-    columns: list[Column] = []
-    for column in table.columns:
-        columns.append(column)
-        if column.name in {PAPER, "value"}:
-            columns += _columns(column)
-    rows = []
-    for row in table.rows:
-        driver, setting, item = _key(row, named)
-        values = dict(row.values)
-        if item in INDICATOR_ROWS:
-            printed = _row(published(INDICATORS_FILE), driver, setting, "")
-            # The paper prints verdicts by its own rule, so the robust ones have no counterpart.
-            values |= _compared(row, PAPER, printed, INDICATOR_ROWS[item])
-        elif theirs := _metric_columns(driver).get(item):
-            printed = _row(published(METRICS_FILE), driver, setting, "")
-            values |= _compared(row, "value", printed, theirs)
-        rows.append(replace(row, values=values))
-    return columns, rows
-
-
-def _theirs(table: str, driver: str) -> dict[str, str]:
-    """Maps our columns to the columns that the paper fills in for a driver."""
-    return COLUMNS.get(table) or _metric_columns(driver)
-
-
-def _metric_columns(driver: str) -> dict[str, str]:
-    """Maps metrics to columns of the file: the paper judges human collisions by another rule."""
-    columns = {
-        one.name: one.paper_of_humans if driver == HUMAN else one.paper_of_drivers
-        for one in shown_in("tables")
+def _paper(table: str) -> dict[Key, dict[str, Value]]:
+    """The values that the paper prints, by row, and by our column."""
+    if table in {"who-first", "gap"}:
+        rows = published(*FILES[table]).to_dict(orient="records")
+        columns = ("n", "b", "se", {"who-first": "z", "gap": "t"}[table], "p")
+        return {
+            (row["driver"], row["setting"], row["term"]): {c: _number(row[c]) for c in columns}
+            for row in rows
+        }
+    verdicts, measures = _verdicts(), _measures()
+    if table == "ablation-quantitative":
+        return {(*key, ""): values for key, values in measures.items()}
+    if table == "ablation-qualitative":
+        return {
+            (*key, ""): {f"{item.lower()}_paper": value for item, value in values.items()}
+            for key, values in verdicts.items()
+        }
+    return {
+        (*key, item): {column: value}
+        for column, found in (("paper", verdicts), ("value", measures))
+        for key, values in found.items()
+        for item, value in values.items()
     }
-    return {name: column for name, column in columns.items() if column}
 
 
-def _key(row: Row, named: str | None) -> tuple[str, str, str]:
-    """The driver, setting and item under which to look a row up in the paper's files.
+def _verdicts() -> dict[tuple[str, str], dict[str, Value]]:
+    """By driver and setting the verdicts by the paper's rule; robust ones have no counterpart."""
+    return {
+        (row["driver"], row["setting"]): {
+            **{name: bool(row[name.lower()]) for name in INDICATORS},
+            "score": f"{row['score']} of {len(INDICATORS)}",
+        }
+        for row in published(QUALITATIVE).to_dict(orient="records")
+    }
+
+
+def _measures() -> dict[tuple[str, str], dict[str, Value]]:
+    """By driver and setting the metrics: the paper judges human collisions by another rule."""
+    found: dict[tuple[str, str], dict[str, Value]] = {}
+    for row in published(QUANTITATIVE).to_dict(orient="records"):
+        values = found[row["driver"], row["setting"]] = {}
+        for metric in shown_in("tables"):
+            human = row["driver"] == HUMAN
+            if column := metric.paper_of_humans if human else metric.paper_of_drivers:
+                values[metric.name] = _number(row[column])
+    return found
+
+
+def _number(printed: Value) -> Value:
+    """A printed value; a bound of p such as ``<0.001`` stays text."""
+    if isinstance(printed, str) and not printed.startswith("<"):
+        return float(printed)
+    return printed
+
+
+def _key(row: Row, named: str | None) -> Key:
+    """The driver, setting and item under which to look a row up.
 
     The rows of mixed models have no counterpart there.
     """
     group = row.groups[0]
-    item = row.id.removeprefix(group).lstrip("/")
-    driver = row.beside
-    if named is not None and driver != HUMAN:
-        driver = "" if named in row.stand_in_for else named
+    driver = row.beside or ""
+    if named is not None and row.beside not in {None, HUMAN}:
+        driver = named
     # The humans had no prompt, and hence no setting in the file.
-    return driver, "" if driver == HUMAN else group.rpartition("/")[2], item
+    setting = "" if driver == HUMAN else group.rpartition("/")[2]
+    return driver, setting, row.id.removeprefix(group).lstrip("/")
 
 
-def _row(file: pd.DataFrame, driver: str, setting: str, term: str) -> dict[str, Any] | None:
-    chosen = file[(file["driver"] == driver) & (file["setting"] == setting)]
-    if "term" in file:
-        chosen = chosen[chosen["term"] == term]
-    return None if chosen.empty else chosen.iloc[0].to_dict()
-
-
-def _columns(column: Column) -> list[Column]:
+def _columns(column: Column) -> tuple[Column, Column]:
     meaning = f"{column.heading} as printed in the paper"
-    return [
-        Column(f"{column.name}_in_paper", "paper", column.kind, column.digits, meaning, "", True),
-        Column(f"{column.name}_difference", "diff.", "number", column.digits, "", "", True),
-    ]
+    kind, digits = column.kind, column.digits
+    return (
+        Column(f"{column.name}_in_paper", "paper", kind, digits, meaning, optional=True),
+        Column(f"{column.name}_difference", "diff.", "number", digits, optional=True),
+    )
 
 
-def _added(column: Column) -> bool:
-    return column.name.endswith("_in_paper")
+def _beside(row: Row, printed: Mapping[str, Value]) -> Row:
+    """The row with the paper's values, and the differences of numbers unless ours are published."""
+    values = dict(row.values)
+    for name, theirs in printed.items():
+        values[f"{name}_in_paper"] = theirs
+        ours = values.get(name)
+        if _is_number(ours) and _is_number(theirs) and not row.printed:
+            values[f"{name}_difference"] = ours - theirs
+    return replace(row, values=values)
 
 
-def _compared(row: Row, name: str, printed: dict[str, Any] | None, theirs: str) -> dict[str, Value]:
-    """The paper's value, and the difference unless ours rests on published values."""
-    if printed is None:
-        return {}
-    ours, value = row.values.get(name), printed[theirs]
-    if isinstance(value, str):  # p-values; some are printed as a bound, which has no difference
-        if value.startswith("<"):
-            return {f"{name}_in_paper": value}
-        value = float(value)
-    # Scores and verdicts are shown beside ours without a difference.
-    if theirs == "score":
-        return {f"{name}_in_paper": f"{value} of {len(INDICATORS)}"}
-    if theirs.upper() in INDICATORS:
-        return {f"{name}_in_paper": bool(value)}
-    values: dict[str, Value] = {f"{name}_in_paper": value}
-    if isinstance(ours, (int, float)) and name not in row.printed:
-        values[f"{name}_difference"] = ours - value
-    return values
+def _is_number(value: Value) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from math import isinf
 
 from merge_runner.text_safety import quoted
@@ -31,7 +30,6 @@ def contrasts(study: Study) -> Table:
     judged = "judged " if study.unjudged else ""
     return Table(
         "contrasts",
-        "Differences between prompts",
         (
             Column("driver", "driver"),
             Column("setting", "setting"),
@@ -68,7 +66,6 @@ def contrasts(study: Study) -> Table:
             "in which less is enough; means: (t.975 + t.8) times the standard error of the linear "
             "model, with its degrees of freedom",
             RULES_NOTE,
-            *_shared_notes(study),
             *sample_notes(study, study.groups, pooled=False),
             *([] if rows else [f"there is no pair of {judged}groups to compare"]),
         ),
@@ -76,95 +73,63 @@ def contrasts(study: Study) -> Table:
 
 
 def _family(study: Study, driver: str, metric: Metric) -> list[Row]:
-    """One measure of a driver's variants against its reference prompt."""
-    groups = [group for group in study.models if group.driver == driver]
-    reference = next((group for group in groups if group.setting == study.reference), None)
-    if reference is None:
+    """One measure of a driver's prompts against its reference; p are corrected for their number."""
+    groups = {group.setting: group for group in study.models if group.driver == driver}
+    other = groups.pop(study.reference, None)
+    if other is None:
         return []
     found = {
-        group: _contrast(group, reference, metric)
-        for group in groups
-        if group is not reference and in_one_study(study, group, reference)
+        group: contrast
+        for group in groups.values()
+        if in_one_study(study, group, other) and (contrast := _contrast(group, other, metric))
     }
-    return _corrected(found, reference, metric, study.reference)
-
-
-def _corrected(
-    contrasted: Mapping[Group, Difference | str], other: Group, metric: Metric, reference: str
-) -> list[Row]:
-    """One family of contrasts; groups without one are left out, also of its correction."""
-    found = {group: one for group, one in contrasted.items() if isinstance(one, Difference)}
     if not found:
         return []
-    holm, bh = corrected([contrast.p for contrast in found.values()])
+    families = zip(*corrected([contrast.p for contrast in found.values()]), strict=True)
     return [
-        _row(group, other, metric, contrast, reference, (float(holm[i]), float(bh[i])))
-        for i, (group, contrast) in enumerate(found.items())
+        _row(group, other, metric, contrast, float(holm), float(bh))
+        for (group, contrast), (holm, bh) in zip(found.items(), families, strict=True)
     ]
 
 
+def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
+    """The difference between two prompts; None if they share no condition or are undecided."""
+    if undecided(group, metric) or undecided(other, metric):
+        return None
+    if not metric.rate:
+        return contrast_means(group.trials, other.trials, metric.column)
+    both = shared_cells(group.trials, other.trials, metric.column)
+    return contrast_cells(both) if both else None
+
+
 def _row(
-    group: Group,
-    other: Group,
-    metric: Metric,
-    contrast: Difference,
-    reference: str,
-    corrected_p: tuple[float, float],
+    group: Group, other: Group, metric: Metric, contrast: Difference, holm: float, bh: float
 ) -> Row:
     first, second = (
         trials_of(one, metric).dropna(subset=[metric.column])["condition"] for one in (group, other)
     )
-    in_both = first.isin(second), second.isin(first)
-    whole = all(part.all() for part in in_both)
-    named = ", ".join(quoted(name) for name in sorted(first[in_both[0]].unique()))
+    named = ", ".join(quoted(name) for name in sorted({*first} & {*second}))
     # Rates are tested as fractions and shown in percentage points.
     factor = 100 if metric.rate else 1
+    powerless = f"{metric.heading}: so few trials can show no difference, however large"
     return Row(
-        f"{group.id}/{reference}/{metric.name}",
+        f"{group.id}/{other.setting}/{metric.name}",
         (group.id, other.id),
         {
             "driver": group.label,
             "setting": group.setting,
-            "reference": reference,
+            "reference": other.setting,
             "measure": metric.heading,
             "difference": contrast.value * factor,
             "ci": contrast.bounds(factor),
             "p": contrast.p,
-            "p_holm": corrected_p[0],
-            "p_bh": corrected_p[1],
+            "p_holm": holm,
+            "p_bh": bh,
             "detectable": None if contrast.detectable is None else contrast.detectable * factor,
-            "n": int(in_both[0].sum()),
-            "n_reference": int(in_both[1].sum()),
+            "n": int(first.isin(second).sum()),
+            "n_reference": int(second.isin(first).sum()),
             "freedom": None if isinf(contrast.freedom) else contrast.freedom,
         },
-        _powerless(contrast, metric),
-        counts=metric.counts if whole else f"{metric.counts} AND condition IN ({named})",
+        powerless if contrast.detectable is None else "",
+        counts=f"{metric.counts} AND condition IN ({named})",
     )
-
-
-def _contrast(group: Group, other: Group, metric: Metric) -> Difference | str:
-    """The difference between two prompts; empty where they share no condition or are undecided."""
-    if undecided(group, metric) or undecided(other, metric):
-        return ""
-    if not metric.rate:
-        return contrast_means(group.trials, other.trials, metric.column) or ""
-    both = shared_cells(group.trials, other.trials, metric.column)
-    return contrast_cells(both) if both else ""
-
-
-def _powerless(contrast: Difference, metric: Metric) -> str:
-    if contrast.detectable is not None:
-        return ""
-    return f"{metric.heading}: so few trials can show no difference, however large"
-
-
-def _shared_notes(study: Study) -> list[str]:
-    """Notes on replies that variants share with the baseline, where their prompts are equal."""
-    named = {name: group.id for group in study.models for name in group.trials["spec_hash"]}
-    return [
-        f"{named[row.spec_hash]}: {row.shared} of {row.calls} calls share their reply with "
-        f"{named[row.baseline]}, where prompt and slot are equal: the groups are not independent, "
-        "and the tests, which take them as such, are conservative there"
-        for row in study.shared.itertuples()
-        if row.spec_hash in named and row.baseline in named
-    ]

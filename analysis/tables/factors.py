@@ -27,7 +27,8 @@ DIFFERENCES = (
     "differences are from the reference, the level that stands first, in the cells that both have "
     "(a cell is a condition with one level of each other factor): of rates by the weights of "
     "Mantel and Haenszel, with Newcombe's interval and Fisher's exact test within cells; of means "
-    "by least squares with a level for each cell, and its t test; of medians without a test"
+    "by least squares with a level for each cell, and its t test; of medians without a test. So "
+    "they are within driver and condition; where a level lacks cells, they have no p"
 )
 INTERACTIONS = (
     "an interaction (×) is the difference at that level minus the one at the first level of {by}, "
@@ -55,21 +56,13 @@ def factors(study: Study) -> Table:
     judged = "judged " if study.unjudged else ""
     return Table(
         "factors",
-        "Each factor's levels, pooled over all other factors" + (f", by {by}" if by else ""),
         (
             *([Column("at", by)] if by else []),
             Column("factor", "factor"),
             Column("drivers", "drivers", optional=True),
             Column("measure", "measure"),
             Column("level", "level"),
-            Column(
-                "trials",
-                "trials",
-                "count",
-                0,
-                "trials of the level that ended",
-                "status <> 'failed'",
-            ),
+            Column("trials", "trials", "count", 0, "trials of the level that ended"),
             Column("n", "n", "count", 0, "of these, trials that count for the measure"),
             Column("value", "value", "number", 2, "the measure", optional=True),
             Column("ci", "95 % CI", "interval", 2, "of the measure", optional=True),
@@ -93,7 +86,7 @@ def factors(study: Study) -> Table:
 
 def _compared(name: str, heading: str, kind: Kind, meaning: str) -> Column:
     digits = 3 if kind == "p" else 2
-    return Column(name, heading, kind, digits, meaning, optional=True, of="both")
+    return Column(name, heading, kind, digits, meaning, optional=True)
 
 
 def _named(level: Level) -> str:
@@ -122,7 +115,8 @@ def _row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
         if metric.estimator == "median":
             cells |= {"difference": difference_of_medians(study, level, first, metric)}
         else:
-            cells |= _difference(difference(study, level, first, metric), metric)
+            found_difference = difference(study, level, first, metric)
+            cells |= _difference(found_difference, metric, of=(level, first))
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
     return Row(
         f"{level.id}/{metric.name}",
@@ -130,7 +124,6 @@ def _row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
         cells,
         "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric)))),
         counts=metric.counts,
-        references=() if level is first else first.groups,
     )
 
 
@@ -146,14 +139,17 @@ def _cells(level: Level, metric: Metric) -> dict[str, Value]:
     }
 
 
-def _difference(found: Difference | None, metric: Metric) -> dict[str, Value]:
-    unit = 100 if metric.rate else 1
+def _difference(
+    found: Difference | None, metric: Metric, of: tuple[Level, ...]
+) -> dict[str, Value]:
+    """A difference of levels; no p where some of them lack cells that others have."""
     if found is None:
         return {}
+    unit = 100 if metric.rate else 1
     return {
         "difference": unit * found.value,
         "difference_ci": found.bounds(unit),
-        "p": found.p,
+        "p": found.p if len({frozenset(level.cells) for level in of}) == 1 else None,
     }
 
 
@@ -175,7 +171,7 @@ def _interactions(study: Study, found: list[list[Level]]) -> Iterator[Row]:
 def _interaction(
     study: Study, pair: tuple[Level, Level], others: tuple[Level, Level], metric: Metric
 ) -> Row:
-    (level, first), (twin, base) = pair, others
+    level, base = pair[0], others[1]
     by, _, at = level.at.partition("=")
     cells = _cells(level, metric) | {
         "at": f"{at} - {base.at.partition('=')[2]}",
@@ -186,8 +182,7 @@ def _interaction(
     return Row(
         f"{level.id}/interaction/{metric.name}",
         level.groups,
-        cells | _difference(found, metric),
+        cells | _difference(found, metric, of=(*pair, *others)),
         "" if found else f"{metric.heading}: {NO_INTERACTION}",
         metric.counts,
-        references=tuple(dict.fromkeys((*first.groups, *twin.groups, *base.groups))),
     )

@@ -20,10 +20,17 @@ from merge_runner_analysis.stats.first_action import (
     seats,
     slope,
 )
-from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
-from merge_runner_analysis.tables.notes import repeated_note, sample_notes
+from merge_runner_analysis.tables.model import (
+    ENDED,
+    GROUP_COLUMNS,
+    Column,
+    Row,
+    Table,
+    Value,
+    row_of,
+)
+from merge_runner_analysis.tables.notes import repeated_notes, sample_notes
 
-ENDED = "status <> 'failed'"
 FILE = "human_first_actions"
 # By the sign of the own relative velocity.
 VELOCITIES = {-1: "slower", 0: "equal", 1: "faster"}
@@ -53,8 +60,7 @@ def first_action(study: Study) -> Table:
     groups = (*study.groups, *study.asked)
     return Table(
         "first-action",
-        "Net acceleration (m/s²) at the first decision, by own relative velocity",
-        (*GROUP_COLUMNS, *(replace(one, counts=ENDED, optional=True) for one in COLUMNS)),
+        (*GROUP_COLUMNS, *(replace(one, optional=True) for one in COLUMNS)),
         [row for group in groups for row in _rows(study, group)],
         (
             "the first action is the net acceleration of the first step under control, drag "
@@ -117,9 +123,7 @@ def _published_row(group: Group) -> Row:
         "slope_ci": (float(known["low"]), float(known["high"])),
         **_estimate("exchange_rate", human_exchange_rate()),
     }
-    columns = tuple(column.name for column in COLUMNS)
-    row = row_of(group, values, "published", counts=ENDED, published=columns)
-    return replace(row, cited=FILE)
+    return row_of(group, values, f"published ({citation(FILE)})", counts="")
 
 
 def _estimate(name: str, estimate: Clustered | None) -> dict[str, Value]:
@@ -137,7 +141,7 @@ def _human_notes(study: Study) -> Iterator[str]:
     known = _published_slope()
     yield (
         f"human: slope {known['value']} [{known['low']}, {known['high']}] as published: "
-        f"{known['caution']}. {citation(FILE)}"
+        f"{known['caution']}"
     )
     yield f"human: exchange rate: {citation('human_outcomes')}"
 
@@ -148,8 +152,7 @@ def _asked_notes(study: Study) -> Iterator[str]:
             f"{group.id}: asked without the loop (`merge-runner sweep --first`), in "
             f"{len(group.ended)} trials that end before a second decision"
         )
-        if group.repeated:
-            yield f"{group.id}: {repeated_note(group)}"
+    yield from repeated_notes(study.asked)
 
 
 def _left_out_notes(study: Study) -> Iterator[str]:

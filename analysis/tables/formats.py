@@ -1,8 +1,6 @@
 """Tables as text, CSV, JSON, Markdown and LaTeX: at full precision in CSV and JSON, else rounded.
 
-No library writes them. A text table by rich is aligned differently and takes eight times as long
-(1.8 s for 600 rows). Pandas needs tabulate for Markdown. Its LaTeX has the same rows and rules,
-once they are escaped as here, but takes nine times as long, and 1.5 s more to import its templates.
+Rich and pandas would take eight times as long, and 1.5 s to import their templates.
 """
 
 from __future__ import annotations
@@ -28,19 +26,16 @@ def render(tables: Sequence[Table], form: TableFormat, width: int | None = None)
     """All tables as one text that ends without a line break; ``width`` is that of a terminal."""
     if form is TableFormat.JSON:
         return json.dumps({"tables": [as_json(t) for t in tables]}, indent=2, ensure_ascii=False)
-    write: Callable[[Table], str] = {
-        TableFormat.TEXT: lambda table: as_text(table, width),
+    if form is TableFormat.TEXT:
+        return "\n\n".join(as_text(table, width) for table in tables)
+    write = {
         TableFormat.CSV: as_csv,
         TableFormat.MD: as_markdown,
         TableFormat.LATEX: as_latex,
     }[form]
-    return "\n\n".join(
-        # Several CSV tables in one stream could not be told apart without their names.
-        f"# {table.name}\n{write(table)}"
-        if form is TableFormat.CSV and len(tables) > 1
-        else write(table)
-        for table in tables
-    )
+    # Several CSV tables in one stream could not be told apart without their names.
+    named = form is TableFormat.CSV and len(tables) > 1
+    return "\n\n".join(f"# {table.name}\n" * named + write(table) for table in tables)
 
 
 def with_columns(tables: Sequence[Table], names: Sequence[str]) -> list[Table]:
@@ -55,14 +50,14 @@ def with_columns(tables: Sequence[Table], names: Sequence[str]) -> list[Table]:
             columns=[
                 column
                 for place, column in enumerate(table.columns)
-                if column.name in names or place < _naming(table.columns)
+                if column.name in names or place < leading(table.columns)
             ],
         )
         for table in tables
     ]
 
 
-def _naming(columns: Sequence[Column]) -> int:
+def leading(columns: Sequence[Column]) -> int:
     """How many columns at the left name a row."""
     return sum(1 for _ in takewhile(lambda column: column.kind == "text", columns))
 
@@ -76,16 +71,13 @@ def as_text(table: Table, width: int | None = None) -> str:
     from rich.cells import cell_len
 
     shown = shown_columns(table)
-    columns: list[list[str]] = []
-    for column in shown:
-        cells = [_text(column, row.values.get(column.name)) for row in table.rows]
-        widest = max(cell_len(cell) for cell in (column.heading, *cells))
-        blanks = [" " * (widest - cell_len(cell)) for cell in (column.heading, *cells)]
+    columns = []
+    for column, *cells in zip(shown, *_grid(table), strict=True):
+        widest = max(map(cell_len, cells))
+        blanks = [" " * (widest - cell_len(cell)) for cell in cells]
+        left = column.kind == "text"
         columns.append(
-            [
-                cell + blank if column.kind == "text" else blank + cell
-                for cell, blank in zip((column.heading, *cells), blanks, strict=True)
-            ]
+            [c + b if left else b + c for c, b in zip(cells, blanks, strict=True)],
         )
     notes = notes_of(table)
     if width is not None:
@@ -102,6 +94,13 @@ def as_text(table: Table, width: int | None = None) -> str:
     lines[1:1] = ["─" * max(map(cell_len, lines))] if lines else []
     texts = (_wrapped(f"  {note}", width) for note in notes)
     return "\n".join([_wrapped(table.heading, width), *(line.rstrip() for line in lines), *texts])
+
+
+def _grid(table: Table) -> list[list[str]]:
+    """The headings, then each row, of the columns that are shown, as a reader sees them."""
+    shown = shown_columns(table)
+    rows = [[shown_value(c, row.values.get(c.name)) for c in shown] for row in table.rows]
+    return [[column.heading for column in shown], *rows]
 
 
 def _wrapped(text: str, width: int | None) -> str:
@@ -154,59 +153,40 @@ def value_rows(table: Table) -> list[dict[str, Value]]:
 
 def as_markdown(table: Table) -> str:
     """A table for a README or an issue."""
-    shown = shown_columns(table)
-    lines = [
-        f"**{table.heading}**",
-        "",
-        "| " + " | ".join(_bar(column.heading) for column in shown) + " |",
-        "|" + "|".join(":--" if column.kind == "text" else "--:" for column in shown) + "|",
-    ]
-    lines += [
-        "| "
-        + " | ".join(_bar(_text(column, row.values.get(column.name))) for column in shown)
-        + " |"
-        for row in table.rows
-    ]
-    return "\n".join([*lines, "", *(f"- {note}" for note in notes_of(table))])
+    rules = [":--" if column.kind == "text" else "--:" for column in shown_columns(table)]
+    escaped = ([cell.replace("|", r"\|") for cell in cells] for cells in _grid(table))
+    head, *rows = (f"| {' | '.join(cells)} |" for cells in escaped)
+    notes = (f"- {note}" for note in notes_of(table))
+    return "\n".join([f"**{table.heading}**", "", head, f"|{'|'.join(rules)}|", *rows, "", *notes])
 
 
 def as_latex(table: Table) -> str:
     r"""A table for the paper: needs the packages booktabs, amssymb and graphicx."""
     shown = shown_columns(table)
+    body = [[_latex(column, row.values.get(column.name)) for column in shown] for row in table.rows]
     form = "".join("l" if column.kind == "text" else "r" for column in shown)
-    body = [
-        " & ".join(_latex(column, row.values.get(column.name)) for column in shown) + r" \\"
-        for row in table.rows
-    ]
+    head = " & ".join(_escaped(column.heading) for column in shown)
+    rows = "\n".join(" & ".join(cells) + r" \\" for cells in body)
     notes = r"\\ ".join(_escaped(note) for note in notes_of(table))
-    return "\n".join(
-        [
-            r"\begin{table*}",
-            r"\centering",
-            rf"\caption{{{_escaped(table.title)}}}",
-            rf"\label{{tab:{table.name}}}",
-            r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
-            rf"\begin{{tabular}}{{{form}}}",
-            r"\toprule",
-            " & ".join(_escaped(column.heading) for column in shown) + r" \\",
-            r"\midrule",
-            *body,
-            r"\bottomrule",
-            r"\end{tabular}}",
-            rf"\\[2pt]\parbox{{\linewidth}}{{\footnotesize {notes}}}",
-            r"\end{table*}",
-        ]
-    )
-
-
-def shown_value(column: Column, value: Value) -> str:
-    """One value as a reader sees it."""
-    return _text(column, value)
+    return rf"""\begin{{table*}}
+\centering
+\caption{{{_escaped(table.title)}}}
+\label{{tab:{table.name}}}
+\resizebox{{\ifdim\width>\linewidth\linewidth\else\width\fi}}{{!}}{{%
+\begin{{tabular}}{{{form}}}
+\toprule
+{head} \\
+\midrule
+{rows}
+\bottomrule
+\end{{tabular}}}}
+\\[2pt]\parbox{{\linewidth}}{{\footnotesize {notes}}}
+\end{{table*}}"""
 
 
 def printed(table: Table, row: Row) -> dict[str, str]:
     """A row's values as a reader sees them, by column."""
-    return {column.name: _text(column, row.values.get(column.name)) for column in table.columns}
+    return {c.name: shown_value(c, row.values.get(c.name)) for c in table.columns}
 
 
 def shown_columns(table: Table) -> list[Column]:
@@ -223,7 +203,8 @@ def notes_of(table: Table) -> list[str]:
     return [*(f"{', '.join(ids)}: {note}" for note, ids in groups.items()), *table.notes]
 
 
-def _text(column: Column, value: Value) -> str:
+def shown_value(column: Column, value: Value) -> str:
+    """One value as a reader sees it."""
     if value is None:
         return "" if column.kind == "text" else MISSING
     if isinstance(value, tuple):
@@ -264,12 +245,8 @@ def _plain(column: Column, row: Row) -> tuple[Value, ...]:
     return value if isinstance(value, tuple) else (None, None)
 
 
-def _bar(text: str) -> str:
-    return text.replace("|", r"\|")
-
-
 def _latex(column: Column, value: Value) -> str:
-    text = _text(column, value)
+    text = shown_value(column, value)
     if isinstance(value, bool):
         return r"\checkmark" if value else r"\textbf{X}"
     if column.kind in {"p", "number", "percent", "interval"} and value is not None:
@@ -302,11 +279,11 @@ def _escaped(text: str) -> str:
 def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> dict[str, object]:
     """A table as templates need it: headings, cells with what ``link`` returns, notes.
 
-    The text cells before a row's first other cell are its headers.
+    The text cells before a row's first other cell are its headers: a screen reader announces them
+    with each of its cells.
     """
     columns = shown_columns(table)
-    # A screen reader announces a row's headers with each of its cells.
-    leading = next((i for i, c in enumerate(columns) if c.kind != "text"), len(columns))
+    headers = leading(columns)
     return {
         "name": table.name,
         "heading": table.heading,
@@ -320,16 +297,21 @@ def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> di
                     {
                         "text": shown_value(column, row.values.get(column.name)),
                         "left": column.kind == "text",
-                        "header": i < leading,
-                        "link": None
-                        if column.kind == "text" or row.values.get(column.name) is None
-                        else link(table, row, column),
+                        "header": place < headers,
+                        "link": link(table, row, column) if _linked(row, column) else None,
                         "label": f"{column.heading} of {row.id}",
                     }
-                    for i, column in enumerate(columns)
+                    for place, column in enumerate(columns)
                 ],
             }
             for row in table.rows
         ],
         "notes": notes_of(table),
     }
+
+
+def _linked(row: Row, column: Column) -> bool:
+    """Whether a value leads to trials: a published one has none, nor has a count of zero."""
+    value = row.values.get(column.name)
+    nothing = value is None or (column.counts and not value)
+    return bool(row.counts) and column.kind != "text" and not nothing

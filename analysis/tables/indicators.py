@@ -28,9 +28,8 @@ from merge_runner_analysis.tables.notes import (
 )
 from merge_runner_analysis.tables.profiles import gain_values
 
-# The indicators that rest on who merged first, and the columns of their rows that do so too.
+# The indicators that rest on who merged first.
 OF_OUTCOMES = ("I1", "I2")
-EVERY = ("paper", "robust", "differ", "value", "interval", "n")
 BESIDE_I5 = {"held": "I5 held (%)", "clock": "I5 at 1 Hz", "humans": "I5 - humans (SD)"}
 RULES = (
     "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
@@ -51,7 +50,6 @@ def indicators(study: Study) -> Table:
         rows += [_metric_row(group, metric) for group in study.baselines]
     return Table(
         "indicators",
-        "Qualitative and quantitative indicators of behaviour during merging conflicts",
         (
             Column("indicator", "indicator"),
             Column("driver", "driver"),
@@ -178,7 +176,6 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
         },
         *remarks,
         item=name,
-        published=EVERY if of_outcomes else (),
     )
 
 
@@ -244,7 +241,7 @@ def _metric_row(group: Group, metric: Metric) -> Row:
     values |= {"value": found.value, "interval": found.bounds()}
     if isinstance(found, HumanReference):
         source = f"published value, no human traces are imported ({found.source})"
-        return row_of(group, values, source, item=item, printed=("value",))
+        return row_of(group, values, source, item=item)
     return row_of(
         group,
         values | {"n": found.n},
@@ -253,5 +250,4 @@ def _metric_row(group: Group, metric: Metric) -> Row:
         outcomes_note(group),
         item=item,
         counts=metric.counts,
-        published=EVERY if metric.humans_from == "outcomes" else (),
     )

@@ -16,15 +16,18 @@ if TYPE_CHECKING:
 
 Kind = Literal["text", "count", "number", "percent", "p", "verdict", "interval"]
 Value = str | int | float | bool | tuple[float, float] | None
+# Which trials a row rests on, in SQL over the trials of its groups.
+FINISHED = "status = 'finished'"
+ENDED = "status <> 'failed'"
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
     """One column.
 
-    ``meaning`` describes its values in words, and ``counts`` is the SQL predicate for the trials
-    that they rest on. If ``optional``, a value may be missing without a note. ``of`` says
-    whose trials the values rest on: those of the row, those of its ``references``, or both.
+    ``meaning`` describes its values in words. ``counts`` is the SQL condition, beside the row's, of
+    the trials that a share or a count counts. If ``optional``, a value may be missing without a
+    note.
     """
 
     name: str
@@ -32,35 +35,27 @@ class Column:
     kind: Kind = "text"
     digits: int = 2
     meaning: str = ""
-    counts: str = "status = 'finished'"
+    counts: str = ""
     optional: bool = False
-    of: Literal["own", "reference", "both"] = "own"
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
-    ``counts`` is the SQL predicate for its trials, where that of the columns does not apply.
-    ``printed`` names the columns whose values are published ones or rest on them. ``published``
-    names the columns that rest on the published human outcomes where the others rest on human
-    trials. ``beside`` is the paper's driver whose row it is compared with, if any, and
-    ``stand_in_for`` the models in whose names a scripted stand-in answered. ``references`` are the
-    groups that the comparing columns compare it with, and ``cited`` the shipped file that its
-    ``published`` columns are computed from.
+    ``counts`` is the SQL predicate for its trials, empty where it rests on none. ``beside`` is the
+    paper's driver whose row it is compared with, if any, and None where a scripted stand-in
+    answered in the name of a model. ``printed`` says that values are published ones, which have no
+    difference from these.
     """
 
     id: str
     groups: tuple[str, ...]
     values: Mapping[str, Value]
     note: str = ""
-    counts: str = ""
-    printed: tuple[str, ...] = ()
-    beside: str = ""
-    stand_in_for: tuple[str, ...] = ()
-    references: tuple[str, ...] = ()
-    published: tuple[str, ...] = ()
-    cited: str = ""
+    counts: str = FINISHED
+    beside: str | None = ""
+    printed: bool = False
 
 
 GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "setting"))
@@ -71,19 +66,18 @@ def row_of(
     values: Mapping[str, Value],
     *remarks: str,
     item: str = "",
-    counts: str = "",
-    printed: tuple[str, ...] = (),
-    published: tuple[str, ...] = (),
+    counts: str = FINISHED,
 ) -> Row:
-    """A group's row with its GROUP_COLUMNS, named ``o3/A2/item``; its note joins the remarks."""
+    """A group's row with its GROUP_COLUMNS, named ``o3/A2/item``; its note joins the remarks.
+
+    The published values of humans rest on no trials here.
+    """
     return Row(
         f"{group.id}/{item}" if item else group.id,
         (group.id,),
         {"driver": group.label, "setting": group.setting, **values},
         "; ".join(filter(None, remarks)),
-        counts,
-        printed,
-        published=published,
+        counts if group.measured else "",
     )
 
 
@@ -92,10 +86,10 @@ class Table:
     """A table: a missing value in a required column always has a note, and NaN never occurs."""
 
     name: str
-    title: str
     columns: Sequence[Column]
     rows: Sequence[Row]
     notes: Sequence[str] = field(default_factory=tuple)
+    title: str = ""
     number: str = ""
 
     # NaN is not valid JSON, and a reader could not tell its cause: a missing value is None.
@@ -129,7 +123,6 @@ def from_text(text: str) -> Table:
         for name in intervals & row["values"].keys():
             if row["values"][name] is not None:
                 row["values"][name] = tuple(row["values"][name])
-        for name in ("groups", "printed", "stand_in_for", "references", "published"):
-            row[name] = tuple(row[name])
+        row["groups"] = tuple(row["groups"])
     rows = [Row(**row) for row in content["rows"]]
     return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})

@@ -23,19 +23,15 @@ def listed(items: Sequence[str]) -> str:
 def sample_notes(
     study: Study, groups: Iterable[Group], *, pooled: bool = True, whole: bool = True
 ) -> list[str]:
-    """A note for each group on its trials and those left out, and caveats about the drivers.
+    """Notes on the trials behind a table: which did not finish, and caveats about the drivers.
 
     ``pooled`` means that the table treats imported human trials as independent, ``whole`` that it
     leaves out those that did not finish.
     """
     shown = list(groups)
-    notes = [
-        f"{group.id}: {len(group.finished)} of {len(group.trials)} trials finished, left out: "
-        f"{group.left_out}"
-        if whole
-        else f"{group.id}: {len(group.ended)} of {len(group.trials)} trials ended, and count"
-        for group in shown
-    ]
+    left_out = {g.id: g.left_out if whole else _failed(g) for g in shown}
+    parts = [f"{name} {reasons}" for name, reasons in left_out.items() if reasons != "none"]
+    notes = [f"trials that did not finish: {'; '.join(parts)}"] if parts else []
     if study.empty:
         notes.append(
             f"{study.db} holds no trial of a model; `merge-runner sweep baseline` plays some"
@@ -43,9 +39,12 @@ def sample_notes(
     notes += _pooled_notes(study, [group for group in shown if group.setting])
     if study.human in study.groups:
         notes += [*_human_notes(study, pooled), *_own_notes(study, shown)]
-    notes += [f"{group.id}: {repeated_note(group)}" for group in shown if group.repeated]
-    notes += [f"{group.id}: {equal_note(group)}" for group in shown if group.equal]
-    return [*notes, *(f"{group.id}: {pair_note(group)}" for group in shown if group.is_mixed)]
+    return [*notes, *repeated_notes(shown), *equal_notes(shown), *pair_notes(shown)]
+
+
+def _failed(group: Group) -> str:
+    failed = len(group.trials) - len(group.ended)
+    return f"{failed} failed" if failed else "none"
 
 
 def _pooled_notes(study: Study, groups: list[Group]) -> Iterator[str]:
@@ -111,33 +110,42 @@ def footnoted(table: Table, study: Study) -> Table:
     return replace(table, rows=rows, notes=(*table.notes, *notes))
 
 
-def repeated_note(group: Group) -> str:
-    """Says that a deterministic driver repeats its trials."""
-    return (
-        f"{group.repeated} of {len(group.stored.trials)} trials repeat an earlier one to the last "
-        "state, of programs that declare no chance: they are left out, and n counts the others"
-    )
+def repeated_notes(groups: Iterable[Group]) -> list[str]:
+    """Say which deterministic drivers repeat their trials."""
+    counts = [f"{g.id}: {g.repeated} of {len(g.stored.trials)}" for g in groups if g.repeated]
+    if not counts:
+        return []
+    return [
+        f"{', '.join(counts)} trials repeat an earlier one to the last state, of programs that "
+        "declare no chance: they are left out, and n counts the others"
+    ]
 
 
-def equal_note(group: Group) -> str:
-    """Says that trials of a language model are equal."""
-    return (
-        f"{group.equal} of {len(group.trials)} trials are as an earlier one to the last state; "
-        "each counts"
-    )
+def equal_notes(groups: Iterable[Group]) -> list[str]:
+    """Say which trials of language models are equal."""
+    counts = [f"{g.id}: {g.equal} of {len(g.trials)}" for g in groups if g.equal]
+    text = "trials are as an earlier one to the last state; each counts"
+    return [f"{', '.join(counts)} {text}"] if counts else []
 
 
-def pair_note(group: Group) -> str:
-    """Says whose odds those of two different drivers are, and on which sides they sat."""
-    ego, other = group.models
-    left, right = group.seats
-    whose = (
-        f"left stands for {ego} and right for {other}, wherever they sat: odds that {ego} goes "
-        f"first, against {other}"
-    )
+def pair_notes(groups: Iterable[Group]) -> list[str]:
+    """Say whose odds those of two different drivers are, and on which sides they sat."""
+    pairs = [f"{group.id}: {_seats_note(group)}" for group in groups if group.is_mixed]
+    if not pairs:
+        return []
+    return [
+        "of two different drivers left stands for the one that is named first, wherever it sat: "
+        f"odds that it goes first. {'; '.join(pairs)}"
+    ]
+
+
+def _seats_note(group: Group) -> str:
     if group.one_sided:
-        return f"{whose}; {one_sided_note(group)}"
-    return f"{whose}; {ego} sat on the left in {left} trials, and on the right in {right}, mirrored"
+        return one_sided_note(group)
+    left, right = group.seats
+    return (
+        f"{group.models[0]} sat on the left in {left} trials, and on the right in {right}, mirrored"
+    )
 
 
 def one_sided_note(group: Group) -> str:

@@ -12,7 +12,6 @@ def velocity_profiles(study: Study) -> Table:
     """A row per group: how far accelerations are held, compared with humans, and plan revisions."""
     return Table(
         "velocity-profiles",
-        "Piecewise-linear velocity profiles (I5) and plan revisions",
         (
             *GROUP_COLUMNS,
             Column("n", "n", "count", 0, "finished trials"),
@@ -43,11 +42,10 @@ def velocity_profiles(study: Study) -> Table:
                 "number",
                 3,
                 "mean |new plan - old plan| over the instants of both, in units of full throttle",
-                "true",
-                True,
+                optional=True,
             ),
             Column(
-                "revised_percent", "> 0.1 (%)", "percent", 1, "revisions above 0.1", "true", True
+                "revised_percent", "> 0.1 (%)", "percent", 1, "revisions above 0.1", optional=True
             ),
             Column(
                 "coarse_percent",
@@ -55,8 +53,7 @@ def velocity_profiles(study: Study) -> Table:
                 "percent",
                 1,
                 "plans of at most two distinct values",
-                "true",
-                True,
+                optional=True,
             ),
         ),
         [_row(study, group) for group in study.groups],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 
 from merge_runner_analysis.data.reference_data import citation, published
@@ -18,7 +18,15 @@ from merge_runner_analysis.stats.regressions import (
     gap_ols,
     who_first_logit,
 )
-from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.model import (
+    GROUP_COLUMNS,
+    Column,
+    Kind,
+    Row,
+    Table,
+    Value,
+    row_of,
+)
 from merge_runner_analysis.tables.notes import sample_notes
 
 TERM_NAMES = {
@@ -35,75 +43,56 @@ TESTED_ELSEWHERE = (
     "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
     "table differences tests it"
 )
-# The columns of Table III that rest on who merged first.
-OF_OUTCOMES = ("n", "b", "se", "z", "p", "firth_b", "firth_se", "firth_p")
 RANDOM_INTERCEPT = "random intercept per pair"
+KEYS = (
+    Column("term", "term"),
+    *GROUP_COLUMNS,
+    Column("n", "n", "count", 0, "trials in the regression"),
+    Column("b", "b", "number", 2, "coefficient"),
+    Column("se", "SE", "number", 3, "standard error"),
+)
+P = Column("p", "p", "p", 3, "Wald test")
 
 
 def who_first(study: Study) -> Table:
     """Table III: logistic regression of left-first on h (m) and dv (m/s)."""
-    rows = []
-    for term in WHO_FIRST_TERMS:
-        for group in study.groups:
-            rows += [
-                _who_first_row(group, term),
-                *_clustered_rows(group, term, _who_first_clustered),
-            ]
     return Table(
         "who-first",
-        "Logistic regression of which driver merged first (1: left)",
         (
-            *_key_columns(WITH_MERGER),
-            *_wald_columns("z", WITH_MERGER),
-            Column(
-                "firth_b", "Firth b", "number", 2, "Firth's penalised estimate", WITH_MERGER, True
-            ),
-            Column("firth_se", "SE", "number", 3, "its standard error", WITH_MERGER, True),
-            Column("firth_p", "LR p", "p", 3, "its likelihood-ratio test", WITH_MERGER, True),
+            *KEYS,
+            Column("z", "z", "number", 2, "b / SE"),
+            P,
+            _optional("firth_b", "Firth b", "Firth's penalised estimate", digits=2),
+            _optional("firth_se", "SE", "its standard error"),
+            _optional("firth_p", "LR p", "its likelihood-ratio test"),
         ),
-        rows,
-        (
-            TESTED_ELSEWHERE,
-            *sample_notes(study, study.groups),
-            *_mixed_notes(study, "S4"),
-        ),
+        _rows(study, WHO_FIRST_TERMS, _who_first_row, _who_first_clustered),
+        (TESTED_ELSEWHERE, *sample_notes(study, study.groups), *_mixed_notes(study, "S4")),
     )
 
 
 def gap(study: Study) -> Table:
     """Table IV: linear regression of the gap (m) on |h|, |dv| and h*dv."""
-    rows = []
-    for term in GAP_TERMS:
-        for group in study.groups:
-            rows += [_gap_row(group, term), *_clustered_rows(group, term, _gap_clustered)]
     return Table(
         "gap",
-        "Linear regression of the gap at the merge point (m, net of the vehicle length)",
         (
-            *_key_columns(WITH_GAP),
-            *_wald_columns("t", WITH_GAP),
-            Column("hc3_se", "HC3 SE", "number", 3, "HC3 standard error", WITH_GAP, True),
-            Column("hc3_p", "HC3 p", "p", 3, "its t test", WITH_GAP, True),
-            Column(
+            *KEYS,
+            Column("t", "t", "number", 2, "b / SE"),
+            P,
+            _optional("hc3_se", "HC3 SE", "HC3 standard error"),
+            _optional("hc3_p", "HC3 p", "its t test"),
+            _optional(
                 "equivalence_p",
                 "equiv. p",
-                "p",
-                3,
                 "two one-sided tests: relative velocity alone moves no gap by the margin",
-                WITH_GAP,
-                True,
             ),
-            Column(
+            _optional(
                 "velocity_p",
                 "joint p",
-                "p",
-                3,
                 "F test of all terms with relative velocity, HC3 errors",
-                WITH_GAP,
-                True,
             ),
         ),
-        rows,
+        _rows(study, GAP_TERMS, _gap_row, _gap_clustered),
         (
             "of all terms with relative velocity together: equiv. p, that the predicted gaps of "
             "any two played conditions that differ in relative velocity alone are less than "
@@ -116,21 +105,23 @@ def gap(study: Study) -> Table:
     )
 
 
-def _key_columns(counts: str) -> tuple[Column, ...]:
-    return (
-        Column("term", "term"),
-        *GROUP_COLUMNS,
-        Column("n", "n", "count", 0, "trials in the regression", counts),
-    )
+def _optional(name: str, heading: str, meaning: str, digits: int = 3) -> Column:
+    kind: Kind = "p" if name.endswith("_p") else "number"
+    return Column(name, heading, kind, digits, meaning, optional=True)
 
 
-def _wald_columns(statistic: str, counts: str) -> tuple[Column, ...]:
-    return (
-        Column("b", "b", "number", 2, "coefficient", counts),
-        Column("se", "SE", "number", 3, "standard error", counts),
-        Column(statistic, statistic, "number", 2, "b / SE", counts),
-        Column("p", "p", "p", 3, "Wald test", counts),
-    )
+def _rows(
+    study: Study,
+    terms: Iterable[str],
+    row: Callable[[Group, str], Row],
+    clustered: Callable[[Group], dict[str, tuple[str, Regression]]],
+) -> list[Row]:
+    return [
+        one
+        for term in terms
+        for group in study.groups
+        for one in (row(group, term), *_clustered_rows(group, term, clustered))
+    ]
 
 
 def _who_first_row(group: Group, term: str) -> Row:
@@ -149,7 +140,7 @@ def _who_first_row(group: Group, term: str) -> Row:
         _problems(fit.logit, fit.firth),
         outcomes_note(group),
         item=term,
-        published=OF_OUTCOMES,
+        counts=WITH_MERGER,
     )
 
 
@@ -173,7 +164,7 @@ def _gap_row(group: Group, term: str) -> Row:
         furthest = fit.hc3.apart[furthest_apart(fit.hc3)]
         values["equivalence_p"] = equivalence_p(furthest.b, furthest.se, fit.hc3.freedom)
         values["velocity_p"] = fit.hc3.velocity_p
-    return row_of(group, values, _problems(fit.ols, fit.hc3), item=term)
+    return row_of(group, values, _problems(fit.ols, fit.hc3), item=term, counts=WITH_GAP)
 
 
 def _values(fit: Regression, term: str, prefix: str = "") -> dict[str, Value]:
@@ -213,6 +204,7 @@ def _clustered_rows(
             },
             fit.problem or fit.remark,
             item=f"{name}/{term}",
+            counts=WITH_MERGER if clustered is _who_first_clustered else WITH_GAP,
         )
         for name, (label, fit) in clustered(group).items()
     ]
@@ -275,5 +267,4 @@ def _published_gap(group: Group, term: str) -> Row:
         },
         f"published values, no human traces are imported ({citation('paper_gap')})",
         item=term,
-        printed=("n", "b", "se", "t", "p"),
     )

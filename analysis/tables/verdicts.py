@@ -14,7 +14,7 @@ from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.stats.verdicts import Comparison, Estimate, compared, of_humans
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
-from merge_runner_analysis.tables.notes import pair_note, replayed_notes
+from merge_runner_analysis.tables.notes import pair_notes, replayed_notes
 from merge_runner_analysis.verdict_words import (
     HUMANS,
     LANGUAGE_MODEL,
@@ -31,7 +31,7 @@ COLUMNS = (
     Column("kind", "kind", meaning="language model, program or mock model"),
     Column("measure", "measure", optional=True),
     Column("n", "n", "count", 0, "trials that the estimate rests on", optional=True),
-    Column("k", "k", "count", 0, "trials that collided", optional=True),
+    Column("k", "k", "count", 0, "trials that collided", "collided_boxes", optional=True),
     Column("undecided", "undecided", "count", 0, "ended by another rule", optional=True),
     Column("estimate", "estimate", "number", 2, "in the unit of the measure"),
     Column("ci", "95 % CI", "interval", 2, "of the same model", optional=True),
@@ -53,11 +53,6 @@ COLUMNS = (
     Column("rule", "rule", meaning="how the verdict is set", optional=True),
 )
 
-ESTIMATES = ("n", "estimate", "ci")
-# What the published outcomes tell of the humans, and the file of what else is published of them.
-OF_OUTCOMES = {MEASURES[name].counts for name in ("headway", "collisions")}
-PUBLISHED_GAPS = "paper_gap"
-
 
 def verdicts(study: Study) -> Table:
     """Every driver and prompt that is judged, and the humans first, by every measure."""
@@ -71,7 +66,6 @@ def verdicts(study: Study) -> Table:
     ]
     return Table(
         TABLE,
-        "What drivers show beside the humans",
         COLUMNS,
         rows,
         (
@@ -86,7 +80,7 @@ def verdicts(study: Study) -> Table:
             "20 Hz; the humans' share weighs conditions as the driver's trials do",
             f"intervals take trials as independent. The {HUMAN_TRIALS} human trials are of nine "
             "pairs who differ, which only the mean gap and imported gaps allow for",
-            *(f"{group.id}: {pair_note(group)}" for group in study.models if group.is_mixed),
+            *pair_notes(study.models),
             *replayed_notes(study),
         ),
     )
@@ -129,17 +123,9 @@ def _human_rows(study: Study) -> Iterator[Row]:
     for name, found in of_humans(study).items():
         values = _named(study.human, HUMANS) | {"measure": name, **_values(found)}
         note = "; ".join(filter(None, (found.problem, found.remark)))
-        # What is published is no imported trial.
-        of_outcomes = MEASURES[name].counts in OF_OUTCOMES
-        yield Row(
-            f"{HUMAN}/{name}",
-            (HUMAN,),
-            values,
-            note,
-            MEASURES[name].counts,
-            published=ESTIMATES if of_outcomes or found.remark else (),
-            cited=PUBLISHED_GAPS if found.remark else "",
-        )
+        # What is published rests on no trials here.
+        counts = "" if found.remark or not study.human.measured else MEASURES[name].counts
+        yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, counts)
 
 
 def _values(found: Estimate) -> dict[str, Value]:

@@ -7,10 +7,17 @@ from merge_runner_analysis.stats.first_action import HOLD_MPS2, Seat, seats
 from merge_runner_analysis.stats.intervals import Estimate
 from merge_runner_analysis.stats.words import CUES, Words
 from merge_runner_analysis.stats.words import words as words_of
-from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
+from merge_runner_analysis.tables.model import (
+    ENDED,
+    GROUP_COLUMNS,
+    Column,
+    Row,
+    Table,
+    Value,
+    row_of,
+)
 from merge_runner_analysis.tables.notes import sample_notes
 
-ENDED = "status <> 'failed'"
 SHARES = {
     "merge_yields": ("M", "M, yields (%)", "of these, followed by a second of yielding"),
     "yield_goes": ("Y", "Y, goes (%)", "of these, followed by a second of going"),
@@ -26,7 +33,6 @@ def words(study: Study) -> Table:
     judged = "judged " if study.unjudged else ""
     return Table(
         "words",
-        "Words and deeds: what follows M (merge first) and Y (yield)",
         (*GROUP_COLUMNS, *_share_columns(), *_cue_columns()),
         [_row(seat, found) for seat, found in spoken],
         (
@@ -47,21 +53,20 @@ def words(study: Study) -> Table:
 def _share_columns() -> list[Column]:
     columns = []
     for name, (n, heading, meaning) in SHARES.items():
-        counts = ENDED if "first" not in n else "status = 'finished'"
         columns += [
-            Column(f"{name}_n", n, "count", 0, f"decisions with {n}", counts),
-            Column(f"{name}_percent", heading, "percent", 1, meaning, counts, optional=True),
-            Column(f"{name}_ci", "95 % CI", "interval", 1, "Wilson's", counts, optional=True),
+            Column(f"{name}_n", n, "count", 0, f"decisions with {n}"),
+            Column(f"{name}_percent", heading, "percent", 1, meaning, optional=True),
+            Column(f"{name}_ci", "95 % CI", "interval", 1, "Wilson's", optional=True),
         ]
     return columns
 
 
 def _cue_columns() -> list[Column]:
-    columns = [Column("first_n", "first words", "count", 0, "of the drivers", ENDED)]
+    columns = [Column("first_n", "first words", "count", 0, "of the drivers")]
     for term, name in CUES.items():
         columns += [
-            Column(f"{term}_b", f"{name} b", "number", 2, f"of own {name}, in logits", ENDED),
-            Column(f"{term}_p", "p", "p", 3, "penalised likelihood ratio", ENDED),
+            Column(f"{term}_b", f"{name} b", "number", 2, f"of own {name}, in logits"),
+            Column(f"{term}_p", "p", "p", 3, "penalised likelihood ratio"),
         ]
     return [*columns, Column("follows", "follows", meaning="what the first word follows")]
 
@@ -81,4 +86,4 @@ def _row(seat: Seat, found: Words) -> Row:
         if name in CUES:
             cells |= {f"{name}_b": term.b, f"{name}_p": term.p}
     note = f"the first word: {found.first.problem}" if found.first.problem else ""
-    return row_of(seat.group, cells, note, item=seat.side)
+    return row_of(seat.group, cells, note, item=seat.side, counts=ENDED)

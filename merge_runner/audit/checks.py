@@ -17,13 +17,14 @@ import duckdb
 
 from merge_runner.errors import RecordingError, StoreError
 from merge_runner.llm.cache import CachedCall
-from merge_runner.llm.content_hashes import canonical_json, spec_hash, without_prompt
-from merge_runner.records import ANSWERED_FIELD
+from merge_runner.records import ANSWERED_FIELD, SIDES, canonical_json
 from merge_runner.results.database import (
     SETTINGS,
+    Instance,
     append,
     by_name,
     fetched,
+    has_long_texts,
     in_memory,
     read_database,
     schema_sql,
@@ -58,6 +59,8 @@ GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
 SHOWN = 20
+ENOUGH = "200MB"
+"""Of memory for DuckDB where replies are short: more would only cache the file."""
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 
@@ -115,7 +118,9 @@ class Audit:
 def audited_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open a database with the views of checks.sql; raises UsageError or StoreError."""
     try:
-        with read_database(path) as connection:
+        with read_database(path, Instance()) as connection:
+            if not has_long_texts(connection):
+                connection.execute(f"SET memory_limit = '{ENOUGH}'")
             prepare(connection)
             yield connection
     except duckdb.Error as exc:
@@ -179,8 +184,8 @@ def check_sweep(
     append(connection, "planned", planned)
     connection.execute(AUDITED)
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
-    audit = Audit(sweep_id, counts, [*_findings(connection, "findings", sweep_id)])
-    audit.notes += _notes(connection)
+    findings = [*_findings(connection, "findings", sweep_id)]
+    audit = Audit(sweep_id, counts, findings, [*_notes(connection)])
     connection.execute("INSERT INTO done FROM audited")
     return audit
 
@@ -253,27 +258,23 @@ def audit_recording(file: Path) -> Audit:
 def _fill(connection: duckdb.DuckDBPyConnection, entries: Iterator[CachedCall]) -> None:
     """Fill the tables with the calls of a recording.
 
-    A spec stands for all requests that differ in the prompt alone, and a trial for a repetition
-    of a condition: a recording does not say which prompt variant a call was made for.
+    A spec stands for an endpoint, and a trial for a repetition of a condition: a recording does not
+    say which prompt variant a call was made for.
     """
     specs: dict[str, str] = {}
     trials: dict[TrialKey, Row] = {}
     while batch := list(islice(entries, BATCH)):
         rows: list[Row] = []
         for entry in batch:
-            request, slot = entry.request, entry.request.slot
-            asked = (request.endpoint, request.model, request.path, request.headers)
-            spec = spec_hash(canonical_json([*asked, without_prompt(request.body)]))
-            driver = {"endpoint": request.endpoint}
-            specs[spec] = canonical_json({"left": driver, "right": driver})
+            slot, endpoint = entry.request.slot, entry.request.endpoint
+            specs[endpoint] = canonical_json({side: {"endpoint": endpoint} for side in SIDES})
             set_ = f"/set{slot.sample_set}" if slot.sample_set else ""
-            trial = f"{slot.condition}/rep{slot.repetition:02d}{set_}"
-            trials[trial, spec] = (
-                *(trial, spec, None, "llm", None, None, None, slot.condition, 0.0, 0.0),
+            key = (f"{slot.condition}/rep{slot.repetition:02d}{set_}", endpoint)
+            trials[key] = (
+                *(*key, None, "llm", None, None, None, slot.condition, 0.0, 0.0),
                 *(slot.repetition, slot.sample_set, "finished", None, 0.0, None, False),
             )
-            attempts = entry.attempts
-            rows += [call_row((trial, spec), request, each, cached=True) for each in attempts]
+            rows += [call_row(key, entry.request, each, cached=True) for each in entry.attempts]
         append(connection, "calls", rows)
     append(connection, "specs", specs.items())
     append(connection, "trials", trials.values())

@@ -12,18 +12,8 @@ from typing import Annotated
 import typer
 
 from merge_runner import __version__
+from merge_runner.cli import commands
 from merge_runner.cli.options import flag, print_out
-from merge_runner.cli.results import (
-    audit,
-    digest,
-    emulate,
-    forget,
-    ledger,
-    models,
-    recording_app,
-    sql,
-)
-from merge_runner.cli.sweep import init, replay, sweep
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.text_safety import say
 
@@ -51,9 +41,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.callback(invoke_without_command=True)(common)
-for _command in (init, sweep, replay, sql, digest, audit, ledger, forget, models, emulate):
+for _command in (
+    *(commands.init, commands.sweep, commands.replay, commands.sql, commands.digest),
+    *(commands.audit, commands.ledger, commands.forget, commands.models, commands.emulate),
+):
     app.command()(_command)
-app.add_typer(recording_app, name="recording")
+app.add_typer(commands.recording_app, name="recording")
 
 
 def alone(command: str | None) -> typer.Typer:

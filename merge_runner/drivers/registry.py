@@ -117,12 +117,6 @@ class Program:
             based_on=self.based_on or name,
         )
 
-    @property
-    def source(self) -> str:
-        """The hash of its source; see ``source_digest``."""
-        assert isinstance(self.driver, type)
-        return source_digest(self.driver)
-
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """Return the driver of one side of a trial."""
         return self.driver(self.seat(scenario, spec, side))
@@ -144,10 +138,11 @@ class Program:
 
     def in_spec(self, name: str) -> dict[str, object]:
         """What the spec of its trials says of it; its version covers what all drivers share."""
+        assert isinstance(self.driver, type)
         said = {
             "program": name,
             "parameters": self.values,
-            "source": self.source,
+            "source": source_digest(self.driver),
             "chance": self.chance or None,
             "rate_hz": self.rate_hz,
             "data": self.data and self.data.digest,

@@ -40,33 +40,20 @@ Body = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Completion:
-    """An answer of the model; ``reply`` becomes part of its id.
-
-    ``output`` are the billed output tokens, ``reasoning`` those of them that no reply shows.
-    """
-
-    reply: str
-    model: str
-    text: str
-    tokens_in: int
-    output: int
-    reasoning: int
-
-
-@dataclass(frozen=True, slots=True)
 class ServedFormat:
     """A wire format from the server's side.
 
     ``path`` is a regular expression. A request has its messages in the member ``turns``, or is one
     text there, and the text of a message in ``content``; ``parameters_in`` names the member with
-    its parameters, if they do not stand at the top.
+    its parameters, if they do not stand at the top. ``answer`` makes a body of an id, the model,
+    the text and the billed tokens: those of the prompt, of the output, and those of the output that
+    no reply shows.
     """
 
     path: str
     turns: str
     content: str
-    answer: Callable[[Completion], Body]
+    answer: Callable[[str, str, str, int, int, int], Body]
     parameters_in: str | None = None
 
     def prompt(self, body: Body) -> str:
@@ -80,29 +67,29 @@ class ServedFormat:
         return dict(body.get(self.parameters_in) or {}) if self.parameters_in else body
 
 
-def _chat(said: Completion) -> Body:
+def _chat(reply: str, model: str, text: str, tokens: int, output: int, reasoning: int) -> Body:
     """Whole, as in the shipped recording, which the emulator makes byte for byte."""
-    message: Body = {"role": "assistant", "content": said.text, "refusal": None, "annotations": []}
+    message: Body = {"role": "assistant", "content": text, "refusal": None, "annotations": []}
     return {
-        "id": f"chatcmpl-{said.reply}",
+        "id": f"chatcmpl-{reply}",
         "object": "chat.completion",
         "created": CREATED,
-        "model": said.model,
+        "model": model,
         "choices": [{"index": 0, "message": message, "logprobs": None, "finish_reason": "stop"}],
         "usage": {
-            "prompt_tokens": said.tokens_in,
-            "completion_tokens": said.output,
-            "total_tokens": said.tokens_in + said.output,
+            "prompt_tokens": tokens,
+            "completion_tokens": output,
+            "total_tokens": tokens + output,
             "prompt_tokens_details": {"cached_tokens": 0, "audio_tokens": 0},
-            "completion_tokens_details": {"reasoning_tokens": said.reasoning, "audio_tokens": 0},
+            "completion_tokens_details": {"reasoning_tokens": reasoning, "audio_tokens": 0},
         },
         "service_tier": "default",
         "system_fingerprint": None,
     }
 
 
-def _response(said: Completion) -> Body:
-    content = [{"type": "output_text", "text": said.text, "annotations": []}]
+def _response(reply: str, model: str, text: str, tokens: int, output: int, reasoning: int) -> Body:
+    content = [{"type": "output_text", "text": text, "annotations": []}]
     message: Body = {
         "type": "message",
         "role": "assistant",
@@ -110,48 +97,48 @@ def _response(said: Completion) -> Body:
         "content": content,
     }
     return {
-        "id": f"resp_{said.reply}",
+        "id": f"resp_{reply}",
         "object": "response",
         "created_at": CREATED,
         "status": "completed",
-        "model": said.model,
+        "model": model,
         "output": [{"type": "reasoning", "summary": []}, message],
         "usage": {
-            "input_tokens": said.tokens_in,
-            "output_tokens": said.output,
-            "output_tokens_details": {"reasoning_tokens": said.reasoning},
-            "total_tokens": said.tokens_in + said.output,
+            "input_tokens": tokens,
+            "output_tokens": output,
+            "output_tokens_details": {"reasoning_tokens": reasoning},
+            "total_tokens": tokens + output,
         },
     }
 
 
-def _content(said: Completion) -> Body:
-    content = {"role": "model", "parts": [{"text": said.text}]}
+def _content(reply: str, model: str, text: str, tokens: int, output: int, reasoning: int) -> Body:
+    content = {"role": "model", "parts": [{"text": text}]}
     return {
         "candidates": [{"content": content, "finishReason": "STOP", "index": 0}],
         "usageMetadata": {
-            "promptTokenCount": said.tokens_in,
-            "candidatesTokenCount": said.output - said.reasoning,
-            "thoughtsTokenCount": said.reasoning,
-            "totalTokenCount": said.tokens_in + said.output,
+            "promptTokenCount": tokens,
+            "candidatesTokenCount": output - reasoning,
+            "thoughtsTokenCount": reasoning,
+            "totalTokenCount": tokens + output,
         },
-        "modelVersion": said.model,
-        "responseId": said.reply,
+        "modelVersion": model,
+        "responseId": reply,
     }
 
 
-def _message(said: Completion) -> Body:
+def _message(reply: str, model: str, text: str, tokens: int, output: int, reasoning: int) -> Body:
     return {
-        "id": f"msg_{said.reply}",
+        "id": f"msg_{reply}",
         "type": "message",
         "role": "assistant",
-        "model": said.model,
-        "content": [{"type": "text", "text": said.text}],
+        "model": model,
+        "content": [{"type": "text", "text": text}],
         "stop_reason": "end_turn",
         "usage": {
-            "input_tokens": said.tokens_in,
-            "output_tokens": said.output,
-            "output_tokens_details": {"thinking_tokens": said.reasoning},
+            "input_tokens": tokens,
+            "output_tokens": output,
+            "output_tokens_details": {"thinking_tokens": reasoning},
         },
     }
 
@@ -270,9 +257,9 @@ class Emulator:
         # comes back for an answer that was given twice.
         which = f"{asked.path} {asked.where} {attempt}".encode()
         reply = hashlib.sha256(asked.raw + which).hexdigest()[:24]
-        said = Completion(reply, model, text, tokens_in, visible + reasoning, reasoning)
+        told = asked.wire.answer(reply, model, text, tokens_in, visible + reasoning, reasoning)
         request = {"body_sha256": asked.body_sha256, "slot": slot and slot.as_dict()}
-        return {**asked.wire.answer(said), ANSWERED_FIELD: request, SCRIPTED_FIELD: True}
+        return {**told, ANSWERED_FIELD: request, SCRIPTED_FIELD: True}
 
 
 def as_response(body: bytes, status: int, headers: Mapping[str, str]) -> httpx.Response:

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
+from threading import Lock
 from typing import Annotated, Any, Literal
 
 import diskcache
@@ -31,7 +32,6 @@ from diskcache.core import METADATA, MODE_RAW, UNKNOWN
 from pydantic import Field, TypeAdapter, ValidationError
 
 from merge_runner.errors import CacheFailed, RecordingError, UsageError
-from merge_runner.llm.content_hashes import DAMAGED, check_body, check_call
 from merge_runner.llm.durable import (
     BUSY_S,
     BatchWriter,
@@ -42,7 +42,7 @@ from merge_runner.llm.durable import (
     making,
 )
 from merge_runner.llm.ledger import LedgerFile
-from merge_runner.records import Attempt, ChatRequest
+from merge_runner.records import DAMAGED, Attempt, ChatRequest, check_body, check_call
 from merge_runner.text_safety import one_line
 
 FILE = "cache.db"
@@ -120,8 +120,8 @@ def refuse_others(folder: Path) -> None:
     """
     sql = "SELECT CAST(value AS BLOB) FROM Cache WHERE key = ? AND raw = 1"
     with contextlib.closing(connect(folder / FILE)) as connection:
-        settings = connection.rows("SELECT key, value FROM Settings")
-        ((mark,),) = connection.rows(sql, FORMAT_KEY) or [(b"1",)]
+        settings = connection.execute("SELECT key, value FROM Settings").fetchall()
+        (mark,) = connection.execute(sql, [FORMAT_KEY]).fetchone() or (b"1",)
     for key, value in settings:
         if key not in METADATA and (key not in SETTINGS or value != SETTINGS[key]):
             name = one_line(repr(key))[:40]
@@ -197,7 +197,7 @@ class ResponseCache:
                 _make(folder)
             refuse_others(folder)
             self._opened = self._file
-            self._reading = connect(folder / FILE)
+            self._reading, self._one_query = connect(folder / FILE), Lock()
             self._texts: Any = None if read_only else open_texts(folder)
         except FAILURES as exc:
             raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
@@ -281,8 +281,7 @@ class ResponseCache:
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raises RecordingError where it is damaged."""
-        with self._told("read"):
-            rows = self._reading.rows(_GET, name)
+        rows = self._rows(_GET, name)
         return _checked(self._disk.fetch(*rows[0])) if rows else None
 
     def replace(self, name: str, text: str) -> None:
@@ -295,8 +294,7 @@ class ResponseCache:
 
     def names(self, prefix: str) -> list[str]:
         """Return the names, none of a call, that begin with a prefix."""
-        with self._told("read"):
-            rows = self._reading.rows(_KEYS, prefix, prefix + chr(0x10FFFF))
+        rows = self._rows(_KEYS, prefix, prefix + chr(0x10FFFF))
         return [name.decode(errors="replace") for (name,) in rows]
 
     def entries(self, left_out: list[str] | None = None) -> Iterator[CachedCall]:
@@ -307,8 +305,7 @@ class ResponseCache:
         with self._told("read"):
             for row in self._reading.execute(_CALLS):
                 try:
-                    with self._told("read"):
-                        ((key, raw, *value),) = self._reading.rows(_CALL, *row)
+                    ((key, raw, *value),) = self._rows(_CALL, *row)
                     key, text = self._disk.get(key, raw), self._disk.fetch(*value)
                     entry = _verified(key, _checked(text))
                     check_body(entry.request.body)
@@ -318,16 +315,20 @@ class ResponseCache:
                         left_out.append(str(exc))
         yield from self._overlay.values()
 
-    def recorded(self, **fields: str) -> Iterator[ChatRequest]:
-        """Yield the requests with these values and a reply: the recording's, else the folder's."""
-        for entries in (self._overlay.values(), self.entries()):
-            found = False
-            for request in (entry.request for entry in entries):
-                if all(getattr(request, name) == value for name, value in fields.items()):
-                    found = True
-                    yield request
-            if found:
-                return
+    def recorded(self, name: str, **fields: str) -> set[str]:
+        """Return what ``name`` is in requests with a reply and these ``fields``.
+
+        They are those of the recording, else of the folder.
+        """
+
+        def values(entries: Iterable[CachedCall]) -> set[str]:
+            return {
+                getattr(entry.request, name)
+                for entry in entries
+                if all(getattr(entry.request, key) == value for key, value in fields.items())
+            }
+
+        return values(self._overlay.values()) or values(self.entries())
 
     def close(self) -> None:
         """Close the folder, and free its locks."""
@@ -357,6 +358,10 @@ class ResponseCache:
             return ATTEMPTS.validate_json(self.read(_UNANSWERED + key) or "[]")
         except ValidationError as exc:
             raise RecordingError("the list of earlier attempts is damaged") from exc
+
+    def _rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
+        with self._told("read"), self._one_query:
+            return self._reading.execute(sql, values).fetchall()
 
     @contextlib.contextmanager
     def _told(self, done: str) -> Iterator[None]:

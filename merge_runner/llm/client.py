@@ -27,7 +27,6 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request, reply_object
 from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.http_outcome import (
     AttemptOutcome,
@@ -50,6 +49,8 @@ from merge_runner.records import (
     Slot,
     Usage,
     is_scripted,
+    make_request,
+    reply_object,
     says_scripted,
 )
 
@@ -326,12 +327,13 @@ class LlmClient:
 
     async def _call(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
-        opened = self.rounds is not None and self.rounds.open_batch(call.request.key) is not None
-        if opened:
+        if self.rounds is not None:
+            call.open = self.rounds.open_batch(call.request.key)
+        if call.open:
             self.money.begin_anew(call.order)
         with self._waiting(call, "for trials before it to end, under --max-cost", idle=True):
             await self.money.admit(call.order)
-        alone = not self.passed and not opened  # nobody waits for an answer that may take hours
+        alone = not self.passed and not call.open  # nobody waits for an answer that may take hours
         if alone:
             with self._waiting(call, f"for the first answer of {self.driver}"):
                 await self._alone.acquire()
@@ -357,13 +359,9 @@ class LlmClient:
                 f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set aside "
                 f"in the cache as 'damaged {name}', and asked again"
             )
-        earlier = self.cache.unanswered(key)
-        if self.rounds is not None:
-            call.open = self.rounds.open_batch(key)
-        opened = call.open  # the attempt that has begun there is the one that goes on
-        call.attempts = [
-            each for each in earlier if not opened or each.number < opened.note.lines[key]
-        ]
+        # The attempt that has begun in a batch is the one that goes on.
+        end = call.open.note.lines[key] if call.open else math.inf
+        call.attempts = [each for each in self.cache.unanswered(key) if each.number < end]
         call.earlier = len(call.attempts)
 
     async def _attempts(self, call: Call) -> ChatReply:
@@ -462,8 +460,9 @@ class LlmClient:
         began, clock_s = datetime.now(UTC), asyncio.get_running_loop().time
         began_s, timeout_s = clock_s(), min(self.entry.timeout_s, call.left_s)
         try:
-            number = len(call.attempts) + 1
-            raw = await self.transport.send(call.request, attempt=number, timeout_s=timeout_s)
+            raw = await self.transport.send(
+                call.request, attempt=len(call.attempts) + 1, timeout_s=timeout_s
+            )
             outcome = judge(raw, self._wire)
         except TransportFailure as exc:
             outcome = AttemptOutcome(exc.action, exc.outcome, str(exc), charged=exc.sent)

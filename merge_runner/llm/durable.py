@@ -16,7 +16,6 @@ import re
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from threading import Lock
 from typing import Any, TypeVar
 
 from merge_runner.errors import UsageError
@@ -40,27 +39,15 @@ def making(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-class Connection(sqlite3.Connection):
-    """A connection for all threads; ``rows`` runs one query at a time.
+def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
+    """Return a connection of our own to an SQLite file, for all threads; ``mode`` is SQLite's.
 
-    Threads share prepared statements, and one could read the row that another has asked for.
+    One query at a time: threads share prepared statements, and one could read another's row.
     """
-
-    def __init__(self, uri: str) -> None:
-        super().__init__(
-            uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
-        )
-        self._one_at_a_time = Lock()
-
-    def rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
-        """Return the rows of a query."""
-        with self._one_at_a_time:
-            return self.execute(sql, values).fetchall()
-
-
-def connect(file: Path, mode: str = "ro") -> Connection:
-    """Return a connection of our own to an SQLite file; ``mode`` is SQLite's."""
-    return Connection(f"{file.absolute().as_uri()}?mode={mode}")
+    uri = f"{file.absolute().as_uri()}?mode={mode}"
+    return sqlite3.connect(
+        uri, uri=True, timeout=BUSY_S, isolation_level=None, check_same_thread=False
+    )
 
 
 class BatchWriter:

@@ -103,9 +103,9 @@ class WireFormat(ABC):
     def meaning(self, error: ServerError) -> str | None:
         """Return the meaning of an error whose status does not tell it.
 
-        It is ``refusal``, ``quota_exhausted``, ``unknown_model``, ``not_allowed``,
-        ``rate_limited`` or ``request_too_large``, as in the table of calls, or ``bad_prompt``,
-        which speaks of one prompt alone.
+        As in the table of calls: ``refusal``, ``quota_exhausted``, ``unknown_model``,
+        ``not_allowed``, ``rate_limited``, ``request_too_large``, or ``bad_prompt``, which speaks
+        of one prompt alone.
         """
         return None
 
@@ -189,29 +189,27 @@ def known_meaning(error: ServerError) -> str | None:
 
     What an added format knows is its own alone: it must not change how others are read.
     """
-    status, names = error.status, error.names
-    # Azure's content filter, and OpenRouter's moderation.
-    if status == 400 and "content_filter" in names:
-        return "refusal"
-    if status == 403 and "flagged_input" in error.body:
-        return "refusal"
-    # OpenRouter's want of credit while other requests run: it passes when they end.
-    in_flight = status == 402 and "openrouter_in_flight_budget" in error.body
-    if in_flight and "retry-after" in error.headers:
-        return "rate_limited"
-    # Gemini's quota per day has the words of one per minute, and does not pass.
+    names, words = error.names, error.message
     violations = [v for detail in error.details for v in as_dicts(detail.get("violations"))]
     per_day = any("PerDay" in str(violation.get("quotaId")) for violation in violations)
-    spent = status == 400 and any(words in error.message for words in SPENT)
-    if names & QUOTA or spent or (status == 429 and per_day):
-        return "quota_exhausted"
-    if status in (400, 401, 403, 404) and "model_not_found" in names:
-        return "unknown_model"
-    if status == 429 and error.message.startswith("Request too large"):
-        return "request_too_large"
-    if status == 400 and "invalid_prompt" in names:
-        return "bad_prompt"
-    return "not_allowed" if status == 400 and "API_KEY_INVALID" in names else None
+    in_flight = "openrouter_in_flight_budget" in error.body and "retry-after" in error.headers
+    cases = (
+        # Azure's content filter, and OpenRouter's moderation.
+        (400, "content_filter" in names, "refusal"),
+        (403, "flagged_input" in error.body, "refusal"),
+        # OpenRouter's want of credit while other requests run: it passes when they end.
+        (402, in_flight, "rate_limited"),
+        (error.status, bool(names & QUOTA), "quota_exhausted"),
+        (400, any(spent in words for spent in SPENT), "quota_exhausted"),
+        # Gemini's quota per day has the words of one per minute, and does not pass.
+        (429, per_day, "quota_exhausted"),
+        *((each, "model_not_found" in names, "unknown_model") for each in (400, 401, 403, 404)),
+        (429, words.startswith("Request too large"), "request_too_large"),
+        (400, "invalid_prompt" in names, "bad_prompt"),
+        (400, "API_KEY_INVALID" in names, "not_allowed"),
+    )
+    told = (meaning for status, is_so, meaning in cases if is_so and status == error.status)
+    return next(told, None)
 
 
 def known_delay_s(error: ServerError) -> float | None:
@@ -438,7 +436,10 @@ class AnthropicMessages(WireFormat):
 
 
 FORMATS: Registry[WireFormat] = Registry("wire format")
-FORMATS.register("openai-chat", OpenAIChat())
-FORMATS.register("openai-responses", OpenAIResponses())
-FORMATS.register("gemini", GeminiGenerateContent())
-FORMATS.register("anthropic", AnthropicMessages())
+for _name, _format in {
+    "openai-chat": OpenAIChat(),
+    "openai-responses": OpenAIResponses(),
+    "gemini": GeminiGenerateContent(),
+    "anthropic": AnthropicMessages(),
+}.items():
+    FORMATS.register(_name, _format)

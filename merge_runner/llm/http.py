@@ -8,8 +8,9 @@ import re
 import select
 import ssl
 from base64 import b64encode
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import aclosing, suppress
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 from urllib.request import getproxies_environment, proxy_bypass
@@ -22,10 +23,9 @@ from httpx_aiohttp import AiohttpTransport
 
 from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url
 from merge_runner.errors import UsageError
-from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import as_dict, as_dicts, as_text
 from merge_runner.llm.http_outcome import RawReply, TransportFailure
-from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest
+from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest, canonical_json
 
 if TYPE_CHECKING:
     from aiohttp.client_proto import ResponseHandler
@@ -97,8 +97,6 @@ class HttpTransport:
     ) -> None:
         self._endpoint = endpoint
         self._tells_slot = endpoint.is_emulator
-        self._base = httpx.URL(endpoint.base_url)
-        self._urls: dict[str, httpx.URL] = {}
         self._most_bytes = most_bytes
         keys = (value.removeprefix("Bearer ") for value in endpoint.auth_headers.values())
         secrets = {*keys, *proxy_secrets()}
@@ -135,31 +133,20 @@ class HttpTransport:
         timeout_s: float,
         most_bytes: int | None = None,
     ) -> RawReply:
-        """Ask for anything; raises TransportFailure."""
-        async with self._exchange(method, path, headers, body, timeout_s) as (reply, _):
-            return await self._read(reply, most_bytes or self._most_bytes)
-
-    @asynccontextmanager
-    async def _exchange(
-        self, method: str, path: str, headers: Mapping[str, str], body: bytes, timeout_s: float
-    ) -> AsyncIterator[tuple[httpx.Response, asyncio.Timeout]]:
-        """Yield the reply to a request, with its body unread, and the time limit of both.
-
-        Turns every error of the libraries into a TransportFailure.
-        """
+        """Ask for anything; every error of the libraries becomes a TransportFailure."""
         own_id = self._own + next(self._ids)
         sent = {**HEADERS, **headers, **self._endpoint.auth_headers}
         sent |= dict.fromkeys(ID_HEADERS, own_id)
         sent["connection"] = "close" if self.one_each else "keep-alive"
-        request = httpx.Request(method, self._url(path), headers=sent, content=body)
+        request = httpx.Request(
+            method, url_of(self._endpoint.base_url, path), headers=sent, content=body
+        )
         try:
-            async with asyncio.timeout(timeout_s) as limit:
+            async with asyncio.timeout(timeout_s):
                 reply = await self._carrier.handle_async_request(request)
-                try:
+                async with aclosing(reply):
                     self._refuse_others(reply, own_id)
-                    yield reply, limit
-                finally:
-                    await reply.aclose()
+                    return await self._read(reply, most_bytes or self._most_bytes)
         except TransportFailure:
             self.doubted = True
             raise
@@ -182,22 +169,20 @@ class HttpTransport:
             raise TransportFailure("wrong_answer", "the server sent the answer to another request")
 
     async def _read(self, reply: httpx.Response, most_bytes: int) -> RawReply:
-        pieces, size = [], 0
+        body = bytearray()
         async for piece in reply.aiter_bytes():
-            size += len(piece)
-            if size > most_bytes:
-                why = f"it is longer than {most_bytes / 1e6:g} MB (max_reply_mb)"
+            body += piece
+            if len(body) > most_bytes:
                 raise TransportFailure(
-                    "reply_refused", f"the reply is refused: {why}", action="fail"
+                    "reply_refused",
+                    f"the reply is longer than {most_bytes / 1e6:g} MB (max_reply_mb)",
+                    action="fail",
                 )
-            pieces.append(piece)
         headers = {name.lower(): value for name, value in reply.headers.items()}
-        return RawReply(reply.status_code, headers, self._text(b"".join(pieces)))
-
-    def _text(self, body: bytes | bytearray) -> str:
-        """Decode as UTF-8, the encoding of JSON, whatever a header says, without secrets."""
-        # A provider may echo the key in an error; it must not get into a log or a database.
-        return self._mask(body.decode("utf-8-sig", errors="replace"))
+        # As UTF-8, the encoding of JSON, whatever a header says. A provider may echo the key in an
+        # error; it must not get into a log or a database.
+        text = self._mask(body.decode("utf-8-sig", errors="replace"))
+        return RawReply(reply.status_code, headers, text)
 
     def _failure(self, error: Exception) -> TransportFailure:
         """Return the TransportFailure for an error of the libraries."""
@@ -215,23 +200,9 @@ class HttpTransport:
         self.doubted = True
         return TransportFailure("connection_lost", reason)
 
-    def _url(self, path: str) -> httpx.URL:
-        """Return the URL of a path at the configured host, which alone may get the key."""
-        if path not in self._urls:
-            try:
-                url = httpx.URL(self._endpoint.base_url + path)
-            except httpx.InvalidURL:
-                url = httpx.URL()
-            if url.netloc != self._base.netloc:
-                raise UsageError(
-                    f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml"
-                )
-            self._urls[path] = url
-        return self._urls[path]
-
     def _network(self, connections: int) -> AiohttpTransport:
         """Return the connections, by the proxies and certificates of the environment."""
-        url = self._base
+        url = httpx.URL(self._endpoint.base_url)
         # An empty one where there is no TLS, since to load the certificates takes long.
         trusted = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
@@ -289,6 +260,15 @@ class Connections(aiohttp.TCPConnector):
             if not (handler.should_close or arrived.poll(0) or self._transport.one_each):
                 return connection
             connection.close()
+
+
+@lru_cache
+def url_of(base_url: str, path: str) -> httpx.URL:
+    """Return the URL of a path at the configured host, which alone may get the key."""
+    with suppress(httpx.InvalidURL):
+        if path.startswith("/"):
+            return httpx.URL(base_url + path)
+    raise UsageError(f"{path[:60]!r} can be no path: correct the entry in experiments/models.toml")
 
 
 def proxy_secrets() -> Iterator[str]:

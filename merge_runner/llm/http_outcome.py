@@ -131,8 +131,7 @@ class AttemptOutcome:
     ``accept`` it as the answer, ``retry`` after ``delay_s`` (all calls of the key wait where
     ``pause``), ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the
     endpoint ``refused`` the key or the model. ``name`` is its outcome in the calls table.
-    ``of_prompt`` says that a failure is of this prompt alone. Without a ``raw`` reply the attempt
-    may have been ``charged`` all the same.
+    Without a ``raw`` reply the attempt may have been ``charged`` all the same.
     """
 
     action: Action
@@ -141,7 +140,6 @@ class AttemptOutcome:
     reading: Reading = Reading("error")  # noqa: RUF009 # frozen
     delay_s: float | None = None
     pause: bool = False
-    of_prompt: bool = False
     raw: RawReply | None = None
     charged: bool = True
 
@@ -173,8 +171,7 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if reading.outcome == "error":
         error = replace(raw.error, status=status_within(raw.error))
         return replace(judge_error(error, wire), reading=reading, raw=raw)
-    nothing: tuple[object, ...] = (None, [], {})
-    if reading.outcome == "empty" and all(body.get(name) in nothing for name in wire.members):
+    if reading.outcome == "empty" and not any(body.get(name) for name in wire.members):
         why = "the body has nothing of an answer"
         return AttemptOutcome("retry", "bad_body", why, reading, raw=raw)
     return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)
@@ -194,14 +191,12 @@ def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
     """Classify an error, whatever was asked for."""
     name = wire.meaning(error) or known_meaning(error) or STATUSES.get(error.status, "bad_request")
     action = ACTIONS.get(name, "fail")
-    of_prompt = name == "bad_prompt"
     return AttemptOutcome(
         action,
-        "bad_request" if of_prompt else name,
+        name,
         f"HTTP {error.status}: {error.message}",
         delay_s=server_delay_s(error, wire) if action == "retry" else None,
         pause=name == "rate_limited",
-        of_prompt=of_prompt,
     )
 
 
@@ -268,19 +263,18 @@ def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | 
     """Return why all calls of a run would fail, and what to set; None: they might not."""
     raw, place = outcome.raw, f"[{name}] in {REGISTRY}"
     base_url = set_base_url(name, entry)
-    if outcome.name == "bad_certificate":
-        why = (
-            "the endpoint's certificate cannot be trusted, and nothing was sent; check the base "
-            "URL, or set SSL_CERT_FILE to the certificates of whoever signed it"
-        )
-    elif raw is None or outcome.of_prompt:
+    key = " or ".join(entry.key_envs) or f"`key_env` of {place}"
+    if outcome.action == "refused":
+        why = {
+            "bad_certificate": "the endpoint's certificate cannot be trusted, and nothing was "
+            "sent; check the base URL, or set SSL_CERT_FILE to the certificates of whoever signed "
+            "it",
+            "not_allowed": f"the endpoint does not accept the key; set {key} to a valid one",
+            "unknown_model": f"the endpoint has no model {entry.id!r}; see `merge-runner models`, "
+            f"or {base_url}",
+        }[outcome.name]
+    elif raw is None or outcome.name == "bad_prompt":
         return None
-    elif outcome.action == "refused" and outcome.name == "not_allowed":
-        key = " or ".join(entry.key_envs) or f"`key_env` of {place}"
-        why = f"the endpoint does not accept the key; set {key} to a valid one"
-    elif outcome.action == "refused":
-        model = f"the endpoint has no model {entry.id!r}"
-        why = f"{model}; see `merge-runner models`, or {base_url}"
     elif outcome.action == "fail" and raw.status in REQUEST_ITSELF:
         why = f"the request is refused: look at {place}"
     elif (

@@ -31,12 +31,12 @@ from decimal import Decimal
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
-from threading import RLock
+from threading import Lock, RLock
 from typing import TYPE_CHECKING, Any
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
-from merge_runner.llm.durable import BatchWriter, Connection, Operation, connect, making
+from merge_runner.llm.durable import BatchWriter, Operation, connect, making
 from merge_runner.records import Attempt, Usage
 
 if TYPE_CHECKING:
@@ -161,17 +161,17 @@ class LedgerFile:
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / FILE
-        self._connections: dict[str, Connection] = {}
-        self._one_at_a_time = RLock()
+        self._connections: dict[str, sqlite3.Connection] = {}
+        self._one_query, self._one_writer = Lock(), RLock()
         self.writer = BatchWriter(self.run_now)
 
     def read(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises UsageError for a damaged file, and CacheFailed."""
-        with self._told():
+        with self._told(), self._one_query:
             # Its first transaction makes all tables: until then it is empty.
             if not self._connections and not (self._file.exists() and self._file.stat().st_size):
                 return []
-            return self._connection("ro").rows(sql, *values)
+            return self._connection("ro").execute(sql, values).fetchall()
 
     def spending(self, scope: str, ask: Callable[..., Rows]) -> Spending:
         """Return the sums of a sweep, by ``read`` or ``write``; raises UsageError for odd ones."""
@@ -184,41 +184,29 @@ class LedgerFile:
         return Spending(spent_usd, reserved_usd, attempts, overrun_usd, overruns)
 
     def write(self, sql: str, *values: object) -> Rows:
-        """Execute a statement within a transaction, and return its rows."""
-        return self._connection("rwc").rows(sql, *values)
-
-    @contextlib.contextmanager
-    def transaction(self) -> Iterator[None]:
-        """Make what is written within it, in this thread, one durable transaction."""
-        with self._told(), self._one_at_a_time:
-            connection = self._connection("rwc")
-            if connection.in_transaction:  # a part of the one around it
-                yield
-                return
-            with connection:
-                connection.execute("BEGIN IMMEDIATE")
-                yield
+        """Execute a statement, and return its rows; an operation."""
+        with self._told(), self._one_writer:
+            return self._connection("rwc").execute(sql, values).fetchall()
 
     def run_now(self, operations: list[Operation]) -> list[Any]:
         """Run operations in one durable transaction, in this thread; raises UsageError."""
-        with self.transaction():
+        with self._told(), self._one_writer, self._connection("rwc") as connection:
+            connection.execute("BEGIN IMMEDIATE")
             return [operation() for operation in operations]
 
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
         """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""
-        rows: Rows = []
+        why = "the run ended before a reply was seen; it may have been charged"
         with contextlib.suppress(UsageError, CacheFailed):  # told before anything is paid
-            rows = self.read(_BEGUN, call, tried)
-        for number, (since,) in enumerate(rows, tried + 1):
-            why = "the run ended before a reply was seen; it may have been charged"
-            yield Attempt(number, "unknown", started_at=since, error=why)
+            for number, (since,) in enumerate(self.read(_BEGUN, call, tried), tried + 1):
+                yield Attempt(number, "unknown", started_at=since, error=why)
 
     def close(self) -> None:
         """Close the file."""
         while self._connections:
             self._connections.popitem()[1].close()
 
-    def _connection(self, mode: str) -> Connection:
+    def _connection(self, mode: str) -> sqlite3.Connection:
         """Return a connection of its own to read or write: the event loop reads while one syncs."""
         if mode not in self._connections:
             connection = connect(self._file, mode)
@@ -277,16 +265,15 @@ class Ledger:
     def reserve(
         self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
     ) -> bool:
-        """Reserve the worst case of an attempt at a call; False if that exceeds the cap."""
+        """Reserve the worst case of an attempt; False if that exceeds the cap; an operation."""
         if not self.scope:
             return True
-        with self._money.transaction():
-            committed_usd = self._money.spending(self.scope, self._money.write).committed_usd
-            if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
-                return False
-            since = datetime.now(UTC).isoformat(timespec="milliseconds")
-            place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
-            self._money.write(_OPEN, self.scope, key, number, usd, *place)
+        committed_usd = self._money.spending(self.scope, self._money.write).committed_usd
+        if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
+            return False
+        since = datetime.now(UTC).isoformat(timespec="milliseconds")
+        place = (asked.driver, asked.slot, asked.honest_usd, since, "in flight")
+        self._money.write(_OPEN, self.scope, key, number, usd, *place)
         return True
 
     async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
@@ -314,11 +301,11 @@ class Ledger:
 
     def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
         """Put what a task has spent, and has open, in the place of the share reserved for it."""
-        with self._money.transaction():
-            self._money.write("DELETE FROM open WHERE scope = ? AND call = ?", self.scope, name)
-            for sql, rows in ((_PAY, spent), (_OPEN, opened)):
-                for row in rows:
-                    self._money.write(sql, self.scope, *row)
+        sql = "DELETE FROM open WHERE scope = ? AND call = ?"
+        operations: list[Operation] = [partial(self._money.write, sql, self.scope, name)]
+        operations += [partial(self._money.write, _PAY, self.scope, *row) for row in spent]
+        operations += [partial(self._money.write, _OPEN, self.scope, *row) for row in opened]
+        self._money.run_now(operations)
 
     def reasons(self) -> list[dict[str, Any]]:
         """Return the reservations by driver and outcome, with times in UTC and one of the slots."""
@@ -327,8 +314,7 @@ class Ledger:
 
     def release(self) -> None:
         """Count no longer what is reserved; nobody may be asking meanwhile."""
-        with self._money.transaction():
-            self._money.write("DELETE FROM open WHERE scope = ?", self.scope)
+        self._money.write("DELETE FROM open WHERE scope = ?", self.scope)
         self.read()
 
 
@@ -358,18 +344,12 @@ class PaidAttempt:
 
     async def begin(self, attempts: Sequence[Attempt]) -> None:
         """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
-        ledger, reserve = self.budget.ledger, partial(self.set_aside, attempts)
-        if ledger.scope and not await ledger.cache.money.writer.write(reserve):
+        if not self.queued:  # in a smaller batch than before, or in one of an earlier run
+            return
+        ledger, cap_usd, number = self.budget.ledger, self.budget.cap_usd, len(attempts) + 1
+        worst = partial(ledger.reserve, self.key, number, self.aside_usd, cap_usd, self.asked)
+        if ledger.scope and not await ledger.cache.money.writer.write(worst):
             raise TrialSuspended("another run spends from the same cap, and has used it up")
-        self.begun()
-
-    def set_aside(self, attempts: Sequence[Attempt]) -> bool:
-        """Do the durable part of ``begin`` in this thread; False if the cap is used up."""
-        number, cap_usd = len(attempts) + 1, self.budget.cap_usd
-        return self.budget.ledger.reserve(self.key, number, self.aside_usd, cap_usd, self.asked)
-
-    def begun(self) -> None:
-        """Count the reservation no longer here: ``set_aside`` has made it durable."""
         self.queued = False
         self.budget.queued_usd -= self.aside_usd
 

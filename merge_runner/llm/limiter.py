@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from math import inf
 
 from asyncio_throttle.throttler import Throttler
 
@@ -35,8 +36,7 @@ class _Turn:
     arrival: int
     tokens: int = field(compare=False)
     given: asyncio.Future[None] = field(compare=False)
-    dispatched_at: float = field(default=0.0, compare=False)
-    counts: bool = field(default=False, compare=False)
+    dispatched_at: float = field(default=-inf, compare=False)
 
 
 @dataclass(slots=True)
@@ -109,9 +109,9 @@ class Limiter:
 
     def _settle(self, turn: _Turn, tokens: int) -> None:
         """Replace the estimate of a turn by the tokens that its request used."""
-        if turn.counts:
+        if asyncio.get_running_loop().time() - turn.dispatched_at < self._window_s:
             self._tokens_in_window += tokens - turn.tokens
-        turn.tokens = tokens
+            turn.tokens = tokens
         self._changed.set()
 
     async def _dispatch(self) -> None:
@@ -135,7 +135,7 @@ class Limiter:
                 await throttle.acquire()  # type: ignore[no-untyped-call] # ships no types
             heapq.heappop(self._waiting)
             if self._tpm is not None:
-                turn.counts, turn.dispatched_at = True, loop.time()
+                turn.dispatched_at = loop.time()
                 self._window.append(turn)
                 self._tokens_in_window += turn.tokens
             turn.given.set_result(None)
@@ -143,9 +143,7 @@ class Limiter:
     def _blocked_for(self, turn: _Turn, now: float) -> float:
         """Return the least wait in s of the head of the queue."""
         while self._window and now - self._window[0].dispatched_at >= self._window_s:
-            expired = self._window.popleft()
-            expired.counts = False
-            self._tokens_in_window -= expired.tokens
+            self._tokens_in_window -= self._window.popleft().tokens
         free_at = max(self._pause.until, *(throttle.free_at for throttle in self._throttles), 0.0)
         if self._tpm is not None and self._tokens_in_window + turn.tokens > self._tpm:
             # At least until the oldest leaves the window; if that frees too little, once more.

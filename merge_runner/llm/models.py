@@ -102,9 +102,7 @@ def with_parameter(name: str, entry: ModelEntry, parameter: str, level: JsonValu
     What is the provider's default already is not sent.
     """
     if parameter == CAP:
-        if type(level) is not int or level < 1:
-            raise UsageError(f"{CAP} is a whole number from 1")
-        return entry.model_copy(update={CAP: level})
+        return validated(ModelEntry, {**dict(entry), CAP: level}, name)
     if parameter == EFFORT and entry.efforts:
         if level not in entry.efforts:
             raise unknown_name(f"{EFFORT} of {name}", str(level), entry.efforts)

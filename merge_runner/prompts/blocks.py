@@ -27,7 +27,6 @@ from merge_runner.registry import Catalogue, Registry, require
 
 OUTPUT_FORMAT = "C5"
 LAST = "the end"
-TO_MERGE = "distance_to_merge"
 _UNIT_OF_NOTHING = re.compile(rf"({NOT_SEEN}) (?:m/s\^2|m/s|km/h|mph|m|s)(?![\w/^])")
 KMH_OF_MPS = 3.6
 MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
@@ -126,7 +125,8 @@ class Block:
 
     def __post_init__(self) -> None:
         for road, template in (("merge", self.merge), ("straight", self.straight)):
-            fields = {n: f for n, f in FIELDS.items() if (road, n) != ("straight", TO_MERGE)}
+            absent = "distance_to_merge" if road == "straight" else ""
+            fields = {name: field for name, field in FIELDS.items() if name != absent}
             for name in named(template or ""):
                 require(fields, f"field on the road {road} of the block {self.meaning!r}:", name)
 
@@ -203,9 +203,6 @@ History of the last {memory_s} s, one value every {step_s} s, oldest first:
 - Your executed accelerations (m/s^2): {own_accelerations}
 - Observed speeds of the other car (m/s): {other_speeds}"""
 
-_PREVIOUS_PLAN = "Previous plan (the part of it that has not been executed yet): {remaining_plan}"
-
-_SAFETY = "Avoid a collision with the other car."
 _HUMAN = "Drive the way a human driver would drive in this situation."
 _DISTANCE = "Be risk-averse: keep a conservative distance to the other car."
 _REASSESS = (
@@ -234,34 +231,42 @@ Time to the merge point at present speeds:
 - You: {own_time_to_merge}
 - The other car: {other_time_to_merge}"""
 _GAP = "Time gap (how long the car behind takes to where the car ahead is now): {time_gap}"
-_FASTER = "Relative speed: {relative_speed_in_words}"
 _KMH = "In km/h: your speed is {own_speed_kmh}, the speed of the other car {other_speed_kmh}"
 _MPH = "In mph: your speed is {own_speed_mph}, the speed of the other car {other_speed_mph}"
 
+# The name, the meaning, and a text for both roads, or one for each.
 _PAPER = (
     ("C0", "situation", *_SITUATIONS),
-    ("C1", "history", _HISTORY, _HISTORY),
-    ("C2", "previous plan", _PREVIOUS_PLAN, _PREVIOUS_PLAN),
-    ("C3.safety", "avoid a collision", _SAFETY, _SAFETY),
-    ("C3.human", "drive like a human", _HUMAN, _HUMAN),
-    ("C3.distance", "keep a distance", _DISTANCE, _DISTANCE),
-    ("C3.reassess", "reassess", _REASSESS, _REASSESS),
+    ("C1", "history", _HISTORY),
+    (
+        "C2",
+        "previous plan",
+        "Previous plan (the part of it that has not been executed yet): {remaining_plan}",
+    ),
+    ("C3.safety", "avoid a collision", "Avoid a collision with the other car."),
+    ("C3.human", "drive like a human", _HUMAN),
+    ("C3.distance", "keep a distance", _DISTANCE),
+    ("C3.reassess", "reassess", _REASSESS),
     ("C4", "tactical decision", _TACTICAL, None),
-    (OUTPUT_FORMAT, "output format", _SCHEMA, _SCHEMA),
+    (OUTPUT_FORMAT, "output format", _SCHEMA),
 )
 _READY = (
     ("state.projected_headway", "projected headway", _HEADWAY, None),
     ("state.time_to_merge", "times to the merge point", _TIMES, None),
-    ("state.time_gap", "time gap", _GAP, _GAP),
-    ("state.relative_speed", "relative speed in words", _FASTER, _FASTER),
-    ("state.kmh", "speeds in km/h", _KMH, _KMH),
-    ("state.mph", "speeds in mph", _MPH, _MPH),
+    ("state.time_gap", "time gap", _GAP),
+    (
+        "state.relative_speed",
+        "relative speed in words",
+        "Relative speed: {relative_speed_in_words}",
+    ),
+    ("state.kmh", "speeds in km/h", _KMH),
+    ("state.mph", "speeds in mph", _MPH),
     ("state.table", "situation as a table, in place of C0", *map(_tabled, _SITUATIONS)),
 )
 BLOCKS = Registry[Block]("prompt block")
 for _before, _blocks in ((None, _PAPER), ("C1", _READY)):
-    for _name, _meaning, _merge, _straight in _blocks:
-        BLOCKS.register(_name, Block(_meaning, _merge, _straight, _before))
+    for _name, _meaning, *_texts in _blocks:
+        BLOCKS.register(_name, Block(_meaning, _texts[0], _texts[-1], _before))
 
 VARIANTS = Registry[Variant]("variant")
 for _name, _removed, _title in (

@@ -174,13 +174,17 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
 
     Merging takes as much memory as the texts of a full group, and rewrites these each time.
     """
+    tasks = 0 if has_long_texts(connection) else 100
+    connection.execute(f"SET max_vacuum_tasks = {tasks}")
+
+
+def has_long_texts(connection: duckdb.DuckDBPyConnection) -> bool:
+    """Whether the open database is larger than one of as many calls with short replies."""
     (calls, path), *_ = connection.execute(
         "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
     ).fetchall()
-    bytes_of_texts = Path(path).stat().st_size - int(calls) * BYTES_OF_A_CALL
-    tasks = 100 if bytes_of_texts <= MERGED_BYTES else 0
-    connection.execute(f"SET max_vacuum_tasks = {tasks}")
+    return Path(path).stat().st_size > int(calls) * BYTES_OF_A_CALL + MERGED_BYTES
 
 
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:

@@ -34,15 +34,17 @@ from pydantic import (
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import ATTEMPTS, CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import (
+from merge_runner.paths import refuse_another_kind
+from merge_runner.records import (
     DAMAGED,
     KEY_VERSION,
+    ChatRequest,
     canonical_json,
     check_body,
     check_call,
+    is_scripted,
 )
-from merge_runner.paths import refuse_another_kind
-from merge_runner.records import ChatRequest, is_scripted
+from merge_runner.results import database
 from merge_runner.results.database import Settings, append, fetched, in_memory
 from merge_runner.results.rows import Row
 from merge_runner.text_safety import first_line, one_line, quoted
@@ -78,9 +80,9 @@ SHOWN = 70
 # Misses that differ in numbers alone have one cause.
 _NUMBER = re.compile(r"-?\d+(\.\d+)?")
 SETTINGS: Settings = {
+    **database.SETTINGS,
     "autoinstall_known_extensions": False,
     "autoload_known_extensions": False,
-    "memory_limit": "1GB",  # unpacked bytes count, too
     "threads": 1,
 }
 
@@ -237,8 +239,7 @@ class Spilled(Mapping[str, CachedCall]):
         return (key for (key,) in self._db.execute("SELECT key FROM entries"))
 
     def __len__(self) -> int:
-        count: int = self._db.execute("SELECT count(*) FROM entries").fetchone()[0]
-        return count
+        return int(self._db.execute("SELECT count(*) FROM entries").fetchone()[0])
 
 
 def import_recording(file: Path, cache: ResponseCache) -> tuple[int, int]:
@@ -257,20 +258,17 @@ def summarise(file: Path) -> dict[str, Any]:
     Of the calls a mock model answered ``scripted``; ``cost_usd`` is what its replies cost when they
     were made.
     """
-    numbers, cost_usd = Counter(calls=0, scripted=0, attempts=0), 0.0
     names = ("models_requested", "models_served", "endpoints", "outcomes")
     counts = {name: Counter[str]() for name in names}
-    provenance = read_provenance(file)
+    numbers = Counter(calls=0, scripted=0, attempts=0)
+    cost_usd, provenance = 0.0, read_provenance(file)
     for entry in read_recording(file):
         request, last = entry.request, entry.attempts[-1]
-        scripted, attempts = is_scripted(request, last), len(entry.attempts)
-        numbers.update(calls=1, scripted=scripted, attempts=attempts)
+        numbers.update(calls=1, scripted=is_scripted(request, last), attempts=len(entry.attempts))
         cost_usd += sum(attempt.cost_usd or 0.0 for attempt in entry.attempts)
-        served = last.model_served or "unknown"
-        for name, value in zip(
-            names, (request.model, served, request.endpoint, last.outcome), strict=True
-        ):
-            counts[name][value] += 1
+        told = (request.model, last.model_served or "unknown", request.endpoint, last.outcome)
+        for count, value in zip(counts.values(), told, strict=True):
+            count[value] += 1
     return {**numbers, "cost_usd": round(cost_usd, 6), **counts, "provenance": provenance}
 
 
@@ -314,16 +312,11 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
                 f"read_parquet({pattern}, file_row_number = true, hive_partitioning = false)"
             )
             columns = connection.execute("DESCRIBE recording").fetchall()
-        except duckdb.Error as exc:
-            raise RecordingError(
-                f"{file} is not a readable Parquet file: {first_line(exc)}"
-            ) from exc
-        if {name: kind for name, kind, *_ in columns if name != "file_row_number"} != COLUMNS:
-            raise RecordingError(
-                f"{file} is not one of our recordings: it has other columns than "
-                f"{', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())}"
-            )
-        try:
+            if {name: kind for name, kind, *_ in columns if name != "file_row_number"} != COLUMNS:
+                raise RecordingError(
+                    f"{file} is not one of our recordings: it has other columns than "
+                    f"{', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())}"
+                )
             pairs = connection.execute(
                 f"SELECT key, value FROM parquet_kv_metadata({pattern})"  # noqa: S608 # quoted
             ).fetchall()
@@ -337,7 +330,9 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
             _refuse_bombs(file, connection)
             yield connection, metadata
         except (duckdb.Error, UnicodeDecodeError) as exc:
-            raise RecordingError(f"{file} is damaged: {first_line(exc)}") from exc
+            raise RecordingError(
+                f"{file} is damaged, or no Parquet file: {first_line(exc)}"
+            ) from exc
 
 
 def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
@@ -462,7 +457,7 @@ def explain(misses: list[Miss], recorded: Iterable[CachedCall]) -> list[str]:
 
 def _differences(recorded: ChatRequest, wanted: ChatRequest) -> list[str]:
     """Return the fields that differ, each with both values; of texts the first lines that do."""
-    old, new, texts = dict(_leaves(recorded)), dict(_leaves(wanted)), []
+    old, new, texts = _fields(recorded), _fields(wanted), []
     for name in sorted(old.keys() | new.keys()):
         before, after = old.get(name), new.get(name)
         if isinstance(before, str) and isinstance(after, str):
@@ -475,17 +470,17 @@ def _differences(recorded: ChatRequest, wanted: ChatRequest) -> list[str]:
     return texts
 
 
-def _leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """The fields of a request that its key covers, each by its path."""
-    if isinstance(value, ChatRequest):
-        yield from _leaves(asdict(value.slot))
-        yield from _leaves({"endpoint": value.endpoint, "path": value.path})
-        yield from _leaves({"headers": value.headers, "body": json.loads(value.body)})
-    elif isinstance(value, dict):
-        for key, inner in value.items():
-            yield from _leaves(inner, f"{name}.{key}".lstrip("."))
-    elif isinstance(value, list):
-        for index, inner in enumerate(value):
-            yield from _leaves(inner, f"{name}[{index}]")
+def _fields(request: ChatRequest) -> dict[str, object]:
+    """The fields that a request's key covers, those of its body each by its path."""
+    told = {"endpoint": request.endpoint, "path": request.path, "headers": request.headers}
+    body = json.loads(request.body)
+    return dict(leaves({**asdict(request.slot), **told, "body": body}))
+
+
+def leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
+    """Yield the values within a JSON value, each with its path."""
+    if isinstance(value, dict | list):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from leaves(inner, f"{name}.{key}".lstrip("."))
     else:
         yield name, value

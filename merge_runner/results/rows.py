@@ -11,11 +11,12 @@ from dataclasses import dataclass, fields
 from datetime import datetime
 from itertools import chain
 from operator import attrgetter, itemgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import duckdb
 
 from merge_runner.records import (
+    ANSWERS,
     Attempt,
     ChatRequest,
     Observation,
@@ -107,11 +108,11 @@ def _told(told: Observation | None) -> Row:
     """What a driver was told, of the other vehicle only where it was seen; NULLs: the truth."""
     if told is None:
         return (None,) * 7
-    of_itself = (told.other_seen, told.own_position_m, told.own_speed_mps)
-    if not told.other_seen:
-        return (*of_itself, None, None, None, None)
-    of_the_other = (told.relative_distance_m, told.other_speed_mps, told.other_acceleration_mps2)
-    return (*of_itself, *of_the_other, list(told.other_speeds_mps))
+    other: Row = (None,) * 4
+    if told.other_seen:
+        other = (told.relative_distance_m, told.other_speed_mps, told.other_acceleration_mps2)
+        other = (*other, list(told.other_speeds_mps))
+    return (told.other_seen, told.own_position_m, told.own_speed_mps, *other)
 
 
 def call_row(key: TrialKey, request: ChatRequest, attempt: Attempt, *, cached: bool) -> Row:
@@ -137,7 +138,8 @@ def _as_json(attempt: Attempt) -> str | None:
     text = attempt.reply
     # Most texts have nothing that needs a search for half a pair.
     plain = text is None or (text.isascii() and "\\u" not in text)
-    if text is None or (attempt.answered and (plain or not _SURROGATE.search(text))):
+    answered = attempt.http_status == 200 and attempt.outcome in ANSWERS
+    if text is None or (answered and (plain or not _SURROGATE.search(text))):
         return text
     try:
         json.dumps(json.loads(text), ensure_ascii=False).encode()
@@ -146,22 +148,15 @@ def _as_json(attempt: Attempt) -> str | None:
     return text
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """What differs in ``rows`` stored rows of a trial: ``name`` is TABLE.COLUMN, or the rows.
+class Difference(NamedTuple):
+    """What differs in rows of a trial: ``name`` is TABLE.COLUMN, or says that it is the rows.
 
-    ``place`` is that of the first of these rows, of which ``text`` tells.
+    ``place`` is that of the first of them, and ``text`` says how it differs.
     """
 
     name: str
-    text: str
     place: dict[str, Any]
-    rows: int
-
-    def __str__(self) -> str:
-        at = f" at step {self.place['step']}" if "step" in self.place else ""
-        more = f", and {self.rows - 1} more in the trial" if self.rows > 1 else ""
-        return f"{self.name}{at} {self.text}{more}"
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,21 +187,25 @@ class Stored:
         odd = new.keys() ^ old.keys()
         if self.table == FACTORS:  # another study may have other ones for the same trial
             odd -= old.keys()
-        number = len(odd) + len(stored) - len(old)
-        if number:
-            place = dict(zip(names, min(odd or old), strict=True))
-            text = "are missing or too many"
-            yield Difference(f"rows of {self.table}", text, place, number)
+        if number := len(odd) + len(stored) - len(old):
+            yield self._difference(
+                f"rows of {self.table}", min(odd or old), number, "are missing or too many"
+            )
         common = [place for place in new if place in old and old[place] != new[place]]
         for index, name in enumerate(self.names):
             places = [p for p in common if not same_value(old[p][index], new[p][index], tolerance)]
             if places and name not in ignored:
-                place = dict(zip(names, places[0], strict=True))
                 values = (rows[places[0]][index] for rows in (old, new))
                 texts = ("NULL" if value is None else str(value) for value in values)
                 was, now = (text[:SHOWN] + "..." * (len(text) > SHOWN) for text in texts)
                 text = f"is {was}, and {now} replayed"
-                yield Difference(f"{self.table}.{name}", text, place, len(places))
+                yield self._difference(f"{self.table}.{name}", places[0], len(places), text)
+
+    def _difference(self, name: str, first: Row, rows: int, text: str) -> Difference:
+        place = dict(zip(PLACES[self.table], first, strict=True))
+        at = f" at step {place['step']}" if "step" in place else ""
+        more = f", and {rows - 1} more in the trial" if rows > 1 else ""
+        return Difference(name, place, f"{name}{at} {text}{more}")
 
 
 def stored_rows(
@@ -267,10 +266,8 @@ def in_order(
 
 def same_value(one: Any, other: Any, tolerance: float) -> bool:  # noqa: ANN401 # any value of a table
     """Whether two values of a table are equal; numbers, even within lists, within the tolerance."""
-    if one == other:
-        return True
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(
-            same_value(a, b, tolerance) for a, b in zip(one, other, strict=True)
-        )
-    return isinstance(one, float) and isinstance(other, float) and abs(one - other) <= tolerance
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        return all(same_value(a, b, tolerance) for a, b in zip(one, other, strict=True))
+    if not (isinstance(one, float) and isinstance(other, float)):
+        return bool(one == other)
+    return one == other or abs(one - other) <= tolerance

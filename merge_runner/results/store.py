@@ -36,7 +36,6 @@ from merge_runner.results.database import (
     unreadable_is_usage,
     write_database,
 )
-from merge_runner.results.progress_file import running
 from merge_runner.results.rows import (
     FACTORS,
     PLACES,
@@ -97,8 +96,6 @@ class Store:
     def __init__(self, path: Path) -> None:
         """Open or make the database; raises UsageError for a foreign one or another schema."""
         self.path = path
-        if path.exists() and not path.is_file():
-            raise UsageError(f"{path} is not a file: name one with --db")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as exc:
@@ -140,9 +137,17 @@ class Store:
         Raises UsageError where one of their conditions had other numbers when they were stored:
         the spec's hash does not cover these.
         """
+        named = list(keys)
+        columns = "DISTINCT condition, projected_headway_m, relative_velocity_mps"
         with write_database(self.path) as connection:
-            _refuse_other_conditions(connection, list(keys))
-            return {key for key, ended in _ended(connection, list(keys)).items() if ended}
+            for name, *numbers in rows_of_trials(connection, columns, "trials", named).fetchall():
+                condition = CONDITIONS[name]
+                if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
+                    raise UsageError(
+                        f"the condition {name} is stored with a headway of {numbers[0]:g} m and a "
+                        f"relative velocity of {numbers[1]:g} m/s: give the changed one a new name"
+                    )
+            return {key for key, ended in _ended(connection, named).items() if ended}
 
     def decisions_by_spec(self, spec_hashes: Collection[str]) -> list[tuple[Any, ...]]:
         """Of the trials that did not fail, by spec and side, how many decisions are (in)valid.
@@ -322,12 +327,8 @@ def sweep_facts(path: Path, sweep_id: str) -> SweepFacts:
 def to_forget(db: Path, patterns: Sequence[str]) -> tuple[list[str], str]:
     """Return the ids of the sweeps to forget, in which * stands for anything, and all that goes.
 
-    Raises UsageError where a pattern names nothing, or a sweep into the database is running.
+    Raises UsageError where a pattern names nothing.
     """
-    for busy in running(db):
-        raise UsageError(
-            f"the sweep {busy.sweep_id} is running into {db}: stop it, or wait for its end"
-        )
     with read_database(db) as connection:
         rows = connection.execute("SELECT sweep_id FROM sweeps ORDER BY ALL").fetchall()
         known, ids = [sweep_id for (sweep_id,) in rows], []
@@ -367,17 +368,6 @@ def _add_factors(connection: duckdb.DuckDBPyConnection, rows: Sequence[Row]) -> 
 def _add_specs(connection: duckdb.DuckDBPyConnection, specs: Mapping[str, str]) -> None:
     sql = "INSERT OR IGNORE INTO specs SELECT unnest(?), unnest(?)"
     connection.execute(sql, [list(specs), list(specs.values())])
-
-
-def _refuse_other_conditions(connection: duckdb.DuckDBPyConnection, keys: list[TrialKey]) -> None:
-    columns = "DISTINCT condition, projected_headway_m, relative_velocity_mps"
-    for name, *numbers in rows_of_trials(connection, columns, "trials", keys).fetchall():
-        condition = CONDITIONS[name]
-        if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
-            raise UsageError(
-                f"the condition {name} is stored with a headway of {numbers[0]:g} m and a relative "
-                f"velocity of {numbers[1]:g} m/s: give the changed one a new name"
-            )
 
 
 def _key(record: TrialRecord) -> TrialKey:

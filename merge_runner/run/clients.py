@@ -13,7 +13,7 @@ from merge_runner.config import (
     resolve_endpoint,
 )
 from merge_runner.errors import UsageError
-from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
@@ -198,4 +198,11 @@ def check_batches(plan: Plan, options: Options) -> None:
         raise UsageError("--batch asks models from this process: leave it, --replay or --dask out")
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
-        require_batch(plan.registered[name], entry, registry)
+        if batch_terms(entry) is None:
+            valid = ", ".join(each for each, its in registry.items() if batch_terms(its))
+            raise UsageError(
+                f"{plan.registered[name]} has no batch mode that is known; valid with --batch: "
+                f"{valid}. Leave --batch out, or give the entry in experiments/models.toml `batch "
+                "= { price_factor = 0.5, source = ... }` where its server has one in the same "
+                "format"
+            )

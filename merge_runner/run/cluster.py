@@ -115,6 +115,10 @@ async def connected(where: str) -> AsyncIterator[Client]:
         yield client
 
 
+# The calls with an answer, and by key the attempts at those without one.
+Recorded = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]]
+
+
 @dataclass(frozen=True, slots=True)
 class Task:
     """Trials for one worker, what is recorded of their calls, and its ``share`` of the limits.
@@ -131,8 +135,7 @@ class Task:
     earlier: Mapping[str, Usage | None]
     share: float
     first: FirstDecisions
-    recorded: Sequence[CachedCall]
-    unanswered: Mapping[str, tuple[Attempt, ...]]
+    recorded: Recorded
     overruns: Sequence[tuple[str, float]]
 
 
@@ -141,8 +144,7 @@ class Played:
     """What a worker returns: ``spent`` and ``opened`` are rows of its ledger."""
 
     ended: list[tuple[TrialSpec, TrialRecord | TrialSuspended]] = field(default_factory=list)
-    replies: list[CachedCall] = field(default_factory=list)
-    unanswered: dict[str, tuple[Attempt, ...]] = field(default_factory=dict)
+    recorded: Recorded = ((), ())
     spent: Rows = field(default_factory=list)
     opened: Rows = field(default_factory=list)
     meters: Mapping[str, Meter] = field(default_factory=dict)
@@ -196,7 +198,7 @@ async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Pla
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
         replies = stack.enter_context(closing(ResponseCache(folder)))
         ledger = Ledger(replies, task.plan.ledger)
-        replies.put_now(task.recorded, task.unanswered.items())
+        replies.put_now(*task.recorded)
         ledger.settle_share("", [(driver, 0, 0, ratio) for driver, ratio in task.overruns], [])
         try:
             clients = live_clients(
@@ -216,9 +218,9 @@ async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Pla
                 work.result()
         except MergeRunnerError as exc:
             played.error = type(exc)(str(exc))
-        known = {call.request.key for call in task.recorded}
-        played.replies = [call for call in replies.entries() if call.request.key not in known]
-        played.unanswered = replies.all_unanswered()
+        known = {call.request.key for call in task.recorded[0]}
+        new = [call for call in replies.entries() if call.request.key not in known]
+        played.recorded = new, [*replies.all_unanswered().items()]
         played.spent, played.opened = ledger.rows()
     return played
 
@@ -301,7 +303,7 @@ class DaskTasks:
         specs = self._groups.popleft()
         while self._groups and len(specs) + len(self._groups[0]) <= size:
             specs = specs + self._groups.popleft()
-        recorded, unanswered = await self._recorded(specs)
+        recorded = await self._recorded(specs)
         name = f"task {secrets.token_hex(8)}"
         cap_usd = self._options.max_cost_usd
         if any(entry.price != "free" for entry in self._plan.entries.values()):
@@ -321,7 +323,6 @@ class DaskTasks:
             share=1 / slots,
             first=self.first,
             recorded=recorded,
-            unanswered=unanswered,
             overruns=[*self._ledger.read().overruns.items()],
         )
         # Out of Dask's scheduling, which would retry it: the share of the cap is spent once.
@@ -330,23 +331,20 @@ class DaskTasks:
         )
         self._given[address] = task, asyncio.ensure_future(work)
 
-    async def _recorded(
-        self, specs: Sequence[TrialSpec]
-    ) -> tuple[list[CachedCall], dict[str, tuple[Attempt, ...]]]:
+    async def _recorded(self, specs: Sequence[TrialSpec]) -> Recorded:
         """What the cache holds of the calls of these trials, up to the first that is missing."""
         player = LocalRunner.sealed(self._plan, self._cache)
-        recorded: dict[str, CachedCall] = {}
+        answered: dict[str, CachedCall] = {}
         unanswered: dict[str, tuple[Attempt, ...]] = {}
         for spec in specs:
             record = await player.play_one(spec)
-            for row in record.decisions:
-                if (reply := row.decision.reply) is not None:
-                    recorded[reply.request.key] = CachedCall(reply.request, reply.attempts)
+            replies = (row.decision.reply for row in record.decisions)
+            answered |= {r.request.key: CachedCall(r.request, r.attempts) for r in replies if r}
             for call in record.failed_calls:
                 with contextlib.suppress(RecordingError):  # a damaged one is asked again
                     if attempts := self._cache.unanswered(call.request.key):
                         unanswered[call.request.key] = attempts
-        return list(recorded.values()), unanswered
+        return [*answered.values()], [*unanswered.items()]
 
     async def _collect(self) -> None:
         """Wait a while for tasks, and keep what those that have ended return."""
@@ -367,7 +365,7 @@ class DaskTasks:
 
     def _keep(self, task: Task, played: Played) -> None:
         """Keep what a task has brought: its replies first."""
-        self._cache.put_now(played.replies, played.unanswered.items())
+        self._cache.put_now(*played.recorded)
         self._ledger.settle_share(task.name, played.spent, played.opened)
         for model, meter in played.meters.items():
             self.meters[model].add(meter)

@@ -11,11 +11,10 @@ from statistics import fmean
 from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.content_hashes import canonical_json, without_prompt
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import cost_usd
 from merge_runner.prompts.blocks import render_prompt
-from merge_runner.records import Usage, is_scripted
+from merge_runner.records import Usage, canonical_json, is_scripted, without_prompt
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -95,8 +94,7 @@ def estimate(
     """
     number = read = written = 0
     usd = singly_usd = 0.0
-    in_turn_s: defaultdict[str, float] = defaultdict(float)
-    limited_s: defaultdict[str, float] = defaultdict(float)
+    busy_s: defaultdict[str, float] = defaultdict(float)
     at_once = min(options.connections, 2 * max(trials, 1))
     for label, arm in plan.by_label().items():
         for name, entry in arm.entries.items():
@@ -109,10 +107,8 @@ def estimate(
             singly_usd += asked * call_usd
             usd += asked * call_usd * _price_factor(entry, options.batch)
             # An account's limits are those of a model, with whatever parameters it is asked.
-            model = plan.registered[name]
-            in_turn_s[model] += asked / at_once * entry.typical_latency_s
-            limited_s[model] += asked * _limited_s(options, entry, usage)
-    longest_s = max([*in_turn_s.values(), *limited_s.values()], default=0.0)
+            call_s = max(entry.typical_latency_s / at_once, _limited_s(options, entry, usage))
+            busy_s[plan.registered[name]] += asked * call_s
     rounds = max((math.ceil(usual_prompts(arm)) for arm in plan.arms), default=0)
     return Estimate(
         plan.driver,
@@ -122,7 +118,7 @@ def estimate(
         output_tokens=written,
         cost_usd=None if math.isnan(usd) else round(usd, 2),
         singly_usd=None if math.isnan(usd) else round(singly_usd, 2),
-        minutes=round(longest_s / 60, 1),
+        minutes=round(max(busy_s.values(), default=0.0) / 60, 1),
         rounds=rounds if options.batch else 0,
         free=all(entry.price == "free" for entry in plan.entries.values()),
         measured=any(map(facts.get, plan.entries)),

@@ -1,9 +1,10 @@
-"""Plays trials with the clients of their models, in this process."""
+"""Plays trials with the clients of their models, in this process, and stores them meanwhile."""
 
 from __future__ import annotations
 
 import asyncio
 import math
+import sys
 from collections import Counter
 from collections.abc import (
     AsyncIterator,
@@ -17,16 +18,24 @@ from collections.abc import (
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import accumulate, chain
 
 from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import NoValidDecision, ProviderDown, TrialSuspended
+from merge_runner.errors import (
+    NoValidDecision,
+    ProviderDown,
+    StoreError,
+    StoreLocked,
+    TrialSuspended,
+)
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient, Wait
 from merge_runner.llm.http_outcome import REGISTRY
 from merge_runner.records import SIDES, ChatReply, Decision, Slot, TrialRecord, TrialSpec
+from merge_runner.results.store import Store
 from merge_runner.run.clients import sealed_clients
 from merge_runner.run.plan import Plan
 from merge_runner.text_safety import one_line
@@ -47,6 +56,17 @@ ADVICE = (
     "look at what the prompt asks for, and in which output format; some servers hold a small "
     "model to it by a grammar. Where replies are cut off or empty, set a higher "
     f"`max_output_tokens` in {REGISTRY}"
+)
+EVERY_S, POLL_S = 1.0, 0.05
+# Trials in one transaction, which costs as much as storing dozens of them; and in memory while
+# storing fails, as when another program holds the file.
+BATCH = 256
+MOST_PENDING = 2 * BATCH
+BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
+LOCK_PATIENCE_S = 2.0
+AGAIN = (
+    "When that is fixed, run the same command again: it writes them from the recorded replies "
+    "without a call."
 )
 
 
@@ -249,3 +269,121 @@ class LocalRunner:
             return await client.ask(prompt, slot, order=spec.order)
         finally:
             self._asking[spec.order] -= 1
+
+
+class Flusher:
+    """Collects ended trials and stores them about once a second.
+
+    While storing fails, trials beyond a batch are dropped and others are played; where storing is
+    merely slow, new trials wait for it. ``dropped`` trials can be played again from the recorded
+    replies; failed ones cannot, and stay in memory. ``differing`` maps trials that were already
+    stored with other values to the columns that differ.
+    """
+
+    def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
+        self.differing: dict[str, list[str]] = {}
+        self.dropped: list[TrialSpec] = []
+        self._store = store
+        self._sweep_id = sweep_id
+        self._say = say
+        self._pending: list[tuple[TrialRecord, int]] = []  # with the bytes of their replies
+        self._problem: StoreError | None = None
+        self._closing = False
+        self._task = asyncio.create_task(self._run())
+
+    def add(self, record: TrialRecord) -> None:
+        """Store this trial with the next batch, or drop it while storing fails."""
+        attempts = chain.from_iterable(call.attempts for call in record.calls)
+        size = sum(sys.getsizeof(attempt.reply) for attempt in attempts)
+        self._pending.append((record, size))
+        if self._problem is not None:
+            self._drop_excess()
+
+    async def room(self) -> None:
+        """Wait while too much is still to be stored, unless storing fails or has ended."""
+        while self._problem is None and not self._task.done():
+            if len(self._pending) <= MOST_PENDING and self._bytes <= MOST_PENDING_BYTES:
+                return
+            await asyncio.sleep(POLL_S)
+
+    @property
+    def left(self) -> int:
+        """How many trials are not stored yet."""
+        return len(self._pending) + len(self.dropped)
+
+    @property
+    def problem(self) -> str:
+        """Why trials are not stored, as a line of text; empty where nothing is wrong."""
+        if self._problem is None:
+            return ""
+        what = f"{self.left} trials wait" if self.left else "how the sweep ended waits"
+        return f"{what} to be stored: {self._problem}"
+
+    async def close(self) -> None:
+        """Store the trials in memory, and leave the database reachable.
+
+        Waits for a program that holds it as long as that does; raises StoreError for anything else.
+        More trials may be added later, and stored by the next call.
+        """
+        self._closing = True
+        await self._task
+        said = False
+        while not await self._flush() or self._pending:
+            if isinstance(self._problem, StoreLocked):
+                if not said:
+                    self._say(
+                        f"the playing has ended; {self.problem}. Ctrl-C ends the waiting: all "
+                        "replies are in the cache"
+                    )
+                said = True
+                await asyncio.sleep(EVERY_S)
+            elif self._problem and self.left:
+                raise StoreError(f"{self.left} trials are not stored: {self._problem}. {AGAIN}")
+            elif self._problem:
+                return  # whoever opens the database next will say what is wrong with it
+
+    @property
+    def _bytes(self) -> int:
+        return sum(size for _, size in self._pending)
+
+    async def _run(self) -> None:
+        clock_s = asyncio.get_running_loop().time
+        flushed_s = clock_s()
+        while not self._closing:
+            await asyncio.sleep(POLL_S)
+            is_much = len(self._pending) >= BATCH or self._bytes >= BATCH_BYTES
+            if self._pending and (is_much or clock_s() - flushed_s >= EVERY_S):
+                flushed_s = clock_s()
+                await self._flush()
+
+    async def _flush(self) -> bool:
+        """Write one batch, which may be empty; False if that did not work."""
+        sizes = accumulate(size for _, size in self._pending[:BATCH])
+        # At least one: a single trial may be larger than a batch should be.
+        number = max(1, sum(size <= BATCH_BYTES for size in sizes))
+        # It stays in front until it is stored: others are added behind it meanwhile.
+        batch = [record for record, _ in self._pending[:number]]
+        try:
+            # In a thread, since DuckDB waits for the file's lock and for the disk.
+            self.differing |= await asyncio.to_thread(
+                self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
+            )
+        except StoreError as exc:
+            self._problem = exc
+            self._drop_excess()
+            return False
+        self._problem = None
+        del self._pending[: len(batch)]
+        return True
+
+    def _drop_excess(self) -> None:
+        """Drop the newest trials beyond what may wait, which are in no batch under way."""
+        pending, self._pending = self._pending, []
+        held_bytes = 0
+        for record, size in pending:
+            is_much = len(self._pending) >= BATCH or held_bytes + size > MOST_PENDING_BYTES
+            if is_much and self._pending and record.status != "failed":
+                self.dropped.append(record.spec)
+            else:
+                self._pending.append((record, size))
+                held_bytes += size

@@ -17,7 +17,6 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, computed_field
 
 from merge_runner.config import (
-    MOST_REPETITIONS,
     REHEARSAL,
     ModelEntry,
     ScenarioConfig,
@@ -29,11 +28,18 @@ from merge_runner.config import (
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
-from merge_runner.llm.content_hashes import SPEC_VERSION, canonical_json, spec_hash
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
-from merge_runner.records import SIDES, Side, TrialSpec
+from merge_runner.records import (
+    MOST_REPETITIONS,
+    SIDES,
+    SPEC_VERSION,
+    Side,
+    TrialSpec,
+    canonical_json,
+    spec_hash,
+)
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import (
     CONDITIONS,
@@ -129,8 +135,8 @@ class Plan(BaseModel):
     drives but for opponents, as ids of sweeps do, with a comma between models. ``levels`` are those
     of each factor of its file, a factor's reference first. ``entries`` are the language models of
     all arms by what an arm's ``asked`` calls them, and ``endpoints`` the identities of their
-    endpoints (see ``config.Endpoint``). ``mirror``: pairs are played both ways round whatever the
-    file says. ``seat`` is ``first`` where only first decisions are asked, and empty in a sweep.
+    endpoints (see ``config.Endpoint``). ``seat`` is ``first`` where only first decisions are asked,
+    and empty in a sweep.
     """
 
     model_config = ConfigDict(frozen=True, serialize_by_alias=True, validate_by_name=True)
@@ -147,7 +153,6 @@ class Plan(BaseModel):
     sample_set: int
     order_seed: int
     seat: Literal["", "first"] = ""
-    mirror: bool = False
 
     @property
     def ledger(self) -> str:
@@ -155,7 +160,7 @@ class Plan(BaseModel):
 
         A study with a budget of its own has one ledger over all its models and samples.
         """
-        if self.study.file.budget.total_usd is not None:
+        if self.study.file.budget:
             return self.study.name
         models = ",".join(sorted(self.model.split(",")))
         seat = f"/{self.seat}" if self.seat else ""
@@ -368,7 +373,6 @@ def make_plan(
         sample_set=sample_set,
         order_seed=order_seed,
         seat="first" if first else "",
-        mirror=mirror,
     )
 
 

@@ -1,21 +1,39 @@
-"""What a user sees while a sweep runs: a live text on a terminal, plain lines elsewhere."""
+"""What a user sees of a sweep: its progress while it runs, and a summary of what came of it.
+
+The progress is also in a small file beside the database, for other processes.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import os
+import platform
 import sys
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from itertools import count
+from io import StringIO
+from itertools import count, groupby
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
+from urllib.parse import quote
 
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+
+from merge_runner.audit.checks import Audit
+from merge_runner.drivers.registry import EMULATOR
+from merge_runner.errors import ReplayMiss
+from merge_runner.llm.client import Meter
 from merge_runner.llm.ledger import Ledger
-from merge_runner.results.progress_file import Standing, clear_dead, remove_standing, write_standing
-from merge_runner.run.plan import Plan
+from merge_runner.records import Status
+from merge_runner.results.export import write_table
+from merge_runner.results.store import SweepFacts
+from merge_runner.run.estimate import Estimate
+from merge_runner.run.plan import Options, Plan
 from merge_runner.text_safety import printable, say
 
 if TYPE_CHECKING:
@@ -27,9 +45,111 @@ if TYPE_CHECKING:
 PULSE_S = 0.05
 # In pulses: how often the file and a terminal are written, and plain lines.
 PUBLISHED_EVERY, PLAIN_EVERY = 20, 100
-NOTES_SHOWN = 10
-REASONS_SHOWN = 3
+SHOWN, REASONS_SHOWN = 10, 3
 CLOSE_IT = "you may close this: the same command goes on"
+COLUMNS = ("trials", "left first", "right first", "collided", "timeout", "failed")
+# While a sweep checks what it stored, the file is silent: only its process shows that it lives.
+STALE_S = {"playing": 10.0, "checking": 600.0}
+MOST_BYTES = 1_000_000
+# Identifies the machine among those that share a folder: process ids mean nothing on another one.
+MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+
+
+class Standing(BaseModel):
+    """Snapshot of a sweep, for its display and for other processes.
+
+    ``ended`` trials have an outcome, those that were stored before this run among them. ``left_s``
+    is the estimated time left, None while there is no estimate. ``rows`` are what is shown, each
+    with its name: ``WARNING``, ``waiting`` (for what), ``trials``, ``cost`` and so on.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    sweep_id: str
+    pid: int = Field(default_factory=os.getpid, ge=1, lt=2**31)
+    machine: str = MACHINE
+    updated_at: AwareDatetime
+    doing: Literal["playing", "checking"]
+    ended: NonNegativeInt
+    failed: NonNegativeInt
+    cost_usd: float
+    left_s: float | None
+    rows: tuple[tuple[str, str], ...]
+
+    @property
+    def alive(self) -> bool:
+        """Whether the sweep is still running, by its file and its process."""
+        try:
+            if self.machine == MACHINE:
+                os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:
+            pass  # it is another user's
+        return (datetime.now(UTC) - self.updated_at).total_seconds() < STALE_S[self.doing]
+
+
+def write_standing(db: Path, standing: Standing) -> None:
+    """Replace a sweep's file as a whole: a reader sees the old state or the new one, never a part.
+
+    A sweep goes on where it cannot be written.
+    """
+    path = _path(db, standing.sweep_id)
+    made = path.with_suffix(".tmp")
+    with suppress(OSError):
+        path.parent.mkdir(exist_ok=True)
+        made.write_text(standing.model_dump_json(), encoding="utf-8")
+        os.replace(made, path)
+
+
+def remove_standing(db: Path, sweep_id: str) -> None:
+    """Remove the file of a sweep that has ended normally."""
+    path = _path(db, sweep_id)
+    with suppress(OSError):
+        path.with_suffix(".tmp").unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
+        path.parent.rmdir()
+
+
+def read_standing(db: Path, sweep_id: str) -> Standing | None:
+    """The snapshot of a sweep that runs, or was killed; None without a file."""
+    standing = _read(_path(db, sweep_id))
+    return standing if standing and standing.sweep_id == sweep_id else None
+
+
+def running(db: Path) -> list[Standing]:
+    """The snapshots of the sweeps into this database that are running now."""
+    return [standing for _, standing in _standings(db) if standing.alive]
+
+
+def clear_dead(db: Path) -> None:
+    """Remove what killed sweeps left, and nothing else."""
+    with suppress(OSError):
+        for path, standing in _standings(db):
+            if not standing.alive:
+                path.unlink(missing_ok=True)
+
+
+def _standings(db: Path) -> Iterator[tuple[Path, Standing]]:
+    folder = _path(db, "").parent
+    with suppress(OSError):
+        for path in [] if folder.is_symlink() else list(folder.iterdir()):
+            if standing := _read(path):
+                yield path, standing
+
+
+def _path(db: Path, sweep_id: str) -> Path:
+    return db.with_name(f"{db.name}.progress") / f"{quote(sweep_id, safe='+')}.json"
+
+
+def _read(path: Path) -> Standing | None:
+    if not path.is_file():
+        return None  # reading a pipe might never end
+    try:
+        with path.open("rb") as file:
+            return Standing.model_validate_json(file.read(MOST_BYTES))
+    except (OSError, ValidationError):
+        return None
 
 
 @dataclass(slots=True)
@@ -67,10 +187,10 @@ class Progress:
         batches = first_of(self.batches(), "others")
         # How long a batch takes nobody knows.
         left_s = None if batches else self._left_s(elapsed_s, ended + failed, live + cached)
-        trials = f"{ended + failed}/{self.planned - self.stored} ended"
-        trials += f" (+{self.stored} stored before)" if self.stored else ""
-        trials += f", {self.runner.running} running"
-        trials += "" if self.runner.workers is None else f" on {self.runner.workers} workers"
+        before = f" (+{self.stored} stored before)" if self.stored else ""
+        workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
+        running = f"{self.runner.running} running{workers}"
+        trials = f"{ended + failed}/{self.planned - self.stored} ended{before}, {running}"
         cost = f"{cost_usd:.2f} USD"
         if self.cap_usd is not None:
             cost += f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
@@ -196,9 +316,198 @@ def terminal_text(progress: Progress) -> Text:
 
 
 def _notes(progress: Progress) -> list[str]:
-    """The clients' messages since the last call: each once, and the first NOTES_SHOWN."""
+    """The clients' messages since the last call: each once, and the first SHOWN."""
     notes: dict[str, None] = {}
     for meter in progress.runner.meters.values():
         notes |= dict.fromkeys(meter.notes)
         meter.notes.clear()
-    return first_of(list(notes), "more like these", NOTES_SHOWN)
+    return first_of(list(notes), "more like these", SHOWN)
+
+
+def as_dict(
+    options: Options,
+    progress: Progress,
+    expected: Estimate | None,
+    checked: tuple[SweepFacts, Audit] | None,
+    **told: object,
+) -> dict[str, Any]:
+    """The summary as JSON values; ``expected`` is the estimate made before the run, if any.
+
+    ``checked`` is what the database holds of the sweep. From ``decisions`` on, values are there
+    where anything is stored. ``told`` goes into it.
+    """
+    plan, spending, meter = progress.plan, progress.ledger.spending, Meter()
+    for each in progress.runner.meters.values():
+        meter.add(each)
+    playing_s = ((progress.ended_at or progress.began_at) - progress.began_at).total_seconds()
+    summary: dict[str, Any] = {
+        **told,
+        "name": plan.name,
+        "model": plan.model,
+        "driver": plan.driver,
+        "scripted": plan.scripted,
+        "db": str(options.db),
+        "trials": {
+            "planned": plan.trials,
+            "stored_before": progress.stored,
+            "suspended": progress.outcome_counts["suspended"],
+        },
+        "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
+        "attempts": meter.outcomes,
+        "cost_usd": round(meter.cost_usd, 6),
+        "calls_of_unknown_cost": meter.cost_unknown,
+        "estimate": None if expected is None else asdict(expected),
+        "sweep_cost_usd": round(spending.spent_usd, 6),
+        "set_aside_usd": round(spending.reserved_usd, 6),
+        "attempts_of_unknown_cost": spending.open_attempts,
+        "over_the_worst_case_usd": round(spending.overrun_usd, 6),
+        "dearest": spending.dearest,
+        "damaged_entries": meter.damaged,
+        "open_batches": progress.batches(),
+        "playing_s": round(playing_s, 3),
+        "worst_stall_s": round(progress.worst_stall_s, 3),
+        "audit": None,
+    }
+    if checked is None:
+        return summary
+    facts, audit = checked
+    statuses = Counter(dict.fromkeys(get_args(Status), 0))
+    for _, status, _, number in facts.outcomes:
+        statuses[status] += number
+    summary["trials"] |= statuses
+    return summary | {
+        "scripted": bool(facts.stand_ins),
+        "audit": audit.as_dict(),
+        "decisions": facts.decisions,
+        "invalid_decisions": facts.invalid,
+        "fallbacks": facts.fallbacks,
+        "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts.others},
+        "stand_ins": [row[:3] for row in facts.stand_ins],
+        "failed": dict(facts.failed),
+        "outcomes_by_level": [*_tallies(plan, facts)],
+        "first_looks": facts.first_looks,
+    }
+
+
+def _tallies(plan: Plan, facts: SweepFacts) -> Iterator[dict[str, Any]]:
+    """Counts of trials by COLUMNS, for each condition, all, and each level of each factor."""
+    shown = {"condition": [*plan.conditions, "all"], **plan.levels}
+    tallies = {(name, level): Counter[str]() for name in shown for level in shown[name]}
+    rows = [
+        ("condition", level, status, merged_first, trials)
+        for condition, status, merged_first, trials in facts.outcomes
+        for level in (condition, "all")
+    ]
+    for factor, level, status, merged_first, trials in [*rows, *facts.levels]:
+        outcome = f"{merged_first} first" if status == "finished" else status
+        tally = tallies.setdefault((factor, level), Counter())
+        tally.update({"trials": trials, outcome: trials})
+    for (factor, level), tally in tallies.items():
+        if tally["trials"]:
+            yield {"factor": factor, "level": level, **{name: tally[name] for name in COLUMNS}}
+
+
+def as_lines(summary: dict[str, Any]) -> Iterator[str]:
+    """The summary by ``as_dict`` for a reader."""
+    is_stored = summary["audit"] is not None
+    if is_stored:
+        yield from _results(summary)
+    yield from _costs(summary)
+    yield from (f"open batch: {text}" for text in summary["open_batches"])
+    for key in summary["damaged_entries"]:
+        yield f"WARNING: a recorded reply was damaged, set aside and asked again: {key}"
+    if is_stored:
+        yield from _faults(summary)
+        yield f"database: {summary['db']}"
+
+
+def _results(summary: dict[str, Any]) -> Iterator[str]:
+    """How the trials ended, or what drivers do first."""
+    if looks := summary["first_looks"]:
+        yield as_table(looks)
+    for factor, group in groupby(summary["outcomes_by_level"], key=itemgetter("factor")):
+        levels = [{factor: row["level"], **{name: row[name] for name in COLUMNS}} for row in group]
+        if len(levels) > 1 and not looks:
+            yield as_table(levels)
+    decisions, invalid = summary["decisions"], summary["invalid_decisions"]
+    share = f" ({invalid / decisions:.1%})" if invalid else ""
+    yield (
+        f"decisions: {decisions}, {invalid} invalid{share}, "
+        f"{summary['fallbacks']} fallbacks to an earlier plan"
+    )
+
+
+def _costs(summary: dict[str, Any]) -> Iterator[str]:
+    number = summary["calls_of_unknown_cost"]
+    unknown = f" and {number} calls of unknown cost" if number else ""
+    yield (
+        f"calls: {summary['calls']['live']} live, {summary['calls']['cached']} from recordings; "
+        f"cost {summary['cost_usd']:.4f} USD{unknown}"
+    )
+    if (expected := summary["estimate"]) is not None:
+        usd = _about(expected["cost_usd"])
+        yield f"estimated before: {expected['calls']} calls, {usd}"
+    spent_usd, aside_usd = summary["sweep_cost_usd"], summary["set_aside_usd"]
+    if spent_usd + aside_usd:
+        yield (
+            f"this sweep over all its runs: {spent_usd:.4f} USD, and {aside_usd:.4f} set aside "
+            "(`merge-runner ledger` says why)"
+        )
+    if over_usd := summary["over_the_worst_case_usd"]:
+        yield (
+            f"WARNING: replies cost {over_usd:.4f} USD more than their worst case "
+            f"({summary['dearest']}): the server does not keep to the output cap"
+        )
+
+
+def _faults(summary: dict[str, Any]) -> Iterator[str]:
+    """Who answered in whose place, what the audit says, and which trials failed."""
+    for pair, answers in summary["model_mismatches"].items():
+        yield f"WARNING: another model answered than was asked for: {pair} ({answers} answers)"
+    for driver, model, provider in summary["stand_ins"]:
+        if provider == EMULATOR:
+            yield f"The model `{model}` is a scripted stand-in, no language model."
+        else:
+            yield f"{driver}: a scripted stand-in answered, not {model}"
+    audit = summary["audit"]
+    checked = ", ".join(f"{n} {what}" for what, n in audit["counts"].items() if n)
+    yield f"audited: {checked}: {len(audit['findings']) or 'no'} findings"
+    notes = [f"note: {each}" for each in audit["notes"]]
+    yield from first_of(notes, "more notes: `merge-runner audit`", SHOWN)
+    failed = [f"failed: {trial_id}: {error}" for trial_id, error in summary["failed"].items()]
+    yield from first_of(failed, "more, in the table trials", SHOWN)
+    if failed and summary["exit_code"] != ReplayMiss.exit_code:
+        yield "Run the same command again to play the failed trials anew."
+
+
+def as_table(rows: Sequence[dict[str, Any]]) -> str:
+    """The table of a few rows, numbers shortened; empty without a row."""
+    text = StringIO()
+    if rows:
+        cells = ([f"{v:g}" if isinstance(v, float) else v for v in r.values()] for r in rows)
+        write_table([*rows[0]], map(tuple, cells), text)
+    return text.getvalue()
+
+
+def _about(cost_usd: float | None) -> str:
+    return "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
+
+
+def estimate_lines(expected: Estimate) -> Iterator[str]:
+    """What a run will take, for a reader."""
+    measured = ", as measured before" if expected.measured else ""
+    tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
+    yield f"driver  {expected.driver}"
+    yield f"trials  {expected.trials} that have not ended yet"
+    yield f"calls   about {expected.calls} that are not recorded yet"
+    yield f"tokens  {tokens}"
+    if not expected.rounds:
+        yield f"cost    {_about(expected.cost_usd)}"
+        yield f"time    about {expected.minutes} minutes"
+        return
+    singly = f"{_about(expected.singly_usd)} and {expected.minutes} minutes if asked singly"
+    yield f"cost    {_about(expected.cost_usd)} in batches; {singly}"
+    yield (
+        f"time    about {expected.rounds} rounds; each takes as long as its slowest batch: "
+        "minutes, an hour, a day at most"
+    )

@@ -8,10 +8,10 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, suppress
-from dataclasses import fields, replace
+from contextlib import closing, nullcontext, suppress
+from dataclasses import dataclass, field, fields, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
@@ -23,12 +23,22 @@ from merge_runner.config import ModelEntry
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed, MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import DAMAGED, make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply, judge
 from merge_runner.prompts.blocks import blocks_of
-from merge_runner.records import ANSWERS, SIDES, Attempt, Slot, TrialRecord, TrialSpec, Usage
+from merge_runner.records import (
+    ANSWERS,
+    DAMAGED,
+    SIDES,
+    Attempt,
+    Slot,
+    TrialRecord,
+    TrialSpec,
+    Usage,
+    make_request,
+)
 from merge_runner.registry import in_use, require, use
+from merge_runner.results.recording import leaves
 from merge_runner.results.rows import Stored, in_order, rows_of
 from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Plan
@@ -54,9 +64,10 @@ NOT_REPLAYED = (
     "sweeps.versions",
 )
 # Members of a spec that change with the program or its data, not with the sweep's configuration.
-OF_THE_PROGRAM = frozenset(
-    {"spec_version", "prompt_blocks"}
-    | {f"{side}.{name}" for side in SIDES for name in ("source", "data")}
+OF_THE_PROGRAM = (
+    "spec_version",
+    "prompt_blocks",
+    *(f"{side}.{name}" for side in SIDES for name in ("source", "data")),
 )
 HINT = "install the package that registers it, or name the study: --study FILE"
 SWEEPS = """
@@ -73,14 +84,12 @@ def audit_database(
     A trial that several sweeps have is audited with the newest of them. The replies are those of
     the folder ``cache``, if it is named, and are compared with the stored ones. Raises UsageError.
     """
-    with audited_database(path) as connection, ExitStack() as stack:
+    opened = nullcontext() if cache is None else closing(ResponseCache(cache, read_only=True))
+    with audited_database(path) as connection, opened as recorded:
         sweeps = {row[0]: row for row in connection.execute(SWEEPS).fetchall()}
         if sweep_id is not None:
             oldest_first = dict(reversed(sweeps.items()))
             sweeps = {sweep_id: require(oldest_first, "sweep", sweep_id, f"in {path}")}
-        recorded = None
-        if cache is not None:
-            recorded = stack.enter_context(closing(ResponseCache(cache, read_only=True)))
         audits = [
             _audit(connection, name, config, recorded, finished=finished)
             for name, config, finished in sweeps.values()
@@ -174,24 +183,15 @@ def _replayable(
         actual = hashes.get(spec.trial_id, spec.spec_hash)
         if actual == spec.spec_hash:
             continue
-        old, new = _members(stored.get(actual, "{}")), _members(wanted[spec.spec_hash])
+        texts = (stored.get(actual, "{}"), wanted[spec.spec_hash])
+        old, new = (dict(leaves(json.loads(text))) for text in texts)
         names = sorted(name for name in {**old, **new} if old.get(name) != new.get(name))
-        if OF_THE_PROGRAM.issuperset(names):
+        if all(name.startswith(OF_THE_PROGRAM) for name in names):
             notes[f"they were made by another version or other data: {', '.join(names)}"] += 1
         else:
             text = f"its spec is not what the sweep says in {', '.join(names)}"
             audit.findings.append(Finding("spec", text, audit.subject, spec.trial_id))
     return [spec for spec in specs if hashes.get(spec.trial_id) == spec.spec_hash]
-
-
-def _members(text: str) -> dict[str, Any]:
-    """Return the members of a spec, those of drivers one by one; none of a damaged one."""
-    try:
-        spec: dict[str, Any] = json.loads(text)
-        drivers = [(side, spec.pop(side).items()) for side in SIDES]
-    except (*DAMAGED, AttributeError):
-        return {}
-    return spec | {f"{side}.{name}": value for side, items in drivers for name, value in items}
 
 
 def _replay(
@@ -202,7 +202,7 @@ def _replay(
     sweep_id: str,
 ) -> list[Finding]:
     """Play trials by the replies of a cache, or else the stored ones, and compare their rows."""
-    stored = StoredReplies(plan)
+    stored = StoredReplies(plan, plan.by_label())
     # Of a cache a sealed client only asks ``get``.
     runner = LocalRunner.sealed(plan, cache or cast(ResponseCache, stored))
     by_key = {(spec.trial_id, spec.spec_hash): spec for spec in specs}
@@ -211,8 +211,8 @@ def _replay(
     async def compared() -> list[Finding]:
         findings: list[Finding] = []
         for key, tables in in_order(connection, by_key):
-            stored.take(by_key[key], tables["calls"].named(key))
-            record = await runner.play_one(by_key[key])
+            stored.spec, stored.rows = by_key[key], [*tables["calls"].named(key)]
+            record = await runner.play_one(stored.spec)
             findings += _findings(record, tables, kind, sweep_id)
         return findings
 
@@ -221,22 +221,15 @@ def _replay(
         return thread.submit(asyncio.run, compared()).result()
 
 
+@dataclass
 class StoredReplies:
-    """The replies in the table ``calls``, of one trial at a time, as a client finds them."""
+    """The replies in the table ``calls``, as a client finds them: ``rows`` of one trial."""
 
-    def __init__(self, plan: Plan) -> None:
-        self.money = None  # the ledger of a sealed client keeps nothing
-        self._plan = plan
-        self._spec: TrialSpec
-        self._arm: Arm
-        self._calls: dict[str, list[dict[str, Any]]] = {}
-
-    def take(self, spec: TrialSpec, rows: Iterable[dict[str, Any]]) -> None:
-        """Take the calls of the trial that is played next."""
-        self._spec, self._arm, self._calls = spec, self._plan.by_label()[spec.arm], {}
-        for row in sorted(rows, key=itemgetter("attempt")):
-            if self._arm.asked.get(row["side"]) in self._arm.entries:
-                self._calls.setdefault(row["call_key"], []).append(row)
+    plan: Plan
+    arms: dict[str, Arm]
+    spec: TrialSpec = field(init=False)
+    rows: list[dict[str, Any]] = field(init=False)
+    money: None = None  # the ledger of a sealed client keeps nothing
 
     def get(self, key: str) -> CachedCall | None:
         """Return the call with this key, each answer read anew; None where there is none.
@@ -244,17 +237,18 @@ class StoredReplies:
         Raises RecordingError where its request does not have the key, and CallFailed where it
         ended without an answer.
         """
-        rows = self._calls.get(key)
-        if not rows:
+        spec, arm = self.spec, self.arms[self.spec.arm]
+        rows = sorted((r for r in self.rows if r["call_key"] == key), key=itemgetter("attempt"))
+        side: Any = rows[0]["side"] if rows else None
+        name = arm.asked.get(side, "")
+        if name not in arm.entries:
             return None
-        spec, side = self._spec, rows[0]["side"]
-        name = self._arm.asked[side]
-        entry = self._arm.entries[name]
+        entry = arm.entries[name]
         sent = FORMATS[entry.format].request(entry, "")
         try:
             request = make_request(
                 provider=entry.provider,
-                endpoint=self._plan.endpoints[name],
+                endpoint=self.plan.endpoints[name],
                 model=entry.id,
                 path=sent.path,
                 headers=sent.headers,
@@ -285,7 +279,7 @@ def _attempt(number: int, row: Mapping[str, Any], entry: ModelEntry) -> Attempt:
         if isinstance(text := json.loads(body), str):
             body = text  # a body that is no JSON is stored as a JSON string
     names = ("outcome", "http_status", "model_served", "finish_reason", "error", "scripted")
-    usage = Usage(*(row[field.name] for field in fields(Usage)))
+    usage = Usage(*(row[each.name] for each in fields(Usage)))
     attempt = Attempt(number, **{name: row[name] for name in names}, usage=usage, reply=body)
     outcome = judge(RawReply(attempt.http_status or 0, {}, body or ""), FORMATS[entry.format])
     if outcome.action != "accept" and attempt.outcome not in ANSWERS:
@@ -321,4 +315,4 @@ def _findings(
         found = tables[table].differences(key, rows, ignored=ignored, tolerance=TOLERANCE)
         for difference in found:
             where = (difference.place.get(name) for name in ("side", "decision"))
-            yield Finding(kind, str(difference), sweep_id, key[0], *where)
+            yield Finding(kind, difference.text, sweep_id, key[0], *where)

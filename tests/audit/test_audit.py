@@ -19,8 +19,7 @@ from merge_runner.audit.checks import audit_sweep
 from merge_runner.cli import app
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
-from merge_runner.records import SCRIPTED_FIELD
+from merge_runner.records import SCRIPTED_FIELD, make_request
 from merge_runner.results.recording import export_recording, read_recording
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -236,7 +235,7 @@ WIDER = {
     ),
     "the sweep says another model": (
         ["UPDATE sweeps SET config = replace(config::VARCHAR, 'scripted-driver', 'other')"],
-        {"spec": "is not what the sweep says in left.body, right.body"},
+        {"spec": "is not what the sweep says in left.body.model, right.body.model"},
     ),
     "the sweep is gone": (
         ["DELETE FROM sweeps WHERE sweep_id = (SELECT sweep_id FROM sweep_trials "

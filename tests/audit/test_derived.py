@@ -202,7 +202,7 @@ def test_trials_of_other_prompts_are_a_note(db, monkeypatch):
     monkeypatch.setattr("merge_runner.run.plan.block_digests", lambda _: {"C0": "older"})
     (audit, _) = audit_database(db)
     assert audit.findings == []
-    assert "made by another version or other data: prompt_blocks" in audit.notes[-1]
+    assert "made by another version or other data: prompt_blocks.C0" in audit.notes[-1]
 
 
 def test_a_difference_below_the_tolerance_is_none(db):

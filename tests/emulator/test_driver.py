@@ -10,10 +10,9 @@ from merge_runner.chance import draw, draw_between, draw_index
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.emulator.driver import NEEDED, Seen, answer, read_prompt
-from merge_runner.llm.content_hashes import make_request
 from merge_runner.prompts.blocks import VARIANTS, Variant, render_prompt
 from merge_runner.prompts.parse import parse_reply
-from merge_runner.records import SIDES, ChatReply, Slot, TrialSpec
+from merge_runner.records import SIDES, ChatReply, Slot, TrialSpec, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World

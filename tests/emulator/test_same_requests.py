@@ -17,11 +17,10 @@ from aiohttp import web
 
 from merge_runner.config import resolve_endpoint
 from merge_runner.llm.batch.providers import SERVICES
-from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.models import read_models
-from merge_runner.records import Slot
+from merge_runner.records import Slot, make_request
 from tests.emulator.test_sdks import (
     _no_settings_of_the_user,  # noqa: F401 # a fixture of every test here
     gemini_client,

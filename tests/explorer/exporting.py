@@ -7,10 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from merge_runner_analysis.explorer.export import export_folder
+from merge_runner_analysis.tables import TABLES
 
 FEW_TABLES = {
-    "merge_runner_analysis.explorer.pages.tables.TABLES": {"attempts": None},
-    "merge_runner_analysis.explorer.pages.tables.ABOUT": {"attempts": "a table"},
+    "merge_runner_analysis.explorer.pages.tables.TABLES": {"attempts": TABLES["attempts"]},
     "merge_runner_analysis.explorer.pages.tables.FIGURES": {"ablation-matrix": "a figure"},
 }
 

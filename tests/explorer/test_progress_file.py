@@ -10,15 +10,15 @@ from types import SimpleNamespace
 import pytest
 
 from merge_runner.llm.ledger import Spending
-from merge_runner.results.progress_file import (
+from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.progress import (
+    Progress,
     clear_dead,
     read_standing,
     remove_standing,
     write_standing,
 )
-from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.plan import Options, make_plan
-from merge_runner.run.progress import Progress
 from tests.gate import HANGS_S
 from tests.harness import run_sweep
 

@@ -14,8 +14,8 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from merge_runner.results.progress_file import remove_standing, write_standing
 from merge_runner.results.store import Store, sweep_facts
+from merge_runner.run.progress import remove_standing, write_standing
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.pages import sweep as page

@@ -32,7 +32,7 @@ async def test_conditions_from_outside_go_through_every_command(merge_runner, tm
     read = {
         command[0]: await merge_runner(*command)
         for command in (
-            ("tables", "conflict-resolution", "who-first"),
+            ("tables", "factors", "who-first"),
             ("report", "--out", "report.html"),
             ("view", "--export", "pages"),
             ("audit",),

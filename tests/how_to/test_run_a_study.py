@@ -66,7 +66,7 @@ async def test_the_study_of_the_readme_fits_its_cap_with_models_that_answer_in_2
     options = Options(tmp_path / "db", tmp_path / "cache")
     expected = await unsent(plan, options, say=pytest.fail)
     assert (expected.trials, round(expected.cost_usd)) == (int(trials), int(usd))
-    assert expected.cost_usd < plan.study.file.budget.total_usd
+    assert expected.cost_usd < plan.study.file.budget["total_usd"]
     for entry in plan.entries.values():
         assert entry.shutdown is None or entry.shutdown.year > 2027
 

@@ -24,8 +24,7 @@ import struct
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 
-from merge_runner.llm.content_hashes import make_request
-from merge_runner.records import ChatRequest, Slot
+from merge_runner.records import ChatRequest, Slot, make_request
 
 # A reply that every client of the format openai-chat takes for an answer.
 CHAT = json.dumps(

@@ -21,12 +21,11 @@ from merge_runner.config import Endpoint, ModelEntry, Price
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
-from merge_runner.llm.content_hashes import canonical_json
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.ledger import Budget, Ledger, cost_usd
 from merge_runner.llm.limiter import Limiter
-from merge_runner.records import Slot, Usage
+from merge_runner.records import Slot, Usage, canonical_json
 from tests.emulator.scenarios import SCENARIOS
 from tests.emulator.scenarios.playing import ScenarioPlan, playing
 from tests.harness import each

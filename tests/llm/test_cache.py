@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache, TextDisk
-from merge_runner.llm.content_hashes import make_request
-from merge_runner.records import Attempt, ChatRequest, Slot, Usage
+from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 
 
 def entry(number=0, *, model="m", endpoint="openai", reply="{}", **attempt):
@@ -63,7 +62,7 @@ def cache(folder):
 
 
 def endpoints(cache, model):
-    return sorted({each.endpoint for each in cache.recorded(model=model)})
+    return sorted(cache.recorded("endpoint", model=model))
 
 
 def left_out(cache):
@@ -107,7 +106,12 @@ requests = st.builds(
     headers=st.dictionaries(texts, texts, max_size=3),
     body=texts,
     slot=st.builds(
-        Slot, texts, st.integers(), st.sampled_from(["left", "right"]), st.integers(), st.integers()
+        Slot,
+        st.from_regex("[A-Za-z0-9_.-]+", fullmatch=True),
+        st.integers(1, 100_000),
+        st.sampled_from(["left", "right"]),
+        st.integers(0, 100_000),
+        st.integers(0),
     ),
 )
 

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from merge_runner import records
 from merge_runner.config import ModelEntry
-from merge_runner.llm import content_hashes
-from merge_runner.llm.content_hashes import call_key, canonical_json, make_request
 from merge_runner.llm.formats import FORMATS
-from merge_runner.records import Slot
+from merge_runner.records import Slot, call_key, canonical_json, make_request
 
 SLOT = Slot(condition="A1", repetition=1, side="left", decision=0, sample_set=0)
 BASE = {
@@ -174,7 +173,7 @@ def test_numbers_that_are_equal_but_spelt_differently_are_different_requests():
 
 def test_another_key_version_is_another_key(monkeypatch):
     before = key()
-    monkeypatch.setattr(content_hashes, "KEY_VERSION", content_hashes.KEY_VERSION + 1)
+    monkeypatch.setattr(records, "KEY_VERSION", records.KEY_VERSION + 1)
     assert key() != before
 
 

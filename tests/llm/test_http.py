@@ -17,13 +17,12 @@ from merge_runner.emulator.driver import answer
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
-from merge_runner.llm.content_hashes import call_key, canonical_json, make_request
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.limiter import Limiter
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.prompts.parse import parse_reply
-from merge_runner.records import Slot
+from merge_runner.records import Slot, call_key, canonical_json, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World

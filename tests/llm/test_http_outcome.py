@@ -70,7 +70,7 @@ ERRORS = [
     ("openai-chat", 400, openai(code="unsupported_value"), {}, "fail", "bad_request"),
     ("openai-chat", 400, openai(code="unsupported_parameter"), {}, "fail", "bad_request"),
     ("openai-chat", 400, openai(code="context_length_exceeded"), {}, "fail", "bad_request"),
-    ("openai-chat", 400, openai(code="invalid_prompt"), {}, "fail", "bad_request"),
+    ("openai-chat", 400, openai(code="invalid_prompt"), {}, "fail", "bad_prompt"),
     ("openai-chat", 400, openai(param="service_tier"), {}, "fail", "bad_request"),
     ("openai-responses", 400, openai(code="model_not_found"), {}, "refused", "unknown_model"),
     ("openai-chat", 404, openai(code="model_not_found"), {}, "refused", "unknown_model"),
@@ -420,7 +420,7 @@ SUCCESSES = [
     ("anthropic", {"content": [], "stop_reason": "end_turn"}, "accept", "empty"),
     # Responses fail with status 200.
     ("openai-responses", failed("server_error"), "retry", "server_error"),
-    ("openai-responses", failed("invalid_prompt"), "fail", "bad_request"),
+    ("openai-responses", failed("invalid_prompt"), "fail", "bad_prompt"),
     # One that ended early, whatever the reason.
     ("openai-responses", {"status": "incomplete", "output": []}, "accept", "truncated"),
     # So does OpenRouter, at the top or in the choice.

@@ -69,7 +69,7 @@ ANSWERS = [
 # What no other attempt would mend: scenario, formats, the attempt's outcome, error, its words.
 UNKNOWN = "has no model 'o3-2025-04-16'"
 STOPS = [
-    ("openai/failed_invalid_prompt", [RESPONSES], "bad_request", CallFailed, "flagged"),
+    ("openai/failed_invalid_prompt", [RESPONSES], "bad_prompt", CallFailed, "flagged"),
     ("openai/temperature", OPENAI, "bad_request", CallFailed, "does not support 0.2"),
     ("openai/max_tokens", OPENAI, "bad_request", CallFailed, "Use 'max_completion_tokens'"),
     ("openai/stream_unverified", OPENAI, "bad_request", CallFailed, "must be verified"),

@@ -28,8 +28,7 @@ from merge_runner.emulator.handler import (
     as_response,
 )
 from merge_runner.errors import UsageError
-from merge_runner.llm.content_hashes import canonical_json
-from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_FIELD, SLOT_HEADER
+from merge_runner.records import ATTEMPT_HEADER, SCRIPTED_FIELD, SLOT_HEADER, canonical_json
 from tests.mock_server.errors import ERRORS, as_error, error_body
 
 if TYPE_CHECKING:
@@ -516,10 +515,14 @@ class GeminiMode(BatchMode):
         if request.headers.get("x-goog-upload-command") == "start":
             url = f"http://{request.headers['host']}{request.url.path}?upload_id=1"
             headers = {"x-goog-upload-url": url, "x-goog-upload-status": "active"}
-            return as_json(_marked({}), headers=headers)
+            response = as_json(_marked({}))
+            response.headers.update(headers)
+            return response
         content = request.content
         file = {"name": f"files/{self._file(content)}", "sizeBytes": str(len(content))}
-        return as_json(_marked({"file": file}), headers={"x-goog-upload-status": "final"})
+        response = as_json(_marked({"file": file}))
+        response.headers["x-goog-upload-status"] = "final"
+        return response
 
     def line(self, batch: Batch, result: Result, part: str) -> dict[str, Any] | None:
         if result.kind == "not asked":

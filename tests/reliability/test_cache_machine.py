@@ -25,9 +25,8 @@ from hypothesis.stateful import (
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.ledger import Asked, Budget, Ledger, PaidAttempt
-from merge_runner.records import Attempt, Slot
+from merge_runner.records import Attempt, Slot, make_request
 
 QUESTIONS = 4
 PROCESSES = 2

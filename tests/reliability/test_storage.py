@@ -240,7 +240,7 @@ async def test_what_was_dropped_is_played_again_and_failed_trials_are_kept_as_th
 
     said, is_free, written = [], [], Store.write
     monkeypatch.setattr(Store, "write", write)
-    monkeypatch.setattr("merge_runner.run.flusher.BATCH", 2)
+    monkeypatch.setattr("merge_runner.run.local_runner.BATCH", 2)
     monkeypatch.setattr("merge_runner.run.sweep.BATCH", 2)
     async with watched(fails) as server:
         monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
@@ -383,7 +383,6 @@ async def test_a_damaged_record_of_spending_stops_no_replay(merge_runner, tmp_pa
     assert (await merge_runner("sweep", *part, "--dry-run", "--db", "new")).code == 0
     replay = await merge_runner("replay", *part, "--db", "new")
     assert replay.code == 0, replay.err
-    assert "no cap could hold" in replay.err
     for command in (("sweep", *part), ("ledger",)):
         refused = await merge_runner(*command)
         assert refused.code == 2

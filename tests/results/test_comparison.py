@@ -8,8 +8,15 @@ import pytest
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.llm.content_hashes import make_request
-from merge_runner.records import Attempt, ChatReply, Slot, TrialRecord, TrialSpec, Usage
+from merge_runner.records import (
+    Attempt,
+    ChatReply,
+    Slot,
+    TrialRecord,
+    TrialSpec,
+    Usage,
+    make_request,
+)
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.rows import PLACES, rows_of, stored_rows
 from merge_runner.results.store import OF_A_RUN
@@ -105,7 +112,8 @@ def test_rows_that_lack_or_are_too_many_are_counted(stored):
     stored.execute("INSERT INTO decisions FROM decisions WHERE spec_hash = 'h' AND decision = 1")
     states = stored_rows(stored, "states", [KEY])
     (difference,) = states.differences(KEY, rows_of(RECORD)["states"])
-    assert (difference.rows, difference.place) == (2, {"step": 3, "side": "left"})
+    assert difference.place == {"step": 3, "side": "left"}
+    assert difference.text.endswith("at step 3 are missing or too many, and 1 more in the trial")
     assert differing(stored) == ["rows of states", "rows of decisions"]
 
 

@@ -18,7 +18,7 @@ from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import TrialRecord, TrialSpec
 from merge_runner.results.store import Store, SweepRow, query, results_digest, sweep_facts
-from merge_runner.run.flusher import Flusher
+from merge_runner.run.local_runner import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 

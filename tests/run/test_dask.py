@@ -109,7 +109,7 @@ async def test_tokens_of_a_workers_tasks_count_together_in_its_share(tmp_path):
         task = Task(
             run="run", name="task", specs=specs, plan=plan, options=options,
             urls={}, earlier={},
-            share=0.5, first=FirstDecisions(), recorded=(), unanswered={}, overruns=(),
+            share=0.5, first=FirstDecisions(), recorded=((), ()), overruns=(),
         )  # fmt: skip
         played = await play_task(fingerprint(), pickle.dumps(task), dask_worker=worker)
         assert played.error is None

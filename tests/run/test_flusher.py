@@ -17,7 +17,7 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
-from merge_runner.run.flusher import (
+from merge_runner.run.local_runner import (
     MOST_PENDING,
     MOST_PENDING_BYTES,
     Flusher,

@@ -12,8 +12,7 @@ import pytest
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache, _behind_checksum, import_folder
-from merge_runner.llm.content_hashes import make_request
-from merge_runner.records import Attempt, Slot
+from merge_runner.records import Attempt, Slot, make_request
 
 pytestmark = pytest.mark.long
 

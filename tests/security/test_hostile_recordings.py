@@ -17,8 +17,7 @@ import pytest
 
 from merge_runner.errors import MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.content_hashes import call_key, canonical_json, make_request
-from merge_runner.records import Attempt, Slot
+from merge_runner.records import Attempt, Slot, call_key, canonical_json, make_request
 from merge_runner.results.recording import COLUMNS, export_recording, import_recording, summarise
 
 CALLS = 3
@@ -290,7 +289,7 @@ def test_sql_in_strings_is_a_string(file, tmp_path, monkeypatch):
 )
 def test_foreign_missing_and_mistyped_columns_are_refused(file, cache, tmp_path, select):
     text = refusal(rewritten(file, select=select), cache)
-    assert "is not one of our recordings" in text or "is not a readable Parquet file" in text
+    assert "is not one of our recordings" in text or "is damaged, or no Parquet file" in text
     assert not (tmp_path / "planted.csv").exists()
 
 
@@ -308,7 +307,7 @@ def test_what_is_no_parquet_file_is_refused(file, cache, tmp_path):
     bad = tmp_path / "bad.parquet"
     for content in (b"", b"PAR1", b"PAR1PAR1", b"no Parquet" * 100, whole[:-1], whole[:500]):
         bad.write_bytes(content)
-        assert "is not a readable Parquet file" in refusal(bad, cache)
+        assert "is damaged, or no Parquet file" in refusal(bad, cache)
     for nothing in (tmp_path, tmp_path / "nowhere"):
         assert "there is no recording" in refusal(nothing, cache)
 

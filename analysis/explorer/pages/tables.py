@@ -15,10 +15,6 @@ from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import from_text
 
-# What each shows, for the list: their own titles are known only when they are made.
-ABOUT = {
-    name: f"{one.number}: {one.shows}" if one.number else one.shows for name, one in TABLES.items()
-}
 # How a table can be downloaded, by the suffix of the file: its format, and the file's type.
 FILES = {
     TableFormat.CSV.suffix: (TableFormat.CSV, "text/csv; charset=utf-8"),
@@ -29,7 +25,12 @@ FILE_WAIT_S = 300.0
 
 def tables_page(site: Site) -> str:
     """The list of all tables and figures."""
-    return site.render("tables.html", here="tables", about=ABOUT, figures=FIGURES)
+    return site.render(
+        "tables.html",
+        here="tables",
+        about={name: one.about for name, one in TABLES.items()},
+        figures=FIGURES,
+    )
 
 
 def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
@@ -77,7 +78,7 @@ def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         "table.html",
         here="tables",
         name=name,
-        about=ABOUT[name],
+        about=TABLES[name].about,
         files=[(suffix, site.at.table_file(name, suffix)) for suffix in FILES],
         computed=found,
         table=shown,

@@ -19,8 +19,7 @@ from merge_runner.config import (
     endpoint_identity,
     is_own_host,
 )
-from merge_runner.errors import MergeRunnerError, UsageError
-from merge_runner.llm.content_hashes import LARGEST_STATUS, canonical_json
+from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.formats import (
     ServerError,
     WireFormat,
@@ -38,7 +37,7 @@ from merge_runner.llm.http_outcome import (
     may_be_charged,
     status_within,
 )
-from merge_runner.records import SLOT_HEADER, ChatRequest
+from merge_runner.records import LARGEST_STATUS, SLOT_HEADER, ChatRequest, canonical_json
 
 if TYPE_CHECKING:
     from merge_runner.llm.http import HttpTransport
@@ -329,8 +328,6 @@ class AnthropicBatches(BatchService):
     def _status_of(self, batch: dict[str, Any]) -> BatchStatus:
         if (as_text(batch.get("processing_status")) or "").upper() != "ENDED":
             return BatchStatus()
-        if batch.get("archived_at"):
-            raise BatchFailed("lost", "the results of the batch are no longer kept")
         counts = as_dict(batch.get("request_counts")).values()
         # Not at the URL that the batch names: the key goes to the configured host alone.
         path = f"{self.path}/{id_of(batch)}/results"
@@ -448,16 +445,3 @@ def batch_terms(entry: ModelEntry) -> BatchTerms | None:
     # A provider's price holds at its own address.
     is_its_own = endpoint_identity(entry) == entry.provider
     return PROVIDERS.require(entry.provider).batch if is_its_own else None
-
-
-def require_batch(name: str, entry: ModelEntry, entries: Mapping[str, ModelEntry]) -> BatchTerms:
-    """Return the terms of a model; raises UsageError, which lists those entries that have some."""
-    terms = batch_terms(entry)
-    if terms is None:
-        valid = ", ".join(each for each, its in entries.items() if batch_terms(its))
-        raise UsageError(
-            f"{name} has no batch mode that is known; valid with --batch: {valid}. Leave "
-            "--batch out, or give the entry in experiments/models.toml `batch = "
-            "{ price_factor = 0.5, source = ... }` where its server has one in the same format"
-        )
-    return terms

@@ -191,7 +191,9 @@ class Rounds:
         return [
             batch
             for batch in self.batches.values()
-            if batch.work and not batch.work.done() and model in (None, batch.note.model)
+            if (work := batch.work) and model in (None, batch.note.model)
+            # One whose work was cancelled goes on without this run.
+            if work.cancelled() or not work.done()
         ]
 
     def _ended(self, key: str, batch: Batch) -> bool:
@@ -252,34 +254,27 @@ class Rounds:
         return batch.work
 
     async def _begin(self, batch: Batch, lines: Sequence[Line]) -> list[ChatRequest]:
-        """Note a batch with those of its lines that may begin; returns their requests.
+        """Set the money of lines aside, and note a batch with those that have some.
 
-        Their money is set aside in the same transaction, unless that was done.
+        Returns their requests.
         """
-        by_key = {line.call.request.key: line for line in lines}
+        begun = []
 
-        def operation() -> OpenBatch:
-            begun = {}
-            with self._cache.money.transaction():
-                for key, line in by_key.items():
-                    if not line.paid.queued or line.paid.set_aside(line.call.attempts):
-                        begun[key] = batch.note.lines[key]
-            note = batch.note.model_copy(update={"lines": begun})
-            self._write(note)
-            return note
+        async def begin(line: Line) -> None:
+            with contextlib.suppress(TrialSuspended):
+                await line.paid.begin(line.call.attempts)
+                begun.append(line.call.request)
 
-        batch.note = await self._cache.write(operation)
-        for key in batch.note.lines:
-            if by_key[key].paid.queued:
-                by_key[key].paid.begun()
-        return [by_key[key].call.request for key in batch.note.lines]
+        await asyncio.gather(*map(begin, lines))
+        await self._note(batch, lines={each.key: batch.note.lines[each.key] for each in begun})
+        return begun
 
     async def _submit(self, batch: Batch, requests: Sequence[ChatRequest]) -> bool:
         """Create a batch, or find it where the answer is lost; False if it is not created."""
         service = self.services[batch.note.model]
 
         async def create() -> None:
-            await self._note(batch, await service.create(requests, batch.note.mark))
+            await self._note(batch, batch_id=await service.create(requests, batch.note.mark))
 
         async def created() -> None:
             creation = asyncio.create_task(create())
@@ -308,20 +303,18 @@ class Rounds:
         for pause_s in (0.0, *ARRIVAL_S):
             await asyncio.sleep(pause_s)
             if (batch_id := await self._patiently(batch, find)) is not None:
-                await self._note(batch, batch_id)
+                await self._note(batch, batch_id=batch_id)
                 return True
         return False
 
-    async def _note(self, batch: Batch, batch_id: str) -> None:
-        batch.note = batch.note.model_copy(update={"batch_id": batch_id})
-        await self._cache.write(lambda: self._write(batch.note))
-
-    def _write(self, note: OpenBatch) -> None:
-        self._cache.replace(_BATCH + note.mark, note.model_dump_json())
+    async def _note(self, batch: Batch, **changes: object) -> None:
+        batch.note = note = batch.note.model_copy(update=changes)
+        text = note.model_dump_json()
+        await self._cache.write(partial(self._cache.replace, _BATCH + note.mark, text))
 
     async def _follow(self, batch: Batch) -> None:
         """Wait for the end of a batch, and read its results until no more can be had."""
-        note, message = batch.note, "the batch has ended without a result for it"
+        note = batch.note
         ask = partial(self.services[note.model].status, note.batch_id)
         while (status := await self._patiently(batch, ask)) == BatchStatus():
             age_s = (datetime.now(UTC) - note.submitted_at).total_seconds()
@@ -334,8 +327,7 @@ class Rounds:
         except BatchFailed as exc:
             if exc.kind != "again":
                 raise
-            message = str(exc)
-        batch.rest = _no_answer("no_result", message)
+        batch.rest = _no_answer("no_result", "the batch has ended without a result for it")
         if note.model in self._most:
             self._most[note.model] = max(self._most[note.model], 2 * len(note.lines))
 
@@ -371,9 +363,7 @@ class Rounds:
                 f"{model}: its batch mode refuses: {exc}. Every reply so far is saved: correct "
                 "that, or leave --batch out, and run the same command to go on"
             )
-        elif is_alone and calls == 1:
-            self._say(f"{model}: a call is asked singly, at the full price ({exc})")
-        else:
+        elif calls > 1 or not is_alone:
             if model not in self._most:
                 self._say(f"{model}: {calls} calls go in smaller batches: {exc}")
             self._most[model] = max(1, calls // 2) if is_alone else calls
@@ -384,17 +374,16 @@ class Rounds:
 
     def _lost(self, batch: Batch, exc: BatchFailed) -> None:
         """End a batch that cannot be read: what was set aside for it stays so."""
-        note, service = batch.note, self.services[batch.note.model]
-        is_unknown = not (note.batch_id or service.takes_mark)
+        note = batch.note
+        can_be_found = note.batch_id or self.services[note.model].takes_mark
         # A key that is refused is another account's, perhaps: there the batch goes on.
-        if is_unknown or (not self.submits and exc.kind == "lost"):
-            batch.rest = _no_answer("batch_lost", str(exc))
-            return
-        raise EndpointRefused(
-            f"{note.model}: batch {note.batch_id or note.mark} is refused to this key ({exc}): set "
-            "that of the account that has submitted it. If it is gone, the same command without "
-            "--batch asks its calls anew"
-        ) from exc
+        if can_be_found and (self.submits or exc.kind != "lost"):
+            raise EndpointRefused(
+                f"{note.model}: batch {note.batch_id or note.mark} is refused to this key ({exc}): "
+                "set that of the account that has submitted it. If it is gone, the same command "
+                "without --batch asks its calls anew"
+            ) from exc
+        batch.rest = _no_answer("batch_lost", str(exc))
 
     async def _patiently(
         self, batch: Batch, ask: Callable[[], Awaitable[T]], patience_s: float = math.inf

@@ -104,14 +104,13 @@ class _Conditions(Registry[Condition]):
     """Those that are registered, and any other by the name that ``condition_name`` gives it."""
 
     def __getitem__(self, name: str) -> Condition:
-        with suppress(KeyError):
-            return super().__getitem__(name)
-        if found := _COMPUTED.fullmatch(name):
-            headway_m, velocity_mps = map(float, found.groups())
+        known = self._all
+        if name in known or not (found := _COMPUTED.fullmatch(name)):
+            return known[name]
+        headway_m, velocity_mps = map(float, found.groups())
+        if condition_name(headway_m, velocity_mps) == name:  # each has one name
             with suppress(UsageError):
-                condition = Condition(headway_m, velocity_mps)
-                if condition_name(headway_m, velocity_mps) == name:  # each has one name
-                    return condition
+                return Condition(headway_m, velocity_mps)
         raise KeyError(name)
 
 

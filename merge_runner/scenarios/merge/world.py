@@ -139,10 +139,8 @@ class World:
 
     def _history(self, samples: list[float], before: float) -> tuple[float, ...]:
         wanted = self._config.memory_samples
-        recent = samples[-wanted:]
-        if self._config.history_start == "cruise":
-            return (before,) * (wanted - len(recent)) + tuple(recent)
-        return tuple(recent)
+        lacking = wanted - len(samples) if self._config.history_start == "cruise" else 0
+        return (before,) * lacking + tuple(samples[-wanted:])
 
 
 def _time(step: int, step_s: float) -> float:

@@ -17,8 +17,10 @@ from merge_runner_analysis.data.imported_humans import (
     human_trials,
     imported,
 )
+from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.reference_data import PAIRS, human_outcomes
 from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
 from merge_runner_analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST
 from merge_runner_analysis.stats.measures import counts, known
 from merge_runner_analysis.tables import make_tables
@@ -174,7 +176,9 @@ def test_another_data_set_is_named_in_every_table_with_humans(stored):
 def test_trials_of_other_pairs_are_in_no_row_and_in_no_query(stored):
     trials = published_trials()
     moved = trials.assign(pair=trials["pair"].mask(trials.index < 5, "experiment_7"))
-    human = Study(stored(moved)).human
-    assert len(human.trials) == 985
-    assert "pair IN ('pair1'" in human.narrowed
-    assert "experiment_7" not in human.narrowed
+    study = Study(stored(moved))
+    assert len(study.human.trials) == 985
+    (source,) = explain(study, make_tables(study, ["who-first"])[0], "human/intercept").sources
+    trials = load(source.query, study.db)["trial_id"]
+    assert trials.tolist() == list(source.trials)
+    assert len(trials) == len(study.human.finished)

@@ -34,7 +34,6 @@ from merge_runner_analysis.figures.panels import (
 )
 from merge_runner_analysis.figures.variant_figure import figure_2_variants
 from merge_runner_analysis.stats.intervals import mean, proportion
-from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
 
@@ -153,8 +152,6 @@ def test_conditions_that_were_not_played_are_not_drawn(tmp_path):
     (axis, *others) = figure_2(study).subfigs[1].axes
     assert len(others) == 2, "one relative velocity"
     assert sorted({round(x) for line in axis.lines for x in line.get_xdata()}) == [0, 4]
-    (resolved,) = make_tables(study, ["conflict-resolution"])
-    assert {row.values["condition"] for row in resolved.rows} == {"N_0_0", "L_4_0"}
     humans = Study(write_study(tmp_path / "h.duckdb", []))
     assert {*humans.conditions} == {*HUMAN_CONDITIONS}
 

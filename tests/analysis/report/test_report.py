@@ -159,15 +159,15 @@ def test_an_alias_that_the_sweep_declares_is_no_other_model(tmp_path):
             connection.execute("UPDATE sweeps SET config = ?", [json.dumps({"models": models})])
         study = Study(db)
         assert [one.served for one in provenance(db).mismatches] == found
-        assert tally(study, study.models[0]).others == 6 * len(found)
+        assert tally(study, study.models[0])["other_model"] == 6 * len(found)
 
 
 @pytest.mark.slow
 def test_the_fallbacks_of_a_group_are_unusual_above_one_in_twenty(tmp_path):
     study = asking(tmp_path, Said(failure="no_array"))
     found = tally(study, study.models[0])
-    assert found.fallbacks == 6
-    assert 0.05 < found.fallbacks / found.decisions < 0.07
+    assert found["fallback"] == 6
+    assert 0.05 < found["fallback"] / found["decisions"] < 0.07
     (alarm,) = alarms(study, provenance(study.db))
     assert alarm.title == "Many fallbacks"
     assert "6 of" in alarm.text

@@ -18,8 +18,8 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer.pages.tables import ABOUT
 from merge_runner_analysis.figures import SHOWS
+from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.stats.group_scores import score
 from merge_runner_analysis.stats.intervals import proportion
 from merge_runner_analysis.table_format import TableFormat
@@ -47,7 +47,8 @@ def test_a_table_reads_as_its_golden_file(tables, name):
 
 def test_the_docs_list_the_tables_and_figures_as_the_explorer_does():
     text = (PROJECT / "docs/reference/analysis.md").read_text(encoding="utf-8").replace("\\|", "|")
-    for shows in (ABOUT, SHOWS):
+    about = {name: one.about for name, one in TABLES.items()}
+    for shows in (about, SHOWS):
         rows = [f"| `{name}` | {what} |" for name, what in shows.items()]
         assert "\n".join(["|---|---|", *rows, ""]) in text
 
@@ -167,10 +168,10 @@ def test_several_csv_tables_carry_their_names(study):
 def test_a_table_refuses_nan_and_a_gap_without_a_word():
     column = Column("b", "b", "number")
     with pytest.raises(ValueError, match="NaN"):
-        Table("t", "t", (column,), [Row("r", (), {"b": float("nan")}, "why")])
+        Table("t", (column,), [Row("r", (), {"b": float("nan")}, "why")])
     with pytest.raises(ValueError, match="no note"):
-        Table("t", "t", (column,), [Row("r", (), {})])
-    Table("t", "t", (column,), [Row("r", (), {}, "why")])
+        Table("t", (column,), [Row("r", (), {})])
+    Table("t", (column,), [Row("r", (), {}, "why")])
 
 
 def test_against_the_paper_stand_its_values_and_the_difference(tables):
@@ -326,10 +327,9 @@ def test_every_cell_can_be_traced_to_its_trials_and_the_query_that_lists_them(st
         for row in (row for row in table.rows if row.groups[0] in {"o3/A1", "human"}):
             for column in table.columns:
                 found = explain(study, table, f"{row.id}:{column.name}")
-                compared = len(row.references) if column.of != "own" else 0
-                assert len(found.sources) == len(row.groups) + compared
+                assert len(found.sources) == len(row.groups)
                 listings |= {source.query: source.trials for source in found.sources}
-    assert len(listings) > 20
+    assert len(listings) > 8
     with duckdb.connect(str(study.db), read_only=True) as connection:
         # Computed once, and not for each query.
         connection.execute("CREATE TEMP TABLE trial_metrics AS FROM trial_metrics")
@@ -350,10 +350,6 @@ def test_every_cell_can_be_traced_to_its_trials_and_the_query_that_lists_them(st
         ("indicators", "o3/baseline/collided_percent", "n"),
         ("velocity-profiles", "o3/A2", "n"),
         ("attempts", "other/baseline", "trials"),
-        ("attempts", "other/baseline", "failed"),
-        ("attempts", "other/baseline", "other_model"),
-        ("attempts", "o3/A1", "invalid"),
-        ("attempts", "o3/A1", "no_array"),
     ],
 )
 def test_n_is_the_number_of_trials_that_explain_lists(study, tables, name, row, column):
@@ -372,7 +368,8 @@ def test_explain_marks_the_trials_that_a_share_counts(study, tables):
     for row, column in shares:
         (source,) = explain(study, tables["ablation-quantitative"], f"{row}:{column}").sources
         if source.trials:
-            share = 100 * len(source.numerator) / len(source.trials)
+            (group,) = (group for group in study.models if group.id == row)
+            share = 100 * len(source.numerator) / group.ended[METRICS[column].column].count()
             assert share == pytest.approx(
                 cell(tables["ablation-quantitative"], row, column), rel=1e-9
             )

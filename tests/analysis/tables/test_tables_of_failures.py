@@ -35,12 +35,12 @@ def test_every_attempt_has_one_fate_and_every_call_one_end(study):
         found = tally(study, group)
         rows = every[every["spec_hash"] == group.spec_hash]
         fates = Counter(rows["fate"])
-        assert found.attempts == len(rows) == found.calls + found.retried
-        assert found.calls == fates["driven"] + fates["fallback"] + fates["lost"]
-        assert (found.retried, found.lost) == (fates["retried"], fates["lost"])
-        assert found.invalid == fates["fallback"] == found.fallbacks
-        assert found.unknown == (rows["outcome"] == "unknown").sum()
-        assert found.decisions == found.answers
+        assert found["attempts"] == len(rows) == found["calls"] + found["retried"]
+        assert found["calls"] == fates["driven"] + fates["fallback"] + fates["lost"]
+        assert (found["retried"], found["lost"]) == (fates["retried"], fates["lost"])
+        assert found["invalid"] == fates["fallback"] == found["fallback"]
+        assert found["unknown"] == (rows["outcome"] == "unknown").sum()
+        assert found["decisions"] == found["answers"]
 
 
 def test_each_trouble_is_counted_where_it_was(tables):
@@ -72,13 +72,13 @@ def test_each_trouble_is_counted_where_it_was(tables):
 )
 def test_a_count_leads_to_the_trials_that_it_was_in(study, tables, column, trials):
     found = explain(study, tables["attempts"], f"o3/A1:{column}")
-    assert [list(source.trials) for source in found.sources] == [[f"o3/A1/{t}" for t in trials]]
+    assert [list(source.numerator) for source in found.sources] == [[f"o3/A1/{t}" for t in trials]]
 
 
 def test_a_lost_call_leads_to_its_failed_trial(study, tables):
     for column in ("failed", "lost", "lost_percent"):
         found = explain(study, tables["attempts"], f"other/baseline:{column}")
-        assert [source.trials for source in found.sources] == [("other/baseline/R_-4_-8/rep01",)]
+        assert [source.numerator for source in found.sources] == [("other/baseline/R_-4_-8/rep01",)]
 
 
 def test_a_driver_that_asks_no_model_has_no_rate_but_a_reason(small):

@@ -5,10 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.llm.content_hashes import make_request
 from merge_runner.llm.formats import FORMATS
 from merge_runner.prompts.blocks import render_prompt
-from merge_runner.records import Slot
+from merge_runner.records import Slot, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World

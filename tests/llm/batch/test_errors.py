@@ -383,15 +383,6 @@ async def test_a_file_of_answers_that_is_not_there_yet_is_asked_for_again(
     assert (keys, failed.kind) == ([], kind)
 
 
-async def test_results_that_are_no_longer_kept_are_lost(server, service_at):
-    results_at(server, (200, b""))
-    server.replies[BATCH["anthropic"]] = (
-        200,
-        {"processing_status": "ended", "archived_at": "2026-11-20T00:00:00Z"},
-    )
-    assert (await read(service_at(server.url, "anthropic")))[1].kind == "lost"
-
-
 async def test_blank_lines_and_those_of_windows_are_results_of_nothing(server, service_at):
     body = b"\r\n".join([b"", *jsonl(succeeded("a"), b"", succeeded("b")).split(b"\n"), b"", b""])
     results_at(server, (200, body), succeeded=2)

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import re
 
-import pytest
-
 from merge_runner.config import PROVIDERS, BatchTerms
-from merge_runner.errors import UsageError
-from merge_runner.llm.batch.providers import SERVICES, batch_terms, require_batch
+from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
 from tests.llm.batch.conftest import entry_of
@@ -38,21 +35,12 @@ def test_the_price_of_a_provider_holds_at_its_own_address(form, monkeypatch):
     entry = entry_of(form, **elsewhere)
     assert batch_terms(entry) is None
     assert batch_terms(entry_of(form, **elsewhere, batch=OWN)) == OWN
-    with pytest.raises(UsageError, match=r"is known; valid.*batch = \{"):
-        require_batch("mine", entry, {"mine": entry})
     variable = PROVIDERS[entry.provider].base_url_env
     monkeypatch.setenv(variable, "http://127.0.0.1:8000")
     assert batch_terms(entry_of(form)) is None
     monkeypatch.delenv(variable)
     assert batch_terms(entry_of(form)).price_factor == 0.5
     assert batch_terms(entry_of(form, "emulator")).price_factor == 0.5
-
-
-def test_a_model_without_a_batch_mode_is_refused_with_the_valid_ones():
-    entries = load_models()
-    assert require_batch("o3", entries["o3"], entries).price_factor == 0.5
-    with pytest.raises(UsageError, match=r"local has no batch mode.*valid with --batch: emul.*o3"):
-        require_batch("local", entries["local"], entries)
 
 
 def test_a_key_is_an_id_that_every_provider_takes(form):

@@ -5,7 +5,7 @@ import asyncio
 import numpy as np
 import pytest
 
-from merge_runner.llm.content_hashes import canonical_json
+from merge_runner.records import canonical_json
 from merge_runner.results.store import Store
 from merge_runner_analysis.data.load import load
 from merge_runner_cei.batch import simulate
