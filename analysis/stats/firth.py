@@ -25,6 +25,7 @@ CONVERGED = 1e-8
 ROUNDING = 1e-11
 UNSEEN = 1e-9
 WIDENINGS = 40
+FAR = 1e6  # a loss of log-likelihood that no data make up for
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,17 +95,18 @@ class Counts:
 
         def excess(value: float) -> float:
             profile = self.fit({term: value}, fit.b)
-            return np.nan if profile is None else float(fit.best - profile.best - lost)
+            # Where there is no information left, Jeffreys' prior is 0.
+            return FAR if profile is None else float(fit.best - profile.best - lost)
 
         bounds = []
         for sign in (-1, 1):
             inside, width = float(fit.b[term]), sign * float(self.errors(fit)[term])
             for _ in range(WIDENINGS):
                 outside = inside + width
-                if not excess(outside) < 0:
+                if excess(outside) >= 0:
                     break
                 inside, width = outside, 2 * width
-            if not excess(outside) >= 0:
+            else:
                 return None
             bounds.append(float(brentq(excess, inside, outside, xtol=1e-9)))
         return bounds[0], bounds[1]

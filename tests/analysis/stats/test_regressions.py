@@ -266,6 +266,19 @@ def test_a_difference_of_groups_is_the_interaction_of_a_penalised_model_of_both(
     )
 
 
+def test_small_and_separated_data_have_intervals_about_their_estimates():
+    for seed in range(12):
+        few, others = (
+            drawn(seed + k, 1, *np.random.default_rng(seed).normal(0, 3, 3)) for k in (0, 50)
+        )
+        for fit in (penalised(few), penalised(few, others)):
+            if isinstance(fit, str):
+                continue
+            for name, term in fit.terms.items():
+                low, high = fit.interval(name)
+                assert low < term.b < high
+
+
 def test_the_penalised_fit_takes_the_iterations_that_separation_needs():
     counts = [5, 1, 5, 1, 5, 4, 2, 1, 5, 2, 2]
     rows = [
