@@ -93,13 +93,20 @@ class Counts:
         """
         lost = stats.chi2.ppf(level, 1) / 2
 
+        near = fit.b  # the last profile: far out the other terms are far from the estimate, too
+
         def excess(value: float) -> float:
-            profile = self.fit({term: value}, fit.b)
+            nonlocal near
+            profile = self.fit({term: value}, near)
             # Where there is no information left, Jeffreys' prior is 0.
-            return FAR if profile is None else float(fit.best - profile.best - lost)
+            if profile is None:
+                return FAR
+            near = profile.b
+            return float(fit.best - profile.best - lost)
 
         bounds = []
         for sign in (-1, 1):
+            near = fit.b
             inside, width = float(fit.b[term]), sign * float(self.errors(fit)[term])
             for _ in range(WIDENINGS):
                 outside = inside + width

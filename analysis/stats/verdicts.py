@@ -235,8 +235,10 @@ def _slope(group: Group, name: str) -> Estimate:
         model = penalised(group.outcomes)
         if isinstance(model, str):
             return Estimate(None, len(who_first_data(group.outcomes)[1]), problem=model)
-        slope = model.terms[term]
-        return Estimate(slope.b, model.n, model.interval(term), slope.se)
+        slope, ci = model.terms.get(term), model.interval(term)
+        if slope is None or ci is None:
+            return Estimate(None, model.n, problem="no profile of Firth's likelihood converges")
+        return Estimate(slope.b, model.n, ci, slope.se)
     fit = fits(group).hc3
     if fit.problem:
         return Estimate(None, fit.n, problem=fit.problem)
