@@ -254,18 +254,21 @@ def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
 
     ``drivers`` are those that are judged, by name: no mock model and no program.
     """
+    compared = [name for name, of in drivers.items() if any(v.get("state") for v in of.values())]
     unlike = {name: found for name, of in drivers.items() if (found := strongest(of)) is not None}
     if not drivers:
         return "No language model is judged here.", ""
+    if not compared:
+        return "No language model can be compared with humans yet.", ""
     if not unlike:
-        return f"No difference from humans is shown for {joined([*drivers])}.", ""
+        return f"No difference from humans is shown for {joined(compared)}.", ""
     name, found = min(unlike.items(), key=lambda one: _p(one[1]))
     rest = f"{name} {told(found)}."
     if len(drivers) == 1:
         return f"{name} does not drive like humans:", f"it {told(found)}."
-    if len(unlike) == len(drivers):
+    others = [name for name in compared if name not in unlike]
+    if not others:
         return "No language model here drives like humans:", rest
-    others = [name for name in drivers if name not in unlike]
     return f"No difference from humans is shown for {joined(others)};", f"but {rest}"
 
 

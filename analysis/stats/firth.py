@@ -23,7 +23,9 @@ LONGEST_STEP = 5.0
 CONVERGED = 1e-8
 # Of a log-likelihood: what is smaller than this is no loss.
 ROUNDING = 1e-11
+UNSEEN = 1e-9
 WIDENINGS = 40
+FAR = 1e6  # a loss of log-likelihood that no data make up for
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,8 @@ class Counts:
     ) -> Fit | None:
         """Return the fit with some coefficients ``held``, or None where it does not converge.
 
+        From a ``start`` on it is a profile, of which the likelihood alone counts.
+
         Newton steps on Firth's score with the whole design's information, halved where they do not
         increase the penalised likelihood (Heinze and Schemper 2002).
         """
@@ -63,14 +67,14 @@ class Counts:
             for _ in range(HALVINGS):
                 reached = self._penalised(b + step)
                 if reached >= best - ROUNDING:
-                    b, best = b + step, max(reached, best)
                     break
                 step /= 2
             else:
                 return Fit(b, best)  # no direction is uphill but for rounding
-            if np.abs(step).max(initial=0) < CONVERGED:
+            gained, b, best = reached - best, b + step, max(reached, best)
+            if np.abs(step).max(initial=0) < CONVERGED or (start is not None and gained < UNSEEN):
                 return Fit(b, best)
-        return None
+        return Fit(b, best) if held else None  # the last small steps change no likelihood
 
     def p(self, fit: Fit, term: int) -> float | None:
         """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""
@@ -89,19 +93,27 @@ class Counts:
         """
         lost = stats.chi2.ppf(level, 1) / 2
 
+        near = fit.b  # the last profile: far out the other terms are far from the estimate, too
+
         def excess(value: float) -> float:
-            profile = self.fit({term: value}, fit.b)
-            return np.nan if profile is None else float(fit.best - profile.best - lost)
+            nonlocal near
+            profile = self.fit({term: value}, near)
+            # Where there is no information left, Jeffreys' prior is 0.
+            if profile is None:
+                return FAR
+            near = profile.b
+            return float(fit.best - profile.best - lost)
 
         bounds = []
         for sign in (-1, 1):
+            near = fit.b
             inside, width = float(fit.b[term]), sign * float(self.errors(fit)[term])
             for _ in range(WIDENINGS):
                 outside = inside + width
-                if not excess(outside) < 0:
+                if excess(outside) >= 0:
                     break
                 inside, width = outside, 2 * width
-            if not excess(outside) >= 0:
+            else:
                 return None
             bounds.append(float(brentq(excess, inside, outside, xtol=1e-9)))
         return bounds[0], bounds[1]

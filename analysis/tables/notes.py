@@ -191,9 +191,9 @@ def ceiling_notes() -> list[str]:
     """What the human ceiling is drawn from."""
     return [
         "humans pass: share of 1000 human data sets with as many trials in each condition as the "
-        "row has in that with the fewest; outcomes from the published counts, gaps from the "
-        f"published regression with residuals of SD {HUMAN_GAP_SD_M} m; at the score: I1 to I4 "
-        "together. So often a perfect copy of the humans passes"
+        "row has on average; outcomes from the published counts, gaps from the published "
+        f"regression with residuals of SD {HUMAN_GAP_SD_M} m; at the score: I1 to I4 together. So "
+        "often a perfect copy of the humans passes"
     ]
 
 

@@ -33,7 +33,8 @@ def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
     """All drivers with their prompts; raises NotThere."""
     bar = scope_of(site, asked)
     found, table = verdicts_of(site, bar.scope, asked)
-    drivers = drivers_of(site, table, bar.scope)
+    chosen = bar.scope.drivers or bar.drivers
+    drivers = [one for one in drivers_of(site, table, bar.scope) if unmarked(one.name) in chosen]
     kinds = {kind: [one for one in drivers if one.kind == kind] for kind in KINDS}
     return site.render(
         "drivers.html",

@@ -128,16 +128,7 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
     }
     if table is None:
         return [
-            Driver(
-                name,
-                prompt,
-                LANGUAGE_MODEL if row["asked"] else PROGRAM,
-                {},
-                "",
-                row,
-                endpoints.get((name, prompt), ""),
-                {},
-            )
+            Driver(name, prompt, _kind(row), {}, "", row, endpoints.get((name, prompt), ""), {})
             for (name, prompt), row in facts.items()
         ]
     drivers = []
@@ -161,6 +152,13 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
             )
         )
     return drivers
+
+
+def _kind(row: Row) -> str:
+    """What kind of driver the list of trials tells."""
+    if row["who"] == "stand-ins":
+        return MOCK
+    return LANGUAGE_MODEL if row["asked"] else PROGRAM
 
 
 def _is_shown(one: Driver, scope: Scope) -> bool:
