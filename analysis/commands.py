@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -42,7 +41,7 @@ if TYPE_CHECKING:
 __all__ = ["app", "main"]
 
 HTML = b"<!doctype html"
-TOLD_EVERY_S = 10.0
+TOLD_EVERY = 100  # pages
 
 app.add_typer(human_app, name="human")
 app.command()(power)
@@ -75,6 +74,34 @@ ByOption = Annotated[
 ]
 
 
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option("--columns", metavar="A,B", help="Only these columns, by the names of CSV."),
+]
+AgainstOption = Annotated[
+    str | None,
+    typer.Option(
+        "--against",
+        metavar="paper",
+        help="Published values and differences, for drivers of that name.",
+    ),
+]
+AsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--as",
+        metavar="DRIVER",
+        help="With --against paper: every driver beside the paper's human, o3 or gemini-2.5-pro.",
+    ),
+]
+WithoutFallbacksOption = Annotated[
+    bool,
+    typer.Option(
+        "--without-fallbacks", help="Without the trials in which a reply held no valid plan."
+    ),
+]
+
+
 def _table_names() -> list[str]:
     from merge_runner_analysis.tables import TABLES
 
@@ -97,34 +124,11 @@ def tables(
     output: Annotated[
         TableFormat, typer.Option("--format", help="Form of the tables.")
     ] = TableFormat.TEXT,
-    columns: Annotated[
-        str | None,
-        typer.Option("--columns", metavar="A,B", help="Only these columns, by the names of CSV."),
-    ] = None,
-    against: Annotated[
-        str | None,
-        typer.Option(
-            "--against",
-            metavar="paper",
-            help="Published values and differences, for drivers of that name.",
-        ),
-    ] = None,
-    as_driver: Annotated[
-        str | None,
-        typer.Option(
-            "--as",
-            metavar="DRIVER",
-            help="With --against paper: every driver beside the paper's human, o3 or "
-            "gemini-2.5-pro.",
-        ),
-    ] = None,
+    columns: ColumnsOption = None,
+    against: AgainstOption = None,
+    as_driver: AsOption = None,
     by: ByOption = None,
-    without_fallbacks: Annotated[
-        bool,
-        typer.Option(
-            "--without-fallbacks", help="Without the trials in which a reply held no valid plan."
-        ),
-    ] = False,
+    without_fallbacks: WithoutFallbacksOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print the paper's tables III to VII, and further ones."""
@@ -160,7 +164,7 @@ def explain(
         str,
         typer.Argument(metavar="TABLE", autocompletion=_table_names, help="A table's name."),
     ],
-    cell: Annotated[str, typer.Argument(metavar="CELL", help="ROW, or ROW:COLUMN.")],
+    cell: Annotated[str, typer.Argument(metavar="ROW", help="ROW, or ROW:COLUMN.")],
     db: DbOption = DEFAULT_DB,
     where: WhereOption = None,
     study_file: StudyOption = None,
@@ -168,14 +172,14 @@ def explain(
     by: ByOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Explain a cell of a table: its meaning, query and trials."""
+    """Explain a row of a table: its query and trials, and those that a share counts."""
     use_study(study_file, trust=trust)
     from merge_runner_analysis.explain import explain as explain_cell
     from merge_runner_analysis.tables import finished_tables
 
     study = _study(db, None, where, study_file, by)
-    made = finished_tables(db, None, [table], study)
-    found = explain_cell(study, made[0], cell)
+    (made,) = finished_tables(db, None, [table], study)
+    found = explain_cell(study, made, cell)
     if as_json:
         print_out(json.dumps(asdict(found), indent=2, ensure_ascii=False))
     else:
@@ -336,7 +340,7 @@ def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[s
 
     try:
         if folder is not None:
-            index = export_folder(db, folder, wanted, _told_now_and_then())
+            index = export_folder(db, folder, wanted, _told)
             say(f"open {index}, or send the folder {folder}")
         if file is not None:
             say(f"wrote {export_page(db, file, wanted)}")
@@ -345,14 +349,6 @@ def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[s
         sys.exit(INTERRUPTED)
 
 
-def _told_now_and_then() -> Callable[[int], None]:
-    """Return what says the number of pages so far, now and then."""
-    said = time.monotonic()
-
-    def told(pages: int) -> None:
-        nonlocal said
-        if time.monotonic() - said >= TOLD_EVERY_S:
-            say(f"{pages} pages so far")
-            said = time.monotonic()
-
-    return told
+def _told(pages: int) -> None:
+    if pages % TOLD_EVERY == 0:
+        say(f"{pages} pages so far")

@@ -274,47 +274,46 @@ JOINT = register(
 )
 
 
-def _criticality(name: str, label: str, unit: str, meaning: str) -> Metric:
-    """A surrogate measure of safety, a column of ``trial_metrics``, summed up by its median."""
-    shown = frozenset[Place]({"criticality"})
-    return register(
+# Surrogate measures of safety: columns of ``trial_metrics``, summed up by their medians.
+for _name, _label, _unit, _meaning in (
+    (
+        "conflict_resolution_s",
+        "conflict resolution",
+        "s",
+        "until the vehicles are first off a collision course",
+    ),
+    ("time_to_merge_s", "time to merge", "s", "until the first vehicle reaches the merge point"),
+    (
+        "post_encroachment_s",
+        "PET",
+        "s",
+        "from when the first vehicle has left the merge point to when the second reaches it",
+    ),
+    (
+        "min_ttc_s",
+        "min. TTC",
+        "s",
+        "smallest time to collision after the first merge, where the vehicles close in faster than "
+        f"{NO_CONFLICT_MPS} m/s",
+    ),
+    (
+        "max_acceleration_mps2",
+        "max |a|",
+        "m/s²",
+        "largest absolute acceleration of either vehicle",
+    ),
+):
+    register(
         Metric(
-            name=name,
-            label=label,
-            unit=unit,
-            meaning=meaning,
-            value=name,
+            name=_name,
+            label=_label,
+            unit=_unit,
+            meaning=_meaning,
+            value=_name,
             estimator="median",
-            shown=shown,
+            shown=frozenset[Place]({"criticality"}),
         )
     )
-
-
-_criticality(
-    "conflict_resolution_s",
-    "conflict resolution",
-    "s",
-    "until the vehicles are first off a collision course",
-)
-_criticality(
-    "time_to_merge_s", "time to merge", "s", "until the first vehicle reaches the merge point"
-)
-_criticality(
-    "post_encroachment_s",
-    "PET",
-    "s",
-    "from when the first vehicle has left the merge point to when the second reaches it",
-)
-_criticality(
-    "min_ttc_s",
-    "min. TTC",
-    "s",
-    "smallest time to collision after the first merge, where the vehicles close in faster than "
-    f"{NO_CONFLICT_MPS} m/s",
-)
-_criticality(
-    "max_acceleration_mps2", "max |a|", "m/s²", "largest absolute acceleration of either vehicle"
-)
 RULES_NOTE = (
     f"{COLLISIONS.heading}: by the rule of the trials' scenario, in the paper centres closer than "
     f"a vehicle length at a step of 0.2 s; {BOXES.heading}: by the rule of the human experiment, "

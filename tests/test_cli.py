@@ -183,7 +183,7 @@ async def test_a_mistyped_name_is_answered_with_the_nearest(merge_runner):
         (["tables", "--format", "xml"], "latex"),
         (["report"], "there is no database"),
         (["figures", "--db", "no.duckdb"], "there is no database no.duckdb"),
-        (["explain", "gap"], "Missing argument 'CELL'"),
+        (["explain", "gap"], "Missing argument 'ROW'"),
     ],
 )
 async def test_bad_input_exits_2_with_a_clear_line_and_no_traceback(merge_runner, arguments, says):

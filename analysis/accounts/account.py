@@ -71,39 +71,33 @@ def account(course: Course, decisions: Decided, trial: Mapping[str, Any]) -> Acc
 
 
 def _near_miss(trial: Mapping[str, Any]) -> str:
-    gap = f"the gap was {trial['gap_m']:.1f} m when the first vehicle reached the merge point"
-    if trial["min_ttc_s"] is None:
-        return f"It came close: {gap}."
-    ttc_s = trial["min_ttc_s"]
-    return f"It came close: {gap}, and afterwards the time to collision fell to {ttc_s:.1f} s."
+    gap_m, ttc_s = trial["gap_m"], trial["min_ttc_s"]
+    later = "" if ttc_s is None else f", and afterwards the time to collision fell to {ttc_s:.1f} s"
+    return (
+        f"It came close: the gap was {gap_m:.1f} m when the first vehicle reached the merge point"
+        f"{later}."
+    )
 
 
 def _long_wait(course: Course, trial: Mapping[str, Any]) -> str:
-    alone_s, took_s = min(course.arrival_s(side, 0) for side in SIDES), trial["time_to_merge_s"]
-    reached = (
-        "Nobody had reached the merge point at the end"
-        if took_s is None
-        else f"The first vehicle reached the merge point after {took_s:.1f} s"
-    )
+    alone_s, took_s = min(course.arrival_s(side) for side in SIDES), trial["time_to_merge_s"]
+    reached = "Nobody had reached the merge point at the end"
+    if took_s is not None:
+        reached = f"The first vehicle reached the merge point after {took_s:.1f} s"
     return f"{reached}; at the initial speeds it would have been there after {alone_s:.1f} s."
 
 
 def _collision(course: Course, name: str) -> str:
     at = judged_at(course)
-    left, right = (course.change_mps(side, at) for side in SIDES)
-    when = (
-        "the end; nobody alone could have avoided it"
-        if at == course.last
-        else f"{_clock(course, at)}, when one driver alone could last have avoided it"
-    )
+    changes = (course.change_mps(side, at) for side in SIDES)
+    left, right = (f"{abs(mps):.1f} m/s {'faster' if mps >= 0 else 'slower'}" for mps in changes)
+    when = f"{_clock(course, at)}, when one driver alone could last have avoided it"
+    if at == course.last:
+        when = "the end; nobody alone could have avoided it"
     return (
-        f"{MEANINGS[name]}. At {when}, the left vehicle was {_change(left)} and the right one "
-        f"{_change(right)} than at the start; {ACTED_MPS:g} m/s or more count as acting."
+        f"{MEANINGS[name]}. At {when}, the left vehicle was {left} and the right one {right} than "
+        f"at the start; {ACTED_MPS:g} m/s or more count as acting."
     )
-
-
-def _change(change_mps: float) -> str:
-    return f"{abs(change_mps):.1f} m/s {'faster' if change_mps >= 0 else 'slower'}"
 
 
 def _avoidable(course: Course, side: Side, chance: int | None) -> str:

@@ -46,16 +46,16 @@ class Course:
         """How much faster a vehicle is than it was at the start of control."""
         return self.speeds_mps[side][sample] - self.speeds_mps[side][0]
 
-    def arrival_s(self, side: Side, sample: int) -> float:
-        """When a vehicle would be at the merge point if it kept its speed.
+    def arrival_s(self, side: Side) -> float:
+        """When a vehicle would be at the merge point if it kept its initial speed.
 
         inf: not before a trial is timed out.
         """
-        now_s, speed_mps = self.times_s[sample], self.speeds_mps[side][sample]
-        distance_m = self.track.merge_point_m - self.positions_m[side][sample]
-        if distance_m >= speed_mps * (self.scenario.timeout_s - now_s):
+        start_s, speed_mps = self.times_s[0], self.speeds_mps[side][0]
+        distance_m = self.track.merge_point_m - self.positions_m[side][0]
+        if distance_m >= speed_mps * (self.scenario.timeout_s - start_s):
             return inf
-        return now_s + distance_m / speed_mps
+        return start_s + distance_m / speed_mps
 
     def avoided(self, side: Side, action: float, since: int) -> bool:
         """Whether there is no collision if a side drives one action from a sample on."""

@@ -36,15 +36,6 @@ def human_counts() -> dict[str, HumanCounts]:
     }
 
 
-@cache
-def published_accounts() -> dict[str, dict[str, int]]:
-    """Collisions of the humans and of the published model by class."""
-    found: dict[str, dict[str, int]] = {}
-    for row in _rows("collision_accounts"):
-        found.setdefault(row["drivers"], {})[row["account"]] = int(row["collisions"])
-    return found
-
-
 def outcomes_table() -> tuple[SchemaTable, Path]:
     """The published outcomes as a table of an export, and their file."""
     (source,) = (row["citation"] for row in _rows("sources") if row["file"] == OUTCOMES)

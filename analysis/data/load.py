@@ -160,7 +160,7 @@ ORDER BY ALL
 # Fates of the attempts that were answered, also without a plan.
 ANSWERED = ("driven", "fallback")
 # One row a trial: what became of its calls and decisions. ``failures`` has the reason of each
-# answer without a valid plan; a retried attempt has no share in that of the answer.
+# answer without a valid plan, in lines; a retried attempt has no share in that of the answer.
 CALLS = """
 SELECT trial_id, spec_hash, attempts, calls, retried, lost, unknown, other_model, failures,
     decisions, fallback
@@ -171,7 +171,7 @@ FROM trials LEFT JOIN (
         count(*) FILTER (fate = 'lost') AS lost,
         count(*) FILTER (outcome = 'unknown') AS unknown,
         count(*) FILTER (fate IN {answered} AND {others}) AS other_model,
-        list(failure) FILTER (fate IN {answered} AND failure IS NOT NULL) AS failures
+        string_agg(failure, chr(10)) FILTER (fate IN {answered}) AS failures
     FROM attempts GROUP BY ALL
 ) USING (trial_id, spec_hash) LEFT JOIN (
     SELECT trial_id, spec_hash, count(*) AS decisions, count(*) FILTER (fallback) AS fallback
@@ -243,11 +243,6 @@ class Calls(NamedTuple):
 
     trials: pd.DataFrame
     others: list[Pair]
-
-
-def rows(frame: pd.DataFrame) -> list[Any]:
-    """The rows of a frame as tuples."""
-    return list(frame.itertuples(index=False, name=None))
 
 
 def load_calls(db: Path | str = DEFAULT_DB) -> Calls:

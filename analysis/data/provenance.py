@@ -15,8 +15,8 @@ from merge_runner.audit.checks import make_views
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.results.database import read_database
-from merge_runner.served_model import ALIASES, others_among
-from merge_runner_analysis.data.load import ANSWERED, load_each, load_specs, rows
+from merge_runner.served_model import other_models, sql_of
+from merge_runner_analysis.data.load import ANSWERED, load_each, load_specs
 from merge_runner_analysis.data.study import Group, Study, of_group
 
 SWEEPS = """
@@ -53,15 +53,15 @@ SELECT DISTINCT driver, variant, spec_hash
 FROM specs JOIN trials USING (spec_hash) JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE source NOT IN ('human', 'seat') ORDER BY ALL
 """
-# Answers by each model that answered.
-SERVED = f"""
+# Answers by each other model than was asked for.
+SERVED = """
 SELECT model_requested, model_served,
     count(DISTINCT (trial_id, spec_hash, side, decision)) AS answers,
     list_sort(list(DISTINCT sweep_id) FILTER (sweep_id IS NOT NULL)) AS sweeps
 FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
-WHERE fate IN {ANSWERED} AND model_served IS NOT NULL
+WHERE fate IN {answered} AND {others}
 GROUP BY ALL ORDER BY ALL
-"""  # noqa: S608 # constants
+"""
 SWEEP_COSTS = """
 SELECT sweep_id, name, sweep_costs.* EXCLUDE (sweep_id)
 FROM sweeps JOIN sweep_costs USING (sweep_id) ORDER BY started_at, sweep_id
@@ -123,32 +123,25 @@ class Provenance:
 
 def provenance(db: Path) -> Provenance:
     """Read the origin of a database's results."""
-    found = load_each(
-        {
-            "sweeps": SWEEPS,
-            "calls": CALLS,
-            "sweep_costs": SWEEP_COSTS,
-            "model_costs": MODEL_COSTS,
-            "specs": SPECS,
-            "served": SERVED,
-            "aliases": ALIASES,
-        },
-        db,
-    )
+    names = ("sweeps", "calls", "sweep_costs", "model_costs")
+    found = load_each(dict(zip(names, (SWEEPS, CALLS, SWEEP_COSTS, MODEL_COSTS), strict=True)), db)
     stored = load_specs(db)
-    specs = {row: stored[row.spec_hash] for row in found["specs"].itertuples(index=False)}
+    with read_database(db) as connection:
+        specs = {row: stored[row[2]] for row in connection.execute(SPECS).fetchall()}
+        others = sql_of(other_models(connection))
+        served = connection.execute(SERVED.format(answered=ANSWERED, others=others)).fetchall()
     return Provenance(
-        sweeps=found["sweeps"],
-        calls=found["calls"],
-        sweep_costs=found["sweep_costs"],
-        model_costs=found["model_costs"],
+        **found,
         switches={
-            f"{row.driver}/{row.variant} ({row.spec_hash})": _switched(spec) or "defaults"
-            for row, spec in specs.items()
+            f"{driver}/{variant} ({name})": _switched(spec) or "defaults"
+            for (driver, variant, name), spec in specs.items()
         },
-        mismatches=_mismatches(found["served"], found["aliases"]),
+        mismatches=[
+            Mismatch(asked, by, answers, tuple(sweeps or ()))
+            for asked, by, answers, sweeps in served
+        ],
         alike=_alike(db),
-        sent={row.spec_hash: _sent(spec) for row, spec in specs.items()},
+        sent={name: _sent(spec) for (_, _, name), spec in specs.items()},
     )
 
 
@@ -162,7 +155,7 @@ def tally(study: Study, group: Group) -> Counter[str]:
     """
     trials = of_group(study.calls.trials, group, group.trials)
     counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
-    failures = Counter(trials["failures"].explode().dropna())
+    failures = Counter("\n".join(trials["failures"].dropna()).splitlines())
     return Counter(
         dict(failures)
         | counts
@@ -208,17 +201,4 @@ def _sent(spec: Mapping[str, Any]) -> dict[str, dict[str, object]]:
 
 def _leaves(values: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
     for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _leaves(value)
-        else:
-            yield name, value
-
-
-def _mismatches(served: pd.DataFrame, aliases: pd.DataFrame) -> list[Mismatch]:
-    found = {
-        (row.model_requested, row.model_served): Mismatch(
-            row.model_requested, row.model_served, row.answers, tuple(row.sweeps or ())
-        )
-        for row in served.itertuples()
-    }
-    return [found[pair] for pair in others_among(found, rows(aliases))]
+        yield from _leaves(value) if isinstance(value, dict) else [(name, value)]

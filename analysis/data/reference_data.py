@@ -32,6 +32,11 @@ def published(name: str) -> pd.DataFrame:
     return pd.read_csv(DATA / f"{name}.csv", keep_default_na=False, na_values={})
 
 
+def printed_value(value: str | float) -> str | float:
+    """A printed number; a bound of p such as ``<0.001`` stays text."""
+    return float(value) if isinstance(value, str) and not value.startswith("<") else value
+
+
 @cache
 def citation(name: str) -> str:
     """Where the values of a shipped file come from."""

@@ -65,7 +65,6 @@ MEAN_SPEED = "mean_speed_mps"
 FIRST = (MODEL, PROMPT)
 USUAL = (BASELINE, DEFAULT, SELF)
 ONLY_ASKED = " [asked]"  # ends the name of a driver that was only asked
-OF_SWEEP = "SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = {sweep}"
 SPEC = ["spec_hash", "variant"]
 QUERIES = {
     "asked": ASKED_TRIALS,
@@ -73,6 +72,7 @@ QUERIES = {
     "levels": "FROM trial_levels",
     "traces": TRACES,
 }
+OF_SWEEP = "SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = {sweep}"
 NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
@@ -249,32 +249,37 @@ class Study:
         recorded = trials["source"] == HUMAN
         self.imported = _imported(trials[recorded], self.specs) if recorded.any() else None
         self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
-        driven = trials[~recorded]
+        driven, asked = trials[~recorded], found["asked"]
         if sweep:
             driven = driven.merge(self._read(OF_SWEEP.format(sweep=quoted(sweep))))
         if condition:
             driven = driven[driven["condition"] == condition]
             self.human = self.human.part(lambda rows: rows["condition"] == condition)
-        played, asked = self._groups(driven, found), found["asked"]
+        played = self._groups(driven, found)
         every = pd.concat([trials[SPEC], asked[SPEC]])
         self._sizes = every.value_counts(dropna=False).reset_index(name="trials")
         asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED), found)
+        self.empty = not played
+        kept, human = self._chosen_groups(played, asked, where or {})
+        self.played = [group for group in played if group in kept]
+        self.models, self.unjudged = _by_judgement(self.played)
+        self.asked, self.unjudged_asked = _by_judgement([g for g in asked if g in kept])
+        self.groups = [self.human, *self.models] if human else self.models
+
+    def _chosen_groups(
+        self, played: list[Group], asked: list[Group], where: Mapping[str, Sequence[str]]
+    ) -> tuple[list[Group], bool]:
+        """Those of the chosen drivers at these levels, and whether humans are among them."""
         # Those that were only asked are chosen by the names of their models.
         names = {group: group.driver for group in played}
         names |= {group: group.name.removesuffix(ONLY_ASKED) for group in asked}
         valid = list(dict.fromkeys([HUMAN, *names.values()]))
-        wanted = valid if models is None else list(models)
+        wanted = valid if self.chosen is None else list(self.chosen)
         for name in wanted or [""]:
             if name not in valid:
-                raise unknown_name("driver", name, valid, f"in {db}")
+                raise unknown_name("driver", name, valid, f"in {self.db}")
         kept = [group for group, name in names.items() if name in wanted]
-        if where:
-            kept = _at(where, kept, self.db, self.order)
-        self.empty = not played
-        self.played = [group for group in played if group in kept]
-        self.models, self.unjudged = _by_judgement(self.played)
-        self.asked, self.unjudged_asked = _by_judgement([g for g in asked if g in kept])
-        self.groups = [self.human, *self.models] if HUMAN in wanted else self.models
+        return _at(where, kept, self.db, self.order) if where else kept, HUMAN in wanted
 
     def _groups(self, trials: pd.DataFrame, found: Mapping[str, pd.DataFrame]) -> list[Group]:
         """The groups of these trials that were played for the study, if one was chosen."""
@@ -349,11 +354,6 @@ class Study:
     def baselines(self) -> list[Group]:
         """The humans and every driver with the baseline prompt."""
         return [group for group in self.groups if group.setting in {"", BASELINE}]
-
-    @property
-    def compared(self) -> list[Group]:
-        """The drivers' baselines that are set against the humans."""
-        return [group for group in self.models if group.setting == BASELINE and not group.caution]
 
     @property
     def measured(self) -> list[Group]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from typing import Annotated
 
@@ -30,6 +29,8 @@ def power(
     as_json: cli.JsonOption = False,
 ) -> None:
     """Say what a study could find and what it costs; send nothing."""
+    import asyncio
+
     from merge_runner.run.plan import Options, make_plan
     from merge_runner.run.sweep import unsent
     from merge_runner_analysis.data.study import Study
@@ -45,10 +46,9 @@ def power(
     rows = list(chances(plan, cost_usd, played, sims))
     if as_json:
         facts = {"study": plan.name, "trials": plan.trials, "cost_usd": cost_usd}
-        facts["chances"] = [row.values for row in rows]
-        cli.print_out(json.dumps(facts, ensure_ascii=False))
+        cli.print_out(json.dumps({**facts, "chances": [row.values for row in rows]}))
         return
     costs = "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
-    about = f"{plan.driver}, {plan.trials} trials, {costs}; {sims} simulated studies"
-    table = power_table(f"What the study {plan.name} can find ({about})", rows)
+    about = f"{plan.name} ({plan.driver}, {plan.trials} trials, {costs}; {sims} simulated studies)"
+    table = power_table(f"What can be found by {about}", rows)
     cli.print_out(render([table], TableFormat.TEXT, cli.terminal_width()))

@@ -25,13 +25,13 @@ class Ceiling:
 def ceiling(sizes: tuple[int, ...]) -> Ceiling:
     """Return the ceiling for ``sizes`` trials in the conditions of the humans.
 
-    It is that of the smallest of these, linear between the sizes of the curve, and constant beyond
-    its largest. Without a trial in some condition there is no share.
+    It is that of their mean, linear between the sizes of the curve, and constant beyond its
+    largest. Without a trial in some condition there is no share.
     """
     if not min(sizes):
         return Ceiling({}, {})
     curves = published("human_ceiling").groupby(["rule", "indicator"], sort=False)
     shares: dict[str, dict[str, float]] = {"paper": {}, "robust": {}}
     for (rule, indicator), curve in curves:
-        shares[rule][indicator] = float(np.interp(min(sizes), curve["n"], curve["share"]))
+        shares[rule][indicator] = float(np.interp(np.mean(sizes), curve["n"], curve["share"]))
     return Ceiling(**shares)

@@ -93,7 +93,7 @@ def difference(study: Study, level: Level, first: Level, metric: Metric) -> Diff
     None where these are of several studies, share no cell or have undecided trials; and for
     medians, which have no test.
     """
-    frames = _in_shared_cells(study, metric, level, first)
+    frames = _by_cell(study, metric, level, first)
     if frames is None or metric.estimator == "median":
         return None
     one, other = frames
@@ -131,8 +131,8 @@ def interaction(
     )
 
 
-def _in_shared_cells(study: Study, metric: Metric, *levels: Level) -> list[pd.DataFrame] | None:
-    """The trials of each level that have a measure, in the cells that all have, as conditions.
+def _by_cell(study: Study, metric: Metric, *levels: Level) -> list[pd.DataFrame] | None:
+    """The trials of each level that have a measure, with their cell as condition.
 
     None where these are of several studies or have undecided trials.
     """
@@ -140,11 +140,16 @@ def _in_shared_cells(study: Study, metric: Metric, *levels: Level) -> list[pd.Da
     if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
         return None
     frames = [trials_of(group, metric).dropna(subset=[metric.column]) for group in groups]
-    shared = set.intersection(*(set(frame["cell"]) for frame in frames))
-    return [
-        frame[frame["cell"].isin(shared)].assign(condition=lambda rows: rows["cell"])
-        for frame in frames
-    ]
+    return [frame.assign(condition=frame["cell"]) for frame in frames]
+
+
+def _in_shared_cells(study: Study, metric: Metric, *levels: Level) -> list[pd.DataFrame] | None:
+    """The same in the cells that all levels have."""
+    frames = _by_cell(study, metric, *levels)
+    if frames is None:
+        return None
+    shared = set.intersection(*(set(frame["condition"]) for frame in frames))
+    return [frame[frame["condition"].isin(shared)] for frame in frames]
 
 
 def balance(levels: list[Level]) -> str:

@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf, sqrt
-from typing import Protocol
 
 import numpy as np
 import pandas as pd
@@ -27,19 +26,9 @@ GAP_TERMS = (
     "abs_relative_velocity",
     "headway_x_velocity",
 )
-BY_SIDE = ("the left vehicle", "the right vehicle")
 MIN_PAIRS = 3  # fewer say nothing of how pairs vary
 # Gaps of a program can be equal but for the rounding of a step: that is no effect.
 STEADY_GAP_M = 0.01
-
-
-class _Fit(Protocol):
-    """What we read of statsmodels' results."""
-
-    params: Array
-    bse: Array
-    tvalues: Array
-    pvalues: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +129,7 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
     from statsmodels.tools.sm_exceptions import ConvergenceWarning
 
     design, left = who_first_data(trials)
-    problem = unfit_for_logit(design, left, vehicles(trials))
+    problem = unfit_for_logit(design, left)
     if problem:
         return Regression(len(left), {}, problem)
     with warnings.catch_warnings():
@@ -149,7 +138,9 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
         fit = Logit(left, design).fit(disp=0)
     if not fit.mle_retvals["converged"] or not np.isfinite(fit.bse).all():
         return Regression(len(left), {}, "the maximum likelihood fit does not converge")
-    return Regression(len(left), _terms(WHO_FIRST_TERMS, fit))
+    return Regression(
+        len(left), _terms(WHO_FIRST_TERMS, fit.params, fit.bse, fit.tvalues, fit.pvalues)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,10 +178,10 @@ def penalised(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Penalis
     then it is one model of both in which every term may differ.
     """
     design, left = who_first_data(trials)
-    n, problem = len(left), _unidentified(design, left, vehicles(trials))
+    n, problem = len(left), _unidentified(design, left)
     if less is not None:
         rest, rest_left = who_first_data(less)
-        problem = problem or _unidentified(rest, rest_left, vehicles(less))
+        problem = problem or _unidentified(rest, rest_left)
         design = np.block([[rest, 0 * rest], [design, design]])
         left = np.concatenate([rest_left, left])
     if problem:
@@ -246,7 +237,11 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
     told_apart = np.linalg.matrix_rank(covariance[2:, 2:]) == len(with_velocity)
     velocity_p = float(fit.f_test(with_velocity).pvalue) if told_apart else None
     return Regression(
-        len(gap), _terms(GAP_TERMS, fit), freedom=freedom, apart=apart, velocity_p=velocity_p
+        len(gap),
+        _terms(GAP_TERMS, fit.params, fit.bse, fit.tvalues, fit.pvalues),
+        freedom=freedom,
+        apart=apart,
+        velocity_p=velocity_p,
     )
 
 
@@ -276,35 +271,22 @@ def by_pairs(
     return Regression(whole.n, terms, freedom=freedom, remark=remark)
 
 
-def _terms(names: tuple[str, ...], fit: _Fit) -> dict[str, Term]:
-    return {
-        name: Term(float(b), float(se), float(statistic), float(p))
-        for name, b, se, statistic, p in zip(
-            names, fit.params, fit.bse, fit.tvalues, fit.pvalues, strict=True
-        )
-    }
+def _terms(names: tuple[str, ...], *columns: Array) -> dict[str, Term]:
+    """The terms from columns of estimates, errors, statistics and p."""
+    rows = np.column_stack(columns).tolist()
+    return {name: Term(*row) for name, row in zip(names, rows, strict=True)}
 
 
-def vehicles(trials: pd.DataFrame) -> tuple[str, str]:
-    """What the left vehicle and the right one are called: of two different drivers, by these."""
-    models = trials[["model_left", "model_right"]] if "model_left" in trials else trials.iloc[:0]
-    pairs = models.drop_duplicates().to_numpy().tolist()
-    if len(pairs) == 1 and pairs[0][0] != pairs[0][1]:
-        return pairs[0][0], pairs[0][1]
-    return BY_SIDE
-
-
-def unfit_for_logit(design: Array, left: Array, called: tuple[str, str] = BY_SIDE) -> str:
+def unfit_for_logit(design: Array, left: Array) -> str:
     """Why a logit has no finite maximum likelihood estimate, empty where it has."""
-    return _unidentified(design, left, called) or _separated(design, left)
+    return _unidentified(design, left) or _separated(design, left)
 
 
-def _unidentified(design: Array, left: Array, called: tuple[str, str]) -> str:
+def _unidentified(design: Array, left: Array) -> str:
     if len(left) <= design.shape[1] or np.linalg.matrix_rank(design) < design.shape[1]:
         return _too_few(len(left), "with a first merger")
     if left.min() == left.max():
-        first = called[0] if left[0] else called[1]
-        return f"{first} merged first in all {len(left)} trials: nothing to explain"
+        return f"who merged first is the same in all {len(left)} trials: nothing to explain"
     return ""
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from math import asin, inf, sin, sqrt
+from math import inf
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from merge_runner_analysis.data.reference_data import HUMAN_GAP_PAIR_SD_M, PAIRS
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import BOXES
 from merge_runner_analysis.stats import intervals, likeness
-from merge_runner_analysis.stats.contrasts import corrected, difference_of_rates
+from merge_runner_analysis.stats.contrasts import corrected, detectable_rate, difference_of_rates
 from merge_runner_analysis.stats.group_scores import fits, score
 from merge_runner_analysis.stats.indicators import Verdict
 from merge_runner_analysis.stats.intervals import Difference, newcombe, wilson
@@ -162,8 +162,8 @@ def _of_worst_cases(own: Estimate, human: Estimate) -> Difference | None:
     """
     if own.k is None or human.rate is None:
         return None
-    n = float(own.n)
-    cases = [_of_rates((k / n, n), human.rate) for k in (own.k, own.k + own.undecided)]
+    counts_of = (own.k, own.k + own.undecided)
+    cases = [_of_rates(_rate(k / own.n, own.n, own.n), human) for k in counts_of]
     least, most = cases
     nearest = min(cases, key=lambda one: abs(one.value))
     return replace(nearest, low=least.low, high=most.high, p=max(one.p for one in cases))
@@ -174,7 +174,7 @@ def _difference(own: Estimate, human: Estimate) -> Difference | None:
     if own.value is None or human.value is None:
         return None
     if own.rate and human.rate:
-        return _of_rates(own.rate, human.rate)
+        return _of_rates(own, human)
     if own.se is None or human.se is None:
         return None
     value = own.value - human.value
@@ -191,22 +191,15 @@ def _of_slopes(group: Group, human: Group, term: str) -> Difference | None:
     return Difference(slope.b, *bounds, slope.p, intervals.detectable(slope.se))
 
 
-def _of_rates(own: tuple[float, float], human: tuple[float, float]) -> Difference:
+def _of_rates(own: Estimate, human: Estimate) -> Difference:
     """How two rates differ, in percent."""
-    found = difference_of_rates([own, human])
-    low, high = newcombe([own, human])
-    least = _detectable_rate(own[1], human[1], 100 * human[0])
+    assert own.rate is not None
+    assert human.rate is not None
+    found = difference_of_rates([own.rate, human.rate])
+    low, high = newcombe([own.rate, human.rate])
+    least = detectable_rate(own.n, human.n, human.rate[0])
+    least = None if least is None else 100 * least
     return Difference(100 * found.value, 100 * low, 100 * high, found.p, least)
-
-
-def _detectable_rate(n: float, m: float, percent: float) -> float:
-    """How many points above ``percent`` of m trials a rate of n must lie to be found (80 %).
-
-    By the arcsine of the square root, whose variance is 1 / 4n (Cohen 1988).
-    """
-    apart = intervals.detectable(sqrt(1 / n + 1 / m)) / 2
-    highest = min(asin(sqrt(percent / 100)) + apart, asin(1.0))
-    return 100 * sin(highest) ** 2 - percent
 
 
 def _own(study: Study, group: Group, name: str) -> Estimate:

@@ -8,7 +8,7 @@ from typing import TypeGuard
 
 from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
-from merge_runner_analysis.data.reference_data import citation, published
+from merge_runner_analysis.data.reference_data import citation, printed_value, published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import shown_in
 from merge_runner_analysis.names import HUMAN
@@ -98,7 +98,9 @@ def _paper(table: str) -> dict[Key, dict[str, Value]]:
         rows = published(*FILES[table]).to_dict(orient="records")
         columns = ("n", "b", "se", {"who-first": "z", "gap": "t"}[table], "p")
         return {
-            (row["driver"], row["setting"], row["term"]): {c: _number(row[c]) for c in columns}
+            (row["driver"], row["setting"], row["term"]): {
+                c: printed_value(row[c]) for c in columns
+            }
             for row in rows
         }
     verdicts, measures = _verdicts(), _measures()
@@ -136,15 +138,8 @@ def _measures() -> dict[tuple[str, str], dict[str, Value]]:
         for metric in shown_in("tables"):
             human = row["driver"] == HUMAN
             if column := metric.paper_of_humans if human else metric.paper_of_drivers:
-                values[metric.name] = _number(row[column])
+                values[metric.name] = printed_value(row[column])
     return found
-
-
-def _number(printed: Value) -> Value:
-    """A printed value; a bound of p such as ``<0.001`` stays text."""
-    if isinstance(printed, str) and not printed.startswith("<"):
-        return float(printed)
-    return printed
 
 
 def _key(row: Row, named: str | None) -> Key:

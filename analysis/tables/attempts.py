@@ -72,8 +72,8 @@ def _condition(name: str) -> str:
     """Which trials have what a column counts, by the columns of ``Calls.trials``."""
     failures = {heading: failure for failure, heading in ANSWERS.items()}
     if name in failures or name not in MEANINGS:
-        return f"list_contains(failures, {quoted(failures.get(name, name))})"
-    own = {"trials": "", "failed": "status = 'failed'", "invalid": "len(failures) > 0"}
+        return f"list_contains(string_split(failures, chr(10)), {quoted(failures.get(name, name))})"
+    own = {"trials": "", "failed": "status = 'failed'", "invalid": "failures IS NOT NULL"}
     return own.get(name, f"{name} > 0")
 
 

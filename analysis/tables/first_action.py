@@ -29,9 +29,21 @@ from merge_runner_analysis.tables.model import (
     Value,
     row_of,
 )
-from merge_runner_analysis.tables.notes import repeated_notes, sample_notes
+from merge_runner_analysis.tables.notes import sample_notes
 
 FILE = "human_first_actions"
+NOTHING = (
+    "no trial that ended has a first action of both: none did, or with control_start = "
+    '"own_exit" one driver acts while the other is in its tunnel yet'
+)
+REPEATS = (
+    "{name} declares no chance, and does the same first in all repetitions of a situation: each "
+    "situation counts once"
+)
+ONLY_ASKED = (
+    "asked without the loop (`merge-runner sweep --first`), in {trials} trials that end before a "
+    "second decision"
+)
 # By the sign of the own relative velocity.
 VELOCITIES = {-1: "slower", 0: "equal", 1: "faster"}
 COLUMNS = (
@@ -71,9 +83,7 @@ def first_action(study: Study) -> Table:
             "the first word, of humans in one of who merged first; empty where a driver has no "
             "word, or the logit no finite estimate",
             *_human_notes(study),
-            *sample_notes(study, study.models, pooled=False, whole=False),
-            *_asked_notes(study),
-            *_left_out_notes(study),
+            *sample_notes(study, (*study.models, *study.asked), pooled=False, whole=False),
         ),
     )
 
@@ -87,8 +97,12 @@ def _rows(study: Study, group: Group) -> Iterator[Row]:
         rate = human_exchange_rate() if group is study.human else exchange_rate(rows)
         values: dict[str, Value] = {"driver": seat.name, "n": len(rows)}
         values |= _values(rows, rate) if len(rows) else {}
-        note = "" if len(rows) else "no trial that ended has a first action"
-        yield row_of(group, values, note, item=seat.side, counts=ENDED)
+        remarks = (
+            "" if len(rows) else NOTHING,
+            REPEATS.format(name=seat.name) if repeats_itself(study, seat) else "",
+            ONLY_ASKED.format(trials=len(group.ended)) if group in study.asked else "",
+        )
+        yield row_of(group, values, *remarks, item=seat.side, counts=ENDED)
 
 
 def _values(rows: pd.DataFrame, rate: Clustered | None) -> dict[str, Value]:
@@ -144,28 +158,3 @@ def _human_notes(study: Study) -> Iterator[str]:
         f"{known['caution']}"
     )
     yield f"human: exchange rate: {citation('human_outcomes')}"
-
-
-def _asked_notes(study: Study) -> Iterator[str]:
-    for group in study.asked:
-        yield (
-            f"{group.id}: asked without the loop (`merge-runner sweep --first`), in "
-            f"{len(group.ended)} trials that end before a second decision"
-        )
-    yield from repeated_notes(study.asked)
-
-
-def _left_out_notes(study: Study) -> Iterator[str]:
-    for group in (*study.models, *study.asked):
-        scenario = study.specs.get(group.spec_hash or "", {}).get("scenario", {})
-        if scenario.get("control_start") == "own_exit":
-            yield (
-                f'{group.id}: left out: with control_start = "own_exit" one driver acts while the '
-                "other is in its tunnel yet"
-            )
-        for seat in seats(group):
-            if repeats_itself(study, seat):
-                yield (
-                    f"{seat.name}: it declares no chance, and does the same first in all "
-                    "repetitions of a situation: each situation counts once"
-                )

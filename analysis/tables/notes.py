@@ -37,9 +37,9 @@ def sample_notes(
             f"{study.db} holds no trial of a model; `merge-runner sweep baseline` plays some"
         )
     notes += _pooled_notes(study, [group for group in shown if group.setting])
-    if study.human in study.groups:
+    if study.human in shown:
         notes += [*_human_notes(study, pooled), *_own_notes(study, shown)]
-    return [*notes, *repeated_notes(shown), *equal_notes(shown), *pair_notes(shown)]
+    return [*notes, *_repeated_notes(shown), *equal_notes(shown), *pair_notes(shown)]
 
 
 def _failed(group: Group) -> str:
@@ -110,7 +110,7 @@ def footnoted(table: Table, study: Study) -> Table:
     return replace(table, rows=rows, notes=(*table.notes, *notes))
 
 
-def repeated_notes(groups: Iterable[Group]) -> list[str]:
+def _repeated_notes(groups: Iterable[Group]) -> list[str]:
     """Say which deterministic drivers repeat their trials."""
     counts = [f"{g.id}: {g.repeated} of {len(g.stored.trials)}" for g in groups if g.repeated]
     if not counts:
@@ -191,9 +191,9 @@ def ceiling_notes() -> list[str]:
     """What the human ceiling is drawn from."""
     return [
         "humans pass: share of 1000 human data sets with as many trials in each condition as the "
-        "row has in that with the fewest; outcomes from the published counts, gaps from the "
-        f"published regression with residuals of SD {HUMAN_GAP_SD_M} m; at the score: I1 to I4 "
-        "together. So often a perfect copy of the humans passes"
+        "row has on average; outcomes from the published counts, gaps from the published "
+        f"regression with residuals of SD {HUMAN_GAP_SD_M} m; at the score: I1 to I4 together. So "
+        "often a perfect copy of the humans passes"
     ]
 
 

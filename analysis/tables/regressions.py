@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import cache
 
-from merge_runner_analysis.data.reference_data import citation, published
+from merge_runner_analysis.data.reference_data import citation, printed_value, published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.stats.group_scores import fits
 from merge_runner_analysis.stats.indicators import GAP_MARGIN_M, equivalence_p, furthest_apart
@@ -41,7 +41,7 @@ WITH_MERGER = "status = 'finished' AND merged_first IS NOT NULL"
 WITH_GAP = "gap_m IS NOT NULL"
 TESTED_ELSEWHERE = (
     "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
-    "table differences tests it"
+    "table verdicts tests it"
 )
 RANDOM_INTERCEPT = "random intercept per pair"
 KEYS = (
@@ -230,11 +230,6 @@ def _gap_clustered(group: Group) -> dict[str, tuple[str, Regression]]:
     }
 
 
-def _published_p(text: str) -> Value:
-    """A printed p-value; a bound such as ``<0.001`` stays text."""
-    return text if text.startswith("<") else float(text)
-
-
 def _mixed_notes(study: Study, table: str) -> tuple[str, ...]:
     """A note with the published mixed model, for comparison with the human rows."""
     if study.human not in study.groups:
@@ -263,7 +258,7 @@ def _published_gap(group: Group, term: str) -> Row:
             "b": float(printed["b"]),
             "se": float(printed["se"]),
             "t": float(printed["t"]),
-            "p": _published_p(str(printed["p"])),
+            "p": printed_value(printed["p"]),
         },
         f"published values, no human traces are imported ({citation('paper_gap')})",
         item=term,

@@ -10,7 +10,6 @@ from merge_runner_analysis.data.intermittency import measure_profiles
 from merge_runner_analysis.data.load import SPEEDS
 from merge_runner_analysis.data.study import Study, of_group
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer.analysis_worker import home_panels
 from merge_runner_analysis.figures.gallery import figure_2
 from merge_runner_analysis.figures.variant_figure import figure_2_variants
 from merge_runner_analysis.human.archive import open_files
@@ -87,16 +86,6 @@ def test_the_ceiling_of_humans_is_left_out_where_their_indicators_rest_on_both(i
         assert rows[f"human/{name}"].values["n"] == 55
         assert rows[f"human/{name}"].values.get("ceiling_paper") is None
         assert "990 published outcomes" in rows[f"human/{name}"].note
-
-
-def test_the_panels_have_published_outcomes_and_imported_gaps(imported):
-    found = home_panels(imported, "")
-    human = found["groups"][0]
-    assert human["label"] == "humans (66 of 990 imported)"
-    tie = human["conditions"]["N_0_0"]
-    assert tie["left_first_percent"]["n"] > 66 / 11
-    assert tie["gap_m"]["n"] <= 6
-    assert "66 imported trials" in found["caveat"]
 
 
 def test_humans_have_further_rows_with_errors_by_pair(imported):

@@ -72,14 +72,10 @@ def test_its_number_is_that_of_the_states_and_leads_to_its_trials(study, install
 
 
 @pytest.mark.long
-def test_the_report_shows_and_tells_it(report):
+def test_the_report_shows_it(report):
     text = unescape(report)
     assert HEADING in text
-    assert re.search(
-        r"projected-order comes to [0-9.]+ m/s² in the mean absolute acceleration, the mean of 3 "
-        rf"trials \(95 % CI .*\); {re.escape(NOTHING)}\.",
-        text,
-    )
+    assert NOTHING in text
     drawn = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)', report)
     assert any(f"<!-- {HEADING} -->" in b64decode(figure).decode() for figure in drawn)
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from math import inf
-
-import numpy as np
 import pytest
 
 from merge_runner.records import SIDES
 from merge_runner_analysis.accounts.account import Mark, account
 from tests.analysis.accounts.crashes import EXAMPLES, course_of, crash, decided, drive
-from tests.analysis.studies import Drive, played
+from tests.analysis.studies import played
 
 WORDS = {
     "both insisted": "Both insisted: both had sped up. At 2.0 s, when one driver alone could "
@@ -48,15 +45,6 @@ def test_of_each_driver_it_says_what_would_have_helped_and_what_it_did_instead()
         "on. Instead it sped up by 1.2 m/s² on average."
     )
     assert right.startswith("The right driver could still have avoided it at 2.0 s")
-
-
-def test_a_vehicle_that_stands_or_creeps_would_never_arrive():
-    record = played(Drive("o3", "baseline", "N_0_0", 1, (-1.0,) * 4 + (0.002,) * 2, ()))
-    course = course_of(record)
-    at = np.round(course.times_s, 6).tolist().index
-    assert course.arrival_s("left", at(4.0)) == inf
-    assert 0 < course.speeds_mps["left"][at(5.0)] < 0.01
-    assert course.arrival_s("left", at(5.0)) == inf
 
 
 def test_a_change_of_mind_is_marked_once():

@@ -134,7 +134,7 @@ def test_who_goes_first_is_told_of_the_ego_on_either_side(played):
     assert set(finished["merged_first"]) == {"left"}, "who brakes is never first"
     assert set(finished["model_left"]) == {"goes"}
     (group,) = (group for group in study.models if group.driver == "goes+brakes")
-    assert fits(group).logit.problem.startswith("goes merged first in all")
+    assert fits(group).logit.problem.startswith("who merged first is the same in all")
     (table,) = make_tables(study, ["who-first"])
     (note,) = (note for note in table.notes if note.startswith("of two different drivers left"))
     assert (

@@ -59,8 +59,9 @@ def test_a_ceiling_is_that_of_the_curve_and_between_its_sizes_linear():
     assert ceiling(even(500)) == ceiling(even(200))
 
 
-def test_the_condition_with_the_fewest_trials_decides():
-    assert ceiling((5, *even(10)[1:])) == ceiling(even(5))
+def test_the_mean_size_decides_and_every_condition_needs_a_trial():
+    uneven = ceiling((9, 11, *even(10)[2:]))
+    assert uneven == ceiling(even(10))
     assert ceiling((0, *even(10)[1:])) == Ceiling({}, {})
 
 

@@ -11,7 +11,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.stats.intervals import newcombe, two_sided_p
 from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, who_first_data
-from merge_runner_analysis.stats.verdicts import _of_rates, compared, of_humans
+from merge_runner_analysis.stats.verdicts import _of_rates, _rate, compared, of_humans
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.verdict_words import (
     MEASURES,
@@ -86,12 +86,12 @@ def test_a_slope_of_who_goes_first_has_the_interval_of_its_profile(tmp_path, nam
 
 
 def test_a_difference_of_rates_is_newcombes_and_its_p_the_level_that_leaves_0_out():
-    found = _of_rates((0.5, 20), (0.1, 50))
+    found = _of_rates(_rate(0.5, 20, 20), _rate(0.1, 50, 50))
     low, high = newcombe([(0.5, 20), (0.1, 50)])
     assert found.bounds() == pytest.approx((100 * low, 100 * high))
     z = stats.norm.isf(found.p / 2)
     assert newcombe([(0.5, 20), (0.1, 50)], z)[0] == pytest.approx(0, abs=1e-9)
-    assert _of_rates((0.2, 20), (0.2, 50)).p == two_sided_p(0.0) == 1
+    assert _of_rates(_rate(0.2, 20, 20), _rate(0.2, 50, 50)).p == two_sided_p(0.0) == 1
 
 
 def test_interval_and_p_of_a_difference_agree(rows):

@@ -169,8 +169,8 @@ def test_a_driver_without_chance_in_a_mixed_pair_counts_once_in_each_situation(t
     assert rows["alike+zero/baseline/left"]["n"] == 44
     assert rows["alike+zero/baseline/right"]["n"] == 11
     assert rows["alike+zero/baseline/right"]["mean_equal"] == pytest.approx(0.25)
-    (note,) = [note for note in table.notes if "declares no chance" in note]
-    assert note.startswith("zero of alike+zero: it declares no chance, and does the same")
+    (note,) = {row.note for row in table.rows if "declares no chance" in row.note}
+    assert note.startswith("zero of alike+zero declares no chance, and does the same")
 
 
 @pytest.mark.slow
@@ -203,8 +203,8 @@ def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_action
         twin = driven[name.replace(" [asked]", "")]
         assert " [asked]" in row.values["driver"]
         assert row.values | {"driver": twin.values["driver"]} == twin.values
-    (note, _) = [note for note in table.notes if "asked without the loop" in note]
-    assert note.startswith("emulator [asked]/baseline: ")
+    note = driven["emulator [asked]/baseline"].note
+    assert "asked without the loop" in note
     assert "in 22 trials" in note
     (source,) = explain(study, table, "emulator [asked]/baseline:slope").sources
     assert len(source.trials) == len(load(source.query, study.db)) == 22
@@ -281,7 +281,7 @@ def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(
     first, words = make_tables(study, ["first-action", "words"])
     (row,) = [row for row in first.rows if row.id.startswith("emulator")]
     assert row.values["n"] == 0
-    assert any('"own_exit" one driver acts while' in note for note in first.notes)
+    assert '"own_exit" one driver acts while' in row.note
     assert words.rows[0].values["first_n"] == 8, "each driver has a first word, also a later one"
 
 
