@@ -72,7 +72,8 @@ class Counts:
                 return Fit(b, best)  # no direction is uphill but for rounding
             if np.abs(step).max(initial=0) < CONVERGED:
                 return Fit(b, best)
-        return self._climbed(b, free)
+        # Of a profile the likelihood alone counts, which the last small steps hardly change.
+        return self._climbed(b, free) or (Fit(b, best) if held else None)
 
     def _climbed(self, b: Array, free: list[int]) -> Fit | None:
         """Return the fit by quasi-Newton steps, for where the information misses the curvature.
@@ -118,7 +119,8 @@ class Counts:
 
         def excess(value: float) -> float:
             nonlocal near
-            profile = self.fit({term: value}, near)
+            fits = [self.fit({term: value}, start) for start in (near, fit.b)]
+            profile = max(filter(None, fits), key=lambda each: each.best, default=None)
             if profile is None:
                 return np.nan
             near = profile.b
