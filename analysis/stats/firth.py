@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.optimize import brentq, linprog
+from scipy.optimize import brentq, linprog, minimize
 from scipy.special import expit
 
 Array = NDArray[np.float64]
@@ -23,9 +23,9 @@ LONGEST_STEP = 5.0
 CONVERGED = 1e-8
 # Of a log-likelihood: what is smaller than this is no loss.
 ROUNDING = 1e-11
-UNSEEN = 1e-9
-WIDENINGS = 40
-FAR = 1e6  # a loss of log-likelihood that no data make up for
+WIDENINGS, WIDER = 40, 1.3
+# The largest slope of a likelihood at its top: what is aimed at, and what is still taken for one.
+FLAT, SLOPING = 1e-7, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +49,6 @@ class Counts:
     ) -> Fit | None:
         """Return the fit with some coefficients ``held``, or None where it does not converge.
 
-        From a ``start`` on it is a profile, of which the likelihood alone counts.
-
         Newton steps on Firth's score with the whole design's information, halved where they do not
         increase the penalised likelihood (Heinze and Schemper 2002).
         """
@@ -67,14 +65,39 @@ class Counts:
             for _ in range(HALVINGS):
                 reached = self._penalised(b + step)
                 if reached >= best - ROUNDING:
+                    b, best = b + step, max(reached, best)
                     break
                 step /= 2
             else:
                 return Fit(b, best)  # no direction is uphill but for rounding
-            gained, b, best = reached - best, b + step, max(reached, best)
-            if np.abs(step).max(initial=0) < CONVERGED or (start is not None and gained < UNSEEN):
+            if np.abs(step).max(initial=0) < CONVERGED:
                 return Fit(b, best)
-        return Fit(b, best) if held else None  # the last small steps change no likelihood
+        # Of a profile the likelihood alone counts, which the last small steps hardly change.
+        return self._climbed(b, free) or (Fit(b, best) if held else None)
+
+    def _climbed(self, b: Array, free: list[int]) -> Fit | None:
+        """Return the fit by quasi-Newton steps, for where the information misses the curvature.
+
+        That is so far from the estimate, and where data are separated.
+        """
+
+        def placed(values: Array) -> Array:
+            whole = b.copy()
+            whole[free] = values
+            return whole
+
+        try:
+            found = minimize(
+                lambda values: -self._penalised(placed(values)),
+                b[free],
+                jac=lambda values: -self._score(placed(values))[free],
+                method="BFGS",
+                options={"gtol": FLAT},
+            )
+        except np.linalg.LinAlgError:
+            return None
+        flat = np.abs(found.jac).max(initial=0) < SLOPING
+        return Fit(placed(found.x), -float(found.fun)) if flat else None
 
     def p(self, fit: Fit, term: int) -> float | None:
         """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""
@@ -92,15 +115,14 @@ class Counts:
         None where no bound is found.
         """
         lost = stats.chi2.ppf(level, 1) / 2
-
         near = fit.b  # the last profile: far out the other terms are far from the estimate, too
 
         def excess(value: float) -> float:
             nonlocal near
-            profile = self.fit({term: value}, near)
-            # Where there is no information left, Jeffreys' prior is 0.
+            fits = [self.fit({term: value}, start) for start in (near, fit.b)]
+            profile = max(filter(None, fits), key=lambda each: each.best, default=None)
             if profile is None:
-                return FAR
+                return np.nan
             near = profile.b
             return float(fit.best - profile.best - lost)
 
@@ -110,12 +132,15 @@ class Counts:
             inside, width = float(fit.b[term]), sign * float(self.errors(fit)[term])
             for _ in range(WIDENINGS):
                 outside = inside + width
-                if excess(outside) >= 0:
+                if not excess(outside) < 0:
                     break
-                inside, width = outside, 2 * width
-            else:
+                inside, width = outside, WIDER * width
+            if not excess(outside) >= 0:
                 return None
-            bounds.append(float(brentq(excess, inside, outside, xtol=1e-9)))
+            try:
+                bounds.append(float(brentq(excess, inside, outside, xtol=1e-9)))
+            except ValueError:  # a profile in between does not converge
+                return None
         return bounds[0], bounds[1]
 
     def infinite(self) -> NDArray[np.bool_]:
@@ -147,12 +172,19 @@ class Counts:
     def _step(self, b: Array, free: list[int]) -> Array:
         """Return a Newton step of the ``free`` coefficients, (terms,)."""
         p = expit(self.design @ b)
-        weights = self.n * p * (1 - p)
-        information = self._information(weights)
-        # Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
-        # split, and half of its leverage had gone either way (Heinze and Schemper 2002).
-        leverage = weights * ((self.design @ np.linalg.inv(information)) * self.design).sum(axis=1)
-        score = (self.chosen - self.n * p + leverage * (0.5 - p)) @ self.design
+        information = self._information(self.n * p * (1 - p))
         step = np.zeros_like(b)
-        step[free] = np.linalg.solve(information[np.ix_(free, free)], score[free])
+        step[free] = np.linalg.solve(information[np.ix_(free, free)], self._score(b)[free])
         return np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+
+    def _score(self, b: Array) -> Array:
+        """Return the gradient of the penalised log-likelihood, (terms,).
+
+        Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
+        split, and half of its leverage had gone either way (Heinze and Schemper 2002).
+        """
+        p = expit(self.design @ b)
+        weights = self.n * p * (1 - p)
+        inverse = np.linalg.inv(self._information(weights))
+        leverage = weights * ((self.design @ inverse) * self.design).sum(axis=1)
+        return np.asarray((self.chosen - self.n * p + leverage * (0.5 - p)) @ self.design)

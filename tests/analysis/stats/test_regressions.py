@@ -266,7 +266,7 @@ def test_a_difference_of_groups_is_the_interaction_of_a_penalised_model_of_both(
     )
 
 
-def test_small_and_separated_data_have_intervals_about_their_estimates():
+def test_small_and_separated_data_have_intervals_about_their_estimates_or_none():
     for seed in range(12):
         few, others = (
             drawn(seed + k, 1, *np.random.default_rng(seed).normal(0, 3, 3)) for k in (0, 50)
@@ -275,8 +275,8 @@ def test_small_and_separated_data_have_intervals_about_their_estimates():
             if isinstance(fit, str):
                 continue
             for name, term in fit.terms.items():
-                low, high = fit.interval(name)
-                assert low < term.b < high
+                bounds = fit.interval(name)
+                assert bounds is None or bounds[0] < term.b < bounds[1]
 
 
 def test_the_penalised_fit_takes_the_iterations_that_separation_needs():
