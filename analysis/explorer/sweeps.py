@@ -245,7 +245,7 @@ class VariantCondition:
     planned: int = 0
     ended: int = 0
     failed: int = 0
-    decisions: int = 0
+    asked: int = 0
     invalid: int = 0
     state: dict[str, str] = field(default_factory=dict)
 
@@ -378,7 +378,7 @@ def cells_of(entry: ListedSweep, stored: list[Row]) -> dict[tuple[str, str], Var
             planned=planned.get(key, 0),
             ended=row.get("ended", 0),
             failed=row.get("failed", 0),
-            decisions=row.get("decisions", 0),
+            asked=row.get("asked", 0) or row.get("decisions", 0),
             invalid=row.get("invalid", 0),
             state=states.get(key[0], {"variant": key[0]}),
         )
@@ -407,6 +407,10 @@ def rates_of(
     pair = next(iter(mismatches)) if len(mismatches) == 1 else ""
     other = {"cause": f"model: {pair}"} if pair else {}
     played, attempts = sums["ended"] + sums["failed"], outcomes.total()
+    # A program's decisions count where no model was asked.
+    decided, decisions = sums["asked"] or sums["decisions"], "decisions"
+    if sums["asked"]:
+        decisions = "decisions asked"
     return [
         Rate(name, count, of, things, meaning, {"sweep": sweep_id, **state} if state else {})
         for name, count, of, things, meaning, state in (
@@ -415,9 +419,9 @@ def rates_of(
             ("failed trials", sums["failed"], played, "stored trials",
              "a call got no answer; the trial has no outcome and can be played anew",
              {"outcome": "failed"}),
-            ("invalid replies", sums["invalid"], sums["decisions"], "decisions",
+            ("invalid replies", sums["invalid"], decided, decisions,
              "the reply held no valid plan", {"validity": "fallbacks"}),
-            ("fallbacks", sums["fallbacks"], sums["decisions"], "decisions",
+            ("fallbacks", sums["fallbacks"], decided, decisions,
              "an older plan was driven on, or none", {"validity": "fallbacks"}),
             ("refusals", outcomes["refusal"], attempts, "attempts",
              "the model, or a filter before it, declined", {"cause": "attempt: refusal"}),

@@ -100,7 +100,7 @@ def _total(variant: str, cells: list[VariantCondition | None]) -> VariantConditi
         planned=sum(cell.planned for cell in there),
         ended=sum(cell.ended for cell in there),
         failed=sum(cell.failed for cell in there),
-        decisions=sum(cell.decisions for cell in there),
+        asked=sum(cell.asked for cell in there),
         invalid=sum(cell.invalid for cell in there),
         state=there[0].state,
     )
