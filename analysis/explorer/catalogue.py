@@ -348,21 +348,19 @@ class Catalogue:
         factors = [f"{FACTOR}{name}" for name in self.factors()]
         found: dict[str, list[tuple[str, int]]] = {name: [] for name in (*FACETS, *factors)}
         counts, values = [], list[Any]()
-        for name in FACETS:
+        for name in found:
             where, wants = wanted.where(leave_out=name)
-            table = f"listed JOIN {SEVERAL[name]} USING (number)" if name in SEVERAL else "listed"
+            table, value = "listed", name
+            if name in SEVERAL:
+                table = f"listed JOIN {SEVERAL[name]} USING (number)"
+            elif name in factors:
+                table, value = "listed JOIN (FROM levels WHERE factor = ?) USING (number)", "level"
+                wants = [name.removeprefix(FACTOR), *wants]
             counts.append(
-                f"SELECT '{name}' AS facet, {name} AS value, count(*) AS trials FROM {table} "  # noqa: S608 # constants
-                f"WHERE {where} AND value IS NOT NULL GROUP BY ALL"
+                f"SELECT ? AS facet, {value} AS value, count(*) AS trials FROM {table} "  # noqa: S608 # constants
+                f"WHERE {where} AND {value} IS NOT NULL GROUP BY ALL"
             )
-            values += wants
-        for name in factors:
-            where, wants = wanted.where(leave_out=name)
-            counts.append(
-                "SELECT ? || factor AS facet, level AS value, count(*) AS trials "  # noqa: S608 # constants
-                f"FROM listed JOIN levels USING (number) WHERE factor = ? AND {where} GROUP BY ALL"
-            )
-            values += [FACTOR, name.removeprefix(FACTOR), *wants]
+            values += [name, *wants]
         for row in self.ask(f"{' UNION ALL '.join(counts)} ORDER BY ALL", *values):
             found[row["facet"]].append((row["value"], row["trials"]))
         return found
@@ -377,19 +375,12 @@ class Catalogue:
         """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``."""
         return {row["who"]: row for row in self.counts(wanted, "who")}
 
-    def counts(self, wanted: Filter, *columns: str, factor: str = "") -> list[Row]:
-        """What a filter's trials come to by columns; ``level`` is one where a factor is named.
-
-        Counts over all of them, and means over those that have the value.
-        """
+    def counts(self, wanted: Filter, *columns: str) -> list[Row]:
+        """What a filter's trials come to by columns: counts of all, means of those with a value."""
         where, values = wanted.where()
-        source = "listed"
-        if factor:
-            source += " JOIN (FROM levels WHERE factor = ?) USING (number)"
-            values = [factor, *values]
         named = ", ".join(columns)
         return self.ask(
-            f"SELECT {named}, {COUNTS} FROM {source} WHERE {where} GROUP BY {named} "  # noqa: S608 # constants
+            f"SELECT {named}, {COUNTS} FROM listed WHERE {where} GROUP BY {named} "  # noqa: S608 # constants
             f"ORDER BY {named}",
             *values,
         )

@@ -11,7 +11,6 @@ from typing import Any
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
-from merge_runner_analysis.data.driver_words import unresponsive
 from merge_runner_analysis.explorer.prompts import Part, parts_of
 from merge_runner_analysis.explorer.reading import Row, reading, records
 
@@ -33,7 +32,7 @@ FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) {ONE}
 ORDER BY decision, side
 """  # noqa: S608 # constants
 TASKS = f"""
-SELECT trial_id, spec_hash, source, spec
+SELECT source, spec
 FROM (FROM trials {ONE}) LEFT JOIN specs USING (spec_hash)
 """  # noqa: S608 # constants
 # Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz.
@@ -46,16 +45,13 @@ ATTEMPTS = f"SELECT * FROM calls {ONE} ORDER BY attempt"  # noqa: S608 # constan
 class Trial:
     """A trial's samples by side and its decisions without prompts, and the task it is of.
 
-    ``paces`` say when each driver decided, ``caution`` whether a human is replayed.
+    ``paces`` say when each driver decided.
     """
 
-    trial_id: str
-    spec_hash: str
     scenario: ScenarioConfig
     paces: dict[Side, Pace]
     states: dict[Side, Row]
     decisions: list[Row]
-    caution: str
 
     @property
     def end_s(self) -> float:
@@ -88,7 +84,20 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
         states = records(connection, STATES, key)
         decisions = records(connection, DECISIONS, key)
         (task,) = records(connection, TASKS, key)
-    return _trial(task, states, decisions)
+    told = json.loads(task["spec"] or "{}")
+    scenario = scenario_of(task["source"], told.get("scenario"))
+    samples = {row["side"]: row for row in states}
+    trial = Trial(
+        scenario,
+        {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
+        {side: samples[side] for side in SIDES if side in samples},
+        decisions,
+    )
+    for row in decisions:
+        if row["lost"]:
+            row["time_s"] = trial.end_s
+        row["driven"] = row["time_s"] < trial.end_s
+    return trial
 
 
 def read_decisions(db: Path, trial_id: str, spec_hash: str) -> dict[tuple[str, int], Decision]:
@@ -113,26 +122,6 @@ def read_decisions(db: Path, trial_id: str, spec_hash: str) -> dict[tuple[str, i
             attempts.get((side, number), []),
         )
     return decisions
-
-
-def _trial(task: Row, states: list[Row], decisions: list[Row]) -> Trial:
-    told = json.loads(task["spec"] or "{}")
-    scenario = scenario_of(task["source"], told.get("scenario"))
-    samples = {row["side"]: row for row in states}
-    trial = Trial(
-        task["trial_id"],
-        task["spec_hash"],
-        scenario,
-        {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
-        {side: samples[side] for side in SIDES if side in samples},
-        decisions,
-        unresponsive(told),
-    )
-    for row in decisions:
-        if row["lost"]:
-            row["time_s"] = trial.end_s
-        row["driven"] = row["time_s"] < trial.end_s
-    return trial
 
 
 def scenario_of(source: str, told: Mapping[str, Any] | None) -> ScenarioConfig:

@@ -11,7 +11,7 @@ import os
 import secrets
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -67,7 +67,6 @@ class Kept:
 
     notes: tuple[Note, ...] = ()
     damage: tuple[str, ...] = ()
-    of_trial: dict[tuple[str, str], list[Note]] = field(default_factory=dict)
     tags: tuple[tuple[str, str, str], ...] = ()
     """Of each trial and its decisions: (trial, spec, tag), each once."""
 
@@ -97,7 +96,7 @@ class Notes:
 
     def of(self, trial_id: str, spec_hash: str) -> list[Note]:
         """The notes of a trial."""
-        return self.kept().of_trial.get((trial_id, spec_hash), [])
+        return [note for note in self.kept().notes if note.trial == (trial_id, spec_hash)]
 
     def add(
         self,
@@ -137,11 +136,8 @@ class Notes:
                 notes.setdefault(entry.id, entry)
             elif entry.withdraws in notes and notes[entry.withdraws].reader == entry.reader:
                 del notes[entry.withdraws]
-        of_trial: dict[tuple[str, str], list[Note]] = {}
-        for note in notes.values():
-            of_trial.setdefault(note.trial, []).append(note)
         tags = sorted({(*note.trial, tag) for note in notes.values() for tag in note.tags})
-        return Kept(tuple(notes.values()), tuple(damage), of_trial, tuple(tags))
+        return Kept(tuple(notes.values()), tuple(damage), tuple(tags))
 
     def _append(self, entry: Note | Withdrawal) -> None:
         """Add a line; raises UsageError."""

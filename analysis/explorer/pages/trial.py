@@ -78,7 +78,7 @@ def shown(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
     return {
         "row": row,
         "outcome": views.outcome_text(row, trial.scenario),
-        "facts": [*views.facts(row), *([f"Note: {trial.caution}."] if trial.caution else [])],
+        "facts": views.facts(row),
         "judged": views.judged_text(trial.scenario),
         "view_box": views.view_box(),
         "data": embedded(replayed(site, row, trial, account)) if trial.states else None,
