@@ -16,10 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import duckdb
+
 from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.registry import in_use, use
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import catalogue_of
+from merge_runner.text_safety import first_line
 from merge_runner_analysis.explorer.analysis_worker import Numbers
 from merge_runner_analysis.explorer.catalogue import State, stamp_of
 
@@ -82,7 +85,10 @@ class Answering:
 
     def _answer(self, request: Request) -> dict[str, Any]:
         assert self._numbers is not None
-        return self._numbers.answer(request)
+        try:
+            return self._numbers.answer(request)
+        except duckdb.Error as exc:  # as where the file is replaced while it is read
+            raise UsageError(f"{self.db} cannot be read: {first_line(exc)}") from exc
 
 
 class Worker:

@@ -53,7 +53,7 @@ FIRST_TIME = (
     "The trials are read for the first time; ten thousand take about ten seconds. This page comes "
     "back by itself."
 )
-KINDS = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}
+CSV = "text/csv; charset=utf-8"
 # What a name of a trial may hold and the name of a file had better not.
 FILE_NAME = re.compile(r"[^A-Za-z0-9_.-]+")
 MOST_NOTED = 65_536  # bytes of a form with a note
@@ -106,13 +106,10 @@ def _sweep_routes(site: Site) -> list[Route]:
 def _trial_routes(site: Site) -> list[Route]:
     def export(request: Request) -> Response:
         site.refresh()
-        form = request.path_params["form"]
-        if form not in KINDS:
-            raise NotThere(f"trials come as {' or '.join(KINDS)}")
         asked = request.query_params
         wanted = trials.export_filter(site, asked)
-        content = site.catalogue.export(wanted, trials.sort_of(asked), form)
-        return _download(content, KINDS[form], f"trials.{form}")
+        content = site.catalogue.export(wanted, trials.sort_of(asked))
+        return _download(content, CSV, "trials.csv")
 
     def raw(request: Request) -> Response:
         text = trial.raw_reply(site, request.path_params["trial"], request.query_params)
@@ -140,7 +137,7 @@ def _trial_routes(site: Site) -> list[Route]:
     return [
         Route("/trials", listing),
         Route("/trials/", page_of_all),
-        Route("/trials.{form}", export),
+        Route("/trials.csv", export),
         Route("/trials/{trial:path}", _page(site, one)),
         Route("/decisions/{trial:path}", _page(site, fragment)),
         Route("/others/{trial:path}", _page(site, others)),
@@ -246,7 +243,7 @@ def _sql_routes(site: Site) -> list[Route]:
             content = sql.sql_csv(site, request.query_params)
         except MergeRunnerError as exc:
             return HTMLResponse(sql.sql_page(site, request.query_params, problem=str(exc)), 400)
-        return _download(content, KINDS["csv"], "query.csv")
+        return _download(content, CSV, "query.csv")
 
     return [Route("/sql", sql_query), Route("/sql.csv", sql_download)]
 
@@ -255,7 +252,7 @@ def _words_routes(site: Site) -> list[Route]:
     """Search in words, and what readers note; see ``Guard`` for who may write."""
 
     def as_csv(_: Request) -> Response:
-        return _download(notes.notes_csv(site), KINDS["csv"], "notes.csv")
+        return _download(notes.notes_csv(site), CSV, "notes.csv")
 
     def write(request: Request, form: Mapping[str, str]) -> Response:
         site.refresh()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import json
-import tempfile
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -20,7 +20,7 @@ from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, schema_sql
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import ALIASES, others_among
-from merge_runner.text_safety import csv_writer, quoted
+from merge_runner.text_safety import csv_writer
 from merge_runner_analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
 from merge_runner_analysis.accounts.course import Course
 from merge_runner_analysis.data.driver_words import language_models, stand_in, unresponsive
@@ -42,38 +42,17 @@ WHERE one.model = ? AND one.variant = ? AND base.variant = 'baseline' AND one.so
     AND one.{fate} IS NOT NULL AND base.{fate} IS NOT NULL
 ORDER BY one.trial_id, one.spec_hash, base.spec_hash
 """
-# What is known of each trial. Texts and prompts stay in the database. ``tried`` are its attempts,
-# counted where they are alike; ``levels`` are those of its study's own factors, ``flaws`` says of
-# each invalid reply what is wrong with it, and ``posed`` on which sides a stand-in answered.
-LISTED = """
+# ``tried`` are a trial's attempts, counted where they are alike.
+BEGUN = """
 CREATE SEQUENCE numbers;
-CREATE TABLE listed (
-    number INTEGER DEFAULT nextval('numbers'), trial_id VARCHAR, spec_hash VARCHAR,
-    source VARCHAR, who VARCHAR, model_left VARCHAR, model_right VARCHAR, model VARCHAR,
-    variant VARCHAR, condition VARCHAR, projected_headway_m DOUBLE, relative_velocity_mps DOUBLE,
-    rep INTEGER, pair VARCHAR,
-    status VARCHAR, merged_first VARCHAR, outcome VARCHAR, validity VARCHAR, end_time_s DOUBLE,
-    error VARCHAR, scripted BOOLEAN, stand_in VARCHAR, caution VARCHAR,
-    time_to_merge_s DOUBLE, gap_m DOUBLE, rmse_mps DOUBLE,
-    joint BOOLEAN, min_ttc_s DOUBLE, account VARCHAR, decisions BIGINT, asked BIGINT,
-    invalid BIGINT, fallbacks BIGINT, attempts BIGINT, cost_usd DOUBLE,
-    left_mps FLOAT[], right_mps FLOAT[], left_range_mps FLOAT[],
-    right_range_mps FLOAT[], flaws VARCHAR[], posed VARCHAR[],
-    tried STRUCT(requested VARCHAR, served VARCHAR, answered BOOLEAN, outcome VARCHAR,
-        unpriced BIGINT, times BIGINT)[],
-    levels VARCHAR[]
-);
+{staged}
+CREATE TABLE listed AS {listing};
 CREATE TABLE levels (number INTEGER, factor VARCHAR, level VARCHAR);
 CREATE VIEW tried AS SELECT number, unnest(tried, recursive := true) FROM listed;
 CREATE TABLE noted (trial_id VARCHAR, spec_hash VARCHAR, tag VARCHAR);
 CREATE VIEW tagged AS SELECT number, tag FROM noted JOIN listed USING (trial_id, spec_hash);
 CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
-CREATE TABLE decided (trial_id VARCHAR, spec_hash VARCHAR, decisions BIGINT, asked BIGINT,
-    invalid BIGINT, fallbacks BIGINT, flaws VARCHAR[]);
-CREATE TABLE driven (trial_id VARCHAR, spec_hash VARCHAR, made STRUCT(side VARCHAR,
-    time_s DOUBLE, fallback BOOLEAN)[]);
-CREATE TABLE called AS SELECT trial_id, spec_hash, attempts, cost_usd, posed, tried FROM listed;
 """
 # The trials of each sweep, and how often what went wrong in a trial. Equal failures are counted
 # together: an error is named by its words before the particulars, without numbers and hashes.
@@ -114,19 +93,22 @@ INSERT INTO memory.trial_factors FROM trial_factors SEMI JOIN memory.trials
     USING (trial_id, spec_hash);
 INSERT INTO memory.states BY NAME
     FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
-INSERT INTO memory.decided
-    SELECT trial_id, spec_hash, count(*), count(call_key), count(*) FILTER (NOT valid),
-        count(*) FILTER (fallback),
-        list(failure) FILTER (failure IS NOT NULL)
+"""
+# Of their decisions and calls what is listed. Texts and prompts stay in the database.
+STAGED = """
+CREATE OR REPLACE TABLE memory.decided AS
+    SELECT trial_id, spec_hash, count(*) AS decisions, count(call_key) AS asked,
+        count(*) FILTER (NOT valid) AS invalid, count(*) FILTER (fallback) AS fallbacks,
+        list(failure) FILTER (failure IS NOT NULL) AS flaws
     FROM decisions SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
-INSERT INTO memory.driven
+CREATE OR REPLACE TABLE memory.driven AS
     SELECT trial_id, spec_hash, list({side: side, time_s: time_s, fallback: fallback}
-        ORDER BY decision)
+        ORDER BY decision) AS made
     FROM decisions SEMI JOIN (FROM memory.decided WHERE fallbacks > 0) USING (trial_id, spec_hash)
         SEMI JOIN (FROM memory.trials WHERE status = 'collided') USING (trial_id, spec_hash)
     GROUP BY ALL;
-INSERT INTO memory.called BY NAME
-    SELECT trial_id, spec_hash, sum(times) AS attempts, sum(cost_usd) AS cost_usd,
+CREATE OR REPLACE TABLE memory.called AS
+    SELECT trial_id, spec_hash, sum(times)::BIGINT AS attempts, sum(cost_usd) AS cost_usd,
         list(DISTINCT side ORDER BY side) FILTER (scripted) AS posed,
         list({requested: requested, served: served, answered: answered, outcome: outcome,
             unpriced: unpriced, times: times}) AS tried
@@ -138,17 +120,19 @@ INSERT INTO memory.called BY NAME
         FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL
     ) GROUP BY ALL;
 """
-# A fallback follows every invalid reply, and nothing else; the audit checks that.
-# A sparkline has about 24 points; its words give the slowest and the fastest of all samples.
-LIST = f"""
-INSERT INTO listed BY NAME
-SELECT trials.trial_id, trials.spec_hash, source,
+# A trial as it is listed. A fallback follows every invalid reply, and nothing else: see the audit.
+# ``levels`` are those of its study's own factors, ``flaws`` says of each invalid reply what is
+# wrong with it, and ``posed`` on which sides a stand-in answered. A sparkline has about 24 points;
+# its words give the slowest and the fastest of all samples.
+LISTING = f"""
+SELECT nextval('numbers')::INTEGER AS number, trials.trial_id, trials.spec_hash, source,
     CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' ELSE 'drivers' END
         AS who,
     model_left, model_right,
     if(source = 'human', 'human', driver) AS model,
     variant, condition, projected_headway_m, relative_velocity_mps, rep, pair, status,
     merged_first, end_time_s, error, scripted,
+    NULL::VARCHAR AS stand_in, NULL::VARCHAR AS caution,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'
@@ -181,7 +165,10 @@ LEFT JOIN (
                 1 + (max(step) - min(step)) // 24 AS every FROM states GROUP BY ALL)
             USING (trial_id, spec_hash))
     WHERE time_s >= 0 GROUP BY ALL
-) USING (trial_id, spec_hash);
+) USING (trial_id, spec_hash)
+"""  # noqa: S608 # constants
+LIST = f"""
+INSERT INTO listed BY NAME {LISTING};
 INSERT INTO levels SELECT number, factor, value FROM trial_levels
     JOIN listed USING (trial_id, spec_hash) WHERE factor <> 'prompt';
 """  # noqa: S608 # constants
@@ -197,21 +184,14 @@ FROM trials JOIN listed USING (trial_id, spec_hash) JOIN states USING (trial_id,
 LEFT JOIN specs USING (spec_hash) LEFT JOIN driven USING (trial_id, spec_hash)
 WHERE trials.status = 'collided' AND time_s >= 0 GROUP BY ALL HAVING len(left_m) = len(right_m)
 """
-TAKEN = """
-TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states; TRUNCATE decided; TRUNCATE driven;
-TRUNCATE called;
+# What else their specs tell of the trials that were listed last.
+DRIVEN_BY = """
+SELECT model_left AS left, model_right AS right, spec::VARCHAR AS spec, scripted, posed,
+    list(number) AS numbers
+FROM listed SEMI JOIN trials USING (trial_id, spec_hash) LEFT JOIN specs USING (spec_hash)
+GROUP BY ALL
 """
-# Trials that a stand-in drove, without a note on it yet: by their drivers and spec, and its sides.
-UNNAMED = """
-SELECT model_left, model_right, spec::VARCHAR, posed, list(number)
-FROM listed LEFT JOIN specs USING (spec_hash) WHERE scripted AND stand_in IS NULL GROUP BY ALL
-"""
-# The specs of trials with a human who may be replayed, without a note on it yet.
-UNCAUTIONED = """
-SELECT spec_hash, spec::VARCHAR FROM specs
-SEMI JOIN (FROM listed WHERE caution IS NULL) USING (spec_hash)
-WHERE contains(spec::VARCHAR, '"data":')
-"""
+TAKEN = "TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states;"
 # Before the name of a factor: its facet.
 FACTOR = "factor."
 # Facets of which a trial may have several values, and the tables that hold these.
@@ -332,13 +312,14 @@ class Catalogue:
                 self._begin(stamp[0])
             try:
                 # What is forgotten is taken again before anybody else can hold the file.
-                waiting = self._reading(FORGET + TAKE)
+                waiting = self._reading(FORGET + TAKE + STAGED)
                 while waiting:
                     # With the file closed: measuring takes longer than copying.
                     self._memory.execute(LIST)
                     self._account_for_collisions()
+                    self._name_drivers()
                     self._memory.execute(TAKEN)
-                    waiting = self._reading(TAKE)
+                    waiting = self._reading(TAKE + STAGED)
             except StoreLocked:
                 if self._stamp is None:
                     raise
@@ -349,8 +330,6 @@ class Catalogue:
             else:
                 self._stamp, self.held = stamp, False
             self._note_others()
-            self._name_stand_ins()
-            self._name_replayed()
             self._memory.execute(GROUPED)
             return not self.held
 
@@ -369,21 +348,19 @@ class Catalogue:
         factors = [f"{FACTOR}{name}" for name in self.factors()]
         found: dict[str, list[tuple[str, int]]] = {name: [] for name in (*FACETS, *factors)}
         counts, values = [], list[Any]()
-        for name in FACETS:
+        for name in found:
             where, wants = wanted.where(leave_out=name)
-            table = f"listed JOIN {SEVERAL[name]} USING (number)" if name in SEVERAL else "listed"
+            table, value = "listed", name
+            if name in SEVERAL:
+                table = f"listed JOIN {SEVERAL[name]} USING (number)"
+            elif name in factors:
+                table, value = "listed JOIN (FROM levels WHERE factor = ?) USING (number)", "level"
+                wants = [name.removeprefix(FACTOR), *wants]
             counts.append(
-                f"SELECT '{name}' AS facet, {name} AS value, count(*) AS trials FROM {table} "  # noqa: S608 # constants
-                f"WHERE {where} AND value IS NOT NULL GROUP BY ALL"
+                f"SELECT ? AS facet, {value} AS value, count(*) AS trials FROM {table} "  # noqa: S608 # constants
+                f"WHERE {where} AND {value} IS NOT NULL GROUP BY ALL"
             )
-            values += wants
-        for name in factors:
-            where, wants = wanted.where(leave_out=name)
-            counts.append(
-                "SELECT ? || factor AS facet, level AS value, count(*) AS trials "  # noqa: S608 # constants
-                f"FROM listed JOIN levels USING (number) WHERE factor = ? AND {where} GROUP BY ALL"
-            )
-            values += [FACTOR, name.removeprefix(FACTOR), *wants]
+            values += [name, *wants]
         for row in self.ask(f"{' UNION ALL '.join(counts)} ORDER BY ALL", *values):
             found[row["facet"]].append((row["value"], row["trials"]))
         return found
@@ -398,19 +375,12 @@ class Catalogue:
         """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``."""
         return {row["who"]: row for row in self.counts(wanted, "who")}
 
-    def counts(self, wanted: Filter, *columns: str, factor: str = "") -> list[Row]:
-        """What a filter's trials come to by columns; ``level`` is one where a factor is named.
-
-        Counts over all of them, and means over those that have the value.
-        """
+    def counts(self, wanted: Filter, *columns: str) -> list[Row]:
+        """What a filter's trials come to by columns: counts of all, means of those with a value."""
         where, values = wanted.where()
-        source = "listed"
-        if factor:
-            source += " JOIN (FROM levels WHERE factor = ?) USING (number)"
-            values = [factor, *values]
         named = ", ".join(columns)
         return self.ask(
-            f"SELECT {named}, {COUNTS} FROM {source} WHERE {where} GROUP BY {named} "  # noqa: S608 # constants
+            f"SELECT {named}, {COUNTS} FROM listed WHERE {where} GROUP BY {named} "  # noqa: S608 # constants
             f"ORDER BY {named}",
             *values,
         )
@@ -481,40 +451,30 @@ class Catalogue:
                     self._memory.executemany("INSERT INTO noted VALUES (?, ?, ?)", tags)
                 self._tags = tags
 
-    def export(self, wanted: Filter, sort: str, form: str) -> bytes:
-        """All trials of a filter as CSV or Parquet."""
+    def export(self, wanted: Filter, sort: str) -> str:
+        """All trials of a filter as CSV, with a column for each factor but the model."""
         where, values = wanted.where()
-        with tempfile.TemporaryDirectory() as folder, self._lock:
-            path = Path(folder) / f"trials.{form}"
-            columns = f"{EXPORTED}{self._columns()}"
-            chosen = self._memory.sql(
-                f"SELECT {columns} FROM listed WHERE {where} ORDER BY {order_by(sort)}",  # noqa: S608 # constants
-                params=values,
+        factors = [name for name in self.factors() if name != "model"]
+        with self._lock:
+            found = self._memory.execute(
+                f"SELECT {EXPORTED}, levels FROM listed WHERE {where} ORDER BY {order_by(sort)}",  # noqa: S608 # constants
+                values,
             )
-            if form == "csv":
-                with path.open("w", encoding="utf-8", newline="") as file:
-                    rows = [chosen.columns, *chosen.fetchall()]
-                    csv_writer(file).writerows(map(csv_cell, row) for row in rows)
-            else:
-                chosen.write_parquet(str(path))
-            return path.read_bytes()
-
-    def _columns(self) -> str:
-        """A column for each factor of the listed studies but the model, which has one."""
-        return "".join(
-            f", (SELECT level FROM levels WHERE levels.number = listed.number "  # noqa: S608 # quoted
-            f"AND factor = {quoted(name)}) AS "
-            + '"{}"'.format(f"{FACTOR}{name}".replace('"', '""'))
-            for name in self.factors()
-            if name != "model"
-        )
+            names, rows = [name for name, *_ in found.description[:-1]], found.fetchall()
+        lines = io.StringIO()
+        writer = csv_writer(lines)
+        writer.writerow(map(csv_cell, [*names, *(f"{FACTOR}{name}" for name in factors)]))
+        for *cells, levels in rows:
+            chosen = dict(level.split("=", 1) for level in levels or ())
+            writer.writerow(map(csv_cell, [*cells, *map(chosen.get, factors)]))
+        return lines.getvalue()
 
     def _begin(self, file: int) -> None:
         """Forget everything."""
         self._instance.drop()
         self._connection = self._instance.cursor()
         self._connection.execute(schema_sql())
-        self._connection.execute(LISTED + GROUPED)
+        self._connection.execute(BEGUN.format(staged=STAGED, listing=LISTING) + GROUPED)
         self._file, self._stamp, self._tags = file, None, ()
 
     def _reading(self, sql: str) -> int:
@@ -537,22 +497,15 @@ class Catalogue:
             [[crash["number"] for crash in crashes], [_how(crash) for crash in crashes]],
         )
 
-    def _name_stand_ins(self) -> None:
-        """Note for each trial that a stand-in drove which model it stood in for."""
-        unnamed = self._memory.execute(UNNAMED).fetchall()
-        for left, right, spec, sides, numbers in unnamed:
-            models = language_models({"left": left, "right": right}, json.loads(spec or "{}"))
+    def _name_drivers(self) -> None:
+        """Note which model a stand-in stood in for, and that a replayed human does not react."""
+        for group in records(self._memory, DRIVEN_BY, ()):
+            spec = json.loads(group["spec"] or "{}")
+            models = language_models({side: group[side] for side in SIDES}, spec)
+            posed = stand_in(models, group["posed"] or SIDES) if group["scripted"] else None
             self._memory.execute(
-                "UPDATE listed SET stand_in = ? WHERE number IN (SELECT unnest(?))",
-                [stand_in(models, sides or SIDES), numbers],
-            )
-
-    def _name_replayed(self) -> None:
-        """Note for each trial with a replayed human that this one does not react."""
-        for spec_hash, spec in self._memory.execute(UNCAUTIONED).fetchall():
-            self._memory.execute(
-                "UPDATE listed SET caution = ? WHERE spec_hash = ?",
-                [unresponsive(json.loads(spec)), spec_hash],
+                "UPDATE listed SET stand_in = ?, caution = ? WHERE number IN (SELECT unnest(?))",
+                [posed, unresponsive(spec) or None, group["numbers"]],
             )
 
     def _note_others(self) -> None:

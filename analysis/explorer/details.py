@@ -11,7 +11,6 @@ from typing import Any
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.records import SIDES, Side
-from merge_runner_analysis.data.driver_words import unresponsive
 from merge_runner_analysis.explorer.prompts import Part, parts_of
 from merge_runner_analysis.explorer.reading import Row, reading, records
 
@@ -33,31 +32,26 @@ FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) {ONE}
 ORDER BY decision, side
 """  # noqa: S608 # constants
 TASKS = f"""
-SELECT trial_id, spec_hash, source, spec
+SELECT source, spec
 FROM (FROM trials {ONE}) LEFT JOIN specs USING (spec_hash)
 """  # noqa: S608 # constants
 # Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz.
 HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
-DECIDED = "SELECT * FROM decisions {which} ORDER BY decision, side"
-ATTEMPTS = "SELECT * FROM calls {which} ORDER BY decision, side, attempt"
-# One decision, of those with the one before it.
-NUMBERED = f"{ONE} AND side = $side AND decision IN ($number, $number - $before)"
+DECIDED = f"SELECT * FROM decisions {ONE}"  # noqa: S608 # constants
+ATTEMPTS = f"SELECT * FROM calls {ONE} ORDER BY attempt"  # noqa: S608 # constants
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
     """A trial's samples by side and its decisions without prompts, and the task it is of.
 
-    ``paces`` say when each driver decided, ``caution`` whether a human is replayed.
+    ``paces`` say when each driver decided.
     """
 
-    trial_id: str
-    spec_hash: str
     scenario: ScenarioConfig
     paces: dict[Side, Pace]
     states: dict[Side, Row]
     decisions: list[Row]
-    caution: str
 
     @property
     def end_s(self) -> float:
@@ -71,15 +65,16 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """A decision with its prompt in parts, each compared with the one before, and its attempts.
-
-    ``before`` is the decision before on the same side, None for the first.
-    """
+    """A decision, the one before on the same side, None for the first, and its attempts."""
 
     row: Row
     before: Row | None
-    parts: list[Part]
     attempts: list[Row]
+
+    @property
+    def parts(self) -> list[Part]:
+        """The prompt in parts, each compared with the one before."""
+        return parts_of(self.row["prompt"] or "", self.before["prompt"] if self.before else None)
 
 
 def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
@@ -89,30 +84,14 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
         states = records(connection, STATES, key)
         decisions = records(connection, DECISIONS, key)
         (task,) = records(connection, TASKS, key)
-    return _trial(task, states, decisions)
-
-
-def read_whole(db: Path, trial_id: str, spec_hash: str) -> dict[tuple[str, int], Decision]:
-    """Read all decisions of a trial that is known to be there, by side and number."""
-    key = {"trial": trial_id, "spec": spec_hash}
-    with reading(db) as connection:
-        rows = records(connection, DECIDED.format(which=ONE), key)
-        attempts = records(connection, ATTEMPTS.format(which=ONE), key)
-    return _decisions(rows, attempts)
-
-
-def _trial(task: Row, states: list[Row], decisions: list[Row]) -> Trial:
     told = json.loads(task["spec"] or "{}")
     scenario = scenario_of(task["source"], told.get("scenario"))
     samples = {row["side"]: row for row in states}
     trial = Trial(
-        task["trial_id"],
-        task["spec_hash"],
         scenario,
         {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
         {side: samples[side] for side in SIDES if side in samples},
         decisions,
-        unresponsive(told),
     )
     for row in decisions:
         if row["lost"]:
@@ -121,43 +100,31 @@ def _trial(task: Row, states: list[Row], decisions: list[Row]) -> Trial:
     return trial
 
 
+def read_decisions(db: Path, trial_id: str, spec_hash: str) -> dict[tuple[str, int], Decision]:
+    """Read all decisions of a trial that is known to be there, by side and number.
+
+    A call without an answer ends its trial before there is a decision: what was asked is there.
+    """
+    key = {"trial": trial_id, "spec": spec_hash}
+    with reading(db) as connection:
+        rows = records(connection, DECIDED, key)
+        calls = records(connection, ATTEMPTS, key)
+    decided = {(row["side"], row["decision"]): {**row, "lost": False} for row in rows}
+    attempts: dict[tuple[str, int], list[Row]] = {}
+    for call in calls:
+        attempts.setdefault((call["side"], call["decision"]), []).append(call)
+    decisions = {}
+    for side, number in sorted({*decided, *attempts}, key=lambda at: (at[1], at[0])):
+        lost = {"decision": number, "side": side, "lost": True, "prompt": None}
+        decisions[side, number] = Decision(
+            decided.get((side, number), lost),
+            decided.get((side, number - 1)),
+            attempts.get((side, number), []),
+        )
+    return decisions
+
+
 def scenario_of(source: str, told: Mapping[str, Any] | None) -> ScenarioConfig:
     """The task of a trial, as its spec tells it, or as it usually is."""
     usual = HUMAN_TASK if source == "human" else {}
     return ScenarioConfig.model_validate(usual if told is None else told)
-
-
-def read_decision(
-    db: Path, trial_id: str, spec_hash: str, side: str, number: int
-) -> Decision | None:
-    """Read a decision of a trial, or None where there is none.
-
-    A call without an answer ends its trial before there is a decision: what was asked is there.
-    """
-    key = {"trial": trial_id, "spec": spec_hash, "side": side, "number": number}
-    with reading(db) as connection:
-        rows = records(connection, DECIDED.format(which=NUMBERED), {**key, "before": 1})
-        attempts = records(connection, ATTEMPTS.format(which=NUMBERED), {**key, "before": 0})
-    return _decisions(rows, attempts).get((side, number))
-
-
-def _decisions(rows: list[Row], calls: list[Row]) -> dict[tuple[str, int], Decision]:
-    """Decisions in their order by side and number, with those that got no answer."""
-    decided = {(row["side"], row["decision"]): row for row in rows}
-    attempts: dict[tuple[str, int], list[Row]] = {}
-    for call in calls:
-        attempts.setdefault((call["side"], call["decision"]), []).append(call)
-    order = sorted({*decided, *attempts}, key=lambda at: (at[1], at[0]))
-    return {at: _decision(at, decided, attempts.get(at, [])) for at in order}
-
-
-def _decision(
-    at: tuple[str, int], decided: dict[tuple[str, int], Row], attempts: list[Row]
-) -> Decision:
-    side, number = at
-    row = decided.get(at)
-    if row is None:
-        return Decision({"decision": number, "side": side, "lost": True}, None, [], attempts)
-    before = decided.get((side, number - 1))
-    parts = parts_of(row["prompt"] or "", before["prompt"] if before else None)
-    return Decision({**row, "lost": False}, before, parts, attempts)

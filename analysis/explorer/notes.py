@@ -10,9 +10,8 @@ import getpass
 import os
 import secrets
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +22,6 @@ from merge_runner.errors import UsageError
 from merge_runner.records import Side
 
 LONGEST_TEXT, LONGEST_TAG, MOST_TAGS, LONGEST_NAME = 4_000, 40, 10, 60
-MOST_BYTES = 2**26  # of the file: all of it is read for a page
 Name = Annotated[str, StringConstraints(min_length=1, max_length=LONGEST_NAME)]
 Tag = Annotated[str, StringConstraints(min_length=1, max_length=LONGEST_TAG)]
 
@@ -69,7 +67,6 @@ class Kept:
 
     notes: tuple[Note, ...] = ()
     damage: tuple[str, ...] = ()
-    of_trial: dict[tuple[str, str], list[Note]] = field(default_factory=dict)
     tags: tuple[tuple[str, str, str], ...] = ()
     """Of each trial and its decisions: (trial, spec, tag), each once."""
 
@@ -90,7 +87,7 @@ class Notes:
             stamp = (stat.st_ino, stat.st_mtime_ns, stat.st_size)
             with self._lock:
                 if stamp != self._read[0]:
-                    self._read = stamp, self._parsed(stat.st_size)
+                    self._read = stamp, self._parsed()
                 return self._read[1]
         except FileNotFoundError:
             return Kept()
@@ -99,7 +96,7 @@ class Notes:
 
     def of(self, trial_id: str, spec_hash: str) -> list[Note]:
         """The notes of a trial."""
-        return self.kept().of_trial.get((trial_id, spec_hash), [])
+        return [note for note in self.kept().notes if note.trial == (trial_id, spec_hash)]
 
     def add(
         self,
@@ -124,10 +121,7 @@ class Notes:
             raise UsageError(f"there is no note {name} of {self.reader}")
         self._append(Withdrawal(name, datetime.now(UTC), self.reader))
 
-    def _parsed(self, size: int) -> Kept:
-        if size > MOST_BYTES:
-            most = f"{MOST_BYTES >> 20} MB"
-            return Kept(damage=(f"{self.path.name} is larger than {most}, and is not read",))
+    def _parsed(self) -> Kept:
         notes: dict[str, Note] = {}
         damage = []
         for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
@@ -142,14 +136,11 @@ class Notes:
                 notes.setdefault(entry.id, entry)
             elif entry.withdraws in notes and notes[entry.withdraws].reader == entry.reader:
                 del notes[entry.withdraws]
-        of_trial: dict[tuple[str, str], list[Note]] = {}
-        for note in notes.values():
-            of_trial.setdefault(note.trial, []).append(note)
         tags = sorted({(*note.trial, tag) for note in notes.values() for tag in note.tags})
-        return Kept(tuple(notes.values()), tuple(damage), of_trial, tuple(tags))
+        return Kept(tuple(notes.values()), tuple(damage), tuple(tags))
 
     def _append(self, entry: Note | Withdrawal) -> None:
-        """Add a line, whole or not at all; raises UsageError."""
+        """Add a line; raises UsageError."""
         try:
             line = ENTRY.dump_json(entry)
             ENTRY.validate_json(line)
@@ -159,37 +150,15 @@ class Notes:
                 f"{MOST_TAGS} tags of up to {LONGEST_TAG}"
             ) from exc
         try:
-            with _alone(self.path) as file:
-                size = os.fstat(file).st_size
-                if size + len(line) > MOST_BYTES:
-                    raise UsageError(
-                        f"nothing was noted: {self.path.name} is full; move it away to begin anew"
-                    )
-                torn = size > 0 and os.pread(file, 1, size - 1) != b"\n"
-                try:
-                    _write(file, (b"\n" if torn else b"") + line + b"\n")
-                except OSError:
-                    os.ftruncate(file, size)
-                    raise
+            with self.path.open("ab+") as file:
+                fcntl.flock(file, fcntl.LOCK_EX)  # against another explorer
+                size = file.seek(0, os.SEEK_END)
+                torn = size > 0 and os.pread(file.fileno(), 1, size - 1) != b"\n"
+                file.write((b"\n" if torn else b"") + line + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
         except OSError as exc:
             raise UsageError(f"nothing was noted: {self.path}: {exc.strerror}") from exc
-
-
-@contextmanager
-def _alone(path: Path) -> Iterator[int]:
-    """The open file, while no other explorer writes into it."""
-    file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield file
-    finally:
-        os.close(file)
-
-
-def _write(file: int, content: bytes) -> None:
-    while content:
-        content = content[os.write(file, content) :]
-    os.fsync(file)
 
 
 def reader_of(given: str | None) -> str:

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from itertools import pairwise
 from math import ceil, floor, log10
 
 from merge_runner.records import SIDES
@@ -68,37 +66,16 @@ def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
 
 
 def _spark_points(values: Sequence[float], speeds: tuple[int, int]) -> str:
-    # A long list has a million of them: without Scale this takes a third of the time.
-    low, high = speeds
-    heights = [SPARK_HEIGHT - SPARK_HEIGHT * (speed - low) / (high - low) for speed in values]
-    return " ".join([f"{x},{y:.1f}" for x, y in zip(_across(len(values)), heights, strict=True)])
-
-
-@cache
-def _across(count: int) -> list[str]:
-    return [f"{SPARK_WIDTH * i / max(count - 1, 1):.0f}" for i in range(count)]
+    x, y = Scale(0, max(len(values) - 1, 1), 0, SPARK_WIDTH), Scale(*speeds, SPARK_HEIGHT, 0)
+    return " ".join([f"{x(i):.0f},{y(speed):.1f}" for i, speed in enumerate(values)])
 
 
 def step_points(values: Sequence[float], width: float, height: float, steps: int) -> str:
     """Points of a step line from -1 to 1, ``steps`` across the width."""
-    # A page has thousands of them: each place and each height is written once.
-    edges, half = _edges(width, max(steps, len(values), 1), max(steps, 1)), height / 2
-    heights = {
-        value: f"{half - half * min(max(value, -1.0), 1.0):.1f}" for value in dict.fromkeys(values)
-    }
+    x, y = Scale(0, max(steps, 1), 0, width), Scale(-1, 1, height, 0)
     return " ".join(
-        [
-            f"{left},{heights[value]} {right},{heights[value]}"
-            for value, (left, right) in zip(values, edges, strict=False)
-        ]
+        [f"{x(i):.1f},{y(v):.1f} {x(i + 1):.1f},{y(v):.1f}" for i, v in enumerate(values)]
     )
-
-
-@cache
-def _edges(width: float, count: int, steps: int) -> list[tuple[str, str]]:
-    """Where each step begins and ends; what would be beyond the width is at its end."""
-    places = [f"{min(width / steps * i, width):.1f}" for i in range(count + 1)]
-    return list(pairwise(places))
 
 
 @dataclass(frozen=True, slots=True)

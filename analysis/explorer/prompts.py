@@ -13,7 +13,7 @@ from merge_runner.prompts.blocks import BLOCKS
 
 Change = Literal["same", "new", "gone"]
 _WORDS = re.compile(r"[^\s\[\](),]+\s*|[\[\](),]\s*|\s+")
-# Prompts, or lines of them, are taken apart once: each is first the later and then the earlier one.
+# Prompts are taken apart once: each is first the later and then the earlier one.
 KEPT = 256
 
 
@@ -71,25 +71,15 @@ def _begun(paragraphs: Sequence[str]) -> tuple[str, int] | None:
     its paragraphs, is meant.
     """
     agreeing = []
-    for name, beginnings in _like(paragraphs[0]):
-        pairs = zip(beginnings, paragraphs, strict=False)
-        agree = sum(paragraph.startswith(beginning) for beginning, paragraph in pairs)
-        agreeing.append((len(beginnings[0]), agree, name, len(beginnings) - 1))
+    for name, block in BLOCKS.items():
+        for template in filter(None, (block.merge, block.straight)):
+            # A paragraph is known by its text up to its first value.
+            begun = [part.partition("{")[0] for part in template.split("\n\n")]
+            if begun[0] and paragraphs[0].startswith(begun[0]):
+                pairs = zip(begun, paragraphs, strict=False)
+                agree = sum(paragraph.startswith(beginning) for beginning, paragraph in pairs)
+                agreeing.append((len(begun[0]), agree, name, len(begun) - 1))
     return max(agreeing)[2:] if agreeing else None
-
-
-@lru_cache(KEPT)
-def _like(paragraph: str) -> list[tuple[str, list[str]]]:
-    """The blocks that begin like a paragraph, each with what its paragraphs begin with.
-
-    A paragraph is known by its text up to its first value.
-    """
-    begun = [
-        (name, [part.partition("{")[0] for part in template.split("\n\n")])
-        for name, block in BLOCKS.items()
-        for template in filter(None, (block.merge, block.straight))
-    ]
-    return [(name, texts) for name, texts in begun if texts[0] and paragraph.startswith(texts[0])]
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:

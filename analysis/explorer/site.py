@@ -94,6 +94,7 @@ class Site:
             note_limits={"text": LONGEST_TEXT, "tags": MOST_TAGS * (LONGEST_TAG + 2)},
             pages=PAGES,
             share=self.share,
+            db_option=self.db_option,
             program=self.program,
             styles=STYLES,
             study=str(self.db),
@@ -134,8 +135,13 @@ class Site:
 
     def share(self, *options: str) -> str:
         """The command that writes what is shown here as files."""
-        db = () if self.db == DEFAULT_DB else ("--db", str(self.db))
-        return shlex.join([self.program, "view", *db, *options])
+        parts = shlex.join([self.program, "view"]), self.db_option, shlex.join(options)
+        return " ".join(filter(None, parts))
+
+    @property
+    def db_option(self) -> str:
+        """The option that names this database; empty where it is the usual one."""
+        return "" if self.db == DEFAULT_DB else shlex.join(["--db", str(self.db)])
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""

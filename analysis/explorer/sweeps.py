@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass, field
 from datetime import UTC, datetime, timedelta
 
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
@@ -242,12 +243,12 @@ class VariantCondition:
 
     variant: str
     condition: str
-    planned: int = 0
-    ended: int = 0
-    failed: int = 0
-    decisions: int = 0
-    invalid: int = 0
-    state: dict[str, str] = field(default_factory=dict)
+    state: dict[str, str]
+    planned: int
+    ended: int
+    failed: int
+    asked: int
+    invalid: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,19 +371,28 @@ def cells_of(entry: ListedSweep, stored: list[Row]) -> dict[tuple[str, str], Var
     states = {arm.label: arm.state for arm in arms.values()}
     found = {(_label(row, arms), row["condition"]): row for row in stored}
     cells = {}
-    for key in planned | found:
-        row = found.get(key, {})
-        cells[key] = VariantCondition(
-            variant=key[0],
-            condition=key[1],
-            planned=planned.get(key, 0),
-            ended=row.get("ended", 0),
-            failed=row.get("failed", 0),
-            decisions=row.get("decisions", 0),
-            invalid=row.get("invalid", 0),
-            state=states.get(key[0], {"variant": key[0]}),
+    for variant, condition in planned | found:
+        row = found.get((variant, condition), {})
+        cells[variant, condition] = VariantCondition(
+            variant,
+            condition,
+            states.get(variant, {"variant": variant}),
+            planned.get((variant, condition), 0),
+            row.get("ended", 0),
+            row.get("failed", 0),
+            row.get("asked", 0) or row.get("decisions", 0),
+            row.get("invalid", 0),
         )
     return cells
+
+
+def total_of(cells: Iterable[VariantCondition | None]) -> VariantCondition:
+    """The trials of one variant over all conditions."""
+    there = [astuple(cell) for cell in cells if cell is not None]
+    variant, _, state, *_ = there[0]
+    return VariantCondition(
+        variant, "", state, *map(sum, zip(*[cell[3:] for cell in there], strict=True))
+    )
 
 
 def _label(row: Row, arms: dict[ArmKey, Arm]) -> str:
@@ -407,6 +417,10 @@ def rates_of(
     pair = next(iter(mismatches)) if len(mismatches) == 1 else ""
     other = {"cause": f"model: {pair}"} if pair else {}
     played, attempts = sums["ended"] + sums["failed"], outcomes.total()
+    # A program's decisions count where no model was asked.
+    decided, decisions = sums["asked"] or sums["decisions"], "decisions"
+    if sums["asked"]:
+        decisions = "decisions asked"
     return [
         Rate(name, count, of, things, meaning, {"sweep": sweep_id, **state} if state else {})
         for name, count, of, things, meaning, state in (
@@ -415,9 +429,9 @@ def rates_of(
             ("failed trials", sums["failed"], played, "stored trials",
              "a call got no answer; the trial has no outcome and can be played anew",
              {"outcome": "failed"}),
-            ("invalid replies", sums["invalid"], sums["decisions"], "decisions",
+            ("invalid replies", sums["invalid"], decided, decisions,
              "the reply held no valid plan", {"validity": "fallbacks"}),
-            ("fallbacks", sums["fallbacks"], sums["decisions"], "decisions",
+            ("fallbacks", sums["fallbacks"], decided, decisions,
              "an older plan was driven on, or none", {"validity": "fallbacks"}),
             ("refusals", outcomes["refusal"], attempts, "attempts",
              "the model, or a filter before it, declined", {"cause": "attempt: refusal"}),

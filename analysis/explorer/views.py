@@ -134,6 +134,8 @@ def facts(row: Row) -> list[str]:
         found.append(f"{row['invalid']} of {row['decisions']} decisions invalid.")
     if row["cost_usd"] is not None:
         found.append(f"{row['cost_usd']:.3f} USD.")
+    if row["caution"]:
+        found.append(f"Note: {row['caution']}.")
     return found
 
 

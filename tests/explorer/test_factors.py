@@ -62,7 +62,8 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
         connection.execute("DELETE FROM trials WHERE trial_id LIKE '%rep02%'")
     stopped = TestClient(explorer(Site(copy)), base_url=f"http://{HOST}").get(sweep).text
     assert "18 of 36 trials have an outcome" in stopped
-    assert "<code>merge-runner sweep mine.toml --model cheap --model dear</code>" in stopped
+    assert "<code>merge-runner sweep mine.toml --model cheap --model dear<" in stopped
+    assert f"--db {copy}" in stopped
 
 
 ASK = """

@@ -118,8 +118,8 @@ def test_the_page_has_the_numbers_of_the_database(written):
     for said in (
         f"collisions {collided} of 29 ended trials",
         f"failed trials {len(facts['failed'])} of 30 stored trials",
-        f"invalid replies {facts['invalid']} of {facts['decisions']} decisions",
-        f"fallbacks {facts['fallbacks']} of {facts['decisions']} decisions",
+        f"invalid replies {facts['invalid']} of {facts['decisions']} decisions asked",
+        f"fallbacks {facts['fallbacks']} of {facts['decisions']} decisions asked",
         f"refusals 1 of {attempts} attempts",
         f"another model answered 1 of {answers} answers",
         "asked for: o3 → another (1 answers)",

@@ -11,6 +11,7 @@ from merge_runner_analysis.explorer.sweeps import (
     duration,
     find_sweep,
     list_sweeps,
+    total_of,
 )
 from merge_runner_analysis.explorer.views import prompt_text
 
@@ -67,8 +68,7 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
         "variants": variants,
         "states": {variant: cell.state for (variant, _), cell in sweep.cells.items()},
         "matrix": rows,
-        "totals": [_total(variant, [cells[i] for _, cells in rows]) for i, variant in
-                   enumerate(variants)],
+        "totals": list(map(total_of, zip(*[cells for _, cells in rows], strict=True))),
         "causes": {
             text: [row for row in sweep.causes if row["cause"].startswith(f"{kind}: ")]
             for kind, text in KINDS.items()
@@ -76,7 +76,7 @@ def _values(site: Site, sweep: Sweep) -> dict[str, object]:
         "bar": bar,
         "prompt_text": prompt_text,
         "duration": duration,
-    }  # fmt: skip
+    }
 
 
 def bar(cell: VariantCondition) -> list[tuple[str, float, float]]:
@@ -89,18 +89,3 @@ def bar(cell: VariantCondition) -> list[tuple[str, float, float]]:
             parts.append((name, round(begin, 2), round(width, 2)))
         begin += width
     return parts
-
-
-def _total(variant: str, cells: list[VariantCondition | None]) -> VariantCondition:
-    """One variant over all conditions."""
-    there = [cell for cell in cells if cell is not None]
-    return VariantCondition(
-        variant,
-        "",
-        planned=sum(cell.planned for cell in there),
-        ended=sum(cell.ended for cell in there),
-        failed=sum(cell.failed for cell in there),
-        decisions=sum(cell.decisions for cell in there),
-        invalid=sum(cell.invalid for cell in there),
-        state=there[0].state,
-    )

@@ -15,9 +15,8 @@ from merge_runner_analysis.explorer.assets import REPLAY
 from merge_runner_analysis.explorer.details import (
     Decision,
     Trial,
-    read_decision,
+    read_decisions,
     read_trial,
-    read_whole,
 )
 from merge_runner_analysis.explorer.display_text import clamped, shortened
 from merge_runner_analysis.explorer.pictures import step_points
@@ -67,7 +66,9 @@ def whole_panels(site: Site, row: Row, trial: Trial) -> dict[str, Markup]:
         f"{side}/{number}": Markup(  # noqa: S704 # as above
             site.render("_decision.html", **panel_values(site, row, trial, found, others))
         )
-        for (side, number), found in read_whole(site.db, row["trial_id"], row["spec_hash"]).items()
+        for (side, number), found in read_decisions(
+            site.db, row["trial_id"], row["spec_hash"]
+        ).items()
     }
 
 
@@ -77,7 +78,7 @@ def shown(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
     return {
         "row": row,
         "outcome": views.outcome_text(row, trial.scenario),
-        "facts": [*views.facts(row), *([f"Note: {trial.caution}."] if trial.caution else [])],
+        "facts": views.facts(row),
         "judged": views.judged_text(trial.scenario),
         "view_box": views.view_box(),
         "data": embedded(replayed(site, row, trial, account)) if trial.states else None,
@@ -119,7 +120,7 @@ def decision_fragment(site: Site, trial_id: str, asked: Mapping[str, str]) -> st
 
 def decision_panel(site: Site, row: Row, trial: Trial, side: str, number: int) -> str:
     """What a driver was told, said, planned and did; raises NotThere."""
-    found = read_decision(site.db, row["trial_id"], row["spec_hash"], side, number)
+    found = read_decisions(site.db, row["trial_id"], row["spec_hash"]).get((side, number))
     if found is None:
         raise NotThere(f"{row['trial_id']} has no decision {number} of the {side} driver")
     values = panel_values(site, row, trial, found, site.catalogue.others)
@@ -154,7 +155,7 @@ def raw_reply(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     """The body of the last reply to a call, whole."""
     row = find(site, trial_id, asked)
     side, number = _decision_of(asked)
-    found = read_decision(site.db, row["trial_id"], row["spec_hash"], side, number)
+    found = read_decisions(site.db, row["trial_id"], row["spec_hash"]).get((side, number))
     bodies = [a["reply"] for a in found.attempts if a["reply"]] if found else []
     if not bodies:
         raise NotThere(f"{trial_id} has no reply to decision {number} of the {side} driver")
