@@ -120,7 +120,7 @@ async def _crawled(
                 continue
             for link in _LINKS.findall(reply.text) if is_page else ():
                 page, _ = _page_of(unescape(link), heads)
-                if page and page not in files:
+                if page and page not in files and not page.endswith(".png"):
                     files[page] = _file_of(page, files.values())
                     waiting.append(page)
             if is_page and BUSY in reply.text:

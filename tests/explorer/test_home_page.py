@@ -13,14 +13,15 @@ from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from merge_runner.errors import UsageError
+from merge_runner.results.store import results_digest
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explorer.analysis_process import Computing
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.assets import STATIC, STYLES
 from merge_runner_analysis.explorer.pages.home import home_page
 from merge_runner_analysis.explorer.site import NothingNew, Site
-from merge_runner_analysis.figures import SHOWS
-from merge_runner_analysis.figures.gallery import FIGURES as DRAWN
+from merge_runner_analysis.figures import FIGURES
+from merge_runner_analysis.figures.gallery import MAKERS
 from merge_runner_analysis.figures.styles import COLOURS
 from merge_runner_analysis.metrics import shown_in
 from merge_runner_analysis.table_format import TableFormat
@@ -216,16 +217,23 @@ def test_a_table_comes_as_a_file(client, db, suffix, form):
 
 
 @pytest.mark.slow
-def test_every_figure_is_offered_and_comes_as_svg(client):
-    assert list(SHOWS) == list(DRAWN)
+def test_every_figure_is_offered_and_comes_as_svg(client, db):
+    assert list(FIGURES) == list(MAKERS)
     assert set(re.findall(r'href="/figures/([^"]+)\.svg"', client.get("/tables").text)) == set(
-        DRAWN
+        MAKERS
     )
     reply = client.get("/figures/ablation-matrix.svg")
     assert reply.headers["content-type"].startswith("image/svg+xml")
     assert "</svg>" in reply.text
-    assert "sandbox" in reply.headers["content-security-policy"]
+    policy = reply.headers["content-security-policy"]
+    assert "style-src 'unsafe-inline'; img-src data:; sandbox" in policy
+    assert client.get("/figures/ablation-matrix.png").content.startswith(b"\x89PNG")
     assert client.get("/figures/nothing.svg").status_code == 404
+    page = client.get("/figures/ablation-matrix").text
+    assert 'src="data:image/svg+xml;base64,' in page
+    assert 'href="/tables/ablation-qualitative.csv" download' in page
+    assert f"<code>{results_digest(db)[0]}</code>" in page
+    assert "arXiv:2604.09609" in page
 
 
 def test_no_head_of_a_table_is_empty(client):
