@@ -31,12 +31,12 @@ from merge_runner_analysis.explorer.assets import STATIC
 from merge_runner_analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
 from merge_runner_analysis.explorer.offline import page_of_trials
 from merge_runner_analysis.explorer.pages import (
-    ablations,
     comparing,
     conditions,
     drivers,
     home,
     notes,
+    prompts,
     sql,
     sweep,
     tables,
@@ -182,8 +182,8 @@ def _computed_routes(site: Site) -> list[Route]:
         Route("/figures/{name}.{form}", page(figure)),
         Route("/figures/{name}", page(figure_page)),
         Route("/tables/{name}", page(table)),
-        Route("/ablations", page(lambda r: ablations.ablations_page(site, r.query_params))),
-        Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),
+        Route("/prompts", page(lambda r: prompts.prompts_page(site, r.query_params))),
+        Route("/discordant", page(lambda r: prompts.discordant_page(site, r.query_params))),
     ]
 
 

@@ -37,8 +37,8 @@ FOLLOWED: dict[str, Collection[str]] = {
     "drivers": ("prompt",),
     "trials": ("spec", "page", *FACETS),
     "conditions": ("by",),
-    "discordant": ("model", "variant", "by"),
-    **dict.fromkeys(("sweeps", "tables", "figures", "ablations", "notes", "notes.csv"), ()),
+    "discordant": ("model", "variant"),
+    **dict.fromkeys(("sweeps", "tables", "figures", "prompts", "notes", "notes.csv"), ()),
     "glossary": (),
 }
 OF_TRIALS = ("trials", "glossary")

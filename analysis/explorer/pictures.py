@@ -147,24 +147,3 @@ def ends_and_ticks(
     first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
     last = max(last, first + 1)
     return first * step, last * step, [round(i * step, 6) for i in range(first, last + 1)]
-
-
-def marker(shape: str, x: float, y: float, r: float = 4.2) -> str:
-    """A shape about a point, as a path."""
-    corners: dict[str, list[tuple[float, float]]] = {
-        "square": [(-1, -1), (1, -1), (1, 1), (-1, 1)],
-        "triangle": [(0, -1.2), (1.15, 0.9), (-1.15, 0.9)],
-        "down": [(0, 1.2), (1.15, -0.9), (-1.15, -0.9)],
-        "diamond": [(0, -1.35), (1.35, 0), (0, 1.35), (-1.35, 0)],
-    }
-    if shape in corners:
-        points = [f"{x + r * 0.9 * dx:.1f} {y + r * 0.9 * dy:.1f}" for dx, dy in corners[shape]]
-        return f"M{' L'.join(points)}Z"
-    if shape == "cross":
-        return (
-            f"M{x - r:.1f} {y - r:.1f} L{x + r:.1f} {y + r:.1f} "
-            f"M{x - r:.1f} {y + r:.1f} L{x + r:.1f} {y - r:.1f}"
-        )
-    if shape == "plus":
-        return f"M{x - r:.1f} {y:.1f} H{x + r:.1f} M{x:.1f} {y - r:.1f} V{y + r:.1f}"
-    return f"M{x - r:.1f} {y:.1f} a{r} {r} 0 1 0 {2 * r:.1f} 0 a{r} {r} 0 1 0 {-2 * r:.1f} 0Z"

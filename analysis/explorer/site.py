@@ -33,11 +33,11 @@ PAGES = {
     "Drivers": "drivers",
     "Trials": "trials",
     "Words": "words",
+    "Prompts": "prompts",
     "Runs": "sweeps",
-    "Notes": "notes",
-    "Tables": "tables",
-    "Ablations": "ablations",
     "SQL": "sql",
+    "Tables": "tables",
+    "Notes": "notes",
 }
 
 

@@ -95,7 +95,7 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     expect(page.locator("h1")).to_have_text("The baseline prompt in all 11 conditions")
     page.get_by_role("link", name="Tables").click()
     page.get_by_role("link", name="ablation-matrix").click()
-    expect(page.locator("svg")).to_be_visible()
+    expect(page.locator("figure img")).to_be_visible()
 
 
 def test_what_an_export_refers_to_lies_in_it_and_asks_no_server(exported):

@@ -22,8 +22,6 @@ from merge_runner_analysis.explorer.pages.home import home_page
 from merge_runner_analysis.explorer.site import NothingNew, Site
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import MAKERS
-from merge_runner_analysis.figures.styles import COLOURS
-from merge_runner_analysis.metrics import shown_in
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import render
@@ -242,20 +240,6 @@ def test_no_head_of_a_table_is_empty(client):
     assert all(re.sub("<[^>]*>", "", head).strip() for head in heads)
 
 
-def test_every_measure_of_the_ablations_is_explained_above_them(client):
-    above = unescape(client.get("/ablations").text.split("<table")[0])
-    for metric in shown_in("tables"):
-        assert f"<strong>{metric.heading}</strong>: {metric.meaning}" in above
-
-
-def test_the_colours_of_drivers_are_those_of_the_figures():
-    styles = (STATIC / "styles/colours.css").read_text()
-    light, _, _ = styles.partition("@media")
-    assert re.findall(r"--tint-\d: (#\w+);", light) == list(COLOURS)
-    used = (STATIC / "styles/tables.css").read_text()
-    assert re.findall(r"\.tint-(\d) ", used) == [str(i) for i in range(len(COLOURS))]
-
-
 def test_captions_of_all_tables_have_one_rule():
     rules = [
         name
@@ -266,13 +250,9 @@ def test_captions_of_all_tables_have_one_rule():
 
 
 @pytest.mark.long
-def test_ablations_are_whole_at_1024_pixels_and_numbers_look_like_links(browser, db):
+def test_the_numbers_of_a_table_look_like_links(browser, db):
     with served(db) as address:
         page = browser.new_page(viewport={"width": 1024, "height": 800})
-        page.goto(f"{address}/ablations")
-        table = page.locator("table.ablations")
-        expect(table).to_be_visible()
-        assert page.eval_on_selector(".scroll", "e => e.scrollWidth <= e.clientWidth")
         page.goto(f"{address}/tables/attempts")
         number = page.locator("table.of-report td a").first
         looks = "e => [getComputedStyle(e).color, getComputedStyle(e).textDecorationStyle]"
