@@ -109,15 +109,9 @@ class Axis:
     ticks: Sequence[float]
 
     @classmethod
-    def of(
-        cls,
-        ends: tuple[float, float],
-        places: tuple[float, float],
-        lowest: float | None = None,
-        highest: float | None = None,
-    ) -> Axis:
+    def of(cls, ends: tuple[float, float], places: tuple[float, float]) -> Axis:
         """An axis between two places that shows at least these ends; see ``ends_and_ticks``."""
-        low, high, ticks = ends_and_ticks(*ends, lowest, highest)
+        low, high, ticks = ends_and_ticks(*ends)
         return cls(Scale(low, high, *places), ticks)
 
     @property
@@ -130,15 +124,9 @@ class Axis:
         return round(self.scale(value), 1)
 
 
-def ends_and_ticks(
-    low: float, high: float, lowest: float | None, highest: float | None
-) -> tuple[float, float, list[float]]:
-    """Both ends of an axis, and its ticks: round steps, with 0 in it.
-
-    ``lowest`` and ``highest`` are the ends where the values have such.
-    """
-    low = min(low, 0.0) if lowest is None else lowest
-    high = max(high, 0.0) if highest is None else highest
+def ends_and_ticks(low: float, high: float) -> tuple[float, float, list[float]]:
+    """Both ends of an axis that holds these, and its ticks: round steps, with 0 in it."""
+    low, high = min(low, 0.0), max(high, 0.0)
     high = high if high > low else low + 1.0
     rough = (high - low) / 4
     size = 10.0 ** floor(log10(rough))

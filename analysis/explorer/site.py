@@ -36,9 +36,9 @@ PAGES = {
     "Prompts": "prompts",
     "Runs": "sweeps",
     "SQL": "sql",
-    "Tables": "tables",
-    "Notes": "notes",
 }
+# What hangs under these, each with one list of all.
+LISTS = {"Tables and figures": "tables", "Notes": "notes"}
 
 
 class NotThere(Exception):
@@ -93,6 +93,7 @@ class Site:
             notes=self.notes,
             note_limits={"text": LONGEST_TEXT, "tags": MOST_TAGS * (LONGEST_TAG + 2)},
             pages=PAGES,
+            lists=LISTS,
             share=self.share,
             program=self.program,
             styles=STYLES,

@@ -34,13 +34,16 @@ class References(HTMLParser):
 
 
 def broken(page):
-    """What a page refers to that is no file beside it."""
+    """What a page refers to that is no file beside it; a picture in the page itself is there."""
     return [
         address
         for address in References(page.read_text()).found
-        if (parts := urlsplit(address)).scheme
-        or parts.netloc
-        or not (page.parent / unquote(parts.path) if parts.path else page).is_file()
+        if not address.startswith("data:image/")
+        and (
+            (parts := urlsplit(address)).scheme
+            or parts.netloc
+            or not (page.parent / unquote(parts.path) if parts.path else page).is_file()
+        )
     ]
 
 
