@@ -63,7 +63,7 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     expect(page.locator("h1")).to_have_text("The baseline prompt in all 11 conditions")
     expect(page.locator(".strip")).to_have_count(0)
     expect(page.locator("footer")).to_contain_text("Search, filters, SQL and new notes need")
-    page.locator("#played").get_by_role("link", name="Watch it").click()
+    page.locator('a[href*="outcome-collided"]').first.click()
     expect(page.locator("tbody tr")).to_have_count(1)
     page.locator("tbody tr a").click()
     expect(page.get_by_text("The vehicles collided")).to_be_visible()
@@ -96,7 +96,7 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     expect(page.locator("h1")).not_to_have_text(first)
     page.get_by_role("link", name="Study").click()
     expect(page.locator("h1")).to_have_text("The baseline prompt in all 11 conditions")
-    page.get_by_role("link", name="Tables").click()
+    page.get_by_role("link", name="Tables and figures", exact=True).click()
     page.get_by_role("link", name="ablation-matrix").click()
     expect(page.locator("figure img")).to_be_visible()
 
