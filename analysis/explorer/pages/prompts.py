@@ -60,29 +60,40 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
     """All prompts side by side, and the differences that they make."""
     found = computed(site, ("tables", "contrasts"), asked)
     table = model.from_text(found.result.content["tables"][0]) if found.result else None
-    rows = [row for row in table.rows if row.values.get("difference") is not None] if table else []
-    widest = _widest(rows)
-    drivers: dict[str, dict[str, dict[str, PromptDifference]]] = {}
-    for row in rows:
-        assert table is not None
-        prompt = str(row.values["setting"])
-        compared = f"{prompt} against {row.values['reference']}"
-        driver = row.groups[0].removesuffix(f"/{prompt}")
-        of_driver = drivers.setdefault(str(row.values["driver"]), {})
-        mark = _mark(row, widest[_measure(row)])
-        shown = PromptDifference(row.id, driver, prompt, printed(table, row), mark)
-        of_driver.setdefault(compared, {})[_measure(row)] = shown
     return site.render(
         "prompts.html",
         here="prompts",
         computed=found,
         prompts=_prompts(site),
         left_out=partial(left_out, site),
-        drivers=drivers,
-        widest=widest,
+        drivers=differences(table) if table else {},
+        widest=_widest(table.rows) if table else {},
         collisions=COLLISIONS.name,
         table=table,
     )
+
+
+def differences(table: model.Table) -> dict[str, dict[str, dict[str, PromptDifference]]]:
+    """What each prompt changes, by driver, by both prompts, and by measure."""
+    widest = _widest(table.rows)
+    drivers: dict[str, dict[str, dict[str, PromptDifference]]] = {}
+    for row in filter(_is_compared, table.rows):
+        prompt = str(row.values["setting"])
+        shown = PromptDifference(
+            row.id,
+            row.groups[0].removesuffix(f"/{prompt}"),
+            prompt,
+            printed(table, row),
+            _mark(row, widest[_measure(row)]),
+        )
+        of_driver = drivers.setdefault(str(row.values["driver"]), {})
+        compared = f"{prompt} against {row.values['reference']}"
+        of_driver.setdefault(compared, {})[_measure(row)] = shown
+    return drivers
+
+
+def _is_compared(row: model.Row) -> bool:
+    return row.values.get("difference") is not None  # a driver that is not judged has none
 
 
 def _prompts(site: Site) -> list[Prompt]:
@@ -105,7 +116,7 @@ def _measure(row: model.Row) -> str:
 def _widest(rows: Iterable[model.Row]) -> dict[str, float]:
     """The end of each measure's axis, on both sides of 0, in its unit."""
     found: dict[str, float] = {}
-    for row in rows:
+    for row in filter(_is_compared, rows):
         ends = map(abs, (_number(row.values["difference"]), *_interval(row)))
         found[_measure(row)] = max(found.get(_measure(row), 0.0), *ends)
     return found
