@@ -40,7 +40,8 @@ class Numbers:
 
         Where no table has the cell, the answer says so as ``absent``.
 
-        ``study``, which reads it, ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``figure NAME``,
+        ``study``, which reads it, ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``figure NAME
+        FORM``,
         or ``verdicts SWEEP CONDITION``, of all where these are empty. Raises MergeRunnerError.
         """
         match list(request):
@@ -55,8 +56,11 @@ class Numbers:
                 return self._cell(table, row, column)
             case ["verdicts", sweep, condition]:
                 return self._verdicts(sweep, condition)
-            case ["figure", name]:
-                return self._counted() | {"svg": self._figure(name)}
+            case ["figure", name, "svg" | "png" as form]:
+                from merge_runner_analysis.figures.gallery import rendered
+
+                file = rendered(self.study, name, form)
+                return self._counted() | {"file": file, "digest": self._digest}
         raise UsageError(f"nothing answers {request!r}")
 
     @cached_property
@@ -137,10 +141,11 @@ class Numbers:
             ],
         }
 
-    def _figure(self, name: str) -> str:
-        from merge_runner_analysis.figures.gallery import rendered
+    @cached_property
+    def _digest(self) -> str:
+        from merge_runner.results.store import results_digest
 
-        return rendered(self.study, name, "svg").decode()
+        return results_digest(self.db)[0]
 
     def _keys(self, source: Source, *, numerator: bool) -> list[tuple[str, str]]:
         """The (trial, spec) of a source's trials, or of its ``numerator``."""

@@ -31,12 +31,12 @@ from merge_runner_analysis.explorer.assets import STATIC
 from merge_runner_analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
 from merge_runner_analysis.explorer.offline import page_of_trials
 from merge_runner_analysis.explorer.pages import (
-    ablations,
     comparing,
     conditions,
     drivers,
     home,
     notes,
+    prompts,
     sql,
     sweep,
     tables,
@@ -59,6 +59,11 @@ FILE_NAME = re.compile(r"[^A-Za-z0-9_.-]+")
 MOST_NOTED = 65_536  # bytes of a form with a note
 # Nothing in a reply runs, whatever a browser takes it for.
 SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
+# Matplotlib writes styles into its SVG, and traces as pictures.
+DRAWN = {
+    "content-security-policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
+    "sandbox"
+}
 
 
 def explorer(site: Site) -> Starlette:
@@ -155,8 +160,12 @@ def _computed_routes(site: Site) -> list[Route]:
         return _download(text, kind, ".".join(named))
 
     def figure(request: Request) -> Response:
-        svg = tables.figure_svg(site, request.path_params["name"])
-        return Response(svg, media_type="image/svg+xml", headers=SEALED)
+        named = request.path_params["name"], request.path_params["form"]
+        file = tables.figure_file(site, *named)
+        return Response(file, media_type=tables.FORMS[named[1]], headers=DRAWN)
+
+    def figure_page(request: Request) -> str:
+        return tables.figure_page(site, request.path_params["name"], request.query_params)
 
     def condition(request: Request) -> str:
         return conditions.condition_page(site, request.path_params["name"], request.query_params)
@@ -167,10 +176,11 @@ def _computed_routes(site: Site) -> list[Route]:
         Route("/glossary", page(lambda _: site.render("glossary.html", here="glossary"))),
         Route("/tables", page(lambda _: tables.tables_page(site))),
         Route("/tables/{name}.{suffix}", page(file)),
-        Route("/figures/{name}.svg", page(figure)),
+        Route("/figures/{name}.{form}", page(figure)),
+        Route("/figures/{name}", page(figure_page)),
         Route("/tables/{name}", page(table)),
-        Route("/ablations", page(lambda r: ablations.ablations_page(site, r.query_params))),
-        Route("/discordant", page(lambda r: ablations.discordant_page(site, r.query_params))),
+        Route("/prompts", page(lambda r: prompts.prompts_page(site, r.query_params))),
+        Route("/discordant", page(lambda r: prompts.discordant_page(site, r.query_params))),
     ]
 
 

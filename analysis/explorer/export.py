@@ -37,8 +37,8 @@ FOLLOWED: dict[str, Collection[str]] = {
     "drivers": ("prompt",),
     "trials": ("spec", "page", *FACETS),
     "conditions": ("by",),
-    "discordant": ("model", "variant", "by"),
-    **dict.fromkeys(("sweeps", "tables", "figures", "ablations", "notes", "notes.csv"), ()),
+    "discordant": ("model", "variant"),
+    **dict.fromkeys(("sweeps", "tables", "figures", "prompts", "notes", "notes.csv"), ()),
     "glossary": (),
 }
 OF_TRIALS = ("trials", "glossary")
@@ -120,7 +120,7 @@ async def _crawled(
                 continue
             for link in _LINKS.findall(reply.text) if is_page else ():
                 page, _ = _page_of(unescape(link), heads)
-                if page and page not in files:
+                if page and page not in files and not page.endswith(".png"):
                     files[page] = _file_of(page, files.values())
                     waiting.append(page)
             if is_page and BUSY in reply.text:

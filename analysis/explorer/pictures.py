@@ -86,15 +86,9 @@ class Axis:
     ticks: Sequence[float]
 
     @classmethod
-    def of(
-        cls,
-        ends: tuple[float, float],
-        places: tuple[float, float],
-        lowest: float | None = None,
-        highest: float | None = None,
-    ) -> Axis:
+    def of(cls, ends: tuple[float, float], places: tuple[float, float]) -> Axis:
         """An axis between two places that shows at least these ends; see ``ends_and_ticks``."""
-        low, high, ticks = ends_and_ticks(*ends, lowest, highest)
+        low, high, ticks = ends_and_ticks(*ends)
         return cls(Scale(low, high, *places), ticks)
 
     @property
@@ -107,15 +101,9 @@ class Axis:
         return round(self.scale(value), 1)
 
 
-def ends_and_ticks(
-    low: float, high: float, lowest: float | None, highest: float | None
-) -> tuple[float, float, list[float]]:
-    """Both ends of an axis, and its ticks: round steps, with 0 in it.
-
-    ``lowest`` and ``highest`` are the ends where the values have such.
-    """
-    low = min(low, 0.0) if lowest is None else lowest
-    high = max(high, 0.0) if highest is None else highest
+def ends_and_ticks(low: float, high: float) -> tuple[float, float, list[float]]:
+    """Both ends of an axis that holds these, and its ticks: round steps, with 0 in it."""
+    low, high = min(low, 0.0), max(high, 0.0)
     high = high if high > low else low + 1.0
     rough = (high - low) / 4
     size = 10.0 ** floor(log10(rough))
@@ -124,24 +112,3 @@ def ends_and_ticks(
     first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
     last = max(last, first + 1)
     return first * step, last * step, [round(i * step, 6) for i in range(first, last + 1)]
-
-
-def marker(shape: str, x: float, y: float, r: float = 4.2) -> str:
-    """A shape about a point, as a path."""
-    corners: dict[str, list[tuple[float, float]]] = {
-        "square": [(-1, -1), (1, -1), (1, 1), (-1, 1)],
-        "triangle": [(0, -1.2), (1.15, 0.9), (-1.15, 0.9)],
-        "down": [(0, 1.2), (1.15, -0.9), (-1.15, -0.9)],
-        "diamond": [(0, -1.35), (1.35, 0), (0, 1.35), (-1.35, 0)],
-    }
-    if shape in corners:
-        points = [f"{x + r * 0.9 * dx:.1f} {y + r * 0.9 * dy:.1f}" for dx, dy in corners[shape]]
-        return f"M{' L'.join(points)}Z"
-    if shape == "cross":
-        return (
-            f"M{x - r:.1f} {y - r:.1f} L{x + r:.1f} {y + r:.1f} "
-            f"M{x - r:.1f} {y + r:.1f} L{x + r:.1f} {y - r:.1f}"
-        )
-    if shape == "plus":
-        return f"M{x - r:.1f} {y:.1f} H{x + r:.1f} M{x:.1f} {y - r:.1f} V{y + r:.1f}"
-    return f"M{x - r:.1f} {y:.1f} a{r} {r} 0 1 0 {2 * r:.1f} 0 a{r} {r} 0 1 0 {-2 * r:.1f} 0Z"

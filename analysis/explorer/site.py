@@ -33,12 +33,12 @@ PAGES = {
     "Drivers": "drivers",
     "Trials": "trials",
     "Words": "words",
+    "Prompts": "prompts",
     "Runs": "sweeps",
-    "Notes": "notes",
-    "Tables": "tables",
-    "Ablations": "ablations",
     "SQL": "sql",
 }
+# What hangs under these, each with one list of all.
+LISTS = {"Tables and figures": "tables", "Notes": "notes"}
 
 
 class NotThere(Exception):
@@ -93,6 +93,7 @@ class Site:
             notes=self.notes,
             note_limits={"text": LONGEST_TEXT, "tags": MOST_TAGS * (LONGEST_TAG + 2)},
             pages=PAGES,
+            lists=LISTS,
             share=self.share,
             db_option=self.db_option,
             program=self.program,

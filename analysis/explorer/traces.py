@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,10 @@ POINTS = 40
 # Which vehicle of a trial is its first: the left one, or the right one where it is ``turned``. By
 # order it is who is ahead at the end: who merged first, if anybody did.
 TURNED = {
-    "side": "SELECT *, unnest({seats}) AS turned FROM wanted",
+    "side": "SELECT *, false AS turned FROM wanted",
     "order": """SELECT trial_id, spec_hash, arg_max(position_m, step) FILTER (side = 'left')
             < arg_max(position_m, step) FILTER (side = 'right') AS turned
         FROM states SEMI JOIN wanted USING (trial_id, spec_hash) GROUP BY ALL""",
-    "driver": """SELECT trial_id, spec_hash, ego = 'right' AS turned
-        FROM trial_drivers SEMI JOIN wanted USING (trial_id, spec_hash)""",
 }
 # Both vehicles at each sample under control, of the trials $1 with the specs $2.
 SAMPLED = """
@@ -75,20 +73,12 @@ def read_traces(db: Path, keys: Collection[Key], by: str = "side") -> dict[Key, 
     return {(row["trial_id"], row["spec_hash"]): row for row in rows}
 
 
-def read_band(
-    db: Path, keys: Collection[Key], by: str = "side", seats: Iterable[bool] = (False,)
-) -> list[Row]:
-    """The 10th, 50th and 90th percentile of each of MEASURES over these trials, by ``time_s``.
-
-    ``seats`` say whether each trial is turned, by side: with both it counts both ways round.
-    """
-    return _read(db, BAND, keys, by, seats)
+def read_band(db: Path, keys: Collection[Key], by: str = "side") -> list[Row]:
+    """The 10th, 50th and 90th percentile of each of MEASURES over these trials, by ``time_s``."""
+    return _read(db, BAND, keys, by)
 
 
-def _read(
-    db: Path, sql: str, keys: Collection[Key], by: str, seats: Iterable[bool] = (False,)
-) -> list[Row]:
+def _read(db: Path, sql: str, keys: Collection[Key], by: str) -> list[Row]:
     names: Any = [name for name, _ in keys], [spec for _, spec in keys]
-    turned = TURNED[by].format(seats=[*seats])
     with reading(db) as connection:
-        return records(connection, sql.format(turned=turned), names)
+        return records(connection, sql.format(turned=TURNED[by]), names)

@@ -48,9 +48,9 @@ class Links:
         """A table as a file to download."""
         return f"/tables/{quote(name)}.{suffix}"
 
-    def figure(self, name: str) -> str:
-        """A figure of the report as SVG."""
-        return f"/figures/{quote(name)}.svg"
+    def figure(self, name: str, suffix: str = "") -> str:
+        """A figure's page, or the figure as a file."""
+        return f"/figures/{quote(name)}{suffix}"
 
     def cell(self, table: str, row: str, column: str) -> str:
         """The trials behind a cell.

@@ -1,16 +1,65 @@
-"""The paper's figures, and further ones."""
+"""The paper's figures, and further ones: what each shows, without Matplotlib."""
 
-# What each shows, for lists: to draw them takes Matplotlib.
-SHOWS = {
-    "figure2": (
-        "the paper's Figure 2 for the baselines: speeds, who is first, gap and RMSE by condition"
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+OF_TWO = "Of two different drivers, the left vehicle is that of the one named first."
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a figure shows, for lists; its caption; and the table that holds its numbers.
+
+    The numbers of those without a table are the metrics of the list of trials.
+    """
+
+    shows: str
+    caption: str
+    table: str = ""
+
+
+FIGURES = {
+    "figure2": About(
+        "the paper's Figure 2 for the baselines: speeds, who is first, gap and RMSE by condition",
+        "Baseline behaviour, collisions left out. (A, B) Speed of the left vehicle from the start "
+        "of control, where it merges first and second. (C) How often the left vehicle merges first "
+        "by projected headway and relative velocity, with Wilson intervals. (D) Mean gap at the "
+        "merge point and (E) mean RMSE of the speed from the initial speed, two values a trial, "
+        f"with intervals of Student's t. {OF_TWO}",
     ),
-    "figure2-variants": (
+    "figure2-variants": About(
         "the same with a row for every driver and variant; relative velocities as colours and "
-        "markers"
+        "markers",
+        "The same for every prompt variant, a row a driver and variant, collisions left out. (A, "
+        "B) Speed of the left vehicle from the start of control, where it merges first and second. "
+        "(C) How often the left vehicle merges first by projected headway, with Wilson intervals. "
+        "(D) Mean gap at the merge point and (E) mean RMSE of the speed from the initial speed, "
+        f"two values a trial, with intervals of Student's t. {OF_TWO} "
+        "Colours and markers tell the relative velocities apart; few very wide intervals of D and "
+        "E are cut at the frame.",
     ),
-    "ablation-matrix": "I1 to I5 of every driver and variant",
-    "distributions": "gaps, RMSE and every other metric that is not a share, trial by trial",
-    "factors": "the values of the table of this name, a panel for each metric",
-    "first-action": "means of the first action by own relative velocity",
+    "ablation-matrix": About(
+        "I1 to I5 of every driver and variant",
+        "Indicators of human behaviour by the paper's rule; where the robust tests disagree, their "
+        "verdict stands after a stroke.",
+        "ablation-qualitative",
+    ),
+    "distributions": About(
+        "gaps, RMSE and every other metric that is not a share, trial by trial",
+        "Every metric that is not a share, of all trials that count in it: medians, quartiles, "
+        "whiskers to 1.5 times the quartiles' distance, and every trial.",
+    ),
+    "factors": About(
+        "the values of the table of this name, a panel for each metric",
+        "Each factor's levels, pooled over all other factors, by every metric: its rate, mean or "
+        "median with the 95 % interval that the table of this name prints.",
+        "factors",
+    ),
+    "first-action": About(
+        "means of the first action by own relative velocity",
+        "Mean net acceleration of the first step under control by own relative velocity, own minus "
+        "other, with 95 % intervals clustered by trial; of humans before an import as published.",
+        "first-action",
+    ),
 }

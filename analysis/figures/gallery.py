@@ -55,7 +55,6 @@ from merge_runner_analysis.stats.indicators import INDICATORS
 from merge_runner_analysis.stats.measures import human_reference, known, values
 
 LEGEND_COLUMNS = 4
-OF_TWO = "Of two different drivers, the left vehicle is that of the one named first."
 PASSED, FAILED, UNKNOWN = SKY_BLUE, ORANGE, "#dddddd"
 # These settings are fixed, so that equal input gives equal files.
 SETTINGS: Any = {
@@ -185,45 +184,13 @@ METADATA: dict[str, dict[str, None]] = {
     "png": {"Software": None},
     "svg": {"Date": None, "Creator": None},
 }
-FIGURES: dict[str, tuple[Callable[[Study], Figure], str]] = {
-    "figure2": (
-        figure_2,
-        "Baseline behaviour, collisions left out. (A, B) Speed of the left vehicle from the start "
-        "of control, where it merges first and second. (C) How often the left vehicle merges first "
-        "by projected headway and relative velocity, with Wilson intervals. (D) Mean gap at the "
-        "merge point and (E) mean RMSE of the speed from the initial speed, two values a trial, "
-        f"with intervals of Student's t. {OF_TWO}",
-    ),
-    "figure2-variants": (
-        figure_2_variants,
-        "The same for every prompt variant, a row a driver and variant, collisions left out. (A, "
-        "B) Speed of the left vehicle from the start of control, where it merges first and second. "
-        "(C) How often the left vehicle merges first by projected headway, with Wilson intervals. "
-        "(D) Mean gap at the merge point and (E) mean RMSE of the speed from the initial speed, "
-        f"two values a trial, with intervals of Student's t. {OF_TWO} "
-        "Colours and markers tell the relative velocities apart; few very wide intervals of D and "
-        "E are cut at the frame.",
-    ),
-    "ablation-matrix": (
-        ablation_matrix,
-        "Indicators of human behaviour by the paper's rule; where the robust tests disagree, their "
-        "verdict stands after a stroke.",
-    ),
-    "distributions": (
-        distributions,
-        "Every metric that is not a share, of all trials that count in it: medians, quartiles, "
-        "whiskers to 1.5 times the quartiles' distance, and every trial.",
-    ),
-    "factors": (
-        figure_of_factors,
-        "Each factor's levels, pooled over all other factors, by every metric: its rate, mean or "
-        "median with the 95 % interval that the table of this name prints.",
-    ),
-    "first-action": (
-        figure_of_first_actions,
-        "Mean net acceleration of the first step under control by own relative velocity, own minus "
-        "other, with 95 % intervals clustered by trial; of humans before an import as published.",
-    ),
+MAKERS: dict[str, Callable[[Study], Figure]] = {
+    "figure2": figure_2,
+    "figure2-variants": figure_2_variants,
+    "ablation-matrix": ablation_matrix,
+    "distributions": distributions,
+    "factors": figure_of_factors,
+    "first-action": figure_of_first_actions,
 }
 
 
@@ -233,7 +200,7 @@ def write_figures(study: Study, folder: Path) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as exc:
         raise UsageError(f"{folder} cannot be made: {exc}") from exc
-    for name in FIGURES:
+    for name in MAKERS:
         for form in ("pdf", "png"):
             path = folder / f"{name}.{form}"
             path.write_bytes(rendered(study, name, form))
@@ -251,7 +218,7 @@ def rendered(study: Study, name: str, form: Literal["pdf", "png", "svg"]) -> byt
 @cache
 def _figure(study: Study, name: str) -> Figure:
     """A figure, laid out once for all its forms."""
-    figure = FIGURES[name][0](study)
+    figure = MAKERS[name](study)
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)

@@ -54,8 +54,8 @@ LABEL_IN, ROW_IN = 1.15, 0.62
 LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = LABEL_IN + 0.35, 0.08, 0.4, 0.62
 BETWEEN_ROWS_IN, BETWEEN_COLUMNS_IN = 0.16, 0.3
 # Styles for the humans' relative velocities, in their order, and those left for others.
-STYLES = (Style(BLUE, "down"), Style(GREEN, "circle"), Style(VERMILION, "triangle"))
-OTHER_COLOURS, OTHER_SHAPES = (PURPLE, SKY_BLUE, ORANGE), ("square", "diamond", "plus")
+STYLES = (Style(BLUE, "v"), Style(GREEN, "o"), Style(VERMILION, "^"))
+OTHER_COLOURS, OTHER_MARKERS = (PURPLE, SKY_BLUE, ORANGE), "sDP"
 Styles = dict[float, Style]
 HEADINGS = (
     "left first:\nv left (m/s)",
@@ -96,7 +96,7 @@ def _styles(study: Study) -> Styles:
     """Colour and marker of each relative velocity in m/s."""
     humans = dict(zip(HUMAN_VELOCITIES_MPS, STYLES, strict=True))
     others = [velocity for velocity in velocities_mps(study) if velocity not in humans]
-    own = {velocity: turned(i, OTHER_COLOURS, OTHER_SHAPES) for i, velocity in enumerate(others)}
+    own = {velocity: turned(i, OTHER_COLOURS, OTHER_MARKERS) for i, velocity in enumerate(others)}
     return {velocity: (humans | own)[velocity] for velocity in velocities_mps(study)}
 
 

@@ -14,7 +14,7 @@ from merge_runner_analysis.data.provenance import provenance
 from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import Source, sources_of, sql_command
-from merge_runner_analysis.figures.gallery import FIGURES
+from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.report.alarms import alarms, posing
 from merge_runner_analysis.report.design import design
 from merge_runner_analysis.stats.factors import levels_by_factor
@@ -73,7 +73,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         sentences=said[1:],
         posing=posing(study),
         figures=[
-            {"name": name, "caption": FIGURES[name][1], "data": data}
+            {"name": name, "caption": FIGURES[name].caption, "data": data}
             for name, data in figures.items()
             if name not in left_out
         ],

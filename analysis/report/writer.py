@@ -9,7 +9,8 @@ from pathlib import Path
 from merge_runner.errors import UsageError
 from merge_runner_analysis.data.derived_cache import finished, keep_finished
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.figures.gallery import FIGURES, rendered, write_figures
+from merge_runner_analysis.figures import FIGURES
+from merge_runner_analysis.figures.gallery import rendered, write_figures
 from merge_runner_analysis.report.page import report_html
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import finished_tables

@@ -10,7 +10,7 @@ from merge_runner.audit.checks import not_judged
 from merge_runner.run.stored_replay import audit_database
 from merge_runner_analysis.data.provenance import provenance
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.explorer.pages.ablations import ablations
+from merge_runner_analysis.explorer.pages.prompts import differences
 from merge_runner_analysis.report.alarms import alarms
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Said, changed, write_study, yielding
@@ -43,11 +43,10 @@ def test_more_than_a_fifth_is_too_much_and_a_fifth_is_not():
 
 
 @pytest.mark.slow
-def test_pages_that_are_made_of_tables_show_it_without_a_value(mixed):
-    quantitative, contrasts = make_tables(Study(mixed), ["ablation-quantitative", "contrasts"])
-    variants = {driver.name: driver.variants for driver in ablations(quantitative, contrasts)}
-    shown = [*variants["bad"]["baseline"], *variants["o3"]["A1"]]
-    assert {(cell.estimate, cell.n, cell.difference) for cell in shown} == {("–", None, None)}
+def test_the_page_of_prompts_compares_it_with_nothing(mixed):
+    (contrasts,) = make_tables(Study(mixed), ["contrasts"])
+    shown = {driver: list(prompts) for driver, prompts in differences(contrasts).items()}
+    assert shown == {"o3": ["A2 against baseline"]}
 
 
 @pytest.mark.slow

@@ -7,11 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from merge_runner_analysis.explorer.export import export_folder
+from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
 
 FEW_TABLES = {
     "merge_runner_analysis.explorer.pages.tables.TABLES": {"attempts": TABLES["attempts"]},
-    "merge_runner_analysis.explorer.pages.tables.FIGURES": {"ablation-matrix": "a figure"},
+    "merge_runner_analysis.explorer.pages.tables.FIGURES": {
+        "ablation-matrix": FIGURES["ablation-matrix"]
+    },
 }
 
 

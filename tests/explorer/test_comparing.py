@@ -83,14 +83,6 @@ def test_the_next_repetition_goes_round(client):
     assert ask(client, "o3/A1/N_0_0/rep01", offer="next repetition") is None
 
 
-def test_another_driver_has_the_same_prompt_if_it_can(client):
-    assert ask(client, "o3/A1/N_0_0/rep01", offer="other driver") == "o4/A1/N_0_0/rep01"
-    assert ask(client, "o3/baseline/N_0_0/rep01", offer="other driver") == (
-        "o4/baseline/N_0_0/rep02"
-    )
-    assert ask(client, "human/near/N_0_0/rep01", offer="other driver").startswith("o3/")
-
-
 def test_what_is_offered_to_all_of_a_condition_is_what_is_offered_to_each(db, client):
     site = Site(db)
     site.catalogue.refresh()
@@ -111,7 +103,7 @@ def test_all_words_of_a_search_count_and_the_own_trial_is_not_found(client):
 def test_an_offer_that_is_unknown_names_the_others(client):
     reply = client.get("/others/o3/baseline/N_0_0/rep01", params={"offer": "best"})
     assert reply.status_code == 404
-    assert "nearest human, next repetition, other driver" in reply.text
+    assert "nearest human, next repetition" in reply.text
 
 
 def test_a_name_with_several_specs_is_told_with_its_spec(db, tmp_path):

@@ -13,7 +13,6 @@ from starlette.testclient import TestClient
 
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.catalogue import Filter
-from merge_runner_analysis.explorer.pages.ablations import ablations_page
 from merge_runner_analysis.explorer.pages.home import home_page
 from merge_runner_analysis.explorer.pages.trial import trial_page
 from merge_runner_analysis.explorer.pages.trials import filter_of, trials_page
@@ -106,7 +105,6 @@ def test_every_page_says_who_is_a_stand_in_and_for_whom(site):
         "trials": trials_page(site, {}),
         "trial": trial_page(site, trials[0]["trial_id"], {}),
         "study": computed(home_page, site),
-        "ablations": computed(ablations_page, site),
         "csv": site.catalogue.export(Filter(), "trial"),
     }
     assert [name for name, page in pages.items() if words not in page] == []

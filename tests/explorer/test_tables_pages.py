@@ -1,4 +1,4 @@
-"""Tables, ablations and humans in the explorer: every number leads to its trials."""
+"""Tables, figures and prompts in the explorer: every number leads to its trials."""
 
 from __future__ import annotations
 
@@ -28,11 +28,10 @@ from merge_runner_analysis.explorer.analysis_process import (
 )
 from merge_runner_analysis.explorer.analysis_worker import Numbers
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.pages.ablations import ablations
 from merge_runner_analysis.explorer.pictures import ends_and_ticks
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.metrics import METRICS, shown_in
 from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.tables.formats import printed
 from tests.analysis.studies import Said, write_study, yielding
 from tests.gate import HANGS_S
 
@@ -240,56 +239,6 @@ def test_the_trials_are_read_before_anything_is_asked_and_again_where_the_databa
         computing.close()
 
 
-@pytest.mark.slow
-def test_the_trials_of_a_rate_that_are_in_no_pair_are_counted(tmp_path):
-    """A baseline of two repetitions, the second with collisions, and a variant of one."""
-    baseline = [
-        replace(drive, left=(0.0,), right=(0.0,)) if drive.rep == 2 and drive.left[0] < 0 else drive
-        for drive in yielding("o3", reps=2)
-    ]
-    db = write_study(tmp_path / "t.duckdb", [*baseline, *yielding("o3", "A1", reps=1)])
-    site = Site(db)
-    client = TestClient(explorer(site), base_url=f"http://{HERE}")
-    with duckdb.connect(str(db), read_only=True) as connection:
-        collided = connection.execute(
-            "SELECT trial_id FROM trials WHERE status = 'collided' ORDER BY ALL"
-        ).fetchall()
-        joint = connection.execute(
-            "SELECT trial_id FROM trials JOIN trial_metrics USING (trial_id, spec_hash) "
-            "WHERE joint AND trial_id LIKE '%rep02' ORDER BY ALL"
-        ).fetchall()
-        (known,) = connection.execute(
-            "SELECT count(joint), count(joint) FILTER (trial_id LIKE '%rep02') "
-            "FROM trials JOIN trial_metrics USING (trial_id, spec_hash) WHERE variant = 'baseline'"
-        ).fetchall()
-    assert collided
-    assert joint
-    assert known[0] < 22
-    for by, alone, of in (("outcome", collided, (22, 11)), ("joint", joint, known)):
-        text = client.get(f"/discordant?model=o3 [k]&variant=A1&by={by}").text
-        assert "<strong>0</strong> of 11 pairs differ" in text
-        rows = re.search(r'<table[^>]*id="alone">.*?</table>', text, re.DOTALL)[0]
-        base, own = rows.split("<tr>")[2:]
-        assert [urlsplit(a).path for a in Addresses(base).to if "/trials/" in a] == [
-            f"/trials/{name}" for (name,) in alone
-        ]
-        assert re.findall(r">(\d+)<", base)[::2] == [str(count) for count in of]
-        assert int(re.search(r"<summary>(\d+)<", base)[1]) == len(alone)
-        assert re.findall(r">(\d+)<", own)[::3] == ["11", "0"]
-        for link, count in re.findall(r'href="(/trials\?[^"]*)">(\d+)<', rows):
-            assert listed(client.get(unescape(link)).text) == int(count)
-    even = write_study(
-        tmp_path / "even.duckdb", [*yielding("o3", reps=1), *yielding("o3", "A1", 1)]
-    )
-    text = (
-        TestClient(explorer(Site(even)), base_url=f"http://{HERE}")
-        .get("/discordant?model=o3&variant=A1")
-        .text
-    )
-    assert "0</strong> of 11 pairs differ" in text
-    assert "without a partner" not in text
-
-
 def test_discordant_trials_are_the_pairs_that_differ(ask, db):
     text = ask("/discordant?model=o3&variant=A1")
     with duckdb.connect(str(db), read_only=True) as connection:
@@ -309,35 +258,22 @@ def test_discordant_trials_are_the_pairs_that_differ(ask, db):
         if "compare=" in a
     ]
     assert sorted(shown) == sorted(pairs)
-    assert f"<strong>{len(pairs)}</strong> of 22 pairs differ" in text
-    joint = ask("/discordant?model=o3&variant=A1&by=joint")
-    assert "<strong>1</strong> of 20 pairs differ" in joint
-    assert "right first</span>, not joint" in joint
+    assert f"<strong>{len(pairs)}</strong> of 22 ended differently" in text
     assert "no trial of this variant" in ask("/discordant?model=o3&variant=A7")
-    ask("/discordant?model=o3&variant=A1&by=source", 404)
 
 
-def test_an_ablation_has_the_numbers_of_both_tables(ask, db):
-    quantitative, contrasts = make_tables(Study(db), ["ablation-quantitative", "contrasts"])
-    drivers = {driver.name: driver.variants for driver in ablations(quantitative, contrasts)}
-    assert list(drivers["o3"]) == ["baseline", "A1"]
-    rows = {row.id: row.values for row in contrasts.rows}
-    for cell, base in zip(drivers["o3"]["A1"], drivers["o3"]["baseline"], strict=True):
-        found = rows.get(f"o3/A1/baseline/{cell.measure}")
-        if cell.measure == "collided_boxes_percent":  # some of its trials are undecided
-            assert (found, cell.difference) == (None, None)
-            continue
-        assert cell.difference.value == found["difference"]
-        assert cell.difference.limits == found["ci"]
-        assert (cell.n, base.n) == (found["n"], found["n_reference"])
-        assert base.difference is None
-    text = ask("/ablations")
-    assert "without C1: history" in text
-    assert text.count("<svg") == len(shown_in("tables")) - 1, "none of undecided trials"
-    assert "/discordant?model=o3&amp;variant=A1&amp;by=outcome" in text
+def test_the_page_of_prompts_has_the_differences_of_the_table(ask, db):
+    (contrasts,) = make_tables(Study(db), ["contrasts"])
+    text = ask("/prompts")
+    shown = [row for row in contrasts.rows if row.values["difference"] is not None]
+    assert shown
+    for row in shown:
+        told = printed(contrasts, row)
+        assert f"{told['difference']}</a> <small>{told['ci']}, Holm {told['p_holm']}" in text
+    assert "/discordant?model=o3&amp;variant=A1" in text
 
 
-@pytest.mark.parametrize("address", ["/tables/attempts", "/ablations", "/tables"])
+@pytest.mark.parametrize("address", ["/tables/attempts", "/prompts", "/tables"])
 def test_a_name_is_shown_as_text_and_nothing_is_inline(ask, address):
     text = ask(address)
     assert HOSTILE not in text
@@ -360,7 +296,7 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
     assert "Computing, about 4 s the first time that these 66 trials are read" in first
     assert asked.wait(60)
     assert listed(client.get("/trials").text) == 66
-    assert "Computing, about" in client.get("/ablations").text
+    assert "Computing, about" in client.get("/prompts").text
     going.set()
     while "Computing, about" in (later := client.get("/tables/attempts").text):
         pass
@@ -405,17 +341,10 @@ def test_a_process_of_its_own_answers_alike_and_another_one_takes_its_place(db):
 
 
 @pytest.mark.parametrize(
-    ("kind", "reached", "ends"),
-    [
-        ("gap_m", (0, 0), (0, 1)),
-        ("left_first_percent", (3, 97), (0, 100)),
-        ("gap_m", (-0.2, 1), (-0.5, 1)),
-        ("rmse_mps", (-0.2, 1), (0, 1)),
-        ("collided_percent", (0, 9), (0, 10)),
-    ],
+    ("reached", "ends"),
+    [((0, 0), (0, 1)), ((3, 97), (0, 100)), ((-0.2, 1), (-0.5, 1)), ((0, 9), (0, 10))],
 )
-def test_a_scale_holds_all_that_is_shown_and_0(kind, reached, ends):
-    metric = METRICS[kind]
-    low, high, ticks = ends_and_ticks(*reached, metric.lowest, metric.highest)
+def test_a_scale_holds_all_that_is_shown_and_0(reached, ends):
+    low, high, ticks = ends_and_ticks(*reached)
     assert (low, high) == ends
     assert {low, 0, high} <= {round(tick, 6) for tick in ticks}

@@ -87,7 +87,7 @@ def test_the_exported_pages_show_it(study, installed):
     pages = {
         path.name: unescape(path.read_text()) for path in study.folder.glob("pages/files/*.html")
     }
-    assert HEADING in pages["ablations.html"]
+    assert HEADING in pages["prompts.html"]
     assert all(HEADING in pages[f"tables-{name}.html"] for name in ("indicators", "contrasts"))
 
 

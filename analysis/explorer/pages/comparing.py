@@ -8,7 +8,6 @@ from typing import Any
 from merge_runner_analysis.explorer.details import read_trial
 from merge_runner_analysis.explorer.display_text import visible
 from merge_runner_analysis.explorer.pages.trial import (
-    DRIVER,
     HUMAN,
     OFFERS,
     REPETITION,
@@ -37,12 +36,6 @@ WITH near AS (
         coalesce(lead(number) OVER alike, first_value(number) OVER alike) AS other
     FROM near
     WINDOW alike AS (PARTITION BY model, variant, pair, spec_hash ORDER BY rep, trial_id)
-    UNION ALL BY NAME
-    SELECT one.number, '{DRIVER}' AS kind, arg_min(two.number, (two.variant IS DISTINCT FROM
-        one.variant, two.rep <> one.rep, two.model <= one.model, two.model, two.trial_id,
-        two.spec_hash)) AS other
-    FROM near AS one JOIN near AS two ON two.model <> one.model AND two.source <> 'human'
-    WHERE one.wanted GROUP BY one.number
 )
 SELECT one.trial_id, one.spec_hash, kind, two.trial_id AS other_id, two.spec_hash AS other_hash
 FROM beside JOIN near AS one USING (number) JOIN near AS two ON two.number = beside.other

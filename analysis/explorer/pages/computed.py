@@ -41,9 +41,9 @@ class Computed:
 
     @property
     def clock(self) -> str:
-        """When the result was made, in local time."""
+        """When the result was made, in local time with its zone."""
         assert self.result is not None
-        return f"{datetime.fromtimestamp(self.result.at).astimezone():%Y-%m-%d %H:%M:%S}"
+        return f"{datetime.fromtimestamp(self.result.at).astimezone():%Y-%m-%d %H:%M:%S %Z}"
 
 
 def computed(

@@ -24,16 +24,12 @@ CROSS = "m-5-5 10 10m0-10-10 10"
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """How the vehicles of a trial are told apart: its name, what the first and the second are.
-
-    ``outcomes`` say of a line in the first and in the second colour who went first.
-    """
+    """How the vehicles of a trial are told apart: its name, what the first and the second are."""
 
     name: str
     first: str
     second: str
     meaning: str = ""
-    outcomes: tuple[str, str] = ("left first", "right first")
 
     @property
     def headings(self) -> dict[str, str]:
@@ -43,7 +39,7 @@ class View:
         return dict(zip(MEASURES, texts, strict=True))
 
 
-# The first is what a page shows that asks for none: in the others the humans' median is of those
+# The first is what a page shows that asks for none: in the other the humans' median is of those
 # who go first and of those who yield together, which nobody drives.
 VIEWS = {
     "order": View(
@@ -51,14 +47,7 @@ VIEWS = {
         "Where nobody merged first it is the vehicle that was ahead at the end.",
     ),
     "side": View("side", "the left vehicle", "the right vehicle"),
-    "driver": View(
-        *("who drives", "the driver that is named first", "the other driver"),
-        "Shown are pairs of two different drivers; of the humans, the vehicles on the same sides.",
-        ("the driver named first went first", "the other one did"),
-    ),
 }
-# By driver a line has the look of who went first: the driver that is named first, or the other one.
-TURNED_KIND = {"left-first": "right-first", "right-first": "left-first"}
 
 
 def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
@@ -70,20 +59,19 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     groups = site.catalogue.counts(Filter(condition=name), "model", "variant")
     if not groups:
         raise NotThere(f"no trial of the condition {name} is here")
-    views = views_of(site, name)
-    by = asked.get("by") or next(iter(views))
-    if by not in views:
-        raise NotThere(f"vehicles are told apart with by={' or by='.join(views)}")
+    usual = next(iter(VIEWS))
+    by = asked.get("by") or usual
+    if by not in VIEWS:
+        raise NotThere(f"vehicles are told apart with by={' or by='.join(VIEWS)}")
     wanted = Filter(condition=name, model=asked.get("model", ""), variant=asked.get("variant", ""))
     chosen = {key: value for key, value in wanted.chosen.items() if key != "condition"}
     alone = all(row["model"] == HUMAN for row in groups)
     rows = _rows(site, wanted, with_humans=alone)
-    if by == "driver":
-        rows = [row for row in rows if _mixed(row["model"])]
     drawn = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
     traces = read_traces(site.db, [_key(row) for row in drawn], by)
     drawn = [row for row in drawn if _key(row) in traces]
     humans = _rows(site, Filter(condition=name, model=HUMAN), with_humans=True)
+    band = read_band(site.db, [_key(row) for row in humans], by) if humans else []
     return site.render(
         "condition.html",
         here="",
@@ -91,8 +79,12 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         by=by,
         view=VIEWS[by],
         choices=[
-            (VIEWS[key].name, site.at.condition(name, by=shown, **chosen), key == by)
-            for key, shown in views.items()
+            (
+                view.name,
+                site.at.condition(name, by="" if key == usual else key, **chosen),
+                key == by,
+            )
+            for key, view in VIEWS.items()
         ],
         state=state,
         groups=groups,
@@ -101,32 +93,8 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         sampled=len(rows) if len(rows) > MOST else 0,
         humans=len(humans),
         drawn=len(drawn),
-        picture=picture(drawn, traces, _band_of(site, humans, by, traces), VIEWS[by]),
+        picture=picture(drawn, traces, band, VIEWS[by]),
     )
-
-
-def views_of(site: Site, condition: str) -> dict[str, str]:
-    """The views of a condition, by driver where two different ones drove, as its address has them.
-
-    The first one is what is shown where the address says nothing.
-    """
-    models = site.catalogue.ask("SELECT DISTINCT model FROM listed WHERE condition = ?", condition)
-    there = [key for key in VIEWS if key != "driver" or any(_mixed(row["model"]) for row in models)]
-    return {key: key if i else "" for i, key in enumerate(there)}
-
-
-def _mixed(model: str) -> bool:
-    return "+" in model  # joins the names of two different drivers
-
-
-def _band_of(site: Site, humans: Sequence[Row], by: str, traces: Mapping[Any, Row]) -> list[Row]:
-    """Where the humans' traces lie, in the same view: by driver, those on the drivers' sides."""
-    if not humans:
-        return []
-    keys = [_key(row) for row in humans]
-    if by == "driver":
-        return read_band(site.db, keys, seats={trace["turned"] for trace in traces.values()})
-    return read_band(site.db, keys, by)
 
 
 def picture(
@@ -148,8 +116,6 @@ def picture(
     for row in drawn:
         trace = traces[_key(row)]
         kind = str(row["outcome"]).replace(" ", "-")
-        if view is VIEWS["driver"] and trace["turned"]:
-            kind = TURNED_KIND.get(kind, kind)
         of = lines.setdefault((row["model"], row["variant"] or ""), [])
         of.append({"row": row, "kind": kind, "path": _path(row, trace, time.scale, axes)})
     return {

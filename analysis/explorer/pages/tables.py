@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Collection, Mapping
+from importlib import metadata
 from typing import Any
 
 from merge_runner.errors import StoreError
 from merge_runner_analysis.explorer.analysis_process import Request
 from merge_runner_analysis.explorer.pages.computed import computed
 from merge_runner_analysis.explorer.site import NotThere, Site
-from merge_runner_analysis.figures import SHOWS as FIGURES
+from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.tables.formats import render, table_view
@@ -20,7 +22,14 @@ FILES = {
     TableFormat.CSV.suffix: (TableFormat.CSV, "text/csv; charset=utf-8"),
     TableFormat.LATEX.suffix: (TableFormat.LATEX, "application/x-tex; charset=utf-8"),
 }
+# How a figure can be downloaded, with the file's type.
+FORMS = {"svg": "image/svg+xml", "png": "image/png"}
 FILE_WAIT_S = 300.0
+PAPER = (
+    "S. H. A. Mohammad, W. Mooi, A. Zgonnikov: General-purpose LLMs as Models of Human Driver "
+    "Behavior: The Case of Simplified Merging. arXiv:2604.09609, 2026."
+)
+HUMANS = "O. Siebinga et al.: human merging experiment, data set. doi:10.4121/19550377."
 
 
 def tables_page(site: Site) -> str:
@@ -42,10 +51,31 @@ def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
     return render([from_text(text)], form) + "\n", kind
 
 
-def figure_svg(site: Site, name: str) -> str:
-    """A figure; raises NotThere and StoreError."""
-    svg: str = awaited(site, ("figure", _named(name, FIGURES, "figure")))["svg"]
-    return svg
+def figure_file(site: Site, name: str, form: str) -> bytes:
+    """A figure as a file; raises NotThere and StoreError."""
+    if form not in FORMS:
+        raise NotThere(f"a figure comes as {' or '.join(FORMS)}")
+    file: bytes = awaited(site, ("figure", _named(name, FIGURES, "figure"), form))["file"]
+    return file
+
+
+def figure_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
+    """A figure with its caption, its files, and how it is cited; raises NotThere."""
+    about = FIGURES[_named(name, FIGURES, "figure")]
+    found = computed(site, ("figure", name, "svg"), asked)
+    numbers = site.at.table_file(about.table, "csv") if about.table else site.at.to("trials.csv")
+    return site.render(
+        "figure.html",
+        here="tables",
+        name=name,
+        about=about,
+        computed=found,
+        image=b64encode(found.result.content["file"]).decode() if found.result else "",
+        files={"SVG": site.at.figure(name, ".svg"), "PNG": site.at.figure(name, ".png")}
+        | {"CSV": numbers},
+        sources=(PAPER, HUMANS),
+        version=metadata.version("merge-runner"),
+    )
 
 
 def awaited(site: Site, request: Request) -> dict[str, Any]:

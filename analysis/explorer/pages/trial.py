@@ -25,13 +25,11 @@ from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.explorer.urls import whole
 
 # What is offered to lay beside a trial, and by what rule.
-HUMAN, REPETITION, DRIVER = "nearest human", "next repetition", "other driver"
+HUMAN, REPETITION = "nearest human", "next repetition"
 OFFERS = {
     HUMAN: "the human trial of this condition, at such speeds, whose headway "
     "stays closest to this one's until its first vehicle has merged (root mean square)",
     REPETITION: "the next repetition with the same driver, prompt and condition",
-    DRIVER: "the same condition, and if possible the same prompt and repetition, with the next "
-    "driver by name",
 }
 
 

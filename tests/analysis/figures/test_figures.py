@@ -18,7 +18,7 @@ from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.figures.drawing import PAGE_IN
 from merge_runner_analysis.figures.gallery import (
-    FIGURES,
+    MAKERS,
     SETTINGS,
     figure_2,
     rendered,
@@ -55,7 +55,7 @@ def test_equal_results_give_equal_files(small, written):
 
 def test_figures_are_written_as_vector_pdf_and_as_png_of_page_width(written):
     assert {p.name for p in written.iterdir()} == {
-        f"{n}.{e}" for n in FIGURES for e in ("pdf", "png")
+        f"{n}.{e}" for n in MAKERS for e in ("pdf", "png")
     }
     pdf = (written / "figure2.pdf").read_bytes()
     box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", pdf)
@@ -208,10 +208,10 @@ def written_words(figure):
     }
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", MAKERS)
 def test_no_name_is_cut_and_none_lies_over_another(name, long_names):
     with mpl.rc_context(SETTINGS):
-        figure = FIGURES[name][0](long_names)
+        figure = MAKERS[name](long_names)
         words = written_words(figure)
     for text, box in words.items():
         assert Bbox.union([figure.bbox, box]).bounds == pytest.approx(figure.bbox.bounds, abs=1), (
@@ -221,9 +221,9 @@ def test_no_name_is_cut_and_none_lies_over_another(name, long_names):
         assert not box.padded(-1).overlaps(another.padded(-1)), (one, other)
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", MAKERS)
 def test_every_figure_says_who_is_a_stand_in_and_names_its_variant(name, long_names):
-    figure = FIGURES[name][0](long_names)
+    figure = MAKERS[name](long_names)
     texts = [text.get_text().replace("\n", " ") for text in figure.findobj(Text)]
     shown = {text.replace("+ ", "+").replace("- ", "-") for text in texts}
     marked = [text for text in shown if "scripted stand-in, not" in text]
@@ -300,6 +300,6 @@ def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
 )
 def test_figures_of_next_to_nothing_are_drawn_all_the_same(drives, tmp_path, recwarn):
     study = Study(write_study(tmp_path / "t.duckdb", drives))
-    for draw, _ in FIGURES.values():
+    for draw in MAKERS.values():
         draw(study).draw_without_rendering()
     assert [str(w.message) for w in recwarn.list] == []

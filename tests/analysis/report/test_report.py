@@ -15,7 +15,8 @@ from merge_runner.errors import UsageError
 from merge_runner_analysis.data.provenance import provenance, tally
 from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.figures.gallery import FIGURES, rendered
+from merge_runner_analysis.figures import FIGURES
+from merge_runner_analysis.figures.gallery import MAKERS, rendered
 from merge_runner_analysis.report.alarms import alarms
 from merge_runner_analysis.report.page import report_html
 from merge_runner_analysis.report.writer import finished_figures, write_report
@@ -51,8 +52,8 @@ def one_figure():
     """Drawing takes most of a report's time, and other tests look at the figures."""
     name = "ablation-matrix"
     with pytest.MonkeyPatch.context() as patch:
-        for place in ("report.writer", "figures.gallery"):
-            patch.setattr(f"merge_runner_analysis.{place}.FIGURES", {name: FIGURES[name]})
+        patch.setattr("merge_runner_analysis.report.writer.FIGURES", {name: FIGURES[name]})
+        patch.setattr("merge_runner_analysis.figures.gallery.MAKERS", {name: MAKERS[name]})
         yield
 
 
