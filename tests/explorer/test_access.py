@@ -13,6 +13,8 @@ __all__ = ["exported"]
 PAGES = (
     "/sweeps",
     "/",
+    "/drivers",
+    "/drivers/emulator?prompt=baseline",
     "/conditions/N_0_0",
     "/glossary",
     "/tables",
