@@ -172,7 +172,7 @@ def explain(
     by: ByOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Explain a row of a table: its query and trials, and those that a share counts."""
+    """Explain a row of a table: its query and its trials."""
     use_study(study_file, trust=trust)
     from merge_runner_analysis.explain import explain as explain_cell
     from merge_runner_analysis.tables import finished_tables

@@ -59,8 +59,10 @@ GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
 SHOWN = 20
+REPLIES = "SELECT rowid, reply::VARCHAR FROM calls WHERE rowid >= ? AND rowid < ?"
+REPLIES_AT_ONCE = 20_000
 ENOUGH = "200MB"
-"""Of memory for DuckDB where replies are short: more would only cache the file."""
+"""Of memory for DuckDB and one thread where replies are short: more would only cache the file."""
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 
@@ -120,7 +122,7 @@ def audited_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
     try:
         with read_database(path, Instance()) as connection:
             if not has_long_texts(connection):
-                connection.execute(f"SET memory_limit = '{ENOUGH}'")
+                connection.execute(f"SET memory_limit = '{ENOUGH}'; SET threads = 1")
             prepare(connection)
             yield connection
     except duckdb.Error as exc:
@@ -131,8 +133,11 @@ def prepare(connection: duckdb.DuckDBPyConnection) -> None:
     """Make the views of checks.sql, and read the ids of all replies."""
     make_views(connection)
     append(connection, "other_models", other_models(connection))
-    replies = fetched(connection.execute("SELECT rowid, reply::VARCHAR FROM calls"))
-    append(connection, "told", [row for place, reply in replies if (row := _told(place, reply))])
+    [(calls,)] = fetched(connection.execute("SELECT coalesce(max(rowid), -1) + 1 FROM calls"))
+    for first in range(0, calls, REPLIES_AT_ONCE):  # what they tell lies in memory meanwhile
+        replies = connection.execute(REPLIES, [first, first + REPLIES_AT_ONCE])
+        told = [row for each in fetched(replies) if (row := _told(*each))]
+        append(connection, "told", told)
     connection.execute("INSERT INTO reply_ids FROM identified")
 
 

@@ -82,6 +82,8 @@ class Store:
     def __init__(self, path: Path) -> None:
         """Open or make the database; raises UsageError for a foreign one or another schema."""
         self.path = path
+        if path.exists() and not path.is_file():
+            raise UsageError(f"{path} is not a file: name one with --db")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as exc:

@@ -96,8 +96,6 @@ async def test_the_recordings_of_a_real_small_model_replay_to_what_their_page_sa
     row = " | ".join([f"| `{model}`", *map(str, figures)])
     assert f"{row} |" in (PROJECT / "docs/reference/smollm2.md").read_text()
     assert (await merge_runner("digest")).out == GOLDEN[model]
-    said = await merge_runner("replay", "baseline", "--model", model)
-    assert f"\n{model}: 135 million parameters, " in said.out
 
 
 @pytest.mark.slow

@@ -170,7 +170,7 @@ async def test_a_recording_of_situations_is_no_recording_of_the_sweep(merge_runn
     assert swept.code == 4
     other = ("--db", "other.duckdb", "--cache", "none")
     missed = await merge_runner("replay", "baseline", "--sample-set", 5, *replay[4:], *other)
-    said = "asked.parquet holds baseline-first with emulator: 1 x baseline in 2 conditions"
+    said = "asked.parquet holds 4 calls of scripted-driver"
     assert (missed.code, said in missed.err) == (4, True), missed.err
 
 

@@ -103,7 +103,12 @@ def verdicts_of(
     site: Site, scope: Scope, asked: Mapping[str, str]
 ) -> tuple[Computed, Table | None]:
     """The table of verdicts of a scope, once it is computed."""
-    found = computed(site, (TABLE, scope.sweep, scope.condition), asked)
+    request = (TABLE, scope.sweep, scope.condition)
+    found = computed(site, request, asked)
+    running = any(entry.followed for entry, _ in standing_of(site.catalogue))
+    if found.result and found.older and not running:  # else a new one would soon be old again
+        since = f"{found.result.at + 0.001:.3f}"
+        found = computed(site, request, {**asked, "since": since})
     if found.result is None:
         return found, None
     return found, from_text(found.result.content["tables"][0])
