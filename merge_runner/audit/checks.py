@@ -59,7 +59,6 @@ GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
 SHOWN = 20
-REPLIES = "SELECT rowid, reply::VARCHAR FROM calls WHERE rowid >= ? AND rowid < ?"
 REPLIES_AT_ONCE = 20_000
 ENOUGH = "200MB"
 """Of memory for DuckDB and one thread where replies are short: more would only cache the file."""
@@ -135,9 +134,11 @@ def prepare(connection: duckdb.DuckDBPyConnection) -> None:
     append(connection, "other_models", other_models(connection))
     [(calls,)] = fetched(connection.execute("SELECT coalesce(max(rowid), -1) + 1 FROM calls"))
     for first in range(0, calls, REPLIES_AT_ONCE):  # what they tell lies in memory meanwhile
-        replies = connection.execute(REPLIES, [first, first + REPLIES_AT_ONCE])
-        told = [row for each in fetched(replies) if (row := _told(*each))]
-        append(connection, "told", told)
+        some = connection.execute(
+            "SELECT rowid, reply::VARCHAR FROM calls WHERE rowid BETWEEN ? AND ?",
+            [first, first + REPLIES_AT_ONCE - 1],
+        ).fetchall()
+        append(connection, "told", [row for each in some if (row := _told(*each))])
     connection.execute("INSERT INTO reply_ids FROM identified")
 
 

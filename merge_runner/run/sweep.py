@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
+import stat
 import tempfile
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager, closing
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -53,7 +56,6 @@ from merge_runner.run.local_runner import (
 )
 from merge_runner.run.plan import Options, Plan, usual_prompts
 from merge_runner.run.progress import Progress, as_dict, show_progress, write_standing
-from merge_runner.signals import on_interrupt
 
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
@@ -519,3 +521,44 @@ async def unsent(
         options = replace(options, db=db, cache=cache, dry_run=True)
         async with open_sweep(plan, options, say=say) as sweep:
             return await sweep.estimate(whole=whole)
+
+
+@contextmanager
+def on_interrupt(first: Callable[[], object], again: Callable[[], object]) -> Iterator[None]:
+    """Call ``first`` at the first signal and ``again`` at each later Ctrl-C.
+
+    A terminal that closes sends SIGHUP more than once, often with a SIGTERM. Under nohup SIGHUP
+    is ignored, and stays so.
+    """
+    loop = asyncio.get_running_loop()
+    handled = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        handled.append(signal.SIGHUP)
+    calls = iter((first,))
+
+    def handle(number: signal.Signals) -> None:
+        if number is signal.SIGHUP:
+            handled.remove(number)
+            loop.remove_signal_handler(number)
+            signal.signal(number, signal.SIG_IGN)
+            _leave_terminal()
+        call = next(calls, again if number is signal.SIGINT else None)
+        if call is not None:
+            call()
+
+    for number in handled:
+        loop.add_signal_handler(number, handle, number)
+    try:
+        yield
+    finally:
+        for number in handled:
+            loop.remove_signal_handler(number)
+
+
+def _leave_terminal() -> None:
+    """Send the output to nowhere: writing to a closed terminal fails."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty is false once it is closed
+            os.dup2(nowhere, stream)
+    os.close(nowhere)
