@@ -101,7 +101,7 @@ def test_an_exported_study_has_each_view_of_a_condition(played, tmp_path):
     (sweep,) = (name for name in pages if name.startswith("sweeps-"))
     assert unquote(sweep) == sweep
     # Pairs of two different drivers were played: a condition has a page for each view of them.
-    views = {f"conditions-N_0_0{by}.html" for by in ("", "-by-side", "-by-driver")}
+    views = {f"conditions-N_0_0{by}.html" for by in ("", "-by-side")}
     assert views < pages.keys()
     (ways,) = re.findall(r'<p class="groups">(.*?)</p>', pages["conditions-N_0_0-by-side.html"])
     assert set(re.findall(r'href="([^"]*)"', ways)) == views - {"conditions-N_0_0-by-side.html"}
