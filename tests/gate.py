@@ -27,7 +27,7 @@ class Gate:
         slot = request.headers[SLOT_HEADER]
         self.asked.append(slot)
         if len(self.asked) > self.passing and not self._open.is_set():
-            self.held[slot] = request.transport.get_extra_info("peername")[1]
+            self.held[slot] = request.get_extra_info("peername", ("", 0))[1]
             await self._open.wait()
         return await handler(request)
 

@@ -23,8 +23,7 @@ def application(emulator: Emulator | None = None) -> web.Application:
     answering = emulator or Emulator()
 
     async def respond(request: web.Request) -> web.StreamResponse:
-        assert request.transport is not None
-        port = request.transport.get_extra_info("sockname")[1]
+        port = request.get_extra_info("sockname", ("", 0))[1]  # of a client that has gone: none
         # A web page whose own name resolves to loopback (DNS rebinding) asks by that name.
         if request.headers.get("host", "").lower().removesuffix(f":{port}") not in OWN_NAMES:
             text = f"This is the emulator of merge-runner: ask for {HOST}:{port}."
