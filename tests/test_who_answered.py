@@ -131,10 +131,10 @@ async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
                              **pointed)  # fmt: skip
     assert run.code == 0, run.err
     assert await estimated() == before
-    assert before[1] == []
+    assert before[1] is False
     # Nor at the very address where it answers, but that some of it is recorded now.
     there, measured = await estimated(**pointed)
-    assert measured == []
+    assert measured is False
     assert 0.9 * before[0] < there < before[0]
 
 
@@ -148,14 +148,13 @@ async def test_answers_at_another_effort_or_place_do_not_change_it_either(
                                  **there)  # fmt: skip
     assert run.code == 0, run.err
     assert marks(tmp_path / "results/merge.duckdb") == [(False, False, 200)]
-    driver = f"o3 at {urlsplit(server.url).netloc}"
-    assert (await estimated(**there))[1] == [driver], "of these there is something to measure"
-    assert (await estimated())[1] == []
+    assert (await estimated(**there))[1], "of these there is something to measure"
+    assert not (await estimated())[1]
     registry = (PROJECT / "experiments/models.toml").read_text()
     (tmp_path / "experiments").mkdir()
     (tmp_path / "experiments/models.toml").write_text(registry.replace('"medium"', '"high"'))
     shutil.copy(PROJECT / "experiments/baseline.toml", tmp_path / "experiments")
-    assert (await estimated(**there))[1] == []
+    assert not (await estimated(**there))[1]
 
 
 @pytest.mark.slow

@@ -174,8 +174,8 @@ def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
 
     Merging takes as much memory as the texts of a full group, and rewrites these each time.
     """
-    tasks, memory = (0, SETTINGS["memory_limit"]) if has_long_texts(connection) else (100, "200MB")
-    connection.execute(f"SET max_vacuum_tasks = {tasks}; SET memory_limit = '{memory}'")
+    tasks = 0 if has_long_texts(connection) else 100
+    connection.execute(f"SET max_vacuum_tasks = {tasks}")
 
 
 def has_long_texts(connection: duckdb.DuckDBPyConnection) -> bool:
