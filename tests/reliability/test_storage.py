@@ -252,7 +252,7 @@ async def test_what_was_dropped_is_played_again_and_failed_trials_are_kept_as_th
     assert held["exit_code"] == failed, held["messages"]
     assert [*held["failed"]] == [f"{driver}/baseline/N_0_0/rep01"] * failed
     assert all("HTTP 400" in error for error in held["failed"].values())
-    assert held.meter.calls_live == asked - failed
+    assert held["calls"]["live"] == asked - failed
     assert results_digest(tmp_path / "held")[1] == 11
     replay = Options(tmp_path / "new", tmp_path / "c", replay=True)
     again = await run_sweep(plan, replay, say=said.append)
