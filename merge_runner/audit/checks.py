@@ -25,6 +25,7 @@ from merge_runner.results.database import (
     by_name,
     fetched,
     in_memory,
+    limit_memory,
     read_database,
     schema_sql,
 )
@@ -59,9 +60,6 @@ GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 BATCH = 100
 SHOWN = 20
 REPLIES_AT_ONCE = 20_000
-ARE_LONG = "SELECT stats(reply).max_string_length > 16_384 FROM calls LIMIT 1"
-ENOUGH = "200MB"
-"""Of memory for DuckDB and one thread where replies are short: more would only cache the file."""
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 
@@ -120,8 +118,8 @@ def audited_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open a database with the views of checks.sql; raises UsageError or StoreError."""
     try:
         with read_database(path, Instance()) as connection:
-            if connection.execute(ARE_LONG).fetchone() != (True,):
-                connection.execute(f"SET memory_limit = '{ENOUGH}'; SET threads = 1")
+            if limit_memory(connection):
+                connection.execute("SET threads = 1")
             prepare(connection)
             yield connection
     except duckdb.Error as exc:

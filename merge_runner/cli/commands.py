@@ -30,14 +30,12 @@ if TYPE_CHECKING:
     from merge_runner.run.plan import Options, Plan
 
 # Trials that failed, or are not recorded, are no reason to leave the next sweep out.
-GOES_ON = (0, 1, 4)
 GRID = (
     "With --first, in the place of the study's conditions: h=FROM:TO:STEP,dv=FROM:TO:STEP, "
     "projected headways in m and relative velocities in m/s; usual: -6:6:2 and -1.6:1.6:0.4."
 )
 MAX_COST = "Never spend more on this, over all its runs."
 STRICT = "Stop when another model answers."
-KEEP_GOING = "Go on with a model that gives no valid decision."
 DASK = "Play on a Dask cluster: local:N, a scheduler's address, or its file."
 BATCH = "Ask in the provider's batches, a decision of all trials a round, at a lower price."
 RECORDING = "Also replay from this file, without importing it; may be repeated."
@@ -89,7 +87,9 @@ def sweep(
     dask: Annotated[str | None, cli.option("CLUSTER", DASK)] = None,
     batch: Annotated[bool, cli.flag("--batch", BATCH)] = False,
     strict_model: Annotated[bool, cli.flag("--strict-model", STRICT)] = False,
-    keep_going: Annotated[bool, cli.flag("--keep-going", KEEP_GOING)] = False,
+    keep_going: Annotated[
+        bool, cli.flag("--keep-going", "Go on with a model that gives no valid decision.")
+    ] = False,
     dry_run: Annotated[bool, cli.flag("--dry-run", "Only estimate.")] = False,
     yes: cli.YesOption = False,
     trust: cli.TrustOption = False,
@@ -128,7 +128,7 @@ def sweep(
             say(f"{name}:")
         plan = planned(name)
         codes.append(_play(plan, options, whole=whole, dry_run=dry_run, yes=yes, as_json=as_json))
-        if codes[-1] not in GOES_ON:
+        if codes[-1] not in (0, 1, 4):
             break
     sys.exit(next(filter(None, codes), 0))
 

@@ -328,7 +328,7 @@ class LlmClient:
     async def _call(self, call: Call) -> ChatReply:
         """Make a call when there is money for its trial, and the first call has been answered."""
         if self.rounds is not None:
-            call.open = self.rounds.open_batch(call.request.key)
+            call.open = self.rounds.waiting.get(call.request.key)
         if call.open:
             self.money.begin_anew(call.order)
         with self._waiting(call, "for trials before it to end, under --max-cost", idle=True):

@@ -32,12 +32,16 @@ ROWS_OF_A_GROUP = 8_192
 BYTES_OF_A_CALL, MERGED_BYTES = 3_000, 2**26
 """How many a call takes where replies are short, compressed and with its share of the states, and
 by how much the file may exceed that for its row groups still to be merged."""
+LONGEST_TEXT = """
+SELECT greatest(max(stats(request).max_string_length), max(stats(reply).max_string_length), 0)
+FROM (SELECT request, reply FROM calls LIMIT 1)
+"""
 LOG = logging.getLogger(__name__)
 Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
     # The defaults are shares of the machine's, and most of that memory would cache the file. A
     # thread unpacks the texts of 2,048 rows at once: 128 MB where replies are of 64 KB.
-    "memory_limit": "1GB",
+    "memory_limit": "1GB",  # see limit_memory
     "threads": 2,
     "max_vacuum_tasks": 0,  # see merge_small_groups
     # Of new files: the oldest DuckDB that can open them.
@@ -169,25 +173,29 @@ def _holder(exc: duckdb.Error) -> str:
     return f"{Path(found[1]).name} (PID {found[2]})" if found else "another program"
 
 
+def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> bool:
+    """Let DuckDB use little memory, and return True, where all texts are short.
+
+    ``longest`` is the length of the longest that will be stored; more would only cache the file.
+    """
+    [(stored,)] = connection.execute(LONGEST_TEXT).fetchall()
+    are_short = bool(max(stored, longest) < 16_384)
+    limit = "200MB" if are_short else SETTINGS["memory_limit"]
+    connection.execute(f"SET memory_limit = '{limit}'")
+    return are_short
+
+
 def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:
     """Let the next write merge small row groups, unless the rows hold long texts.
 
     Merging takes as much memory as the texts of a full group, and rewrites these each time.
     """
-    tasks = 0 if has_long_texts(connection) else 100
-    connection.execute(f"SET max_vacuum_tasks = {tasks}")
-
-
-def has_long_texts(connection: duckdb.DuckDBPyConnection) -> bool:
-    """Whether the open database is larger than one of as many calls with short replies."""
-    tables = connection.execute(
+    [(calls, path)] = connection.execute(
         "SELECT estimated_size, path FROM duckdb_tables() JOIN duckdb_databases() "
         "USING (database_name) WHERE table_name = 'calls' AND database_name = current_database()"
     ).fetchall()
-    return any(
-        Path(path).stat().st_size > int(calls) * BYTES_OF_A_CALL + MERGED_BYTES
-        for calls, path in tables
-    )
+    most_bytes = calls * BYTES_OF_A_CALL + MERGED_BYTES
+    connection.execute(f"SET max_vacuum_tasks = {100 * (Path(path).stat().st_size <= most_bytes)}")
 
 
 def fetched(result: duckdb.DuckDBPyConnection) -> Iterator[tuple[Any, ...]]:

@@ -28,6 +28,7 @@ from merge_runner.results.database import (
     check_schema,
     fetched,
     has_these_measures,
+    limit_memory,
     merge_small_groups,
     names_of,
     read_database,
@@ -168,7 +169,9 @@ class Store:
         """
         # Made before the lock is taken, although a trial that is stored already needs none.
         played = [(_key(record), record.status, rows_of(record)) for record in records]
+        texts = (len(str(value)) for *_, rows in played for row in rows["calls"] for value in row)
         with write_database(self.path, patience_s) as connection:
+            limit_memory(connection, max(texts, default=0))
             merge_small_groups(connection)
             _add_specs(connection, specs or {})
             differing = _add_trials(connection, played)

@@ -63,6 +63,7 @@ EVERY_S, POLL_S = 1.0, 0.05
 BATCH = 256
 MOST_PENDING = 2 * BATCH
 BATCH_BYTES, MOST_PENDING_BYTES = 2**25, 2**27
+DECISION_BYTES = 2_000  # with its share of the states
 LOCK_PATIENCE_S = 2.0
 AGAIN = (
     "When that is fixed, run the same command again: it writes them from the recorded replies "
@@ -290,7 +291,7 @@ class Flusher:
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
-        self._pending: list[tuple[TrialRecord, int]] = []  # with the bytes of their replies
+        self._pending: list[tuple[TrialRecord, int]] = []  # with their bytes
         self._problem: StoreError | None = None
         self._closing = False
         self._task = asyncio.create_task(self._run())
@@ -298,7 +299,8 @@ class Flusher:
     def add(self, record: TrialRecord) -> None:
         """Store this trial with the next batch, or drop it while storing fails."""
         attempts = chain.from_iterable(call.attempts for call in record.calls)
-        size = sum(sys.getsizeof(attempt.reply) for attempt in attempts)
+        bytes_of_replies = sum(sys.getsizeof(attempt.reply) for attempt in attempts)
+        size = bytes_of_replies + DECISION_BYTES * len(record.decisions)
         self._pending.append((record, size))
         if self._problem is not None:
             self._drop_excess()

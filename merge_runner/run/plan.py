@@ -199,11 +199,6 @@ class Plan(BaseModel):
         """The arms by the labels that their trials carry."""
         return {arm.label: arm for arm in self.arms}
 
-    def with_entries(self, entries: dict[str, ModelEntry]) -> Plan:
-        """The same with other entries for the same names, in its arms too."""
-        arms = tuple(replace(a, entries={n: entries[n] for n in a.entries}) for a in self.arms)
-        return self.model_copy(update={"arms": arms, "entries": entries})
-
     def specs(self) -> dict[str, str]:
         """Spec hash to the canonical JSON that it covers."""
         texts = (self.spec(arm, name) for arm in self.arms for name in self.conditions)

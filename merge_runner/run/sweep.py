@@ -262,8 +262,7 @@ class Sweep:
         """What plays the trials: this process, or the workers of a cluster."""
         plan, options = self._plan, self._options
         if options.sends_nothing or not plan.entries:
-            in_flight = 1 if plan.entries else options.in_flight
-            return LocalRunner.sealed(plan, self._cache, in_flight)
+            return LocalRunner.sealed(plan, self._cache, 1 if plan.entries else options.in_flight)
         earlier = earlier_answers(plan, self._cache)
         self._rounds = rounds = open_rounds(plan, options, self._cache, self._say)
         first = FirstDecisions()
@@ -459,7 +458,8 @@ async def _with_names(
                     f"{', '.join(sorted(recorded))}. Set the base URL variable of its provider to "
                     "the one to replay."
                 )
-    return plan.with_entries(entries).model_copy(update={"endpoints": endpoints})
+    arms = tuple(replace(arm, entries={n: entries[n] for n in arm.entries}) for arm in plan.arms)
+    return plan.model_copy(update={"arms": arms, "entries": entries, "endpoints": endpoints})
 
 
 async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:

@@ -132,18 +132,14 @@ class Rounds:
         noted.sort(key=lambda note: note.submitted_at)
         self.batches = {note.mark: Batch(note) for note in noted if note.model in models}
         # Where earlier runs have submitted calls last whose attempts there have not ended.
-        self._waiting: dict[str, Batch] = {}
+        self.waiting: dict[str, Batch] = {}
         for batch in self.batches.values():
-            self._waiting |= dict.fromkeys(batch.note.lines, batch)
-        self._waiting = {key: b for key, b in self._waiting.items() if not self._ended(key, b)}
-        ended = self.batches.keys() - {batch.note.mark for batch in self._waiting.values()}
+            self.waiting |= dict.fromkeys(batch.note.lines, batch)
+        self.waiting = {key: b for key, b in self.waiting.items() if not self._ended(key, b)}
+        ended = self.batches.keys() - {batch.note.mark for batch in self.waiting.values()}
         cache.run_now([partial(cache.remove, _BATCH + mark) for mark in ended])
         for mark in ended:
             del self.batches[mark]
-
-    def open_batch(self, key: str) -> Batch | None:
-        """Return where an earlier run has submitted a call, unless its attempt there has ended."""
-        return self._waiting.get(key)
 
     async def ask(self, call: Call, paid: PaidAttempt, model: str) -> tuple[AttemptOutcome, Batch]:
         """Return what became of a call's next attempt, in the next round or where it waits."""
@@ -156,7 +152,7 @@ class Rounds:
             if end is None and not self.submits:
                 end = _no_answer("not_created", "the run ended before", charged=False)
             if end is not None:
-                self._waiting.pop(call.request.key, None)
+                self.waiting.pop(call.request.key, None)
                 return end, batch
             batch = await self._next_round(call, paid, model)
 
