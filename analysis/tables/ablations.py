@@ -118,7 +118,7 @@ def _metric_columns(metric: Metric) -> tuple[Column, Column]:
 def _denominators(metrics: list[Metric]) -> str:
     """Which trials count for which metrics: ``collisions over all ended trials; gap over ...``."""
     ended, finished = (
-        listed([metric.in_sentences for metric in metrics if metric.trials == trials])
+        listed([metric.label for metric in metrics if metric.trials == trials])
         for trials in ("ended", "finished")
     )
     return f"{ended} over all ended trials; {finished} over finished ones"
@@ -174,6 +174,6 @@ def _quantitative_row(group: Group) -> Row:
 
 
 def _shipped_note(metrics: list[Metric], source: str) -> str:
-    names = listed([metric.in_sentences for metric in metrics])
+    names = listed([metric.label for metric in metrics])
     what = "is a published value" if len(metrics) == 1 else "are published values"
     return f"{names} {what}, no human traces are imported ({source})"

@@ -161,7 +161,7 @@ def test_a_rate_is_compared_and_a_median_is_not(added, db):
 
 def test_a_published_human_value_stands_in_the_tables_with_its_interval_and_source(added, db):
     known = HumanReference(0.5, "X (2026)", low=0.4, high=0.6)
-    added(name="a_mps", label="a", phrase="a", human=known)
+    added(name="a_mps", label="a", human=known)
     quantitative, indicators = make_tables(Study(db), ["ablation-quantitative", "indicators"])
     (human,) = (row for row in quantitative.rows if row.id == "human")
     assert (human.values["a_mps"], human.values["a_mps_ci"]) == (0.5, (0.4, 0.6))
