@@ -47,13 +47,13 @@ def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
 
     try:
         with open_files(path) as files:
-            download = sort_files(files)
-            if not download.trials and not download.pages:
+            sources = sort_files(files)
+            if not sources:
                 raise UsageError(
                     f"no trial is in {path}: trials are experiment_N_iter_M.csv, and velocity "
                     "pages are named like 4_-8.html; unpack a zip within the download first"
                 )
-            report = import_trials(download, Store(db))
+            report = import_trials(sources, Store(db))
     except KeyboardInterrupt:
         say("interrupted: what is stored stays; run the same command again to go on")
         sys.exit(INTERRUPTED)
@@ -67,7 +67,7 @@ def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
         say(f"note: {line}")
     print_out(
         f"{report.added} trials added, {report.there} there already, {len(report.unreadable)} "
-        f"files could not be read, {download.skipped} training or simulated runs skipped"
+        "files could not be read"
     )
     sys.exit(1 if errors else 0)
 

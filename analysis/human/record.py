@@ -69,6 +69,7 @@ PAGE_SPEC = canonical_json(
     }
 )
 PAGE_SPEC_HASH = spec_hash(PAGE_SPEC)
+SPECS = {SPEC_HASH: SPEC, PAGE_SPEC_HASH: PAGE_SPEC}
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,12 +114,15 @@ def parse_csv(content: bytes) -> Trace:
     )
 
 
-def trial_record(
-    trace: Trace, experiment: int, iteration: int, read_as: str = SPEC_HASH
-) -> TrialRecord:
-    """The record of trial ``iteration`` of an experiment; raises Unreadable."""
+def trial_record(trace: Trace, experiment: int, iteration: int, page: str = "") -> TrialRecord:
+    """The record of trial ``iteration`` of an experiment; raises Unreadable.
+
+    ``page`` is the condition of the velocity page that shows it.
+    """
     status = _status(trace)
     condition = _condition(trace)
+    if page not in ("", condition):
+        raise Unreadable(f"its speeds are not those of {page}")
     states = tuple(_states(trace))
     pair = PAIRS.get(experiment, f"experiment_{experiment}")
     arrivals = {side: _arrival(trace.positions_m[side]) for side in SIDES}
@@ -127,7 +131,7 @@ def trial_record(
     return TrialRecord(
         spec=TrialSpec(
             trial_id=f"human/{pair}/{condition}/iter{iteration:03d}",
-            spec_hash=read_as,
+            spec_hash=PAGE_SPEC_HASH if page else SPEC_HASH,
             source="human",
             pair=pair,
             model_left="human",
