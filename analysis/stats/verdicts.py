@@ -278,7 +278,7 @@ def _standardised(human: Group, group: Group) -> Estimate:
     trials = human.outcomes.dropna(subset=[BOXES.column])
     by_condition = trials.astype({BOXES.column: bool}).groupby("condition")[BOXES.column]
     rates, sizes = by_condition.mean(), by_condition.size()
-    played = group.outcomes.dropna(subset=[BOXES.column])["condition"]
+    played = group.ended_outcomes["condition"]  # with those that are undecided
     weights = played.value_counts(normalize=True).reindex(rates.index).dropna()
     if weights.empty:
         return Estimate(None, 0, problem="no human drove its conditions")
