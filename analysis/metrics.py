@@ -7,18 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 from merge_runner.errors import UsageError
 from merge_runner.registry import Registry
 from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 
 Estimator = Literal["proportion", "mean", "median"]
-# tables: Tables V and VII, the contrasts, and the sentences and pages made of these; criticality:
-# the table of this name; distributions: the figure.
-Place = Literal["tables", "criticality", "distributions"]
-PLACES: frozenset[Place] = frozenset(get_args(Place))
-EVERYWHERE = PLACES - {"criticality"}
+# By place the estimators of what it shows. tables: Tables V and VII, the contrasts and the pages
+# made of these; criticality: the table of this name; distributions: the figure.
+SHOWN = {
+    "tables": ("proportion", "mean"),
+    "criticality": ("median",),
+    "distributions": ("mean",),
+}
 # The trials that a metric may be of, in SQL.
 STATUS = {"finished": "status = 'finished'", "ended": "status <> 'failed'"}
 INTERVALS: dict[Estimator, str] = {
@@ -90,16 +92,12 @@ class Metric:
     humans_from: Literal["outcomes", "recordings", "all recordings"] = "recordings"
     paper_of_drivers: str = ""
     paper_of_humans: str = ""
-    shown: frozenset[Place] = EVERYWHERE
+    shown: bool = True
 
     def __post_init__(self) -> None:
         wrong = ""
         if not self.name.isidentifier():
             wrong = "needs a name of letters, digits and _"
-        if unknown := self.shown - PLACES:
-            wrong = f"is shown in {', '.join(sorted(unknown))}; valid: {', '.join(get_args(Place))}"
-        if self.rate and "criticality" in self.shown:
-            wrong = "is a share, and criticality shows medians and quartiles"
         if self.value in JUDGED and self.trials != "ended":
             wrong = f"is {self.value}, which ended trials are judged by: it needs trials='ended'"
         if wrong:
@@ -148,20 +146,15 @@ def register(metric: Metric) -> Metric:
     return METRICS.register(metric.name, metric)
 
 
-def shown_in(place: Place) -> list[Metric]:
-    """The metrics that a place shows, in the order of the list."""
-    return [metric for metric in METRICS.values() if place in metric.shown]
+def shown_in(place: str) -> list[Metric]:
+    """The metrics that a place of SHOWN has, in the order of the list."""
+    return [one for one in METRICS.values() if one.shown and one.estimator in SHOWN[place]]
 
 
 def intervals_of(metrics: Iterable[Metric]) -> str:
     """``Wilson for rates, Student's t for means``, as far as there are such."""
     used = {metric.estimator for metric in metrics}
     return ", ".join(text for estimator, text in INTERVALS.items() if estimator in used)
-
-
-def compared() -> list[Metric]:
-    """Those of the tables that are tested; there is no test of a difference of medians here."""
-    return [metric for metric in shown_in("tables") if metric.estimator != "median"]
 
 
 COLLISIONS = register(
@@ -176,7 +169,6 @@ COLLISIONS = register(
         trials="ended",
         humans_from="all recordings",
         paper_of_drivers="collided_percent",
-        shown=frozenset({"tables"}),
     )
 )
 BOXES = register(
@@ -191,7 +183,6 @@ BOXES = register(
         trials="ended",
         humans_from="outcomes",
         paper_of_humans="collided_percent",
-        shown=frozenset({"tables"}),
     )
 )
 LEFT_FIRST = register(
@@ -203,7 +194,7 @@ LEFT_FIRST = register(
         value="merged_first = 'left'",
         estimator="proportion",
         humans_from="outcomes",
-        shown=frozenset(),
+        shown=False,
     )
 )
 GAP = register(
@@ -239,7 +230,6 @@ JOINT = register(
         estimator="proportion",
         paper_of_drivers="joint_percent",
         paper_of_humans="joint_percent",
-        shown=frozenset({"tables"}),
     )
 )
 
@@ -271,7 +261,6 @@ for _name, (_label, _meaning) in SURROGATES.items():
             meaning=_meaning,
             value=_name,
             estimator="median",
-            shown=frozenset[Place]({"criticality"}),
         )
     )
 RULES_NOTE = (

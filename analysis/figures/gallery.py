@@ -146,7 +146,7 @@ def distributions(study: Study) -> Figure:
 
 def _distributed() -> list[Metric]:
     """The metrics whose values have a distribution to show; a rate's values are only 0 and 1."""
-    return [metric for metric in shown_in("distributions") if not metric.rate]
+    return shown_in("distributions")
 
 
 def _distribution(axis: Axes, row: int, group: Group, metric: Metric, colour: str) -> None:
