@@ -5,16 +5,11 @@ from __future__ import annotations
 from math import isinf
 
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.data.study import Group, Study, in_one_study
+from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import RULES_NOTE, Metric, compared
-from merge_runner_analysis.stats.contrasts import (
-    contrast_cells,
-    contrast_means,
-    corrected,
-    shared_cells,
-)
+from merge_runner_analysis.stats.contrasts import contrast, corrected
 from merge_runner_analysis.stats.intervals import Difference
-from merge_runner_analysis.stats.measures import trials_of, undecided
+from merge_runner_analysis.stats.measures import trials_of
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.notes import sample_notes
 
@@ -78,32 +73,22 @@ def _family(study: Study, driver: str, metric: Metric) -> list[Row]:
     other = groups.pop(study.reference, None)
     if other is None:
         return []
-    found = {
-        group: contrast
+    contrasts = {
+        group: found
         for group in groups.values()
-        if in_one_study(study, group, other) and (contrast := _contrast(group, other, metric))
+        if (found := contrast(study, (group, other), metric))
     }
-    if not found:
+    if not contrasts:
         return []
-    families = zip(*corrected([contrast.p for contrast in found.values()]), strict=True)
+    families = zip(*corrected([found.p for found in contrasts.values()]), strict=True)
     return [
-        _row(group, other, metric, contrast, float(holm), float(bh))
-        for (group, contrast), (holm, bh) in zip(found.items(), families, strict=True)
+        _row(group, other, metric, found, float(holm), float(bh))
+        for (group, found), (holm, bh) in zip(contrasts.items(), families, strict=True)
     ]
 
 
-def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
-    """The difference between two prompts; None if they share no condition or are undecided."""
-    if undecided(group, metric) or undecided(other, metric):
-        return None
-    if not metric.rate:
-        return contrast_means(group.trials, other.trials, metric.column)
-    both = shared_cells(group.trials, other.trials, metric.column)
-    return contrast_cells(both) if both else None
-
-
 def _row(
-    group: Group, other: Group, metric: Metric, contrast: Difference, holm: float, bh: float
+    group: Group, other: Group, metric: Metric, found: Difference, holm: float, bh: float
 ) -> Row:
     first, second = (
         trials_of(one, metric).dropna(subset=[metric.column])["condition"] for one in (group, other)
@@ -120,16 +105,16 @@ def _row(
             "setting": group.setting,
             "reference": other.setting,
             "measure": metric.heading,
-            "difference": contrast.value * factor,
-            "ci": contrast.bounds(factor),
-            "p": contrast.p,
+            "difference": found.value * factor,
+            "ci": found.bounds(factor),
+            "p": found.p,
             "p_holm": holm,
             "p_bh": bh,
-            "detectable": None if contrast.detectable is None else contrast.detectable * factor,
+            "detectable": None if found.detectable is None else found.detectable * factor,
             "n": int(first.isin(second).sum()),
             "n_reference": int(second.isin(first).sum()),
-            "freedom": None if isinf(contrast.freedom) else contrast.freedom,
+            "freedom": None if isinf(found.freedom) else found.freedom,
         },
-        powerless if contrast.detectable is None else "",
+        powerless if found.detectable is None else "",
         counts=f"{metric.counts} AND condition IN ({named})",
     )

@@ -15,7 +15,6 @@ from merge_runner_analysis.stats.factors import (
     balance,
     difference,
     difference_of_medians,
-    interaction,
     levels_by_factor,
 )
 from merge_runner_analysis.stats.intervals import Difference
@@ -113,9 +112,9 @@ def _row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
     cells = _cells(level, metric) | {"n": found.n, "value": found.value, "ci": found.bounds()}
     if level is not first:
         if metric.estimator == "median":
-            cells |= {"difference": difference_of_medians(study, level, first, metric)}
+            cells |= {"difference": difference_of_medians(study, metric, level, first)}
         else:
-            found_difference = difference(study, level, first, metric)
+            found_difference = difference(study, metric, level, first)
             cells |= _difference(found_difference, metric, of=(level, first))
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
     return Row(
@@ -178,7 +177,7 @@ def _interaction(
         "factor": f"{level.factor} × {by}",
         "n": estimate(level.pooled, metric).n,
     }
-    found = interaction(study, pair, others, metric)
+    found = difference(study, metric, *pair, *others)
     return Row(
         f"{level.id}/interaction/{metric.name}",
         level.groups,

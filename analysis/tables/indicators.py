@@ -6,19 +6,19 @@ from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import RULES_NOTE, HumanReference, Metric, shown_in
 from merge_runner_analysis.stats.group_scores import Score, score, total, unjudged
 from merge_runner_analysis.stats.indicators import (
-    GAP_MARGIN_M,
     INDICATORS,
     TESTED,
     Verdict,
     disagree,
 )
-from merge_runner_analysis.stats.likeness import difference, gains, held, mean_gain
+from merge_runner_analysis.stats.likeness import gains, held, less_humans, mean_gain
 from merge_runner_analysis.stats.measures import (
     estimate_or_reference,
     no_human_value,
     outcomes_note,
     undecided_note,
 )
+from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
 from merge_runner_analysis.tables.model import Column, Row, Table, Value, row_of
 from merge_runner_analysis.tables.notes import (
     ceiling_notes,
@@ -104,10 +104,9 @@ def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value
 
 def ceiling_values(found: Score, name: str) -> dict[str, Value]:
     """Which percentages of human data sets pass an indicator, or ``I1-I4`` together, by rule."""
-    by_rule = {"paper": found.ceiling.paper, "robust": found.ceiling.robust}
     return {
         f"ceiling_{rule}": 100 * shares[name] if name in shares else None
-        for rule, shares in by_rule.items()
+        for rule, shares in found.ceiling.items()
     }
 
 
@@ -188,7 +187,7 @@ def _beside_i5(study: Study, group: Group) -> dict[str, Row]:
         "held": (100 * share.value, (100 * share.low, 100 * share.high)),
         "clock": (clock.value, clock.bounds()),
     }
-    if found := difference(study, group):
+    if found := less_humans(study, group):
         numbers["humans"] = (found.value, found.bounds())
     return {
         name: row_of(

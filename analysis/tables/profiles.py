@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from merge_runner_analysis.data.study import Group, Study, of_group
-from merge_runner_analysis.stats.likeness import NO_ACTION, difference, gains, held, mean_gain
+from merge_runner_analysis.stats.likeness import NO_ACTION, gains, held, less_humans, mean_gain
 from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Table, Value, row_of
 from merge_runner_analysis.tables.notes import intermittency_notes, sample_notes
 
@@ -71,7 +71,7 @@ def _row(study: Study, group: Group) -> Row:
     values["clocked_gain"] = mean_gain(study, group, "clocked_gain").value
     if share.value is not None:
         values["held_percent"] = 100 * share.value
-    if found := difference(study, group):
+    if found := less_humans(study, group):
         values |= {"difference_sd": found.value, "difference_sd_ci": found.bounds()}
     # Plans are revised in trials that collide, too: ``ended`` here, ``finished`` above.
     plans = of_group(study.plans, group, group.ended)[

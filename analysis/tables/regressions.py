@@ -8,9 +8,9 @@ from functools import cache
 from merge_runner_analysis.data.reference_data import citation, printed_value, published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.stats.group_scores import fits
-from merge_runner_analysis.stats.indicators import GAP_MARGIN_M, equivalence_p, furthest_apart
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import (
+    GAP_MARGIN_M,
     GAP_TERMS,
     WHO_FIRST_TERMS,
     Regression,
@@ -160,9 +160,8 @@ def _gap_row(group: Group, term: str) -> Row:
     }
     # I4 claims that these effects are absent. A large p is no evidence of that, so equivalence is
     # tested (Schuirmann 1987); HC3 errors (MacKinnon and White 1985) hold for unequal variances.
-    if term == "abs_relative_velocity" and fit.hc3.apart:
-        furthest = fit.hc3.apart[furthest_apart(fit.hc3)]
-        values["equivalence_p"] = equivalence_p(furthest.b, furthest.se, fit.hc3.freedom)
+    if term == "abs_relative_velocity":
+        values["equivalence_p"] = fit.hc3.equivalence_p
         values["velocity_p"] = fit.hc3.velocity_p
     return row_of(group, values, _problems(fit.ols, fit.hc3), item=term, counts=WITH_GAP)
 
