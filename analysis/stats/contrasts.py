@@ -153,7 +153,7 @@ def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> D
         return None
     slope = float(group @ value) / weight
     residual = value - slope * group
-    return tested(slope, float(np.sqrt(residual @ residual / freedom / weight)), freedom)
+    return tested(slope, float(np.sqrt(residual @ residual / freedom / weight)), float(freedom))
 
 
 def contrast(
