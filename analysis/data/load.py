@@ -104,27 +104,6 @@ FROM states JOIN (
 ) USING (trial_id, spec_hash, side)
 WHERE time_s >= greatest(0, coalesce(first_s, 0)) GROUP BY ALL ORDER BY ALL
 """
-# A plan's revision: |the new plan's first actions - the old plan's for the same instants|. Both
-# plans cover the horizon; the older one is `executed` actions ahead of the new one.
-PLANS = """
-WITH plans AS (
-    SELECT trial_id, spec_hash, side, decision, plan, len(applied) AS executed,
-        lag(plan) OVER driver AS before
-    FROM decisions WINDOW driver AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
-), compared AS (
-    SELECT trial_id, spec_hash, side, decision,
-        len(list_distinct(plan)) <= 2 AS coarse,
-        CASE WHEN before IS NOT NULL AND len(before) > executed THEN list_avg(list_transform(
-            range(1, len(before) - executed + 1),
-            lambda i: abs(plan[i] - before[i + executed]))) END AS revision
-    FROM plans WHERE plan IS NOT NULL
-)
-SELECT trial_id, spec_hash, count(*) AS plans, count(*) FILTER (coarse) AS coarse_plans,
-    count(revision) AS revised_plans,
-    sum(revision ORDER BY side, decision) AS total_revision,
-    count(*) FILTER (revision > 0.1) AS large_revisions
-FROM compared GROUP BY ALL ORDER BY ALL
-"""
 # One row a decision with a tactical word: whether it is its driver's first, and the mean
 # acceleration of the second that follows it, NULL where the trial ends before.
 WORDS = """

@@ -17,7 +17,7 @@ from merge_runner.records import SIDES
 from merge_runner.results.database import read_database
 from merge_runner.served_model import other_models, sql_of
 from merge_runner_analysis.data.load import ANSWERED, load_each, load_specs
-from merge_runner_analysis.data.study import Group, Study, of_group
+from merge_runner_analysis.data.study import Group, Study, of_trials
 
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
@@ -153,7 +153,7 @@ def tally(study: Study, group: Group) -> Counter[str]:
     valid plan, for a reason that has a count of its own, too. ``fallback`` counts the ``decisions``
     that were driven from an older plan, or none.
     """
-    trials = of_group(study.calls.trials, group, group.trials)
+    trials = of_trials(study.calls.trials, group.trials)
     counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
     failures = Counter("\n".join(trials["failures"].dropna()).splitlines())
     return Counter(

@@ -42,7 +42,6 @@ from merge_runner_analysis.data.load import (
     ASKED_TRIALS,
     EGO_SPEEDS,
     FIRST_ACTIONS,
-    PLANS,
     SPEEDS,
     TRACES,
     WORDS,
@@ -310,7 +309,7 @@ class Study:
         return int(sizes.loc[alike, "trials"].sum()) > len(group.trials)
 
     def _with_fallbacks(self, group: Group) -> set[str]:
-        trials = of_group(self.calls.trials, group, group.trials)
+        trials = of_trials(self.calls.trials, group.trials)
         return set(trials.loc[trials["fallback"] > 0, "trial_id"])
 
     @property
@@ -364,17 +363,12 @@ class Study:
         """One row a vehicle of a group: whether it acted, and how far its acceleration is held."""
         specs = ", ".join(quoted(name) for name in group.trials["spec_hash"].unique())
         speeds = self._read(f"FROM ({SPEEDS}) WHERE list_contains([{specs}], spec_hash)")
-        return measure_profiles(of_group(speeds, group, group.trials))
+        return measure_profiles(of_trials(speeds, group.trials))
 
     @cached_property
     def ego_speeds(self) -> pd.DataFrame:
         """One row a finished trial: the ego's speeds under control, of equal drivers the left."""
         return self._read(EGO_SPEEDS)
-
-    @cached_property
-    def plans(self) -> pd.DataFrame:
-        """One row a trial with valid plans: how coarse they are, how much they were revised."""
-        return self._read(PLANS)
 
     @cached_property
     def first_actions(self) -> pd.DataFrame:
@@ -395,12 +389,8 @@ class Study:
         return load_each({"rows": sql}, self.db)["rows"]
 
 
-def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.DataFrame:
-    """The rows of a per-trial frame that belong to these trials of a group."""
-    return _of_trials(frame, trials)
-
-
-def _of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
+def of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
+    """The rows of a per-trial frame that belong to these trials."""
     # To join all rows takes longer than to leave out those of other groups first.
     near = frame["spec_hash"].isin(trials["spec_hash"].unique())
     return frame[near].merge(trials[KEYS], on=KEYS)
@@ -437,7 +427,7 @@ def _published_group() -> Group:
 
 def _levels(levels: pd.DataFrame, group: Group) -> dict[str, str]:
     """The levels of a group, model and prompt first."""
-    found = of_group(levels, group, group.trials).drop_duplicates("factor")
+    found = of_trials(levels, group.trials).drop_duplicates("factor")
     named = dict(zip(found["factor"], found["value"], strict=True))
     return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
 
@@ -626,7 +616,7 @@ def _model_group(
 
 def _unjudged(decisions: pd.DataFrame, rows: pd.DataFrame) -> str:
     """Why nothing is concluded from these trials, for each of their models; empty: something is."""
-    counts = _of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
+    counts = of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
     reasons = (not_judged(one.Index, one.invalid, one.asked) for one in counts.itertuples())
     return "; ".join(filter(None, reasons))
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from merge_runner.records import SIDES
 from merge_runner_analysis.data.driver_words import has_chance
 from merge_runner_analysis.data.reference_data import human_outcomes
-from merge_runner_analysis.data.study import Group, Study, of_group
+from merge_runner_analysis.data.study import Group, Study, of_trials
 from merge_runner_analysis.stats.intervals import Estimate, estimate
 from merge_runner_analysis.stats.regressions import Array, unfit_for_logit
 
@@ -91,9 +91,7 @@ def _stored(study: Study, seat: Seat) -> pd.DataFrame:
     columns = ["trial_id", "spec_hash", "condition", "projected_headway_m", "relative_velocity_mps",
                "pair", "ego"]  # fmt: skip
     trials = seat.group.ended[columns]
-    rows = of_group(study.first_actions, seat.group, trials).merge(
-        trials, on=["trial_id", "spec_hash"]
-    )
+    rows = of_trials(study.first_actions, trials).merge(trials, on=["trial_id", "spec_hash"])
     return rows[rows["side"].isin([SIDES[side] for side in seat.sides])]
 
 
