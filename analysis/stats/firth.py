@@ -17,7 +17,7 @@ from scipy.special import expit
 Array = NDArray[np.float64]
 
 # The largest slope of a likelihood at its top: what is aimed at, and what is still taken for one.
-FLAT, SLOPING = 1e-7, 1e-3
+FLAT, SLOPING = 1e-8, 1e-3
 # Below this logarithm of its determinant the information is singular but for rounding.
 SINGULAR = -600.0
 WIDENINGS, WIDER = 40, 1.3

@@ -273,7 +273,7 @@ def _standardised(human: Group, group: Group) -> Known:
     trials = human.outcomes.dropna(subset=[BOXES.column])
     by_condition = trials.astype({BOXES.column: bool}).groupby("condition")[BOXES.column]
     rates, sizes = by_condition.mean(), by_condition.size()
-    played = group.outcomes.dropna(subset=[BOXES.column])["condition"]
+    played = group.ended_outcomes["condition"]  # with those that are undecided
     weights = played.value_counts(normalize=True).reindex(rates.index).dropna()
     if weights.empty:
         return Known(Estimate(None, None, None, 0), "no human drove its conditions")

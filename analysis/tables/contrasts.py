@@ -6,7 +6,7 @@ from math import isinf
 
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.metrics import RULES_NOTE, Metric, compared
+from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.stats.contrasts import contrast, corrected
 from merge_runner_analysis.stats.intervals import Difference
 from merge_runner_analysis.stats.measures import trials_of
@@ -19,7 +19,7 @@ def contrasts(study: Study) -> Table:
     for driver in dict.fromkeys(group.driver for group in study.models):
         # A family is one question asked of several variants. Correcting over all metrics at once
         # would make the result depend on how many are registered.
-        for metric in compared():
+        for metric in shown_in("tables"):
             rows += _family(study, driver, metric)
     judged = "judged " if study.unjudged else ""
     return Table(

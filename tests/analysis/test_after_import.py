@@ -39,7 +39,7 @@ def imported(tmp_path_factory):
                 files[name] = drive(played, yields=yields).csv()
     db = write_study(folder / "t.duckdb", yielding("o3", reps=2))
     with open_files(write_folder(folder / "recordings", files)) as found:
-        import_trials(sort_files(found).trials, Store(db))
+        import_trials(sort_files(found), Store(db))
     return Study(db)
 
 
