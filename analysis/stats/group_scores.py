@@ -81,22 +81,10 @@ def ceiling(sizes: tuple[int, ...]) -> dict[str, dict[str, float]]:
     return shares
 
 
-@dataclass(frozen=True, slots=True)
-class Total:
-    """How many indicators hold, of those that can be judged; ``open`` names the others."""
-
-    passed: int
-    judged: int
-    open: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return f"{self.passed} of {self.judged}"
-
-
-def total(judged: dict[str, Verdict]) -> Total:
-    """The score of a group by one rule."""
-    known = {name: v.passed for name, v in judged.items() if v.passed is not None}
-    return Total(sum(known.values()), len(known), tuple(n for n in judged if n not in known))
+def total(judged: dict[str, Verdict]) -> str | None:
+    """How many indicators hold by one rule, ``3 of 4``; None where none can be judged."""
+    known = [verdict.passed for verdict in judged.values() if verdict.passed is not None]
+    return f"{sum(known)} of {len(known)}" if known else None
 
 
 def unjudged(found: Score, *names: str) -> dict[str, tuple[list[str], list[str]]]:

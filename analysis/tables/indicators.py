@@ -8,7 +8,6 @@ from merge_runner_analysis.stats.group_scores import Score, score, total, unjudg
 from merge_runner_analysis.stats.indicators import (
     INDICATORS,
     TESTED,
-    Verdict,
     disagree,
 )
 from merge_runner_analysis.stats.intervals import Estimate
@@ -105,7 +104,7 @@ def _group_row(study: Study, group: Group) -> Row:
     values: dict[str, Value] = {"n": len(group.ended_outcomes)}
     for name in INDICATORS:
         values |= _verdicts(found, name, f"{name.lower()}_")
-    values |= {"score_paper": _total(found.paper), "score_robust": _total(found.robust)}
+    values |= {"score_paper": total(found.paper), "score_robust": total(found.robust)}
     # A ceiling is for one data set of one size; indicators of different trials have no common size.
     remarks = [_verdict_note(found, *INDICATORS), no_ceiling(group)]
     if of_both := outcomes_note(group):
@@ -140,8 +139,8 @@ def _total_row(study: Study, group: Group) -> Row:
     found, of_both = score(study, group), outcomes_note(group)
     values: dict[str, Value] = {
         "indicator": "Score",
-        "paper": _total(found.paper),
-        "robust": _total(found.robust),
+        "paper": total(found.paper),
+        "robust": total(found.robust),
         "n": len(group.finished),
     }
     if not of_both:  # no single ceiling fits a score whose indicators rest on different trials
@@ -178,12 +177,6 @@ def _ceilings(found: Score, name: str) -> dict[str, Value]:
         for rule, shares in found.ceiling.items()
         if name in shares
     }
-
-
-def _total(judged: dict[str, Verdict]) -> str | None:
-    """``3 of 4``, or None where no indicator can be judged."""
-    found = total(judged)
-    return str(found) if found.judged else None
 
 
 def _verdict_note(found: Score, *names: str) -> str:
