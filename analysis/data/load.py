@@ -81,14 +81,6 @@ FROM states JOIN trial_drivers USING (trial_id, spec_hash)
 SEMI JOIN (FROM trials WHERE source <> 'human' AND status <> 'failed')
 USING (trial_id, spec_hash) GROUP BY ALL
 """
-# One row a finished trial: the ego's speeds.
-EGO_SPEEDS = """
-SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s,
-    list(velocity_mps ORDER BY step) AS velocity_mps
-FROM states JOIN trial_drivers USING (trial_id, spec_hash)
-SEMI JOIN (FROM trials WHERE status = 'finished') USING (trial_id, spec_hash)
-WHERE time_s >= 0 AND side = ego GROUP BY ALL ORDER BY ALL
-"""
 # One row a vehicle: its speeds under control, and whether the simulator slowed it by itself. It
 # cruises until its first decision; those of humans are not on record.
 SPEEDS = """
@@ -103,38 +95,6 @@ FROM states JOIN (
     SELECT trial_id, spec_hash, side, min(time_s) AS first_s FROM decisions GROUP BY ALL
 ) USING (trial_id, spec_hash, side)
 WHERE time_s >= greatest(0, coalesce(first_s, 0)) GROUP BY ALL ORDER BY ALL
-"""
-# One row a decision with a tactical word: whether it is its driver's first, and the mean
-# acceleration of the second that follows it, NULL where the trial ends before.
-WORDS = """
-WITH speeds AS (
-    SELECT trial_id, spec_hash, side, round(time_s, 3)::DECIMAL(9, 3) AS time_s, velocity_mps
-    FROM states WHERE time_s >= 0
-), said AS (
-    SELECT trial_id, spec_hash, side, decision, tactical, round(time_s, 3)::DECIMAL(9, 3) AS time_s,
-        decision = min(decision) OVER (PARTITION BY trial_id, spec_hash, side) AS at_first
-    FROM decisions QUALIFY tactical IS NOT NULL
-)
-SELECT said.* EXCLUDE (time_s) REPLACE (if(said.side = ego, 'left', 'right') AS side),
-    later.velocity_mps - now.velocity_mps AS driven_mps2
-FROM said JOIN speeds AS now USING (trial_id, spec_hash, side, time_s)
-JOIN trial_drivers USING (trial_id, spec_hash)
-LEFT JOIN speeds AS later ON later.trial_id = said.trial_id AND later.spec_hash = said.spec_hash
-    AND later.side = said.side AND later.time_s = said.time_s + 1
-ORDER BY ALL
-"""
-# One row a vehicle: the acceleration of the first step that its driver controls, and the word of
-# the first decision. Where each driver takes control at its own exit the other one cruises yet:
-# that is no first action.
-FIRST_ACTIONS = """
-SELECT trial_id, spec_hash, if(side = ego, 'left', 'right') AS side, first_mps2, tactical
-FROM (
-    SELECT trial_id, spec_hash, side, arg_min(acceleration_mps2, step) AS first_mps2
-    FROM states WHERE time_s > 0 GROUP BY ALL
-) JOIN trial_drivers USING (trial_id, spec_hash)
-LEFT JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash, side)
-ANTI JOIN (FROM specs WHERE spec->>'$.scenario.control_start' = 'own_exit') USING (spec_hash)
-ORDER BY ALL
 """
 # Fates of the attempts that were answered, also without a plan.
 ANSWERED = ("driven", "fallback")

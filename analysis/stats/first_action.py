@@ -23,6 +23,19 @@ from merge_runner_analysis.data.study import Group, Study, of_trials
 from merge_runner_analysis.stats.intervals import Estimate, estimate
 from merge_runner_analysis.stats.regressions import Array, unfit_for_logit
 
+# One row a vehicle: the acceleration of the first step that its driver controls, and the word of
+# the first decision. Where each driver takes control at its own exit the other one cruises yet:
+# that is no first action.
+FIRST_ACTIONS = """
+SELECT trial_id, spec_hash, if(side = ego, 'left', 'right') AS side, first_mps2, tactical
+FROM (
+    SELECT trial_id, spec_hash, side, arg_min(acceleration_mps2, step) AS first_mps2
+    FROM states WHERE time_s > 0 GROUP BY ALL
+) JOIN trial_drivers USING (trial_id, spec_hash)
+LEFT JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash, side)
+ANTI JOIN (FROM specs WHERE spec->>'$.scenario.control_start' = 'own_exit') USING (spec_hash)
+ORDER BY ALL
+"""
 # A human pedal seldom holds a speed exactly: within this a driver holds, beyond it goes or brakes.
 HOLD_MPS2 = 0.2
 # First actions are equal but for the last digits, as of a vehicle that drove on the other side.
@@ -91,7 +104,7 @@ def _stored(study: Study, seat: Seat) -> pd.DataFrame:
     columns = ["trial_id", "spec_hash", "condition", "projected_headway_m", "relative_velocity_mps",
                "pair", "ego"]  # fmt: skip
     trials = seat.group.ended[columns]
-    rows = of_trials(study.first_actions, trials).merge(trials, on=["trial_id", "spec_hash"])
+    rows = of_trials(study.read(FIRST_ACTIONS), trials).merge(trials, on=["trial_id", "spec_hash"])
     return rows[rows["side"].isin([SIDES[side] for side in seat.sides])]
 
 

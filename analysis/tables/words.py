@@ -24,6 +24,25 @@ from merge_runner_analysis.tables.model import (
     row_of,
 )
 
+# One row a decision with a tactical word: whether it is its driver's first, and the mean
+# acceleration of the second that follows it, NULL where the trial ends before.
+WORDS = """
+WITH speeds AS (
+    SELECT trial_id, spec_hash, side, round(time_s, 3)::DECIMAL(9, 3) AS time_s, velocity_mps
+    FROM states WHERE time_s >= 0
+), said AS (
+    SELECT trial_id, spec_hash, side, decision, tactical, round(time_s, 3)::DECIMAL(9, 3) AS time_s,
+        decision = min(decision) OVER (PARTITION BY trial_id, spec_hash, side) AS at_first
+    FROM decisions QUALIFY tactical IS NOT NULL
+)
+SELECT said.* EXCLUDE (time_s) REPLACE (if(said.side = ego, 'left', 'right') AS side),
+    later.velocity_mps - now.velocity_mps AS driven_mps2
+FROM said JOIN speeds AS now USING (trial_id, spec_hash, side, time_s)
+JOIN trial_drivers USING (trial_id, spec_hash)
+LEFT JOIN speeds AS later ON later.trial_id = said.trial_id AND later.spec_hash = said.spec_hash
+    AND later.side = said.side AND later.time_s = said.time_s + 1
+ORDER BY ALL
+"""
 SHARES = {
     "merge_yields": ("M", "M, yields (%)", "of these, followed by a second of yielding"),
     "yield_goes": ("Y", "Y, goes (%)", "of these, followed by a second of going"),
@@ -62,7 +81,7 @@ def words(study: Study) -> Table:
 def _said(study: Study, seat: Seat) -> pd.DataFrame:
     """The words of a driver in the trials that ended, one row each."""
     trials = seat.group.ended[["trial_id", "spec_hash", "status", "merged_first"]]
-    said = of_trials(study.words, trials).merge(trials, on=["trial_id", "spec_hash"])
+    said = of_trials(study.read(WORDS), trials).merge(trials, on=["trial_id", "spec_hash"])
     return said[said["side"].isin([SIDES[place] for place in seat.sides])]
 
 
