@@ -98,14 +98,6 @@ def tables(
         str | None,
         option("paper", "Published values and differences, for drivers of that name.", "--against"),
     ] = None,
-    as_driver: Annotated[
-        str | None,
-        option(
-            "DRIVER",
-            "With --against paper: every driver beside the paper's human, o3 or gemini-2.5-pro.",
-            "--as",
-        ),
-    ] = None,
     by: ByOption = None,
     without_fallbacks: Annotated[
         bool,
@@ -116,25 +108,31 @@ def tables(
     """Print the paper's tables III to VII, and further ones."""
     if by is not None and list(names or ()) != ["factors"]:
         raise UsageError("--by FACTOR goes with the table factors: tables factors --by FACTOR")
-    if as_driver is not None and against is None:
-        raise UsageError("--as DRIVER goes with --against paper")
     use_study(study_file, trust=trust)
     from merge_runner_analysis.tables import finished_tables
     from merge_runner_analysis.tables.formats import render, with_columns
 
+    study = None
+    if against is not None:
+        from merge_runner_analysis.data.study import Study
+        from merge_runner_analysis.tables.against import PAPER
+        from merge_runner_analysis.tables.against import against as beside
+
+        if against != PAPER:
+            raise UsageError(f"--against {against}: valid is {PAPER}")
+        study = Study(db, drivers(models), _at(where), study_file, by, without_fallbacks)
     made = finished_tables(
         db,
         drivers(models),
         names or (),
+        study,
         where=_at(where),
         file=study_file,
         by=by,
         without_fallbacks=without_fallbacks,
     )
-    if against is not None:
-        from merge_runner_analysis.tables.against import against as beside
-
-        made = [beside(table, against, as_driver) for table in made]
+    if study is not None:
+        made = [beside(table, study) for table in made]
     if columns is not None:
         made = with_columns(made, listed(columns) or ())
     print_out(render(made, TableFormat.JSON if as_json else output, terminal_width()))
@@ -236,7 +234,7 @@ def export(
 ) -> None:
     """Write every table as Parquet and CSV, with all columns explained."""
     from merge_runner.results.export import export_tables
-    from merge_runner_analysis.data.human_counts import outcomes_table
+    from merge_runner_analysis.data.reference_data import outcomes_table
 
     export_tables(db, folder, [outcomes_table()])
     print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")

@@ -16,7 +16,9 @@ from tests.independent import recompute_trials as measured
 GAP_SLOPES = {"gap-headway": (0.17, 0.034), "gap-velocity": (-0.20, 0.166)}
 GAP_N, GAP_M = 962, 3.85
 # The mean gaps of nine pairs scatter by so much: table S6 of the supplement to pgae420.
-PAIRS, PAIR_SD_M = 9, 1.3
+# Random intercepts of the gap by pair, as published with table S6.
+INTERCEPTS_M = (-0.49, 1.21, 1.94, -0.01, -0.35, 1.07, -1.61, -1.86, 0.09)
+PAIRS, PAIR_SD_M = 9, float(np.std(INTERCEPTS_M, ddof=1))
 VELOCITY_MPS = 0.8  # of the gap's slope on relative velocity
 MARGIN_M = 1.0
 KEPT = ("estimate", "ci_low", "ci_high", "n")

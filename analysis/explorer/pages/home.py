@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.data.studies import DESCRIPTIONS
 from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.conditions import ordered
