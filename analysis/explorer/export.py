@@ -81,7 +81,6 @@ def export_folder(
             site.catalogue.keep([row["number"] for row in rows])
             found = asyncio.run(_crawled(site, "/trials", OF_TRIALS, stage, told))
         else:
-            site.computing.begin()
             found = asyncio.run(_crawled(site, "/", FOLLOWED, stage, told))
         _rewrite(db, stage, found)
     return index

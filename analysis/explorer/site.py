@@ -22,10 +22,12 @@ from merge_runner_analysis.explorer.display_text import visible
 from merge_runner_analysis.explorer.glossary import sections
 from merge_runner_analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
 from merge_runner_analysis.explorer.queries import Queries
+from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.explorer.search import Words
 from merge_runner_analysis.explorer.urls import HOME, Links
 from merge_runner_analysis.explorer.views import clock, condition_text
 from merge_runner_analysis.metrics import METRICS
+from merge_runner_analysis.verdict_words import TABLE
 
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {
@@ -107,8 +109,8 @@ class Site:
         )
 
     def begin(self) -> None:
-        """Read the trials for the first time in the background, since it may take a while."""
-        self.computing.begin()
+        """Read the trials and make the first page's table, before anything is asked."""
+        self.computing.ask(("table", TABLE, "", ""), stamp_of(self.db))
         self._first_reading = threading.Thread(target=self._read_first, daemon=True)
         self._first_reading.start()
 

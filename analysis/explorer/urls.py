@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import quote, urlencode
-
-# Without exponents and names: float() also reads "1e999" and "nan".
-_SECONDS = re.compile(r"[0-9]{1,12}(\.[0-9]{1,6})?")
-
 
 # The page to begin at.
 HOME = "index"
@@ -85,8 +80,3 @@ def query_of(state: Mapping[str, Any]) -> str:
 def whole(text: str) -> int | None:
     """A number of up to 7 digits; None for anything else."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 8 else None
-
-
-def seconds(text: str) -> float:
-    """A time in s since 1970; 0 for anything else."""
-    return float(text) if _SECONDS.fullmatch(text) else 0.0

@@ -75,9 +75,9 @@ from merge_runner.study.parts import load_study
 load_study(sys.argv[2], trust=True)
 Path(sys.argv[2]).with_name("mine.py").write_text("raise RuntimeError('nobody agreed to this')")
 worker = Worker(Path(sys.argv[1]))
-found = worker.submit(("tables", "factors"), (1, 1), 0.0).result(timeout=60)
+found = worker.submit(("table", "factors")).result(timeout=60)
 worker.close()
-print(found.content["tables"][0])
+print(found["table"])
 """
 
 

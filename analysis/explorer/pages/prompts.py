@@ -12,7 +12,7 @@ from typing import Any
 from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
 from merge_runner_analysis.explorer import views
 from merge_runner_analysis.explorer.marks import Mark
-from merge_runner_analysis.explorer.pages.computed import computed
+from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.prompts import Part, parts_of
 from merge_runner_analysis.explorer.reading import Row, reading, records
 from merge_runner_analysis.explorer.scope import unmarked
@@ -58,8 +58,7 @@ class PromptDifference:
 
 def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
     """All prompts side by side, and the differences that they make."""
-    found = computed(site, ("tables", "contrasts"), asked)
-    table = model.from_text(found.result.content["tables"][0]) if found.result else None
+    found, table = computed_table(site, "contrasts", asked)
     return site.render(
         "prompts.html",
         here="prompts",

@@ -8,8 +8,8 @@ from importlib import metadata
 from typing import Any
 
 from merge_runner.errors import StoreError
-from merge_runner_analysis.explorer.analysis_process import Request
-from merge_runner_analysis.explorer.pages.computed import computed
+from merge_runner_analysis.explorer.analysis_worker import Request
+from merge_runner_analysis.explorer.pages.computed import computed, computed_table
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.table_format import TableFormat
@@ -47,8 +47,8 @@ def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
     if suffix not in FILES:
         raise NotThere(f"a table comes as {' or '.join(FILES)}")
     form, kind = FILES[suffix]
-    (text,) = awaited(site, ("tables", _named(name, TABLES, "table")))["tables"]
-    return render([from_text(text)], form) + "\n", kind
+    content = awaited(site, ("table", _named(name, TABLES, "table"), "", ""))
+    return render([from_text(content["table"])], form) + "\n", kind
 
 
 def figure_file(site: Site, name: str, form: str) -> bytes:
@@ -70,7 +70,7 @@ def figure_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         name=name,
         about=about,
         computed=found,
-        image=b64encode(found.result.content["file"]).decode() if found.result else "",
+        image=b64encode(found.content["file"]).decode() if found.content else "",
         files={"SVG": site.at.figure(name, ".svg"), "PNG": site.at.figure(name, ".png")}
         | {"CSV": numbers},
         sources=(PAPER, HUMANS),
@@ -81,9 +81,9 @@ def figure_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
 def awaited(site: Site, request: Request) -> dict[str, Any]:
     """What a computation answers, however long that takes; raises StoreError."""
     found = computed(site, request, {}, wait_s=FILE_WAIT_S)
-    if found.result is None:
+    if found.content is None:
         raise StoreError(found.failure or "it is still being computed: ask again in a minute")
-    return found.result.content
+    return found.content
 
 
 def _named(name: str, known: Collection[str], what: str) -> str:
@@ -94,14 +94,10 @@ def _named(name: str, known: Collection[str], what: str) -> str:
 
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """One table; raises NotThere."""
-    found = computed(site, ("tables", _named(name, TABLES, "table")), asked)
-    shown = None
-    if found.result is not None:
-        table = from_text(found.result.content["tables"][0])
-        shown = table_view(
-            table,
-            lambda table, row, column: site.at.cell(table.name, row.id, column.name),
-        )
+    found, table = computed_table(site, _named(name, TABLES, "table"), asked)
+    shown = table and table_view(
+        table, lambda table, row, column: site.at.cell(table.name, row.id, column.name)
+    )
     names = list(TABLES)
     at = names.index(name)
     return site.render(

@@ -28,9 +28,9 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     cell, named = asked.get("cell", ""), None
     if cell:
         named = computed(site, cell_request(cell), asked)
-        if named.result is None:
+        if named.content is None:
             return site.render("behind.html", here="trials", cell=cell, computed=named)
-        wanted = replace(wanted, trials=behind(named.result.content))
+        wanted = replace(wanted, trials=behind(named.content))
     totals = site.catalogue.totals(wanted)
     trials = sum(part["trials"] for part in totals.values())
     last = max(1, -(-trials // PAGE))
@@ -70,9 +70,9 @@ def export_filter(site: Site, asked: Mapping[str, str]) -> Filter:
     if not cell:
         return wanted
     named = computed(site, cell_request(cell), asked, wait_s=EXPORT_WAIT_S)
-    if named.result is None:
+    if named.content is None:
         raise StoreError(named.failure or f"the trials behind {cell} are still being looked up")
-    return replace(wanted, trials=behind(named.result.content))
+    return replace(wanted, trials=behind(named.content))
 
 
 def cell_request(cell: str) -> tuple[str, str, str, str]:
