@@ -32,7 +32,6 @@ from merge_runner_analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
 from merge_runner_analysis.explorer.offline import page_of_trials
 from merge_runner_analysis.explorer.pages import (
     comparing,
-    conditions,
     drivers,
     home,
     notes,
@@ -167,12 +166,8 @@ def _computed_routes(site: Site) -> list[Route]:
     def figure_page(request: Request) -> str:
         return tables.figure_page(site, request.path_params["name"], request.query_params)
 
-    def condition(request: Request) -> str:
-        return conditions.condition_page(site, request.path_params["name"], request.query_params)
-
     page = partial(_page, site)
     return [
-        Route("/conditions/{name:path}", page(condition)),
         Route("/glossary", page(lambda _: site.render("glossary.html", here="glossary"))),
         Route("/tables", page(lambda _: tables.tables_page(site))),
         Route("/tables/{name}.{suffix}", page(file)),
@@ -242,9 +237,9 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
 def _sql_routes(site: Site) -> list[Route]:
     """Only our own pages run a query; where another site leads to one, it is shown and not run."""
 
-    def sql_query(request: Request) -> Response:
+    def sql_query(request: Request) -> str:
         run = not from_elsewhere(request.headers)
-        return HTMLResponse(sql.sql_page(site, request.query_params, run=run))
+        return sql.sql_page(site, request.query_params, run=run)
 
     def sql_download(request: Request) -> Response:
         if from_elsewhere(request.headers):
@@ -255,7 +250,7 @@ def _sql_routes(site: Site) -> list[Route]:
             return HTMLResponse(sql.sql_page(site, request.query_params, problem=str(exc)), 400)
         return _download(content, CSV, "query.csv")
 
-    return [Route("/sql", sql_query), Route("/sql.csv", sql_download)]
+    return [Route("/sql", _page(site, sql_query)), Route("/sql.csv", sql_download)]
 
 
 def _words_routes(site: Site) -> list[Route]:

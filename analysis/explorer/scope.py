@@ -10,7 +10,7 @@ from starlette.datastructures import QueryParams
 from merge_runner.prompts.blocks import title_of
 from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.conditions import ordered
-from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.explorer.site import SCOPE, NotThere, Site
 from merge_runner_analysis.names import BASELINE
 
 # The number of trials of each run, driver, prompt and condition; each once for its prompt.
@@ -29,11 +29,6 @@ class Scope:
     prompt: str = BASELINE
     condition: str = ""
 
-    @property
-    def state(self) -> dict[str, str]:
-        """Sweep and condition as an address has them."""
-        return {"sweep": self.sweep, "condition": self.condition}
-
     def filter(self, driver: str = "", prompt: str = "", outcome: str = "") -> Filter:
         """Its trials of a driver and a prompt, or of all."""
         return Filter(
@@ -46,7 +41,8 @@ class Scope:
 
     def trials(self, driver: str, prompt: str) -> dict[str, str]:
         """A driver's trials with a prompt, as the list of trials filters them."""
-        return {"model": unmarked(driver), "variant": prompt, **self.state}
+        chosen = {"sweep": self.sweep, "condition": self.condition}
+        return {"model": unmarked(driver), "variant": prompt, **chosen}
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +73,8 @@ def scope_of(site: Site, asked: Mapping[str, str], driver: str = "") -> Bar:
     usual = BASELINE if BASELINE in prompts else next(iter(prompts), BASELINE)
     scope = Scope(
         _known("sweep", asked.get("sweep", ""), sweeps),
-        tuple(_known("driver", name, drivers) for name in _every(asked, "driver")),
-        _known("prompt", asked.get("prompt", "") or usual, [*prompts, usual]),
+        tuple(_known("driver", name, drivers) for name in every(asked, "model")),
+        _known("prompt", asked.get("variant", "") or usual, [*prompts, usual]),
         _known("condition", asked.get("condition", ""), conditions),
     )
     return Bar(
@@ -90,12 +86,17 @@ def scope_of(site: Site, asked: Mapping[str, str], driver: str = "") -> Bar:
     )
 
 
+def carried(asked: Mapping[str, str]) -> dict[str, list[str]]:
+    """The scope in an address, as the addresses of other pages take it on."""
+    return {name: values for name in SCOPE if (values := every(asked, name))}
+
+
 def unmarked(driver: str) -> str:
     """The name by which the list of trials knows a driver, without a mark of its settings."""
     return driver.partition(" [")[0]
 
 
-def _every(asked: Mapping[str, str], name: str) -> list[str]:
+def every(asked: Mapping[str, str], name: str) -> list[str]:
     """All values of one name in an address."""
     several = asked.getlist(name) if isinstance(asked, QueryParams) else [asked.get(name, "")]
     return [value for value in several if value]

@@ -58,9 +58,9 @@ class Links:
         """A sweep's page."""
         return f"/sweeps/{quote(sweep_id)}"
 
-    def condition(self, name: str, **state: object) -> str:
-        """All trials of a condition in one picture."""
-        return f"/conditions/{quote(name)}" + query_of(state)
+    def condition(self, name: str) -> str:
+        """The trials of a condition."""
+        return self.to("trials", condition=name)
 
     def driver(self, name: str, **state: object) -> str:
         """A driver's page."""
@@ -74,7 +74,7 @@ class Links:
 def query_of(state: Mapping[str, Any]) -> str:
     """The part of an address after the path; what is empty is left out."""
     given = {name: value for name, value in state.items() if value is not None and value != ""}
-    return f"?{urlencode(given)}" if given else ""
+    return f"?{urlencode(given, doseq=True)}" if given else ""
 
 
 def whole(text: str) -> int | None:
