@@ -102,7 +102,7 @@ def _sweep_routes(site: Site) -> list[Route]:
             "/drivers/{name:path}",
             page(lambda r: drivers.driver_page(site, r.path_params["name"], r.query_params)),
         ),
-        Route("/sweeps", page(lambda r: sweep.sweeps_page(site, _seen(r)))),
+        Route("/sweeps", page(lambda r: sweep.sweeps_page(site, r.query_params))),
         Route("/sweeps/{sweep:path}", one),
     ]
 

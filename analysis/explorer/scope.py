@@ -22,7 +22,7 @@ SWEEPS = "SELECT sweep_id, name, started_at FROM sweeps ORDER BY started_at DESC
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """A part of the trials; what is empty leaves nothing out, and there is always one prompt."""
+    """A part of the trials; what is empty leaves nothing out."""
 
     sweep: str = ""
     drivers: tuple[str, ...] = ()
@@ -39,6 +39,13 @@ class Scope:
             outcome=outcome,
         )
 
+    def where(self) -> tuple[str, list[object]]:
+        """The trials of all its drivers as SQL over the list, with its values."""
+        where, values = self.filter(prompt=self.prompt).where()
+        if not self.drivers:
+            return where, values
+        return f"{where} AND model IN (SELECT unnest(?::VARCHAR[]))", [*values, list(self.drivers)]
+
     def trials(self, driver: str, prompt: str) -> dict[str, str]:
         """A driver's trials with a prompt, as the list of trials filters them."""
         chosen = {"sweep": self.sweep, "condition": self.condition}
@@ -47,19 +54,25 @@ class Scope:
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """The form that sets a scope: (value, text) of each choice."""
+    """The form that sets a scope: (value, text) of each choice.
+
+    ``any_prompt``: trials of all prompts may be seen together.
+    """
 
     scope: Scope
+    any_prompt: bool
     sweeps: list[tuple[str, str]]
     drivers: list[str]
     prompts: list[tuple[str, str]]
     conditions: list[tuple[str, str]]
 
 
-def scope_of(site: Site, asked: Mapping[str, str], driver: str = "") -> Bar:
+def scope_of(
+    site: Site, asked: Mapping[str, str], driver: str = "", *, any_prompt: bool = False
+) -> Bar:
     """The scope that an address names, with what may be chosen; raises NotThere.
 
-    ``driver``: of this one alone.
+    ``driver``: of this one alone. Unless it may be of ``any_prompt``, it has one.
     """
     rows = site.catalogue.ask(OFFERED)
     drivers = list(dict.fromkeys(row["model"] for row in rows))
@@ -71,6 +84,7 @@ def scope_of(site: Site, asked: Mapping[str, str], driver: str = "") -> Bar:
         for row in site.catalogue.ask(SWEEPS)
     }
     usual = BASELINE if BASELINE in prompts else next(iter(prompts), BASELINE)
+    usual = "" if any_prompt else usual
     scope = Scope(
         _known("sweep", asked.get("sweep", ""), sweeps),
         tuple(_known("driver", name, drivers) for name in every(asked, "model")),
@@ -79,6 +93,7 @@ def scope_of(site: Site, asked: Mapping[str, str], driver: str = "") -> Bar:
     )
     return Bar(
         scope,
+        any_prompt,
         list(sweeps.items()),
         drivers,
         [(name, title_of(name)) for name in prompts],

@@ -171,7 +171,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
     driver, variant = asked.get("model", ""), asked.get("variant", "")
     if not driver or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
-    pairs = of_equal_tasks(site, site.catalogue.pairs(unmarked(driver), variant, "outcome"))
+    pairs = of_equal_tasks(site, site.catalogue.pairs(unmarked(driver), variant))
     differing = [pair for pair in pairs if pair["outcome"] != pair["base_outcome"]]
     kinds = Counter((pair["base_outcome"], pair["outcome"]) for pair in differing)
     return site.render(

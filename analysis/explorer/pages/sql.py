@@ -65,7 +65,7 @@ def sql_page(
     return site.render(
         "sql.html",
         here="sql",
-        bar=scope_of(site, asked),
+        bar=scope_of(site, asked, any_prompt=True),
         carried=carried(asked),
         query=query if is_asked else scoped_query(carried(asked)),
         asked=is_asked,
