@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.text_safety import csv_writer
 from merge_runner_analysis.explorer.display_text import csv_cell
-from merge_runner_analysis.explorer.notes import Note, tags_of
+from merge_runner_analysis.explorer.notes import Note
 from merge_runner_analysis.explorer.pages.trial import find
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.site import Site
@@ -26,18 +26,14 @@ def notes_page(site: Site) -> str:
 
 
 def notes_csv(site: Site) -> str:
-    """Return all notes as CSV."""
+    """Return all notes as CSV, the earliest first; tags are separated by commas."""
     lines = io.StringIO()
-    csv_writer(lines).writerows(map(csv_cell, row) for row in note_rows(site.notes.kept().notes))
-    return lines.getvalue()
-
-
-def note_rows(notes: Sequence[Note]) -> Iterator[Sequence[object]]:
-    """The notes under their columns, the earliest first; tags are separated by commas."""
-    yield COLUMNS
-    for note in notes:
+    writer = csv_writer(lines)
+    writer.writerow(COLUMNS)
+    for note in site.notes.kept().notes:
         texts = {"at": note.at.isoformat(), "tags": ", ".join(note.tags)}
-        yield [texts.get(name, getattr(note, name)) for name in COLUMNS]
+        writer.writerow(csv_cell(texts.get(name, getattr(note, name))) for name in COLUMNS)
+    return lines.getvalue()
 
 
 def add_note(site: Site, given: Mapping[str, str]) -> Row:
@@ -46,15 +42,18 @@ def add_note(site: Site, given: Mapping[str, str]) -> Row:
     side, number = given.get("side", ""), whole(given.get("decision", ""))
     if side not in {"", *SIDES} or (number is None) != (side == ""):
         raise UsageError("a note is of a trial, or of a decision: side left or right, and a number")
-    text = given.get("text", "").replace("\r\n", "\n").strip()
     at = None if number is None else (SIDES[SIDES.index(side)], number)
-    site.notes.add((row["trial_id"], row["spec_hash"]), at, tags_of(given.get("tags", "")), text)
+    # Tags are separated by commas, and have no capitals.
+    tags = [" ".join(tag.split()).lower() for tag in given.get("tags", "").split(",")]
+    text = given.get("text", "").replace("\r\n", "\n").strip()
+    trial = row["trial_id"], row["spec_hash"]
+    site.notes.add(trial, at, list(dict.fromkeys(filter(None, tags))), text)
     return row
 
 
 def _address(site: Site, note: Note) -> str:
     """Where a note belongs; nothing where the trial is not in this database."""
-    row = site.catalogue.find(*note.trial)
+    row = site.catalogue.find(note.trial_id, note.spec_hash)
     if row is None:
         return ""
     at = {} if note.decision is None else {"side": note.side, "decision": note.decision}
