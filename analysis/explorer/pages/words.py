@@ -6,9 +6,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from merge_runner_analysis.explorer.pages.trials import filter_of
-from merge_runner_analysis.explorer.search import KINDS, LONGEST, OWN_FACETS, Wanted
+from merge_runner_analysis.explorer.search import (
+    KINDS,
+    LONGEST,
+    LONGEST_QUERY,
+    MOST_TERMS,
+    OWN_FACETS,
+    Wanted,
+    terms_of,
+)
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.explorer.snippets import LONGEST_QUERY, MOST_TERMS, terms_of
 from merge_runner_analysis.explorer.urls import whole
 
 HEADINGS = {
@@ -47,7 +54,7 @@ def wanted_of(asked: Mapping[str, str]) -> Wanted:
     kind = asked.get("in", "")
     return Wanted(
         kind if kind in KINDS else next(iter(KINDS)),
-        tuple(terms_of(asked.get("q", ""))),
+        terms_of(asked.get("q", "")),
         replace(filter_of(asked), q=""),
         own,
     )
