@@ -57,4 +57,5 @@ def _address(site: Site, note: Note) -> str:
     if row is None:
         return ""
     at = {} if note.decision is None else {"side": note.side, "decision": note.decision}
-    return site.at.trial(row, **at)
+    address: str = site.at.trial(row, **at)
+    return address
