@@ -192,7 +192,7 @@ def _sql_csv(site: Site, asked: Request) -> Response:
     if from_elsewhere(asked.headers):
         return RedirectResponse(site.at.to("sql", q=sql.query_in(state)))
     try:
-        return _download(sql.sql_csv(site, state), CSV, "query.csv")
+        return _download(site.queries.csv(sql.query_in(state)), CSV, "query.csv")
     except MergeRunnerError as exc:
         return HTMLResponse(sql.sql_page(site, state, problem=str(exc)), 400)
 
@@ -224,7 +224,6 @@ PAGES: dict[str, Callable[[Site, Request], str | Response]] = {
     "/discordant": lambda site, asked: prompts.discordant_page(site, asked.query_params),
     "/words": lambda site, asked: words.words_page(site, asked.query_params),
     "/notes": lambda site, _: notes.notes_page(site),
-    "/notes.csv": lambda site, _: _download(notes.notes_csv(site), CSV, "notes.csv"),
     "/sql": _sql,
     "/sql.csv": _sql_csv,
 }

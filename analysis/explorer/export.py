@@ -34,7 +34,7 @@ MOST = 1_000  # trials of drivers; of humans there are at most 990
 # The pages of an export by the first part of their path, and what their addresses may ask for.
 FOLLOWED = {
     *("", "drivers", "trials", "conditions", "discordant", "sweeps", "tables", "figures"),
-    *("prompts", "notes", "notes.csv", "glossary"),
+    *("prompts", "notes", "glossary"),
 }
 OF_TRIALS = {"trials", "glossary"}
 ASKED = {"prompt", "spec", "page", "by", *FACETS}
@@ -142,7 +142,7 @@ def _file_of(page: str, taken: Collection[str]) -> str:
     """Return a name for the file of a page that no other one has, whatever the page is called."""
     parts = urlsplit(page)
     path = PurePosixPath(unquote(parts.path))
-    suffix = path.suffix if page.startswith(("/tables/", "/figures/", "/notes.")) else ""
+    suffix = path.suffix if page.startswith(("/tables/", "/figures/")) else ""
     asked = [part for pair in parse_qsl(parts.query) if pair[0] != "spec" for part in pair]
     words = "-".join([str(path).removesuffix(suffix), *asked])
     name = f"{FILES}/{_ODD.sub('-', words).strip('-')[:LONGEST_NAME]}"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import shutil
 from concurrent.futures import ProcessPoolExecutor
@@ -130,18 +128,6 @@ def test_what_a_reader_wrote_is_text_everywhere(db):
         assert "\u202e" not in "".join(Texts(text).said)
 
 
-def test_a_spreadsheet_runs_nothing_of_the_csv(db):
-    client = asking(db)
-    noted(client, text="=1+1", tags="a,b")
-    noted(client, text="one\ntwo", side="right", decision="0")
-    rows = list(csv.DictReader(io.StringIO(client.get("/notes.csv").text)))
-    assert [(row["text"], row["tags"], row["side"], row["decision"]) for row in rows] == [
-        ("'=1+1", "a, b", "", ""),
-        ("one\ntwo", "", "right", "0"),
-    ]
-    assert {(row["reader"], row["trial_id"]) for row in rows} == {("anna", TRIAL)}
-
-
 @pytest.mark.parametrize("damage", [b'{"at": "1', b"\xff\xfe", b'{"reader": 3}', b"null", b""])
 def test_a_damaged_line_is_told_and_skipped_and_kept(db, damage):
     client = asking(db)
@@ -255,11 +241,6 @@ def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(page, db, t
     page.locator(".all-notes tbody a").last.click()
     expect(page.locator("#noted")).to_contain_text("It hesitates.")
     expect(page.locator("#note")).to_have_count(0)
-    lines = csv.DictReader((files / "notes.csv").open())
-    assert [(line["text"], line["trial_id"]) for line in lines] == [
-        ("It hesitates.", "emulator/baseline/N_0_0/rep01"),
-        ("not of these trials", other),
-    ]
     files = export(db, tmp_path / "few", ["emulator/baseline/N_0_0/*"])
     pages = {path.name: path.read_text() for path in files.glob("*.html")}
     assert "It hesitates." in pages["trials-emulator-baseline-N_0_0-rep01.html"]

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
-from merge_runner.text_safety import csv_writer
-from merge_runner_analysis.explorer.display_text import csv_cell
 from merge_runner_analysis.explorer.notes import Note
 from merge_runner_analysis.explorer.pages.trial import find
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.explorer.urls import whole
-
-COLUMNS = ("at", "reader", "trial_id", "spec_hash", "side", "decision", "tags", "text")
 
 
 def notes_page(site: Site) -> str:
@@ -23,17 +18,6 @@ def notes_page(site: Site) -> str:
     kept = site.notes.kept()
     shown = [(note, _address(site, note)) for note in reversed(kept.notes)]
     return site.render("notes.html", here="notes", kept=kept, shown=shown)
-
-
-def notes_csv(site: Site) -> str:
-    """Return all notes as CSV, the earliest first; tags are separated by commas."""
-    lines = io.StringIO()
-    writer = csv_writer(lines)
-    writer.writerow(COLUMNS)
-    for note in site.notes.kept().notes:
-        texts = {"at": note.at.isoformat(), "tags": ", ".join(note.tags)}
-        writer.writerow(csv_cell(texts.get(name, getattr(note, name))) for name in COLUMNS)
-    return lines.getvalue()
 
 
 def add_note(site: Site, given: Mapping[str, str]) -> Row:
