@@ -114,20 +114,12 @@ class Numbers:
             for group in (*self.study.measured, *self.study.unjudged)
             for trials in [group.stored.trials]
         }
-        sources = [
-            {
-                "group": source.group,
-                "text": source.text,
-                "query": source.query,
-                "trials": [
-                    (trial, specs[source.group][trial])
-                    for trial in (source.numerator if counts else source.trials)
-                ],
-            }
+        trials = [
+            (trial, specs[source.group][trial])
             for source in found.sources
+            for trial in (source.numerator if counts else source.trials)
         ]
-        texts = {"value": found.value, "meaning": found.meaning, "note": found.note}
-        return {**texts, "command": found.command, "sources": sources}
+        return {"explained": found, "trials": trials}
 
 
 _db: Path
