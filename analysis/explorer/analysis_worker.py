@@ -61,8 +61,7 @@ class Numbers:
             case ["figure", name, "svg" | "png" as form]:
                 from merge_runner_analysis.figures.gallery import rendered
 
-                digest = results_digest(self.db)[0]
-                found = {"file": rendered(self.study, name, form), "digest": digest}
+                found = {"file": rendered(self.study, name, form), "digest": self._digest}
             case _:
                 raise UsageError(f"nothing answers {request!r}")
         return {"counted": self._counted, **found}
@@ -79,6 +78,10 @@ class Numbers:
         from merge_runner_analysis.data.study import Study
 
         return Study(self.db)
+
+    @cached_property
+    def _digest(self) -> str:
+        return results_digest(self.db)[0]
 
     @cached_property
     def _state(self) -> str:
@@ -111,20 +114,12 @@ class Numbers:
             for group in (*self.study.measured, *self.study.unjudged)
             for trials in [group.stored.trials]
         }
-        sources = [
-            {
-                "group": source.group,
-                "text": source.text,
-                "query": source.query,
-                "trials": [
-                    (trial, specs[source.group][trial])
-                    for trial in (source.numerator if counts else source.trials)
-                ],
-            }
+        trials = [
+            (trial, specs[source.group][trial])
             for source in found.sources
+            for trial in (source.numerator if counts else source.trials)
         ]
-        texts = {"value": found.value, "meaning": found.meaning, "note": found.note}
-        return {**texts, "command": found.command, "sources": sources}
+        return {"explained": found, "trials": trials}
 
 
 _db: Path

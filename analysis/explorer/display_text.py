@@ -69,19 +69,17 @@ def text_of(value: object) -> str | None:
             text = value.isoformat(" ")
             return INFINITE.get(text, text)
         case list() | tuple() | dict():
-            return json.dumps(_plain(value), ensure_ascii=False)
+            return json.dumps(_plain(value), ensure_ascii=False, default=text_of)
         case _:
             return str(value)
 
 
 def _plain(value: object) -> object:
-    """A nested value as JSON can say it."""
+    """A nested value whose keys JSON can say."""
     match value:
         case list() | tuple():
             return [_plain(item) for item in value]
         case dict():
             return {str(text_of(key)): _plain(item) for key, item in value.items()}
-        case bool() | int() | float():
-            return value
         case _:
-            return text_of(value)
+            return value

@@ -71,6 +71,8 @@ class Site:
     """What to type to run this program."""
     reader: str = "reader"
     """Who writes notes."""
+    is_still: bool = False
+    """Whether no news is taken in."""
 
     def __post_init__(self) -> None:
         self._first_reading: threading.Thread | None = None
@@ -130,6 +132,8 @@ class Site:
 
     def refresh(self) -> None:
         """Take in what is new: in the database, and in the notes beside it."""
+        if self.is_still:
+            return
         if self.catalogue.refresh():
             self._conditions = {}
         self.catalogue.tag(self.notes.kept().tags)

@@ -17,9 +17,6 @@ from merge_runner_analysis.tables.model import Table, from_text
 
 # What is kept comes within this time; what takes longer is asked for again.
 AT_ONCE_S = 0.3
-# CPU time of a first table in a new process, with its imports: 4 s of 110 trials, and of 11,000
-# between 6 s (who merged first) and 10 s (the contrasts).
-FIRST_TABLE_S, TRIALS_A_SECOND = 4.0, 2_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,15 +24,13 @@ class Computed:
     """The content of a result, or None with the seconds that it takes so far, or with a failure.
 
     It is ``older`` where the database has changed since; ``at`` is when it was begun, in s since
-    1970. ``listed`` is how many trials there are now, and ``again`` the query of this page with
-    everything computed anew.
+    1970, ``here`` the query of this page, and ``again`` that with everything computed anew.
     """
 
     content: dict[str, Any] | None
     failure: str
     at: float
     older: bool
-    listed: int
     again: str
     here: str
 
@@ -43,11 +38,6 @@ class Computed:
     def elapsed_s(self) -> float:
         """How long it takes so far."""
         return time.time() - self.at
-
-    @property
-    def usual_s(self) -> float:
-        """How long a first result may take where nothing was read before."""
-        return FIRST_TABLE_S + self.listed / TRIALS_A_SECOND
 
     @property
     def clock(self) -> str:
@@ -73,7 +63,6 @@ def computed(
         failure=failure,
         at=job.at if job else time.time(),
         older=job is not None and job.state != state,
-        listed=site.catalogue.state()[0],
         again=query_of({**here, "anew": 1}),
         here=query_of(here),
     )

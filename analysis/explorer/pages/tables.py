@@ -65,7 +65,7 @@ def figure_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """A figure with its caption, its files, and how it is cited; raises NotThere."""
     about = FIGURES[_named(name, FIGURES, "figure")]
     found = computed(site, ("figure", name, "svg"), asked)
-    numbers = site.at.table_file(about.table, "csv") if about.table else site.at.to("trials.csv")
+    numbers = site.at.table(f"{about.table}.csv") if about.table else site.at.to("trials.csv")
     return site.render(
         "figure.html",
         here="tables",
@@ -73,7 +73,7 @@ def figure_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         about=about,
         computed=found,
         image=b64encode(found.content["file"]).decode() if found.content else "",
-        files={"SVG": site.at.figure(name, ".svg"), "PNG": site.at.figure(name, ".png")}
+        files={"SVG": site.at.figure(f"{name}.svg"), "PNG": site.at.figure(f"{name}.png")}
         | {"CSV": numbers},
         sources=(PAPER, HUMANS),
         version=metadata.version("merge-runner"),
@@ -111,7 +111,7 @@ def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         here="tables",
         name=name,
         about=TABLES[name].about,
-        files=[(suffix, site.at.table_file(name, suffix)) for suffix in FILES],
+        files=[(suffix, site.at.table(f"{name}.{suffix}")) for suffix in FILES],
         computed=found,
         table=shown,
         columns=columns,

@@ -33,7 +33,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         named = computed(site, cell_request(cell), asked)
         if named.content is None:
             return site.render("behind.html", here="trials", cell=cell, computed=named)
-        wanted = replace(wanted, trials=behind(named.content))
+        wanted = replace(wanted, trials=tuple(named.content["trials"]))
     totals = site.catalogue.totals(wanted)
     trials = sum(part["trials"] for part in totals.values())
     last = max(1, -(-trials // PAGE))
@@ -77,7 +77,7 @@ def export_filter(site: Site, asked: Mapping[str, str]) -> Filter:
     named = computed(site, cell_request(cell), asked, wait_s=EXPORT_WAIT_S)
     if named.content is None:
         raise StoreError(named.failure or f"the trials behind {cell} are still being looked up")
-    return replace(wanted, trials=behind(named.content))
+    return replace(wanted, trials=tuple(named.content["trials"]))
 
 
 def cell_request(cell: str) -> tuple[str, str, str, str]:
@@ -87,11 +87,6 @@ def cell_request(cell: str) -> tuple[str, str, str, str]:
     if table not in TABLES or not row:
         raise NotThere(f"a cell is named TABLE/ROW:COLUMN; the tables are {', '.join(TABLES)}")
     return "cell", table, row, column
-
-
-def behind(content: dict[str, Any]) -> tuple[tuple[str, str], ...]:
-    """The (trial, spec) of all groups behind a cell."""
-    return tuple((name, spec) for source in content["sources"] for name, spec in source["trials"])
 
 
 def filter_of(asked: Mapping[str, str]) -> Filter:

@@ -8,9 +8,16 @@ from dataclasses import replace
 
 from merge_runner_analysis.explorer.pages import trials
 from merge_runner_analysis.explorer.scope import carried
-from merge_runner_analysis.explorer.search import KINDS, LIMITS, LONGEST, OWN_FACETS, Wanted
+from merge_runner_analysis.explorer.search import (
+    KINDS,
+    LIMITS,
+    LONGEST,
+    MOST_TERMS,
+    OWN_FACETS,
+    Wanted,
+    terms_of,
+)
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.explorer.snippets import MOST_TERMS, terms_of
 from merge_runner_analysis.explorer.urls import whole
 
 HEADINGS = trials.HEADINGS | {
@@ -49,7 +56,7 @@ def wanted_of(asked: Mapping[str, str]) -> Wanted:
     kind = asked.get("in", "")
     return Wanted(
         kind if kind in KINDS else next(iter(KINDS)),
-        tuple(terms_of(asked.get("q", ""))),
+        terms_of(asked.get("q", "")),
         replace(trials.filter_of(asked), q=""),
         own,
         {name: value for name in LIMITS if (value := _limit(asked.get(name, ""))) is not None},

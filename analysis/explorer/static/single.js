@@ -31,7 +31,6 @@
         .map(({ dataset: { trial, spec, name, outcome } }) => ({ key: `${trial}@${spec}`, name, outcome }));
       return { found, more: fit.length - found.length };
     },
-    offer: async (kind) => JSON.parse(chosen.dataset.offers)[kind] ?? null,
   };
   document.getElementById("shown").replaceChildren(chosen.content.cloneNode(true));
   document.title = `${chosen.dataset.name} · merge-runner`;
