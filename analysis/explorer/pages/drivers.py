@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -32,6 +33,12 @@ ATTEMPTS = """
 SELECT served, outcome, sum(times)::BIGINT AS times
 FROM tried SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (number)
 GROUP BY ALL ORDER BY ALL
+"""
+
+# What was sent with every prompt, as JSON.
+SENT = """
+SELECT any_value(coalesce(spec->'$.left.body', spec->'$.right.body'))::VARCHAR AS body
+FROM listed JOIN specs USING (spec_hash) WHERE model = ? AND variant = ?
 """
 
 
@@ -87,6 +94,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         measures=MEASURES,
         human=humans_of(table),
         first=first,
+        parameters=_parameters(site, own) if own else "",
         found=words,
         kept=bar.scope.trials(name, bar.scope.prompt),
         summary=_summary(own) if own else "",
@@ -128,6 +136,15 @@ def _first(site: Site, own: Driver, scope: Scope, asked: Mapping[str, str]) -> s
                 f"velocity: {of['slope']} {of['slope_ci']}."
             )
     return " ".join(told).replace("-", MINUS) if len(told) > 1 else ""
+
+
+def _parameters(site: Site, own: Driver) -> str:
+    """What was sent to the model beside its prompts; empty for a program."""
+    (row,) = site.catalogue.ask(SENT, unmarked(own.name), own.prompt)
+    body = json.loads(row["body"] or "{}")
+    return ", ".join(
+        f"{name} {value}" for name, value in body.items() if isinstance(value, str | int | float)
+    )
 
 
 def _attempts(site: Site, own: Driver) -> list[Row]:

@@ -104,8 +104,6 @@ def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         lambda table, row, column: site.at.cell(table.name, row.id, column.name),
     )
     places = [place for place, column in enumerate(columns) if column.name not in without]
-    names = list(TABLES)
-    at = names.index(name)
     return site.render(
         "table.html",
         here="tables",
@@ -118,8 +116,6 @@ def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         places=places,
         sort=by,
         without=without,
-        before=names[at - 1] if at else None,
-        after=names[at + 1] if at + 1 < len(names) else None,
     )
 
 
@@ -130,5 +126,6 @@ def _sorted(table: Table, by: str) -> Table:
     """
     name = by.removeprefix("-")
     told = [row for row in table.rows if row.values.get(name) is not None]
+    rest = [row for row in table.rows if row.values.get(name) is None]
     told.sort(key=lambda row: row.values[name], reverse=by.startswith("-"))  # type: ignore[arg-type, return-value]  # a column's values are of one kind
-    return replace(table, rows=[*told, *(row for row in table.rows if row not in told)])
+    return replace(table, rows=[*told, *rest])
