@@ -108,7 +108,7 @@ def _recording(positions, speeds, inputs, end_state) -> Recording:
 
 def file(name: str, content: bytes) -> File:
     """A file of a download, held in memory."""
-    return File(name, len(content), len(content), lambda: content)
+    return File(name, len(content), lambda: content)
 
 
 def write_folder(folder: Path, files: dict[str, bytes]) -> Path:
