@@ -36,7 +36,7 @@ FOLLOWED: dict[str, Collection[str]] = {
     "": (),
     "drivers": ("prompt",),
     "trials": ("spec", "page", *FACETS),
-    "conditions": ("by",),
+    "conditions": (),
     "discordant": ("model", "variant"),
     **dict.fromkeys(("sweeps", "tables", "figures", "prompts", "notes", "notes.csv"), ()),
     "glossary": (),

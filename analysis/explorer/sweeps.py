@@ -264,7 +264,7 @@ def arms_of(catalogue: Catalogue, run: Run) -> list[Row]:
     """
     columns = "model_left", "model_right", "variant", "levels"
     stored = {
-        (*map(row.get, columns[:3]), *row["levels"]): row
+        (*map(row.get, columns[:3]), *(row["levels"] or ())): row
         for row in catalogue.counts(Filter(sweep=run.sweep_id), *columns)
     }
     arms = []

@@ -26,6 +26,7 @@ ON_THE_CROSS = """path => {
     return [x, y];
 }"""
 CRASH = Drive("o3", "baseline", "N_0_0", 9, (0.0,) * 9, (0.0,) * 9)
+OTHER = {"left": "right", "right": "left"}
 # The median of these three is the second one.
 HUMANS = [Drive("human", "baseline", "N_0_0", i, (i / 10,) * 9, (-0.5,) * 9) for i in (1, 2, 3)]
 
@@ -103,44 +104,30 @@ def test_the_humans_are_a_median_and_a_band(ask, db):
     assert high == pytest.approx(last - (last - median) / 5)
 
 
-def test_by_order_the_vehicles_and_the_humans_are_those_that_merged_first_and_second(ask, db):
+def test_the_first_vehicle_is_that_which_merged_first(ask, db):
     with duckdb.connect(str(db), read_only=True) as connection:
         rows = connection.execute(
             "SELECT trial_id, spec_hash, merged_first FROM trials WHERE merged_first IS NOT NULL"
         ).fetchall()
-    keys = [(trial, spec) for trial, spec, _ in rows]
-    by_side, by_order = read_traces(db, keys), read_traces(db, keys, "order")
+        speeds = {
+            tuple(key): speed
+            for *key, speed in connection.execute(
+                "SELECT trial_id, spec_hash, side, arg_max(velocity_mps, step) FROM states "
+                "GROUP BY ALL"
+            ).fetchall()
+        }
+    traces = read_traces(db, [(trial, spec) for trial, spec, _ in rows])
     assert {first for *_, first in rows} == {"left", "right"}
-    for *key, first in rows:
-        one, other = by_side[tuple(key)], by_order[tuple(key)]
-        assert other["turned"] == (first == "right")
-        assert other["headway_m"][-1] > 0
-        swapped = ("second_mps", "first_mps") if first == "right" else ("first_mps", "second_mps")
-        assert [other["first_mps"], other["second_mps"]] == [one[name] for name in swapped]
+    for trial, spec, first in rows:
+        trace = traces[trial, spec]
+        assert trace["headway_m"][-1] > 0
+        last = [speeds[trial, spec, side] for side in (first, OTHER[first])]
+        assert [trace["first_mps"][-1], trace["second_mps"][-1]] == last
     text = ask("/conditions/N_0_0").text
     assert "Speed of the vehicle that merged first (m/s)" in text
     assert text.count('class="median"') == len(MEASURES)
-    assert '<strong aria-current="true">who merged first</strong>' in text
-    text = ask("/conditions/N_0_0?by=side").text
-    assert "Speed of the left vehicle (m/s)" in text
-    assert "by=side" in re.search(r'hx-get="([^"]*seen=[^"]*)"', text)[1]
-
-
-def test_the_human_median_is_of_the_vehicles_that_the_panel_shows(db):
-    turned = [
-        ("o3/baseline/N_0_0/rep01", "o3-baseline"),
-        ("o3/baseline/N_0_0/rep02", "o3-baseline"),
-    ]
-    ends = [trace["headway_m"][-1] for trace in read_traces(db, turned).values()]
-    assert min(ends) < 0 < max(ends)
-    assert read_band(db, turned)[-1]["headway_m"][0] < 0
-    assert read_band(db, turned, "order")[-1]["headway_m"][0] > 0
-
-
-def test_another_way_to_tell_vehicles_apart_names_those_that_there_are(ask):
-    reply = ask("/conditions/N_0_0?by=driver")
-    assert reply.status_code == 404
-    assert "told apart with by=order or by=side" in reply.text
+    turned = [(f"o3/baseline/N_0_0/rep0{i}", "o3-baseline") for i in (1, 2)]
+    assert read_band(db, turned)[-1]["headway_m"][0] > 0
 
 
 def test_without_humans_the_page_says_what_reads_them(ask):
@@ -180,7 +167,7 @@ def test_the_first_page_leads_to_every_condition_and_each_leads_back(ask, db):
         assert 'href="/#collisions"' in ask(f"/conditions/{name}").text
 
 
-@pytest.mark.parametrize("address", ["/", "/trials", "/sweeps/sweep-1"])
+@pytest.mark.parametrize("address", ["/", "/trials"])
 def test_the_code_of_a_condition_says_itself_in_words_on_every_page(ask, address):
     text = ask(address).text
     (told,) = set(re.findall(r'title="([^"]*)"[^>]*>(?:<[^>]*>\s*)*R_-2_8[< ]', text)) or {None}
@@ -225,16 +212,13 @@ def test_a_click_on_a_trace_opens_its_trial_and_a_choice_changes_the_picture(bro
 
 
 @pytest.mark.long
-def test_an_export_has_the_same_picture_in_each_view(page, db, tmp_path):
+def test_an_export_has_the_same_picture(page, db, tmp_path):
     files = export_with_a_table(db, tmp_path / "pages")
     page.context.set_offline(True)
     page.goto(f"file://{tmp_path}/pages/index.html")
     page.get_by_role("link", name="N_0_0", exact=True).click()
     expect(page.locator(".overlay path")).to_have_count(7)
     expect(page.locator(".overlay .median")).to_have_count(3)
-    page.get_by_role("link", name="side", exact=True).click()
-    expect(page.get_by_text("Speed of the left vehicle (m/s)")).to_be_visible()
-    page.get_by_role("link", name="who merged first").click()
     page.locator("tbody tr", has_text="o4").locator("td a").first.click()
     expect(page.locator("tbody tr")).to_have_count(2)
     page.goto(f"file://{files}/conditions-N_0_0.html")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from math import ceil
 from typing import Any
@@ -12,7 +11,7 @@ from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.pictures import Axis, Scale
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.site import NotThere, Site, news_of
-from merge_runner_analysis.explorer.traces import MEASURES, read_band, read_traces
+from merge_runner_analysis.explorer.traces import MEASURES, Key, read_band, read_traces
 from merge_runner_analysis.names import HUMAN
 
 # So many trials are drawn: a browser can still show them, and more would be one dark spot.
@@ -20,34 +19,12 @@ MOST = 500
 # Sizes in the picture, in its units.
 WIDTH, LEFT, RIGHT, PANEL, BETWEEN, TOP, FOOT = 1000, 42, 8, 170, 34, 24, 42
 CROSS = "m-5-5 10 10m0-10-10 10"
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """How the vehicles of a trial are told apart: its name, what the first and the second are."""
-
-    name: str
-    first: str
-    second: str
-    meaning: str = ""
-
-    @property
-    def headings(self) -> dict[str, str]:
-        """What its panels show, by MEASURES."""
-        speed, headway = "Speed of {} (m/s)", "Headway: how far {} is ahead (m)"
-        texts = (speed.format(self.first), speed.format(self.second), headway.format(self.first))
-        return dict(zip(MEASURES, texts, strict=True))
-
-
-# The first is what a page shows that asks for none: in the other the humans' median is of those
-# who go first and of those who yield together, which nobody drives.
-VIEWS = {
-    "order": View(
-        *("who merged first", "the vehicle that merged first", "the second one"),
-        "Where nobody merged first it is the vehicle that was ahead at the end.",
-    ),
-    "side": View("side", "the left vehicle", "the right vehicle"),
-}
+# What the panels show, by MEASURES.
+HEADINGS = (
+    "Speed of the vehicle that merged first (m/s)",
+    "Speed of the second one (m/s)",
+    "Headway: how far the vehicle that merged first is ahead (m)",
+)
 
 
 def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
@@ -59,65 +36,44 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     groups = site.catalogue.counts(Filter(condition=name), "model", "variant")
     if not groups:
         raise NotThere(f"no trial of the condition {name} is here")
-    usual = next(iter(VIEWS))
-    by = asked.get("by") or usual
-    if by not in VIEWS:
-        raise NotThere(f"vehicles are told apart with by={' or by='.join(VIEWS)}")
     wanted = Filter(condition=name, model=asked.get("model", ""), variant=asked.get("variant", ""))
-    chosen = {key: value for key, value in wanted.chosen.items() if key != "condition"}
-    alone = all(row["model"] == HUMAN for row in groups)
-    rows = _rows(site, wanted, with_humans=alone)
-    drawn = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
-    traces = read_traces(site.db, [_key(row) for row in drawn], by)
-    drawn = [row for row in drawn if _key(row) in traces]
-    humans = _rows(site, Filter(condition=name, model=HUMAN), with_humans=True)
-    band = read_band(site.db, [_key(row) for row in humans], by) if humans else []
+    rows, humans = site.catalogue.every(wanted), Filter(condition=name, model=HUMAN)
+    if not wanted.model and any(row["model"] != HUMAN for row in groups):
+        rows = [row for row in rows if row["source"] != "human"]
+    chosen = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
+    traces = read_traces(site.db, [_key(row) for row in chosen])
+    drawn = {_key(row): row for row in chosen if _key(row) in traces}
+    recorded = [_key(row) for row in site.catalogue.every(humans)]
     return site.render(
         "condition.html",
         here="",
         name=name,
-        by=by,
-        view=VIEWS[by],
-        choices=[
-            (
-                view.name,
-                site.at.condition(name, by="" if key == usual else key, **chosen),
-                key == by,
-            )
-            for key, view in VIEWS.items()
-        ],
         state=state,
         groups=groups,
-        chosen=chosen,
+        chosen={key: value for key, value in wanted.chosen.items() if key != "condition"},
         facets=site.catalogue.facets(wanted),
         sampled=len(rows) if len(rows) > MOST else 0,
-        humans=len(humans),
+        humans=len(recorded),
         drawn=len(drawn),
-        picture=picture(drawn, traces, band, VIEWS[by]),
+        picture=picture(drawn, traces, read_band(site.db, recorded)),
     )
 
 
 def picture(
-    drawn: Sequence[Row], traces: Mapping[Any, Row], band: Sequence[Row], view: View
+    drawn: Mapping[Key, Row], traces: Mapping[Key, Row], band: Sequence[Row]
 ) -> dict[str, Any]:
     """Three panels over one axis of time: where all lines lie, in the units of the picture."""
-    ends = [traces[_key(row)]["time_s"][-1] for row in drawn]
+    ends = [traces[key]["time_s"][-1] for key in drawn]
     end = max([*ends, *(row["time_s"] for row in band)], default=1.0)
     time = Axis(Scale(0.0, end, LEFT, WIDTH - RIGHT), range(ceil(end)))
-    lines_of = [*(traces[_key(row)] for row in drawn), *band]
-    values = {name: [value for line in lines_of for value in line[name]] for name in MEASURES}
-    speeds = [*values["first_mps"], *values["second_mps"]]
     axes = {}
     for place, name in enumerate(MEASURES):
         top = TOP + place * (PANEL + BETWEEN)
-        shown = values[name] if name == "headway_m" else speeds  # both speeds can be compared
-        axes[name] = Axis.of((min(shown, default=0.0), max(shown, default=0.0)), (top + PANEL, top))
-    lines: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in drawn:
-        trace = traces[_key(row)]
-        kind = str(row["outcome"]).replace(" ", "-")
-        of = lines.setdefault((row["model"], row["variant"] or ""), [])
-        of.append({"row": row, "kind": kind, "path": _path(row, trace, time.scale, axes)})
+        alike = MEASURES[2:] if place == len(MEASURES) - 1 else MEASURES[:2]
+        lines = (line[one] for one in alike for line in (*map(traces.get, drawn), *band) if line)
+        values = [value for line in lines for value in line]
+        axes[name] = Axis.of((min(values, default=0.0), max(values, default=0.0)),
+                             (top + PANEL, top))  # fmt: skip
     return {
         "width": WIDTH,
         "height": TOP + len(MEASURES) * (PANEL + BETWEEN) - BETWEEN + FOOT,
@@ -125,29 +81,18 @@ def picture(
         "right": WIDTH - RIGHT,
         "time": time,
         "panels": [
-            {
-                "heading": heading,
-                "axis": axes[name],
-                "band": _band(name, band, time.scale, axes[name].scale),
-            }
-            for name, heading in view.headings.items()
+            {"heading": heading, "axis": axes[name],
+             "band": _band(name, band, time.scale, axes[name].scale)}
+            for name, heading in zip(MEASURES, HEADINGS, strict=True)
         ],
-        "lines": lines,
-    }
+        "lines": [
+            {"row": row, "path": _path(row, traces[key], time.scale, axes)}
+            for key, row in drawn.items()
+        ],
+    }  # fmt: skip
 
 
-def _rows(site: Site, wanted: Filter, *, with_humans: bool) -> list[Row]:
-    """The trials of a filter; humans are among them if they alone are wanted."""
-    where, values = wanted.where()
-    others = "" if with_humans or wanted.model else " AND source <> 'human'"
-    return site.catalogue.ask(
-        "SELECT trial_id, spec_hash, condition, model, variant, outcome, end_time_s "  # noqa: S608 # constants
-        f"FROM listed WHERE {where}{others} ORDER BY trial_id, spec_hash",
-        *values,
-    )
-
-
-def _key(row: Row) -> tuple[str, str]:
+def _key(row: Row) -> Key:
     return row["trial_id"], row["spec_hash"]
 
 
