@@ -38,7 +38,6 @@ from merge_runner_analysis.explorer.guard import LOOPBACK, from_elsewhere, guard
 from merge_runner_analysis.explorer.offline import page_of_trials
 from merge_runner_analysis.explorer.pages import (
     comparing,
-    conditions,
     drivers,
     home,
     notes,
@@ -202,7 +201,7 @@ PAGES: dict[str, Callable[[Site, Request], str | Response]] = {
     "/": lambda site, asked: home.home_page(site, asked.query_params),
     "/drivers": lambda site, asked: drivers.drivers_page(site, asked.query_params),
     "/drivers/{name:path}": _named(drivers.driver_page),
-    "/sweeps": lambda site, asked: sweep.sweeps_page(site, asked.query_params.get("seen", "")),
+    "/sweeps": lambda site, asked: sweep.sweeps_page(site, asked.query_params),
     "/sweeps/{name:path}": _named(
         lambda site, name, state: sweep.sweep_page(site, name, state.get("seen", ""))
     ),
@@ -213,7 +212,6 @@ PAGES: dict[str, Callable[[Site, Request], str | Response]] = {
     "/decisions/{name:path}": _named(trial.decision_fragment),
     "/others/{name:path}": _others,
     "/raw/{name:path}": _raw,
-    "/conditions/{name:path}": _named(conditions.condition_page),
     "/glossary": lambda site, _: site.render("glossary.html", here="glossary"),
     "/tables": lambda site, _: tables.tables_page(site),
     "/tables/{name}.{suffix}": _table_file,

@@ -28,7 +28,13 @@ KINDS = {
     "replies": ("calls", "reply", "arg_max(rowid, attempt) FILTER (reply IS NOT NULL)"),
 }
 OWN_FACETS = ("tactical", "planned", "driven", "switch", "failure")
-TRIAL_FACETS = ("model", "variant", "condition", "outcome", "account", "tag")
+# In figures: the least or the most of a mean, as a part of the greatest acceleration.
+LIMITS = {
+    f"{name}_{end}": f"{column} {'>=' if end == 'from' else '<='} ?"
+    for name, column in (("planned", "plan_mean"), ("driven", "drive_mean"))
+    for end in ("from", "to")
+}
+TRIAL_FACETS = ("sweep", "model", "variant", "condition", "outcome", "account", "tag")
 ACTION = (
     f"CASE WHEN list_avg({{0}}) < -{HOLDS} THEN 'brake' WHEN list_avg({{0}}) > {HOLDS} THEN 'go' "
     "WHEN list_avg({0}) IS NOT NULL THEN 'hold' END"
@@ -43,16 +49,18 @@ WITH decided AS (
     SELECT trial_id, spec_hash, side, decision, time_s, coalesce(tactical, 'none') AS tactical,
         CASE WHEN tactical <> lag(tactical IGNORE NULLS) OVER said
             THEN lag(tactical IGNORE NULLS) OVER said || ' to ' || tactical END AS switch,
-        failure, {ACTION.format("plan")} AS planned, {ACTION.format("applied")} AS driven
+        failure, {ACTION.format("plan")} AS planned, {ACTION.format("applied")} AS driven,
+        list_avg(plan) AS plan_mean, list_avg(applied) AS drive_mean
     FROM copied.decisions WHERE call_key IS NOT NULL
     WINDOW said AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
 ), places AS (
     SELECT trial_id, spec_hash, side, decision, {{place}} AS place
     FROM copied.{{table}} GROUP BY ALL
 )
-SELECT number, side, decision, time_s, {", ".join(OWN_FACETS)}, place
+SELECT number, side, decision, time_s, {", ".join(OWN_FACETS)}, plan_mean, place
 FROM decided JOIN listed USING (trial_id, spec_hash)
     LEFT JOIN places USING (trial_id, spec_hash, side, decision)
+WHERE {{limits}}
 """  # noqa: S608 # constants
 
 
@@ -65,6 +73,8 @@ class Wanted:
     trials: Filter
     own: Mapping[str, str]
     """By the names of ``OWN_FACETS``."""
+    limits: Mapping[str, float] = field(default_factory=dict)
+    """By the names of ``LIMITS``."""
 
     def where(self, leave_out: str = "") -> tuple[str, list[Any]]:
         """The filter but for the words as SQL with its values; without one facet."""
@@ -78,13 +88,17 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A page of decisions, with the ``pieces`` of their words, and how many there are."""
+    """A page of decisions, with the ``pieces`` of their words, and how many there are.
+
+    ``crossed`` counts them by what was said, M or Y, and by what was planned.
+    """
 
     hits: list[Row]
     decisions: int
     trials: int
     page: int
     facets: dict[str, list[tuple[str, int]]]
+    crossed: dict[str, dict[str, int]]
 
     @property
     def last_page(self) -> int:
@@ -113,12 +127,14 @@ class Words:
 
 def _searched(connection: duckdb.DuckDBPyConnection, wanted: Wanted, page: int) -> Found:
     table, column, place = KINDS[wanted.kind]
-    hits, values = HITS.format(table=table, place=place), list[Any]()
+    limits = " AND ".join(["true", *map(LIMITS.__getitem__, wanted.limits)])
+    hits = HITS.format(table=table, place=place, limits=limits)
+    values: list[Any] = [*wanted.limits.values()]
     if wanted.terms:
         holds = " AND ".join(
             [f"contains({FOLDED.format(column=column)}, lower(?))"] * len(wanted.terms)
         )
-        hits += f"WHERE place IN (SELECT rowid FROM copied.{table} WHERE {holds})"  # noqa: S608 # constants
+        hits += f"AND place IN (SELECT rowid FROM copied.{table} WHERE {holds})"  # noqa: S608 # constants
         values += wanted.terms
     connection.execute(hits, values)
     where, values = wanted.where()
@@ -128,6 +144,13 @@ def _searched(connection: duckdb.DuckDBPyConnection, wanted: Wanted, page: int) 
         f"SELECT count(*) AS decisions, count(DISTINCT number) AS trials {chosen}",
         values,
     )
+    crossed: dict[str, dict[str, int]] = {}
+    for letter, plan, times in connection.execute(
+        f"SELECT tactical, planned, count(*) {chosen} AND tactical <> 'none' "
+        "AND planned IS NOT NULL GROUP BY ALL",
+        values,
+    ).fetchall():
+        crossed.setdefault(letter, {})[plan] = times
     number = min(page, max(1, -(-totals["decisions"] // PAGE)))
     rows = records(
         connection,
@@ -146,6 +169,7 @@ def _searched(connection: duckdb.DuckDBPyConnection, wanted: Wanted, page: int) 
         **totals,
         page=number,
         facets=_facets(connection, wanted),
+        crossed=crossed,
     )
 
 

@@ -18,7 +18,7 @@ from merge_runner_analysis.explorer.assets import STYLES
 from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.explorer.conditions import condition_texts
 from merge_runner_analysis.explorer.database_copy import Copies
-from merge_runner_analysis.explorer.display_text import visible
+from merge_runner_analysis.explorer.display_text import MINUS, shown_number, visible
 from merge_runner_analysis.explorer.glossary import sections
 from merge_runner_analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
 from merge_runner_analysis.explorer.queries import Queries
@@ -39,6 +39,8 @@ PAGES = {
     "Runs": "sweeps",
     "SQL": "sql",
 }
+# The parts of a scope in an address; the list of trials filters by the same names.
+SCOPE = ("sweep", "model", "variant", "condition")
 # What hangs under these, each with one list of all.
 LISTS = {"Tables and figures": "tables", "Notes": "notes"}
 
@@ -89,8 +91,13 @@ class Site:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        # Jinja's own makes markup of its pattern, and escapes number by number.
-        self._environment.filters["format"] = lambda text, *values: str(text) % values
+        # Jinja's own format makes markup of its pattern, and escapes number by number.
+        self._environment.filters.update(
+            format=lambda text, *values: (str(text) % values).replace("-", MINUS),
+            num=shown_number,
+            whole="{:,}".format,
+            minus=lambda text: str(text).replace("-", MINUS),
+        )
         self._environment.globals.update(
             at=self.at,
             metrics=METRICS,
@@ -104,6 +111,8 @@ class Site:
             styles=STYLES,
             study=str(self.db),
             visible=visible,
+            carried={},
+            scope_names=SCOPE,
             clock=clock,
             condition_text=condition_text,
             in_words=self.in_words,

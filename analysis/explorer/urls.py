@@ -25,7 +25,6 @@ class Links:
     table = partialmethod(_named, "tables")
     figure = partialmethod(_named, "figures")
     sweep = partialmethod(_named, "sweeps")
-    condition = partialmethod(_named, "conditions")
     driver = partialmethod(_named, "drivers")
     static = partialmethod(_named, "static")
 
@@ -43,6 +42,10 @@ class Links:
     decision = partialmethod(_of_decision, "decisions")
     raw = partialmethod(_of_decision, "raw")
 
+    def condition(self, name: str) -> str:
+        """The trials of a condition."""
+        return self.to("trials", condition=name)
+
     def cell(self, table: str, row: str, column: str) -> str:
         """The trials behind a cell.
 
@@ -54,7 +57,7 @@ class Links:
 def query_of(state: Mapping[str, Any]) -> str:
     """The part of an address after the path; what is empty is left out."""
     given = {name: value for name, value in state.items() if value is not None and value != ""}
-    return f"?{urlencode(given)}" if given else ""
+    return f"?{urlencode(given, doseq=True)}" if given else ""
 
 
 def whole(text: str) -> int | None:

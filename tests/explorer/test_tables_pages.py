@@ -23,7 +23,6 @@ from merge_runner_analysis.explorer import analysis_worker
 from merge_runner_analysis.explorer.analysis_process import Computing, Worker
 from merge_runner_analysis.explorer.analysis_worker import Numbers
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.pictures import ends_and_ticks
 from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import printed
@@ -310,13 +309,3 @@ def test_a_process_of_its_own_answers_alike_and_another_one_takes_its_place(db):
     found = computing.ask(request, (1, 1), wait_s=HANGS_S)
     assert found.content == Numbers(db).answer(request)
     computing.close()
-
-
-@pytest.mark.parametrize(
-    ("reached", "ends"),
-    [((0, 0), (0, 1)), ((3, 97), (0, 100)), ((-0.2, 1), (-0.5, 1)), ((0, 9), (0, 10))],
-)
-def test_a_scale_holds_all_that_is_shown_and_0(reached, ends):
-    low, high, ticks = ends_and_ticks(*reached)
-    assert (low, high) == ends
-    assert {low, 0, high} <= {round(tick, 6) for tick in ticks}

@@ -13,7 +13,7 @@ from merge_runner_analysis.explorer.conditions import ordered
 from merge_runner_analysis.explorer.marks import Cell, band, cells
 from merge_runner_analysis.explorer.pages.computed import Computed, computed_table
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.scope import Bar, Scope, scope_of, unmarked
+from merge_runner_analysis.explorer.scope import Bar, Scope, carried, scope_of, unmarked
 from merge_runner_analysis.explorer.site import Site, news_of
 from merge_runner_analysis.explorer.sweeps import standing_of
 from merge_runner_analysis.names import HUMAN
@@ -84,6 +84,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         seen=seen,
         descriptions=[row["description"] for row in site.catalogue.ask(DESCRIPTIONS)],
         bar=bar,
+        carried=carried(asked),
         computed=found,
         table=table,
         kinds={kind: [one for one in shown if one.kind == kind] for kind in KINDS},

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.results.export import tables, units
+from merge_runner.text_safety import quoted
 from merge_runner_analysis.explorer.display_text import visible
 from merge_runner_analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST
+from merge_runner_analysis.explorer.scope import carried, scope_of
 from merge_runner_analysis.explorer.site import Site
 
 # Types of which values stand to the right.
 NUMBER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|BIGNUM|DECIMAL\(.*\)")
 
+# The parts of a scope as columns.
+SCOPED = {"sweep": "sweep_id", "model": "driver", "variant": "variant", "condition": "condition"}
 # Queries to begin with: those of the README.
 EXAMPLES = {
     "Who merged first, and how often did they collide?": """\
@@ -53,7 +57,9 @@ def sql_page(
     return site.render(
         "sql.html",
         here="sql",
-        query=query if is_asked else next(iter(EXAMPLES.values())),
+        bar=scope_of(site, asked, any_prompt=True),
+        carried=carried(asked),
+        query=query if is_asked else scoped_query(carried(asked)),
         asked=is_asked,
         run=run,
         hides=visible(query) != query,
@@ -66,6 +72,27 @@ def sql_page(
         spec=names.index("spec_hash") if "spec_hash" in names else None,
         is_number=NUMBER.fullmatch,
         most=DOWNLOADED_ROWS,
+    )
+
+
+def scoped_query(chosen: Mapping[str, Sequence[str]]) -> str:
+    """A query of the trials of a scope; the first example where none is chosen."""
+    if not chosen:
+        return next(iter(EXAMPLES.values()))
+    members = (
+        "(trial_id, spec_hash) in (select trial_id, spec_hash from sweep_trials\n    where {})"
+    )
+    parts = {
+        name: f"{SCOPED[name]} in ({', '.join(map(quoted, values))})"
+        for name, values in chosen.items()
+    }
+    if "sweep" in parts:
+        parts["sweep"] = members.format(parts["sweep"])
+    return (
+        "select trial_id, status, merged_first, gap_m\n"
+        "from trials join trial_metrics using (trial_id, spec_hash)\n"
+        "    join trial_drivers using (trial_id, spec_hash)\nwhere "
+        + "\n    and ".join(parts.values())
     )
 
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from importlib import metadata
 from typing import Any
 
 from merge_runner.errors import StoreError
 from merge_runner_analysis.explorer.analysis_worker import Request
 from merge_runner_analysis.explorer.pages.computed import computed, computed_table
+from merge_runner_analysis.explorer.scope import every
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES
-from merge_runner_analysis.tables.formats import render, table_view
-from merge_runner_analysis.tables.model import from_text
+from merge_runner_analysis.tables.formats import render, shown_columns, table_view
+from merge_runner_analysis.tables.model import Table, from_text
 
 # How a table can be downloaded, by the suffix of the file: its format, and the file's type.
 FILES = {
@@ -95,9 +97,13 @@ def _named(name: str, known: Collection[str], what: str) -> str:
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """One table; raises NotThere."""
     found, table = computed_table(site, _named(name, TABLES, "table"), asked)
+    by, without = asked.get("sort", ""), every(asked, "without")
+    columns = shown_columns(table) if table else []
     shown = table and table_view(
-        table, lambda table, row, column: site.at.cell(table.name, row.id, column.name)
+        _sorted(table, by),
+        lambda table, row, column: site.at.cell(table.name, row.id, column.name),
     )
+    places = [place for place, column in enumerate(columns) if column.name not in without]
     names = list(TABLES)
     at = names.index(name)
     return site.render(
@@ -108,6 +114,21 @@ def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         files=[(suffix, site.at.table(f"{name}.{suffix}")) for suffix in FILES],
         computed=found,
         table=shown,
+        columns=columns,
+        places=places,
+        sort=by,
+        without=without,
         before=names[at - 1] if at else None,
         after=names[at + 1] if at + 1 < len(names) else None,
     )
+
+
+def _sorted(table: Table, by: str) -> Table:
+    """The table by the values of a column, with ``-`` before its name the largest first.
+
+    What has no value comes last.
+    """
+    name = by.removeprefix("-")
+    told = [row for row in table.rows if row.values.get(name) is not None]
+    told.sort(key=lambda row: row.values[name], reverse=by.startswith("-"))  # type: ignore[arg-type, return-value]  # a column's values are of one kind
+    return replace(table, rows=[*told, *(row for row in table.rows if row not in told)])

@@ -10,11 +10,14 @@ from merge_runner.errors import StoreError
 from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
 from merge_runner_analysis.explorer.pages.computed import computed
 from merge_runner_analysis.explorer.pictures import sparkline, speed_range
+from merge_runner_analysis.explorer.scope import carried
 from merge_runner_analysis.explorer.site import NotThere, Site, news_of
 from merge_runner_analysis.explorer.urls import whole
 from merge_runner_analysis.tables import TABLES
 
 EXPORT_WAIT_S = 300.0
+# What facets are called that have another name in an address.
+HEADINGS = {"sweep": "run", "model": "driver", "variant": "prompt"}
 
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -42,6 +45,8 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         here="trials",
         facets=facets,
         chosen=wanted.chosen,
+        headings=HEADINGS,
+        carried=carried(asked),
         kept={**wanted.chosen, "cell": cell},
         cell=cell,
         computed=named,
