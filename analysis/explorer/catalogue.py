@@ -17,7 +17,7 @@ import duckdb
 from pydantic import ValidationError
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
+from merge_runner.errors import MergeRunnerError, StoreLocked
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, schema_sql
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -29,7 +29,7 @@ from merge_runner_analysis.data.derived_cache import program
 from merge_runner_analysis.data.driver_words import language_models, stand_in, unresponsive
 from merge_runner_analysis.explorer.details import scenario_of
 from merge_runner_analysis.explorer.display_text import csv_cell
-from merge_runner_analysis.explorer.reading import PATIENCE_S, Row, reading, records
+from merge_runner_analysis.explorer.reading import PATIENCE_S, Row, reading, records, stamp_of
 
 PAGE = 100
 State = tuple[int, int]
@@ -569,21 +569,3 @@ def order_by(sort: str) -> str:
     column = SORTS.get(sort.removeprefix("-"), "trial_id")
     direction = "DESC" if sort.startswith("-") else "ASC"
     return f"{column} {direction} NULLS LAST, trial_id, spec_hash"
-
-
-def stamp_of(db: Path) -> tuple[int, ...]:
-    """What changes when a database does; raises UsageError where there is none."""
-    found: list[int] = []
-    for path in (db, db.with_name(f"{db.name}.wal")):
-        try:
-            stat = path.stat()
-        except FileNotFoundError:
-            found += [0, 0, 0]
-        else:
-            found += [stat.st_ino, stat.st_mtime_ns, stat.st_size]
-    if not found[0]:
-        raise UsageError(
-            f"there is no database {db}; `merge-runner sweep baseline` makes one, --db names "
-            "another"
-        )
-    return tuple(found)

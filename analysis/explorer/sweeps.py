@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -21,7 +22,8 @@ from merge_runner_analysis.explorer.reading import Row
 # What each run comes to, and, without an id, all of them together: whatever several runs or trials
 # share counts once.
 RUNS = f"""
-WITH spans AS (FROM members UNION ALL SELECT DISTINCT '', number FROM members),
+WITH shown AS (FROM members SEMI JOIN (FROM listed WHERE {{where}}) USING (number)),
+spans AS (FROM shown UNION ALL SELECT DISTINCT '', number FROM shown),
 of_trials AS (
     SELECT sweep AS sweep_id, {COUNTS}, count(*) FILTER (scripted) AS scripted
     FROM spans JOIN listed USING (number) GROUP BY ALL
@@ -42,7 +44,7 @@ of_trials AS (
 )
 FROM (
     SELECT sweep_id, name, started_at, ended_at, exit_code, config::VARCHAR AS config FROM sweeps
-    UNION ALL SELECT '', '', NULL, NULL, NULL, '{{}}'
+    UNION ALL SELECT '', '', NULL, NULL, NULL, '{{{{}}}}'
 ) LEFT JOIN of_trials USING (sweep_id) LEFT JOIN of_attempts USING (sweep_id)
 LEFT JOIN of_replies USING (sweep_id)
 ORDER BY started_at DESC NULLS LAST, sweep_id DESC
@@ -217,15 +219,20 @@ class Assessment:
     later: str = ""
 
 
-def list_runs(catalogue: Catalogue) -> tuple[list[tuple[Run, Assessment]], Row]:
-    """All runs, the newest first, and what they come to. Raises what ``Catalogue.refresh`` does."""
+def list_runs(
+    catalogue: Catalogue, where: str = "true", values: Sequence[object] = ()
+) -> tuple[list[tuple[Run, Assessment]], Row]:
+    """All runs, the newest first, and what they come to in the listed trials that are wanted.
+
+    Raises what ``Catalogue.refresh`` does.
+    """
     catalogue.refresh()
-    runs = _runs(catalogue)
+    runs = _runs(catalogue, where, values)
     # A run notes its end in the database before its file goes: one that seems to be lost may have
     # ended since the rows were read, by whoever refreshed the catalogue since.
     if any(run.state == "lost" for run in runs):
         catalogue.refresh()
-        runs = _runs(catalogue)
+        runs = _runs(catalogue, where, values)
     *runs, together = runs
     later = [_later(run, runs[:place]) for place, run in enumerate(runs)]
     return [
@@ -233,8 +240,9 @@ def list_runs(catalogue: Catalogue) -> tuple[list[tuple[Run, Assessment]], Row]:
     ], together.row
 
 
-def _runs(catalogue: Catalogue) -> list[Run]:
-    rows = [row | {name: row[name] or 0 for name in NUMBERS} for row in catalogue.ask(RUNS)]
+def _runs(catalogue: Catalogue, where: str, values: Sequence[object]) -> list[Run]:
+    found = catalogue.ask(RUNS.format(where=where), *values)
+    rows = [row | {name: row[name] or 0 for name in NUMBERS} for row in found]
     return [
         Run(
             row,
@@ -285,7 +293,7 @@ def arms_of(catalogue: Catalogue, run: Run) -> list[Row]:
             }
         )
     others = [
-        row | {"label": row["variant"], "planned": 0, "state": {"variant": row["variant"]}}
+        row | {"label": row["variant"] or "", "planned": 0, "state": {"variant": row["variant"]}}
         for row in stored.values()
     ]
     return arms + others

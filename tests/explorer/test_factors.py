@@ -6,7 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
-from urllib.parse import parse_qs, unquote, urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import duckdb
 import pytest
@@ -14,7 +14,6 @@ from starlette.testclient import TestClient
 
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.site import Site
-from tests.explorer.exporting import export_with_a_table
 
 HOST = "127.0.0.1:8700"
 
@@ -74,9 +73,9 @@ from merge_runner.study.parts import load_study
 load_study(sys.argv[2], trust=True)
 Path(sys.argv[2]).with_name("mine.py").write_text("raise RuntimeError('nobody agreed to this')")
 worker = Worker(Path(sys.argv[1]))
-found = worker.submit(("tables", "factors"), (1, 1), 0.0).result(timeout=60)
+found = worker.submit(("table", "factors")).result(timeout=60)
 worker.close()
-print(found.content["tables"][0])
+print(found["table"])
 """
 
 
@@ -91,12 +90,3 @@ def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(pla
         check=True,
     )
     assert "opponent=sleepy/duration_s" in told.stdout
-
-
-@pytest.mark.long
-def test_an_exported_study_has_its_runs_and_conditions(played, tmp_path):
-    files = export_with_a_table(played.db, tmp_path / "o")
-    pages = {path.name: path.read_text() for path in files.glob("*.html")}
-    (sweep,) = (name for name in pages if name.startswith("sweeps-"))
-    assert unquote(sweep) == sweep
-    assert "conditions-N_0_0.html" in pages

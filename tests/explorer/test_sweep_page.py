@@ -102,10 +102,10 @@ def test_a_sweep_says_what_the_registry_says_of_its_model(written):
     assert "o3: retires soon." in text_of(browser(written))
 
 
-def test_runs_are_sorted_by_the_seconds_that_they_lasted(study):
+def test_a_run_says_how_long_it_lasted(study):
     with duckdb.connect(str(study)) as connection:
         connection.execute("UPDATE sweeps SET ended_at = started_at + INTERVAL 2 HOURS")
-    assert 'data-value="7200.0">2.0 h<' in browser(study).get("/sweeps").text
+    assert ">2.0 h<" in browser(study).get("/sweeps").text
     assert "lasted 2.0 h" in text_of(browser(study))
 
 

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from merge_runner_analysis.explorer.scope import carried, scope_of
 from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site, news_of
 from merge_runner_analysis.explorer.sweeps import CAUSES, TRUST, arms_of, duration, list_runs
 from merge_runner_analysis.explorer.views import prompt_text
 
 
-def sweeps_page(site: Site, seen: str = "") -> str:
-    """All runs; raises NothingNew where they are as they were ``seen``."""
-    runs, together = list_runs(site.catalogue)
+def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
+    """The runs of a scope; raises NotThere, and NothingNew where they are as they were ``seen``."""
+    bar, part = scope_of(site, asked, any_prompt=True), carried(asked)
+    runs, together = list_runs(site.catalogue, *bar.scope.where())
+    if part:
+        runs = [(run, said) for run, said in runs if run.row["trials"]]
     return site.render(
         "sweeps.html",
         here="sweeps",
+        bar=bar,
+        carried=part,
         runs=runs,
         together=together,
         trust=TRUST,
         duration=duration,
-        seen=news_of((runs, site.catalogue.state()), seen),
+        seen=news_of((runs, site.catalogue.state()), asked.get("seen", "")),
     )
 
 
