@@ -157,7 +157,7 @@ def test_the_panel_of_a_decision_shows_both_beside_each_other(db):
         ).fetchone()
     said = f"how far ahead the other is (m) {so:.2f} {told:.2f} {told - so:+.2f}"
     assert said in panel("foggy")
-    assert "<td>not seen</td>" in panel("short")
+    assert " not seen " in panel("short")
     assert "what it perceived" not in panel("perfect")
     assert "state.table" in panel("foggy")
     assert "situation as a table" in panel("foggy")
