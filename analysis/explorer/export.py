@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from functools import cache, partial
 from html import unescape
 from itertools import count
 from pathlib import Path, PurePosixPath
@@ -32,12 +33,14 @@ from merge_runner_analysis.explorer.urls import query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
 # The pages of an export by the first part of their path, and what their addresses may ask for.
-FOLLOWED = {
-    *("", "drivers", "trials", "conditions", "discordant", "sweeps", "tables", "figures"),
-    *("prompts", "notes", "glossary"),
-}
-OF_TRIALS = {"trials", "glossary"}
-ASKED = {"prompt", "spec", "page", "by", *FACETS}
+FOLLOWED = frozenset(
+    {
+        *("", "drivers", "trials", "discordant", "sweeps", "tables", "figures"),
+        *("prompts", "notes", "glossary"),
+    }
+)
+OF_TRIALS = frozenset({"trials", "glossary"})
+ASKED = {"prompt", "spec", "page", *FACETS}
 MOMENT = ("side", "decision")  # the script of a trial's page reads these
 POLICY = (
     "default-src 'none'; script-src 'self' file:; style-src 'self' file:; "
@@ -90,7 +93,7 @@ def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
 
 
 async def _crawled(
-    site: Site, begin: str, heads: Collection[str], stage: Path, told: Callable[[int], object]
+    site: Site, begin: str, heads: frozenset[str], stage: Path, told: Callable[[int], object]
 ) -> dict[str, str]:
     """Save the pages to which links lead, as they are served; returns their files by address."""
     files, absent, waiting = {begin: INDEX}, set[str](), deque([begin])
@@ -126,7 +129,8 @@ async def _crawled(
     return {address: file for address, file in files.items() if address not in absent}
 
 
-def _page_of(address: str, heads: Collection[str] = FOLLOWED) -> tuple[str, str]:
+@cache  # a link is read when it is followed, and when it is rewritten
+def _page_of(address: str, heads: frozenset[str] = FOLLOWED) -> tuple[str, str]:
     """Split an address into a page and the moment it shows; two empty texts for other pages."""
     parts = urlsplit(address)
     asked = dict(parse_qsl(parts.query))
@@ -155,17 +159,16 @@ def _file_of(page: str, taken: Collection[str]) -> str:
 def _rewrite(db: Path, stage: Path, files: dict[str, str]) -> None:
     """Have the links of all pages lead to files, and put the files beside them that they need."""
     needed = set[str]()
+    ways = {
+        folder: {page: os.path.relpath(file, folder) for page, file in files.items()}
+        for folder in (".", FILES)
+    }
     for file in files.values():
-        folder = PurePosixPath(file).parent
-
-        def leads(address: str, folder: PurePosixPath = folder) -> str:
-            page, moment = _page_of(address)
-            return os.path.relpath(files[page], folder) + moment if page in files else ""
-
+        folder = str(PurePosixPath(file).parent)
         path = stage / file
         text = path.read_text(encoding="utf-8")
         if file.endswith(".html"):
-            text = offline(text, db.name, POLICY, leads)
+            text = offline(text, db.name, POLICY, partial(_leads, ways[folder]))
             needed.update(_STATIC.findall(text))
             text = _STATIC.sub(rf'="{os.path.relpath(f"{FILES}/static", folder)}/\1"', text)
             path.write_text(text, encoding="utf-8")
@@ -174,6 +177,12 @@ def _rewrite(db: Path, stage: Path, files: dict[str, str]) -> None:
         copy = stage / FILES / "static" / name
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(STATIC / name, copy)
+
+
+def _leads(ways: dict[str, str], address: str) -> str:
+    """Return the way to the file of an address; empty where there is none."""
+    page, moment = _page_of(address)
+    return ways[page] + moment if page in ways else ""
 
 
 @contextmanager
