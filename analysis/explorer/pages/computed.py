@@ -9,7 +9,7 @@ from datetime import datetime
 from typing import Any
 
 from merge_runner.errors import MergeRunnerError
-from merge_runner_analysis.explorer.analysis_worker import Request
+from merge_runner_analysis.explorer.computing import Request
 from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.explorer.urls import query_of

@@ -9,7 +9,7 @@ from importlib import metadata
 from typing import Any
 
 from merge_runner.errors import StoreError
-from merge_runner_analysis.explorer.analysis_worker import Request
+from merge_runner_analysis.explorer.computing import Request
 from merge_runner_analysis.explorer.pages.computed import computed, computed_table
 from merge_runner_analysis.explorer.scope import every
 from merge_runner_analysis.explorer.site import NotThere, Site
