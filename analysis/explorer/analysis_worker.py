@@ -5,63 +5,72 @@ pandas and the fits hold a Python process for seconds, and no page may wait for 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import multiprocessing
+import os
+import signal
+import threading
+import tomllib
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import duckdb
+
 from merge_runner.errors import UsageError
+from merge_runner.registry import use
 from merge_runner.results.database import read_database
+from merge_runner.results.store import results_digest
+from merge_runner.study.file import StudyFile
+from merge_runner.study.parts import catalogue_of
+from merge_runner.text_safety import first_line
 from merge_runner_analysis.data.derived_cache import (
     finished,
     keep_finished,
     options_text,
     present_state,
 )
+from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.tables import make_tables
-from merge_runner_analysis.tables.formats import shown_value
-from merge_runner_analysis.tables.model import Table, from_text, to_text
-from merge_runner_analysis.verdict_words import TABLE as VERDICTS
+from merge_runner_analysis.tables.model import from_text, to_text
 
 if TYPE_CHECKING:
     from merge_runner_analysis.data.study import Study
-    from merge_runner_analysis.explain import Source
+
+Request = tuple[str, ...]
+"""``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN`` or ``figure NAME FORM``."""
 
 
 class Numbers:
-    """Answers from one database; its trials are read when something needs them, and only once."""
+    """Answers from one state of a database, whose trials are read once something needs them."""
 
     def __init__(self, db: Path) -> None:
         self.db = db
-        self._made: dict[str, Table] = {}
+        self.stamp = stamp_of(db)
 
-    def answer(self, request: Sequence[str]) -> dict[str, Any]:
-        """What is asked for, with ``counted``: how many trials it was made of.
+    def answer(self, request: Request) -> dict[str, Any]:
+        """What is asked for, with ``counted``: how many trials the database holds.
 
-        Where no table has the cell, the answer says so as ``absent``.
-
-        ``study``, which reads it, ``tables NAME...``, ``cell TABLE ROW COLUMN``, ``figure NAME
-        FORM``,
-        or ``verdicts SWEEP CONDITION``, of all where these are empty. Raises MergeRunnerError.
+        ``absent`` says that no table has a cell. Raises MergeRunnerError.
         """
-        match list(request):
-            case ["study"]:
-                # What the first table is made with.
-                import statsmodels.regression.linear_model  # noqa: F401
-
-                return {"groups": len(self.study.groups)}
-            case ["tables", *names]:
-                return self._tables(names)
+        match request:
+            case ["table", name, *part]:
+                found: dict[str, Any] = {"table": self._table(name, *part)}
             case ["cell", table, row, column]:
-                return self._cell(table, row, column)
-            case ["verdicts", sweep, condition]:
-                return self._verdicts(sweep, condition)
+                found = self._cell(table, row, column)
             case ["figure", name, "svg" | "png" as form]:
                 from merge_runner_analysis.figures.gallery import rendered
 
-                file = rendered(self.study, name, form)
-                return self._counted() | {"file": file, "digest": self._digest}
-        raise UsageError(f"nothing answers {request!r}")
+                found = {"file": rendered(self.study, name, form), "digest": self._digest}
+            case _:
+                raise UsageError(f"nothing answers {request!r}")
+        return {"counted": self._counted, **found}
+
+    @cached_property
+    def _counted(self) -> int:
+        with read_database(self.db) as connection:
+            rows = connection.execute("SELECT count(*) FROM trials WHERE source <> 'seat'")
+            return int(rows.fetchall()[0][0])
 
     @cached_property
     def study(self) -> Study:
@@ -70,93 +79,77 @@ class Numbers:
 
         return Study(self.db)
 
-    def _counted(self) -> dict[str, Any]:
-        if "study" in self.__dict__:
-            groups = [*self.study.measured, *self.study.unjudged]
-            return {"counted": sum(len(group.trials) for group in groups)}
-        with read_database(self.db) as connection:
-            (row,) = connection.execute(
-                "SELECT count(*) FROM trials WHERE source <> 'seat'"
-            ).fetchall()
-        return {"counted": row[0]}
+    @cached_property
+    def _digest(self) -> str:
+        return results_digest(self.db)[0]
 
-    def _tables(self, names: Sequence[str]) -> dict[str, Any]:
-        found = self._finished(names)
-        return self._counted() | {"tables": [to_text(found[name]) for name in names]}
+    @cached_property
+    def _state(self) -> str:
+        return present_state(self.db)
 
-    def _verdicts(self, sweep: str, condition: str) -> dict[str, Any]:
-        """The table ``verdicts`` of a part of the trials."""
-        if not sweep and not condition:
-            return self._tables([VERDICTS])
+    def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
+        """A table of all trials, or of those of a sweep and a condition; kept for the next time."""
         options = options_text(self.db, sweep=sweep, condition=condition)
-        kept = finished(self.db, present_state(self.db), options, [VERDICTS])
+        kept = finished(self.db, self._state, options, [name])
         if not kept:
             from merge_runner_analysis.data.study import Study
 
-            study = Study(self.db, sweep=sweep, condition=condition)
-            kept = {VERDICTS: to_text(make_tables(study, [VERDICTS])[0])}
+            is_part = sweep or condition
+            study = Study(self.db, sweep=sweep, condition=condition) if is_part else self.study
+            kept = {name: to_text(make_tables(study, [name])[0])}
             keep_finished(self.db, study.state, options, kept)
-        return self._counted() | {"tables": [kept[VERDICTS]]}
+        return kept[name]
 
-    def _finished(self, names: Sequence[str]) -> dict[str, Table]:
-        """Tables by name; those that are kept in the database are not made again."""
-        options = options_text(self.db)
-        wanted = [name for name in names if name not in self._made]
-        kept = finished(self.db, present_state(self.db), options, wanted) if wanted else {}
-        self._made |= {name: from_text(text) for name, text in kept.items()}
-        if missing := [name for name in wanted if name not in kept]:
-            study = self.study
-            made = dict(zip(missing, make_tables(study, missing), strict=True))
-            # If the state in which the study was read is past, they are not kept.
-            texts = {name: to_text(made[name]) for name in missing}
-            keep_finished(self.db, study.state, options, texts)
-            self._made |= made
-        return {name: self._made[name] for name in names}
+    def _cell(self, name: str, row: str, column: str) -> dict[str, Any]:
+        from merge_runner_analysis.explain import explain
 
-    def _cell(self, name: str, row_id: str, column_name: str) -> dict[str, Any]:
-        from merge_runner_analysis.explain import sources_of, sql_command
-
-        table = self._finished([name])[name]
-        rows = {row.id: row for row in table.rows}
-        columns = {column.name: column for column in table.columns}
-        if row_id not in rows:
-            return {"absent": f"the table {name} has no row {row_id!r}"}
-        if column_name not in columns:
-            return {"absent": f"the table {name} has no column {column_name!r}"}
-        row, column = rows[row_id], columns[column_name]
-        return self._counted() | {
-            "value": shown_value(column, row.values.get(column.name)),
-            "heading": table.heading,
-            "meaning": column.meaning or column.heading,
-            "note": row.note,
-            "command": sql_command(self.study),
-            "sources": [
-                {
-                    "group": source.group,
-                    "text": source.text,
-                    "query": source.query,
-                    "trials": self._keys(source, numerator=bool(column.counts)),
-                }
-                for source in sources_of(self.study, table, row, column)
-            ],
-        }
-
-    @cached_property
-    def _digest(self) -> str:
-        from merge_runner.results.store import results_digest
-
-        return results_digest(self.db)[0]
-
-    def _keys(self, source: Source, *, numerator: bool) -> list[tuple[str, str]]:
-        """The (trial, spec) of a source's trials, or of its ``numerator``."""
-        names = source.numerator if numerator else source.trials
-        return [(name, self._specs[source.group][name]) for name in names]
-
-    @cached_property
-    def _specs(self) -> dict[str, dict[str, str]]:
-        """Of each group that has traces the spec of each trial."""
-        return {
+        table = from_text(self._table(name))
+        try:
+            found = explain(self.study, table, f"{row}:{column}")
+        except UsageError as exc:
+            return {"absent": str(exc)}
+        counts = any(one.counts for one in table.columns if one.name == column)
+        specs = {
             group.id: dict(zip(trials["trial_id"], trials["spec_hash"], strict=True))
             for group in (*self.study.measured, *self.study.unjudged)
             for trials in [group.stored.trials]
         }
+        trials = [
+            (trial, specs[source.group][trial])
+            for source in found.sources
+            for trial in (source.numerator if counts else source.trials)
+        ]
+        return {"explained": found, "trials": trials}
+
+
+_db: Path
+_numbers: Numbers | None = None
+
+
+def begin(db: Path, text: str, plugins: Mapping[str, str]) -> None:
+    """Use the study of the explorer, whatever stands in its files by now."""
+    global _db  # noqa: PLW0603 # of a process that has no other use
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the explorer, which then ends it
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    if text:
+        use(catalogue_of(StudyFile.model_validate(tomllib.loads(text)), text, plugins))
+    _db = db
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(0)
+
+
+def answer(request: Request) -> dict[str, Any]:
+    """The answer of the database as it is now; raises MergeRunnerError."""
+    global _numbers  # noqa: PLW0603 # what was read is read once
+    try:
+        if _numbers is None or _numbers.stamp != stamp_of(_db):
+            _numbers = None  # which makes room first
+            _numbers = Numbers(_db)
+        return _numbers.answer(request)
+    except duckdb.Error as exc:  # as where the file is replaced while it is read
+        raise UsageError(f"{_db} cannot be read: {first_line(exc)}") from exc

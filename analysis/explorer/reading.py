@@ -50,3 +50,21 @@ def records(
     found = connection.execute(sql, values)
     names = [column[0] for column in found.description]
     return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
+
+
+def stamp_of(db: Path) -> tuple[int, ...]:
+    """What changes when a database does; raises UsageError where there is none."""
+    found: list[int] = []
+    for path in (db, db.with_name(f"{db.name}.wal")):
+        try:
+            stat = path.stat()
+        except FileNotFoundError:
+            found += [0, 0, 0]
+        else:
+            found += [stat.st_ino, stat.st_mtime_ns, stat.st_size]
+    if not found[0]:
+        raise UsageError(
+            f"there is no database {db}; `merge-runner sweep baseline` makes one, --db names "
+            "another"
+        )
+    return tuple(found)

@@ -14,7 +14,7 @@ PAGES = (
     "/sweeps",
     "/",
     "/drivers",
-    "/drivers/emulator?prompt=baseline",
+    "/drivers/emulator?variant=baseline",
     "/conditions/N_0_0",
     "/glossary",
     "/tables",

@@ -8,8 +8,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from merge_runner.errors import UsageError
-from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.server import listen
+from merge_runner_analysis.explorer.app import explorer, listen
 from merge_runner_analysis.explorer.site import Site
 
 HOST = "127.0.0.1:8700"

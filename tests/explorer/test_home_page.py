@@ -102,7 +102,7 @@ def test_a_row_has_the_sentence_and_the_values_of_the_table(client, verdicts):
     assert sentence(verdicts["o3/baseline"]) in text
     assert sentence(verdicts["o3/A1"]) not in text
     assert "Not shown: 1 other prompt." in text
-    cells = re.findall(r'href="/drivers/o3\?prompt=baseline#([\w-]+)"\s+title="([^"]+)"', text)
+    cells = re.findall(r'href="/drivers/o3\?variant=baseline#([\w-]+)"\s+title="([^"]+)"', text)
     told = dict(cells)
     for name in ("velocity", "collisions", "gap"):  # so few trials have no slope on headway
         values = verdicts["o3/baseline"][name]
@@ -112,10 +112,10 @@ def test_a_row_has_the_sentence_and_the_values_of_the_table(client, verdicts):
 
 
 def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
-    text = unescape(client.get("/?prompt=A1").text)
+    text = unescape(client.get("/?variant=A1").text)
     assert '<option value="A1" selected>' in text
-    assert "/drivers/o3?prompt=A1" in text
-    assert "/drivers/o3?prompt=baseline" not in text
+    assert "/drivers/o3?variant=A1" in text
+    assert "/drivers/o3?variant=baseline" not in text
     one = unescape(client.get(f"/?condition={WORST}").text)
     (link,) = set(re.findall(r'href="(/trials\?[^"]*variant=baseline[^"]*)">3</a>', one)) - set(
         re.findall(r'href="(/trials\?[^"]*outcome[^"]*)"', one)
@@ -125,7 +125,7 @@ def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
     rows = by_group(part.rows)
     assert rows["o3/baseline"]["collisions"]["n"] == 3
     assert rows["human"]["collisions"]["n"] == 90
-    for wrong in ("prompt=A9", "condition=nowhere", "sweep=none", "driver=nobody"):
+    for wrong in ("variant=A9", "condition=nowhere", "sweep=none", "model=nobody"):
         assert client.get(f"/?{wrong}").status_code == 404, wrong
 
 
@@ -136,9 +136,9 @@ def test_a_sweep_is_a_scope(db):
 
 
 def test_a_drivers_page_has_its_verdicts_with_the_trials_behind_them(client, verdicts):
-    text = unescape(client.get("/drivers/o3?prompt=baseline").text)
+    text = unescape(client.get("/drivers/o3?variant=baseline").text)
     assert sentence(verdicts["o3/baseline"]) in text
-    table = text.split('class="verdicts"')[1].split("</table>")[0]
+    table = text.split('class="verdicts ')[1].split("</table>")[0]
     for measure in MEASURES.values():
         assert measure.trait in table
     (link, n) = re.findall(r'<a href="([^"]*cell=verdicts[^"]*)">(\d+)</a>', table)[0]
@@ -167,8 +167,8 @@ def test_a_driver_that_is_not_judged_has_no_verdict(tmp_path):
     site.computing = Awaited(db, InProcess)
     text = client_of(site).get("/").text
     assert "Not judged: 46 of the 92 decisions of bad are invalid (50.0 %, more than 20 %)." in text
-    assert "/drivers/bad?prompt=baseline#" not in text
-    assert "/drivers/o3?prompt=baseline#" in text
+    assert "/drivers/bad?variant=baseline#" not in text
+    assert "/drivers/o3?variant=baseline#" in text
     assert "Not judged" in client_of(site).get("/drivers/bad").text
     site.computing.close()
 

@@ -7,6 +7,8 @@ from typing import Any
 
 from merge_runner_analysis.data.human_counts import human_counts
 from merge_runner_analysis.explorer.conditions import ordered
+from merge_runner_analysis.explorer.display_text import MINUS
+from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.pages.home import (
     KINDS,
     Driver,
@@ -16,9 +18,11 @@ from merge_runner_analysis.explorer.pages.home import (
     verdicts_of,
 )
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.scope import Scope, scope_of, unmarked
+from merge_runner_analysis.explorer.scope import Scope, carried, scope_of, unmarked
+from merge_runner_analysis.explorer.search import Wanted
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.verdict_words import DIFFERS, MEASURES, OPEN, SHOWN
 
 # How attempts of a driver's trials with a prompt ended, and which model answered.
@@ -40,6 +44,7 @@ def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
         "drivers.html",
         here="drivers",
         bar=bar,
+        carried=carried(asked),
         computed=found,
         table=table,
         kinds=kinds,
@@ -60,6 +65,11 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
             f"no driver {name!r} was played with this prompt; there are: "
             f"{', '.join(by_name) or 'none'}"
         )
+    first, words = "", None
+    if own and own.facts and own.facts["asked"]:
+        first = _first(site, own, bar.scope, asked)
+        trials = bar.scope.filter(own.name, own.prompt)
+        words = site.words.search(Wanted("rationales", (), trials, {}), 1)
     return site.render(
         "driver.html",
         here="drivers",
@@ -68,10 +78,14 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         beside=beside,
         others=[one for one in by_name.values() if one is not own],
         bar=bar,
+        carried=carried(asked),
         computed=found,
         table=table,
         measures=MEASURES,
         human=humans_of(table),
+        first=first,
+        found=words,
+        kept=bar.scope.trials(name, bar.scope.prompt),
         summary=_summary(own) if own else "",
         attempts=_attempts(site, own) if own else [],
         accounts=_accounts(site, own, bar.scope) if own else [],
@@ -97,6 +111,22 @@ def _summary(own: Driver) -> str:
     )
 
 
+def _first(site: Site, own: Driver, scope: Scope, asked: Mapping[str, str]) -> str:
+    """What the driver does first, by the table of first actions; empty until that is made."""
+    _, table = computed_table(site, "first-action", asked, scope.sweep, scope.condition)
+    told = []
+    for row in table.rows if table else []:
+        group = row.groups[0]
+        if table and group in {f"{own.name}/{own.prompt}", HUMAN} and row.values.get("slope_ci"):
+            of = printed(table, row)
+            told.append(
+                f"{of['driver']}: brakes in {of['brake_percent']} %, holds in {of['hold_percent']}"
+                f" %, goes in {of['go_percent']} % of {of['n']}; m/s² per m/s of own relative "
+                f"velocity: {of['slope']} {of['slope_ci']}."
+            )
+    return " ".join(told).replace("-", MINUS) if len(told) > 1 else ""
+
+
 def _attempts(site: Site, own: Driver) -> list[Row]:
     return site.catalogue.ask(ATTEMPTS, unmarked(own.name), own.prompt)
 
@@ -108,10 +138,23 @@ def _accounts(site: Site, own: Driver, scope: Scope) -> list[Row]:
 
 
 def _conditions(site: Site, own: Driver | None, scope: Scope) -> dict[str, Any]:
-    """What the driver's trials, or the humans', come to by condition."""
-    humans = human_counts()
-    if own is None:
-        return {"names": list(humans), "cells": {}, "humans": humans}
-    wanted = scope.filter(own.name, own.prompt)
-    rows = {row["condition"]: row for row in site.catalogue.counts(wanted, "condition")}
-    return {"names": ordered(rows), "cells": rows, "humans": humans}
+    """What the driver's trials, and the humans', come to by condition; None where there are none.
+
+    Counts are of ``merged`` and of ``ended`` trials.
+    """
+    humans = {name: _as_counted(row._asdict()) for name, row in human_counts().items()}
+    own_rows: dict[str, Row] = {}
+    if own is not None:
+        rows = site.catalogue.counts(scope.filter(own.name, own.prompt), "condition")
+        own_rows = {row["condition"]: _as_counted(row) for row in rows}
+    names = ordered(own_rows or humans)
+    return {
+        "names": names,
+        "own": [own_rows[name] for name in names] if own_rows else [],
+        "humans": [humans.get(name) for name in names],
+    }
+
+
+def _as_counted(row: Row) -> Row:
+    merged = row["left_first"] + row["right_first"]
+    return {"ended": merged + row["collided"], **row, "merged": merged}

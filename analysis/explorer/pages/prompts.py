@@ -12,10 +12,10 @@ from typing import Any
 from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
 from merge_runner_analysis.explorer import views
 from merge_runner_analysis.explorer.marks import Mark
-from merge_runner_analysis.explorer.pages.computed import computed
+from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.prompts import Part, parts_of
 from merge_runner_analysis.explorer.reading import Row, reading, records
-from merge_runner_analysis.explorer.scope import unmarked
+from merge_runner_analysis.explorer.scope import carried, scope_of, unmarked
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.names import BASELINE
@@ -58,15 +58,19 @@ class PromptDifference:
 
 def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
     """All prompts side by side, and the differences that they make."""
-    found = computed(site, ("tables", "contrasts"), asked)
-    table = model.from_text(found.result.content["tables"][0]) if found.result else None
+    bar = scope_of(site, asked)
+    found, table = computed_table(site, "contrasts", asked, bar.scope.sweep, bar.scope.condition)
+    chosen = bar.scope.drivers or bar.drivers
+    drivers = differences(table) if table else {}
     return site.render(
         "prompts.html",
         here="prompts",
+        bar=bar,
+        carried=carried(asked),
         computed=found,
         prompts=_prompts(site),
         left_out=partial(left_out, site),
-        drivers=differences(table) if table else {},
+        drivers={name: of for name, of in drivers.items() if unmarked(name) in chosen},
         widest=_widest(table.rows) if table else {},
         collisions=COLLISIONS.name,
         table=table,
@@ -167,7 +171,7 @@ def discordant_page(site: Site, asked: Mapping[str, str]) -> str:
     driver, variant = asked.get("model", ""), asked.get("variant", "")
     if not driver or not variant:
         raise NotThere("/discordant needs model=MODEL and variant=VARIANT")
-    pairs = of_equal_tasks(site, site.catalogue.pairs(unmarked(driver), variant, "outcome"))
+    pairs = of_equal_tasks(site, site.catalogue.pairs(unmarked(driver), variant))
     differing = [pair for pair in pairs if pair["outcome"] != pair["base_outcome"]]
     kinds = Counter((pair["base_outcome"], pair["outcome"]) for pair in differing)
     return site.render(

@@ -9,6 +9,7 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from merge_runner.records import SIDES
+from merge_runner.text_safety import quoted
 from merge_runner_analysis.accounts.account import Account
 from merge_runner_analysis.explorer import views
 from merge_runner_analysis.explorer.assets import REPLAY
@@ -31,6 +32,8 @@ OFFERS = {
     "stays closest to this one's until its first vehicle has merged (root mean square)",
     REPETITION: "the next repetition with the same driver, prompt and condition",
 }
+
+SAMPLES = "from states where trial_id = {} and spec_hash = {} order by step, side"
 
 
 def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
@@ -81,6 +84,7 @@ def shown(site: Site, row: Row, trial: Trial) -> dict[str, Any]:
         "view_box": views.view_box(),
         "data": embedded(replayed(site, row, trial, account)) if trial.states else None,
         "account": account,
+        "samples": SAMPLES.format(quoted(row["trial_id"]), quoted(row["spec_hash"])),
         "lines": views.summary(row, trial),
         "actions": {} if decided else views.actions(trial),
         "trial_decisions": decided,
