@@ -86,14 +86,6 @@ AgainstOption = Annotated[
         help="Published values and differences, for drivers of that name.",
     ),
 ]
-AsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--as",
-        metavar="DRIVER",
-        help="With --against paper: every driver beside the paper's human, o3 or gemini-2.5-pro.",
-    ),
-]
 WithoutFallbacksOption = Annotated[
     bool,
     typer.Option(
@@ -126,7 +118,6 @@ def tables(
     ] = TableFormat.TEXT,
     columns: ColumnsOption = None,
     against: AgainstOption = None,
-    as_driver: AsOption = None,
     by: ByOption = None,
     without_fallbacks: WithoutFallbacksOption = False,
     as_json: JsonOption = False,
@@ -134,25 +125,31 @@ def tables(
     """Print the paper's tables III to VII, and further ones."""
     if by is not None and list(names or ()) != ["factors"]:
         raise UsageError("--by FACTOR goes with the table factors: tables factors --by FACTOR")
-    if as_driver is not None and against is None:
-        raise UsageError("--as DRIVER goes with --against paper")
     use_study(study_file, trust=trust)
     from merge_runner_analysis.tables import finished_tables
     from merge_runner_analysis.tables.formats import render, with_columns
 
+    study = None
+    if against is not None:
+        from merge_runner_analysis.data.study import Study
+        from merge_runner_analysis.tables.against import PAPER
+        from merge_runner_analysis.tables.against import against as beside
+
+        if against != PAPER:
+            raise UsageError(f"--against {against}: valid is {PAPER}")
+        study = Study(db, drivers(models), _at(where), study_file, by, without_fallbacks)
     made = finished_tables(
         db,
         drivers(models),
         names or (),
+        study,
         where=_at(where),
         file=study_file,
         by=by,
         without_fallbacks=without_fallbacks,
     )
-    if against is not None:
-        from merge_runner_analysis.tables.against import against as beside
-
-        made = [beside(table, against, as_driver) for table in made]
+    if study is not None:
+        made = [beside(table, study) for table in made]
     if columns is not None:
         made = with_columns(made, listed(columns) or ())
     print_out(render(made, TableFormat.JSON if as_json else output, terminal_width()))

@@ -15,8 +15,7 @@ from merge_runner_analysis.stats.contrasts import (
 )
 from merge_runner_analysis.stats.intervals import Difference
 from merge_runner_analysis.stats.measures import trials_of, undecided
-from merge_runner_analysis.tables.model import Column, Row, Table
-from merge_runner_analysis.tables.notes import sample_notes
+from merge_runner_analysis.tables.model import Column, Optional, Row, Table, interval
 
 
 def contrasts(study: Study) -> Table:
@@ -36,23 +35,14 @@ def contrasts(study: Study) -> Table:
             Column("reference", "against"),
             Column("measure", "measure"),
             Column("difference", "difference", "number", 2, "first minus second"),
-            Column("ci", "95 % CI", "interval", 2, "Newcombe; least squares", optional=True),
+            interval("ci", "Newcombe; least squares"),
             Column("p", "p", "p", 3, "Fisher's exact test or t test"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
             Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
-            Column(
-                "detectable",
-                "detectable",
-                "number",
-                2,
-                "smallest difference, in either direction, found at p < .05 with power .8",
-                optional=True,
-            ),
+            Optional("detectable", "detectable", "number", 2, "at p < .05 with power .8"),
             Column("n", "n", "count", 0, "trials of the setting in the shared conditions"),
-            Column(
-                "n_reference", "n ref.", "count", 0, "trials of the reference in these conditions"
-            ),
-            Column("freedom", "df", "number", 0, "of a t test", optional=True),
+            Column("n_reference", "n ref.", "count", 0, "trials of the reference in these"),
+            Optional("freedom", "df", "number", 0, "of a t test"),
         ),
         rows,
         (
@@ -63,10 +53,8 @@ def contrasts(study: Study) -> Table:
             "detectable: the smallest difference that is found at p < .05, before correction, with "
             "a power of .8; rates: by the exact power of Fisher's test of all these trials as if "
             "of one condition, the reference's true rate being the observed one, in the direction "
-            "in which less is enough; means: (t.975 + t.8) times the standard error of the linear "
-            "model, with its degrees of freedom",
+            "in which less is enough; means: (t.975 + t.8) times the standard error",
             RULES_NOTE,
-            *sample_notes(study, study.groups, pooled=False),
             *([] if rows else [f"there is no pair of {judged}groups to compare"]),
         ),
     )

@@ -20,8 +20,7 @@ from merge_runner_analysis.stats.factors import (
 )
 from merge_runner_analysis.stats.intervals import Difference
 from merge_runner_analysis.stats.measures import estimate, undecided_note
-from merge_runner_analysis.tables.model import Column, Kind, Row, Table, Value
-from merge_runner_analysis.tables.notes import sample_notes
+from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 
 DIFFERENCES = (
     "differences are from the reference, the level that stands first, in the cells that both have "
@@ -59,17 +58,17 @@ def factors(study: Study) -> Table:
         (
             *([Column("at", by)] if by else []),
             Column("factor", "factor"),
-            Column("drivers", "drivers", optional=True),
+            Optional("drivers", "drivers"),
             Column("measure", "measure"),
             Column("level", "level"),
             Column("trials", "trials", "count", 0, "trials of the level that ended"),
             Column("n", "n", "count", 0, "of these, trials that count for the measure"),
-            Column("value", "value", "number", 2, "the measure", optional=True),
-            Column("ci", "95 % CI", "interval", 2, "of the measure", optional=True),
-            _compared("difference", "difference", "number", "from the factor's reference"),
-            _compared("difference_ci", "95 % CI", "interval", "of the difference"),
-            _compared("p", "p", "p", "exact or t test"),
-            _compared("p_holm", "Holm", "p", "corrected by Holm"),
+            Optional("value", "value", "number", 2, "the measure"),
+            interval("ci", "of the measure"),
+            Optional("difference", "difference", "number", 2, "from the factor's reference"),
+            interval("difference_ci", "of the difference"),
+            Optional("p", "p", "p", 3, "exact or t test"),
+            Optional("p_holm", "Holm", "p", 3, "corrected by Holm"),
         ),
         list(_corrected(rows, tested)),
         (
@@ -79,14 +78,8 @@ def factors(study: Study) -> Table:
             *([f"Holm: corrected for all {len(tested)} p of the table"] if tested else []),
             *(f"{_named(levels[0])}: {balance(levels)}" for levels in found),
             RULES_NOTE,
-            *sample_notes(study, study.models),
         ),
     )
-
-
-def _compared(name: str, heading: str, kind: Kind, meaning: str) -> Column:
-    digits = 3 if kind == "p" else 2
-    return Column(name, heading, kind, digits, meaning, optional=True)
 
 
 def _named(level: Level) -> str:

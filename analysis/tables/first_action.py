@@ -29,7 +29,6 @@ from merge_runner_analysis.tables.model import (
     Value,
     row_of,
 )
-from merge_runner_analysis.tables.notes import sample_notes
 
 FILE = "human_first_actions"
 NOTHING = (
@@ -83,7 +82,6 @@ def first_action(study: Study) -> Table:
             "the first word, of humans in one of who merged first; empty where a driver has no "
             "word, or the logit no finite estimate",
             *_human_notes(study),
-            *sample_notes(study, (*study.models, *study.asked), pooled=False, whole=False),
         ),
     )
 

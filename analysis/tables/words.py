@@ -16,7 +16,6 @@ from merge_runner_analysis.tables.model import (
     Value,
     row_of,
 )
-from merge_runner_analysis.tables.notes import sample_notes
 
 SHARES = {
     "merge_yields": ("M", "M, yields (%)", "of these, followed by a second of yielding"),
@@ -43,9 +42,6 @@ def words(study: Study) -> Table:
             "velocity (m/s), with penalised likelihood ratios; both drivers of a trial count, "
             "since neither knows the other's first word. It follows what has p < .05",
             *([] if spoken else [f"no {judged}driver said a tactical word"]),
-            *sample_notes(
-                study, dict.fromkeys(seat.group for seat, _ in spoken), pooled=False, whole=False
-            ),
         ),
     )
 

@@ -16,7 +16,7 @@ from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.explorer.catalogue import Catalogue
-from merge_runner_analysis.figures.first_action_figure import figure_of_first_actions
+from merge_runner_analysis.figures.gallery import figure_of_first_actions
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, write_study, yielding
 
