@@ -13,9 +13,11 @@ from merge_runner_analysis.explorer.pages.home import (
     KINDS,
     Driver,
     drivers_of,
+    humans_by_condition,
     humans_of,
     noted,
     verdicts_of,
+    with_merged,
 )
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.scope import Scope, carried, scope_of, unmarked
@@ -138,23 +140,14 @@ def _accounts(site: Site, own: Driver, scope: Scope) -> list[Row]:
 
 
 def _conditions(site: Site, own: Driver | None, scope: Scope) -> dict[str, Any]:
-    """What the driver's trials, and the humans', come to by condition; None where there are none.
-
-    Counts are of ``merged`` and of ``ended`` trials.
-    """
-    humans = {name: _as_counted(row._asdict()) for name, row in human_counts().items()}
-    own_rows: dict[str, Row] = {}
+    """What the driver's trials, and the humans', come to by condition."""
+    rows: dict[str, Row] = {}
     if own is not None:
-        rows = site.catalogue.counts(scope.filter(own.name, own.prompt), "condition")
-        own_rows = {row["condition"]: _as_counted(row) for row in rows}
-    names = ordered(own_rows or humans)
+        counts = site.catalogue.counts(scope.filter(own.name, own.prompt), "condition")
+        rows = {row["condition"]: with_merged(row) for row in counts}
+    names = ordered(rows or human_counts())
     return {
         "names": names,
-        "own": [own_rows[name] for name in names] if own_rows else [],
-        "humans": [humans.get(name) for name in names],
+        "own": [rows[name] for name in names] if rows else [],
+        "humans": humans_by_condition(names),
     }
-
-
-def _as_counted(row: Row) -> Row:
-    merged = row["left_first"] + row["right_first"]
-    return {"ended": merged + row["collided"], **row, "merged": merged}

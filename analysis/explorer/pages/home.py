@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -186,11 +186,22 @@ def _conditions(site: Site, bar: Bar, shown: list[Driver]) -> dict[str, Any]:
     names = ordered({name for _, _, name in counted})
     return {
         "names": names,
-        "humans": human_counts(),
+        "humans": humans_by_condition(names),
         "imported": bool(site.catalogue.counts(Filter(who="humans"), "who")),
-        "cells": {
-            (one.name, name): counted.get((unmarked(one.name), one.prompt, name))
+        "rows": [
+            (one, [counted.get((unmarked(one.name), one.prompt, name)) for name in names])
             for one in shown
-            for name in names
-        },
+        ],
     }
+
+
+def humans_by_condition(names: Iterable[str]) -> list[Row | None]:
+    """The published counts of conditions; None for one that no human drove."""
+    known = {name: with_merged(counts._asdict()) for name, counts in human_counts().items()}
+    return [known.get(name) for name in names]
+
+
+def with_merged(row: Row) -> Row:
+    """Counts of trials with how many merged, and without other counts how many ended."""
+    merged = row["left_first"] + row["right_first"]
+    return {"ended": merged + row["collided"], **row, "merged": merged}
