@@ -51,6 +51,7 @@ def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
         table=table,
         kinds=kinds,
         headings=KINDS,
+        measures=MEASURES,
         human=humans_of(table),
     )
 
