@@ -117,7 +117,7 @@ def humans_of(table: Table | None) -> dict[str, Any]:
     found = by_group(table.rows).get(HUMAN, {}) if table else {}
     label = str(next(iter(found.values()))["driver"]) if found else HUMAN
     return {
-        "about": label.partition("(")[2].rstrip(")") or "nine pairs, as published",
+        "about": label.partition("(")[2].rstrip(")") or "990 trials of nine pairs, as published",
         "cells": cells(found),
         "bands": {name: band(measure, found.get(name, {})) for name, measure in MEASURES.items()},
     }
