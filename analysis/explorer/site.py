@@ -13,9 +13,9 @@ import jinja2
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
-from merge_runner_analysis.explorer.analysis_process import Computing
 from merge_runner_analysis.explorer.assets import STYLES
 from merge_runner_analysis.explorer.catalogue import Catalogue
+from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.conditions import condition_texts
 from merge_runner_analysis.explorer.database_copy import Copies
 from merge_runner_analysis.explorer.display_text import MINUS, shown_number, visible, with_minus

@@ -15,9 +15,9 @@ from starlette.testclient import TestClient
 from merge_runner.errors import UsageError
 from merge_runner.results.store import results_digest
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.explorer.analysis_process import Computing
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.assets import STATIC, STYLES
+from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.pages.home import home_page
 from merge_runner_analysis.explorer.site import NothingNew, Site
 from merge_runner_analysis.figures import FIGURES

@@ -19,10 +19,9 @@ from starlette.testclient import TestClient
 from merge_runner.errors import UsageError
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer import analysis_worker
-from merge_runner_analysis.explorer.analysis_process import Computing, Worker
-from merge_runner_analysis.explorer.analysis_worker import Numbers
+from merge_runner_analysis.explorer import computing as worker
 from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.computing import Computing, Numbers, Worker
 from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import printed
@@ -215,15 +214,15 @@ def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_
 
 
 def test_the_database_is_read_anew_where_it_changed(db, monkeypatch):
-    monkeypatch.setattr(analysis_worker, "_db", db, raising=False)
-    monkeypatch.setattr(analysis_worker, "_numbers", None)
-    analysis_worker.answer(("table", "attempts"))
-    first = analysis_worker._numbers
-    analysis_worker.answer(("table", "attempts"))
-    assert analysis_worker._numbers is first
+    monkeypatch.setattr(worker, "_db", db, raising=False)
+    monkeypatch.setattr(worker, "_numbers", None)
+    worker._answer(("table", "attempts"))
+    first = worker._numbers
+    worker._answer(("table", "attempts"))
+    assert worker._numbers is first
     os.utime(db)
-    analysis_worker.answer(("table", "attempts"))
-    assert analysis_worker._numbers is not first
+    worker._answer(("table", "attempts"))
+    assert worker._numbers is not first
 
 
 def test_discordant_trials_are_the_pairs_that_differ(ask, db):
