@@ -129,6 +129,26 @@ def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
         assert client.get(f"/?{wrong}").status_code == 404, wrong
 
 
+def test_links_take_the_scope_to_every_page(client):
+    part = f"variant=baseline&condition={WORST}"
+    for page in ("/", "/drivers", "/trials", "/words", "/prompts", "/sweeps", "/sql"):
+        text = unescape(client.get(f"{page}?{part}").text)
+        assert re.search(f'<option value="{WORST}"[^>]* selected', text), page
+        for other in ("/drivers", "/trials", "/words", "/prompts", "/sweeps", "/sql"):
+            assert f'href="{other}?{part}"' in text, (page, other)
+    assert f"condition in ('{WORST}')" in unescape(client.get(f"/sql?{part}").text)
+    runs = client.get(f"/sweeps?{part}").text
+    assert listed(client.get(f"/trials?{part}&sweep=sweep-1").text) == 3
+    assert re.search(r"all runs together</th><td class=\"n\">3</td>", runs)
+
+
+def test_a_number_has_a_true_minus_sign_on_pages(client):
+    for page in ("/", "/drivers/o3?variant=baseline", "/tables/verdicts", "/tables/gap"):
+        shown = re.sub(r"<(script|svg).*?</\1>|<[^>]*>", " ", client.get(page).text, flags=re.S)
+        assert not re.search(r"(?<![\w-])-\d+\.\d", shown), page
+        assert re.search(r"−\d", shown), page
+
+
 def test_a_sweep_is_a_scope(db):
     study = Study(db, sweep="sweep-1")
     assert sum(len(group.trials) for group in study.played) == 44

@@ -135,6 +135,21 @@ def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, ever
         assert found.value in unescape(page)
 
 
+def test_a_table_is_sorted_and_leaves_out_columns_by_its_address(ask):
+    def column(text, place):
+        rows = re.findall(r"<tr id=.*?</tr>", text, re.DOTALL)
+        cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row, re.DOTALL) for row in rows]
+        return [re.sub(r"<[^>]*>|\s", "", row[place]) for row in cells]
+
+    heads = re.findall(r'value="(\w+)"', ask("/tables/attempts"))
+    text = ask("/tables/attempts?sort=-calls")
+    counts = [int(n) for n in column(text, 1 + heads.index("calls")) if n != "–"]
+    assert counts == sorted(counts, reverse=True)
+    assert 'aria-sort="descending"' in text
+    shorter = ask("/tables/attempts?without=calls")
+    assert shorter.count('<th scope="col"') == text.count('<th scope="col"') - 1
+
+
 def test_facets_sorting_and_exports_keep_the_cell(ask):
     cell = "attempts/o3/A1:lost"
     text = ask(f"/trials?cell={cell}")

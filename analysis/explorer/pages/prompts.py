@@ -178,8 +178,13 @@ def left_out(site: Site, variant: str) -> str:
     known = VARIANTS.get(variant) or _as_stored(site, variant)
     if known is None:
         return f"of which {views.UNKNOWN}"
-    changes = views.changes_text(known, lambda name: f"{name}: {views.block_meaning(name)}")
-    return changes or "the whole prompt"
+    return views.changes_text(known, _named) or "the whole prompt"
+
+
+def _named(block: str) -> str:
+    """A block with what it means, if that is known here."""
+    meaning = views.block_meaning(block)
+    return block if meaning == views.UNKNOWN else f"{block}: {meaning}"
 
 
 def _as_stored(site: Site, variant: str) -> Variant | None:
