@@ -59,7 +59,7 @@ GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 BATCH = 100
 SHOWN = 20
-REPLIES_AT_ONCE = 20_000
+REPLIES_AT_ONCE = 4_000
 NEVER = datetime(1970, 1, 1)  # noqa: DTZ001 # as the database has all times
 
 

@@ -32,8 +32,9 @@ ROWS_OF_A_GROUP = 8_192
 BYTES_OF_A_CALL, MERGED_BYTES = 3_000, 2**26
 """How many a call takes where replies are short, compressed and with its share of the states, and
 by how much the file may exceed that for its row groups still to be merged."""
-LONGEST_TEXT = """
-SELECT greatest(max(stats(request).max_string_length), max(stats(reply).max_string_length), 0)
+SIZES = """
+SELECT greatest(max(stats(request).max_string_length), max(stats(reply).max_string_length), 0),
+    (SELECT count(*) FROM calls)
 FROM (SELECT request, reply FROM calls LIMIT 1)
 """
 LOG = logging.getLogger(__name__)
@@ -174,15 +175,16 @@ def _holder(exc: duckdb.Error) -> str:
 
 
 def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> bool:
-    """Let DuckDB use little memory, and return True, where all texts are short.
+    """Let DuckDB use little memory, and return True, where texts are short and calls not many.
 
-    ``longest`` is the length of the longest that will be stored; more would only cache the file.
+    ``longest`` is the length of the longest text that will be stored. A row group of such calls
+    takes two thirds of that memory; more would only cache the file.
     """
-    [(stored,)] = connection.execute(LONGEST_TEXT).fetchall()
-    are_short = bool(max(stored, longest) < 16_384)
-    limit = "200MB" if are_short else SETTINGS["memory_limit"]
+    [(stored, calls)] = connection.execute(SIZES).fetchall()
+    is_little = bool(max(stored, longest) < 8_192 and calls < 250_000)
+    limit = "180MB" if is_little else SETTINGS["memory_limit"]
     connection.execute(f"SET memory_limit = '{limit}'")
-    return are_short
+    return is_little
 
 
 def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:

@@ -169,7 +169,7 @@ class Store:
         """
         # Made before the lock is taken, although a trial that is stored already needs none.
         played = [(_key(record), record.status, rows_of(record)) for record in records]
-        texts = (len(str(value)) for *_, rows in played for row in rows["calls"] for value in row)
+        texts = [len(str(value)) for *_, rows in played for row in rows["calls"] for value in row]
         with write_database(self.path, patience_s) as connection:
             limit_memory(connection, max(texts, default=0))
             merge_small_groups(connection)
