@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -130,6 +130,13 @@ def tables(
     from merge_runner_analysis.tables.formats import render, with_columns
 
     study = None
+    chosen: dict[str, Any] = {
+        "models": drivers(models),
+        "where": _at(where),
+        "file": study_file,
+        "by": by,
+        "without_fallbacks": without_fallbacks,
+    }
     if against is not None:
         from merge_runner_analysis.data.study import Study
         from merge_runner_analysis.tables.against import PAPER
@@ -137,17 +144,8 @@ def tables(
 
         if against != PAPER:
             raise UsageError(f"--against {against}: valid is {PAPER}")
-        study = Study(db, drivers(models), _at(where), study_file, by, without_fallbacks)
-    made = finished_tables(
-        db,
-        drivers(models),
-        names or (),
-        study,
-        where=_at(where),
-        file=study_file,
-        by=by,
-        without_fallbacks=without_fallbacks,
-    )
+        study = Study(db, **chosen)
+    made = finished_tables(db, names or (), study, chosen)
     if study is not None:
         made = [beside(table, study) for table in made]
     if columns is not None:
@@ -175,7 +173,7 @@ def explain(
     from merge_runner_analysis.tables import finished_tables
 
     study = _study(db, None, where, study_file, by)
-    (made,) = finished_tables(db, None, [table], study)
+    (made,) = finished_tables(db, [table], study)
     found = explain_cell(study, made, cell)
     if as_json:
         print_out(json.dumps(asdict(found), indent=2, ensure_ascii=False))
@@ -238,7 +236,7 @@ def report(
 ) -> None:
     """Write conclusions, tables and figures as one HTML file."""
     use_study(study_file, trust=trust)
-    from merge_runner_analysis.report.writer import write_report
+    from merge_runner_analysis.report.page import write_report
 
     refuse_another_kind(out, HTML, "page of HTML")
     deque(write_report(db, drivers(models), out, files, _at(where), study_file), maxlen=0)

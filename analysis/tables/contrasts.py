@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import isinf
 
 from merge_runner.text_safety import quoted
@@ -15,17 +16,19 @@ from merge_runner_analysis.stats.contrasts import (
 )
 from merge_runner_analysis.stats.intervals import Difference
 from merge_runner_analysis.stats.measures import trials_of, undecided
-from merge_runner_analysis.tables.model import Column, Optional, Row, Table, interval
+from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 
 
 def contrasts(study: Study) -> Table:
     """Every prompt against its driver's reference."""
-    rows: list[Row] = []
-    for driver in dict.fromkeys(group.driver for group in study.models):
-        # A family is one question asked of several variants. Correcting over all metrics at once
-        # would make the result depend on how many are registered.
-        for metric in compared():
-            rows += _family(study, driver, metric)
+    # A family is one question asked of several variants. Correcting over all metrics at once would
+    # make the result depend on how many are registered.
+    rows = [
+        row
+        for driver in dict.fromkeys(group.driver for group in study.models)
+        for metric in compared()
+        for row in _family(study, driver, metric)
+    ]
     judged = "judged " if study.unjudged else ""
     return Table(
         "contrasts",
@@ -60,24 +63,20 @@ def contrasts(study: Study) -> Table:
     )
 
 
-def _family(study: Study, driver: str, metric: Metric) -> list[Row]:
+def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
     """One measure of a driver's prompts against its reference; p are corrected for their number."""
     groups = {group.setting: group for group in study.models if group.driver == driver}
     other = groups.pop(study.reference, None)
-    if other is None:
-        return []
-    found = {
-        group: contrast
+    found = [
+        (group, other, contrast)
         for group in groups.values()
-        if in_one_study(study, group, other) and (contrast := _contrast(group, other, metric))
-    }
-    if not found:
-        return []
-    families = zip(*corrected([contrast.p for contrast in found.values()]), strict=True)
-    return [
-        _row(group, other, metric, contrast, float(holm), float(bh))
-        for (group, contrast), (holm, bh) in zip(found.items(), families, strict=True)
+        if other and in_one_study(study, group, other)
+        if (contrast := _contrast(group, other, metric))
     ]
+    if found:
+        families = zip(*corrected([contrast.p for *_, contrast in found]), strict=True)
+        for pair, (holm, bh) in zip(found, families, strict=True):
+            yield _row(*pair, metric, {"p_holm": float(holm), "p_bh": float(bh)})
 
 
 def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
@@ -91,15 +90,13 @@ def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
 
 
 def _row(
-    group: Group, other: Group, metric: Metric, contrast: Difference, holm: float, bh: float
+    group: Group, other: Group, contrast: Difference, metric: Metric, p: dict[str, Value]
 ) -> Row:
     first, second = (
         trials_of(one, metric).dropna(subset=[metric.column])["condition"] for one in (group, other)
     )
     named = ", ".join(quoted(name) for name in sorted({*first} & {*second}))
-    # Rates are tested as fractions and shown in percentage points.
-    factor = 100 if metric.rate else 1
-    powerless = f"{metric.heading}: so few trials can show no difference, however large"
+    factor, least = 100 if metric.rate else 1, contrast.detectable
     return Row(
         f"{group.id}/{other.setting}/{metric.name}",
         (group.id, other.id),
@@ -108,16 +105,17 @@ def _row(
             "setting": group.setting,
             "reference": other.setting,
             "measure": metric.heading,
-            "difference": contrast.value * factor,
+            "difference": factor * contrast.value,
             "ci": contrast.bounds(factor),
             "p": contrast.p,
-            "p_holm": holm,
-            "p_bh": bh,
-            "detectable": None if contrast.detectable is None else contrast.detectable * factor,
+            **p,
+            "detectable": None if least is None else factor * least,
             "n": int(first.isin(second).sum()),
             "n_reference": int(second.isin(first).sum()),
             "freedom": None if isinf(contrast.freedom) else contrast.freedom,
         },
-        powerless if contrast.detectable is None else "",
-        counts=f"{metric.counts} AND condition IN ({named})",
+        f"{metric.heading}: so few trials can show no difference, however large"
+        if least is None
+        else "",
+        f"{metric.counts} AND condition IN ({named})",
     )

@@ -45,13 +45,17 @@ def factors(study: Study) -> Table:
     Where the study is shown by a factor, each of its levels has rows of its own, and interactions.
     """
     by = study.by or ""
-    shown = [""]
-    if by:
-        shown = require(levels_of(study.models, study.order), "factor", by)
+    shown = require(levels_of(study.models, study.order), "factor", by) if by else [""]
     found = [levels for at in shown for levels in levels_by_factor(study, by, at)]
-    rows = [row for levels in found for row in _rows(study, levels)]
+    rows = [
+        _row(study, level, levels[0], metric)
+        for levels in found
+        for metric in METRICS.values()
+        for level in levels
+    ]
     rows += _interactions(study, found) if by else []
-    tested = [row for row in rows if row.values.get("p") is not None]
+    p = {row.id: value for row in rows if isinstance(value := row.values.get("p"), float)}
+    holm = dict(zip(p, corrected([*p.values()])[0].tolist(), strict=True)) if p else {}
     judged = "judged " if study.unjudged else ""
     return Table(
         "factors",
@@ -70,35 +74,20 @@ def factors(study: Study) -> Table:
             Optional("p", "p", "p", 3, "exact or t test"),
             Optional("p_holm", "Holm", "p", 3, "corrected by Holm"),
         ),
-        list(_corrected(rows, tested)),
+        [replace(row, values={**row.values, "p_holm": holm.get(row.id)}) for row in rows],
         (
             *([] if found else [f"the trials of {judged}drivers differ in no factor"]),
             f"intervals: {intervals_of(METRICS.values())}. {DIFFERENCES}",
             *([INTERACTIONS.format(by=by)] if by else []),
-            *([f"Holm: corrected for all {len(tested)} p of the table"] if tested else []),
-            *(f"{_named(levels[0])}: {balance(levels)}" for levels in found),
+            *([f"Holm: corrected for all {len(p)} p of the table"] if p else []),
+            *(f"{_name(levels[0])}: {balance(levels)}" for levels in found),
             RULES_NOTE,
         ),
     )
 
 
-def _named(level: Level) -> str:
+def _name(level: Level) -> str:
     return f"{level.factor}{level.mark}" + (f" at {level.at}" if level.at else "")
-
-
-def _corrected(rows: list[Row], tested: list[Row]) -> Iterator[Row]:
-    """The rows with their p corrected for the number of all that are ``tested``."""
-    p = {row.id: float(str(row.values["p"])) for row in tested}
-    holm = dict(zip(p, corrected([*p.values()])[0], strict=True)) if p else {}
-    for row in rows:
-        extra = {"p_holm": float(holm[row.id])} if row.id in holm else {}
-        yield replace(row, values={**row.values, **extra})
-
-
-def _rows(study: Study, levels: list[Level]) -> Iterator[Row]:
-    for metric in METRICS.values():
-        for level in levels:
-            yield _row(study, level, levels[0], metric)
 
 
 def _row(study: Study, level: Level, first: Level, metric: Metric) -> Row:

@@ -1,4 +1,4 @@
-"""The tables of first actions and of words: their numbers are those of the stored trials."""
+"""The table of first actions: its numbers are those of the stored trials."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.figures.gallery import figure_of_first_actions
 from merge_runner_analysis.tables import make_tables
-from tests.analysis.studies import Drive, write_study, yielding
+from tests.analysis.studies import Drive, write_study
 
 MIRRORED = {
     name: next(
@@ -278,88 +278,7 @@ def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(
     run = prepare(tmp_path, "sweep", "mine.toml")
     assert run.code == 0, run.err
     study = Study(tmp_path / "results/merge.duckdb")
-    first, words = make_tables(study, ["first-action", "words"])
-    (row,) = [row for row in first.rows if row.id.startswith("emulator")]
+    (table,) = make_tables(study, ["first-action"])
+    (row,) = [row for row in table.rows if row.id.startswith("emulator")]
     assert row.values["n"] == 0
     assert '"own_exit" one driver acts while' in row.note
-    assert words.rows[0].values["first_n"] == 8, "each driver has a first word, also a later one"
-
-
-def spoken(drives, tmp_path, words):
-    """A study in which the word of a decision is what ``words`` says of trial, side and number."""
-    db = write_study(tmp_path / "w.duckdb", drives)
-    with duckdb.connect(str(db)) as connection:
-        connection.execute(f"UPDATE decisions SET tactical = {words}")
-    return Study(db)
-
-
-@pytest.mark.slow
-def test_words_that_are_kept_and_that_are_broken_are_counted(tmp_path):
-    study = spoken(yielding("o3", reps=2), tmp_path, "if(applied[1] > 0, 'M', 'Y')")
-    (table,) = make_tables(study, ["words"])
-    values = {row.id: row.values for row in table.rows}["o3/baseline"]
-    assert values["merge_yields_percent"] == values["yield_goes_percent"] == 0
-    assert values["merge_second_percent"] == values["yield_first_percent"] == 0
-    assert values["merge_second_n"] + values["yield_first_n"] == 44
-    broken = spoken(yielding("o3", reps=2), tmp_path, "if(applied[1] > 0, 'Y', 'M')")
-    (table,) = make_tables(broken, ["words"])
-    values = table.rows[0].values
-    assert values["yield_goes_percent"] == 100
-    assert values["merge_second_percent"] == values["yield_first_percent"] == 100
-    # After three seconds the drivers keep their speed: that is no yielding.
-    acted = load("SELECT count(*) AS n FROM decisions WHERE applied[1] < 0", broken.db)["n"].iloc[0]
-    counted = values["merge_yields_percent"] / 100 * values["merge_yields_n"]
-    assert 0 < round(counted) <= acted
-
-
-OWN = "if(side = 'left', 1, -1)"
-
-
-@pytest.mark.parametrize(
-    ("cue", "follows"),
-    [
-        (f"{OWN} * projected_headway_m", "headway"),
-        (f"-{OWN} * relative_velocity_mps", "relative velocity"),
-        (f"{OWN} * (projected_headway_m - 4 * relative_velocity_mps)", "both"),
-        ("0", "neither"),
-    ],
-)
-def test_what_the_first_word_follows_is_told(cue, follows, tmp_path):
-    noise = "3 * ((hash(trial_id, side) % 1000) / 500.0 - 1)" if follows != "neither" else (
-        "(hash(trial_id, side) % 1000) / 500.0 - 1")  # fmt: skip
-    scale = "2.5 *" if follows == "relative velocity" else ""
-    words = (
-        f"(SELECT if({scale} ({cue}) + {noise} > 0, 'M', 'Y') FROM trials "
-        "WHERE trials.trial_id = decisions.trial_id)"
-    )
-    study = spoken(yielding("o3", reps=6), tmp_path, words)
-    (table,) = make_tables(study, ["words"])
-    values = table.rows[0].values
-    assert values["first_n"] == 132
-    assert values["follows"] == follows, values
-
-
-@pytest.mark.slow
-def test_the_words_of_two_models_of_a_pair_are_not_pooled(tmp_path):
-    study = spoken(yielding("o3", reps=1), tmp_path, "if(side = 'left', 'M', 'Y')")
-    with duckdb.connect(str(study.db)) as connection:
-        connection.execute("UPDATE trials SET model_right = 'other'")
-    (table,) = make_tables(Study(study.db), ["words"])
-    found = {row.id: row for row in table.rows}
-    assert set(found) == {"o3+other/baseline/left", "o3+other/baseline/right"}
-    left, right = found.values()
-    assert left.values["driver"] == "o3 of o3+other"
-    assert "it is M in all 11 decisions" in left.note
-    assert "it is Y in all 11 decisions" in right.note
-
-
-@pytest.mark.slow
-def test_one_word_alone_and_no_word_say_so(tmp_path):
-    study = spoken(yielding("o3", reps=1), tmp_path, "'M'")
-    (table,) = make_tables(study, ["words"])
-    assert table.rows[0].values["follows"] is None
-    assert "it is M in all 22 decisions" in table.rows[0].note
-    silent = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
-    (table,) = make_tables(silent, ["words"])
-    assert table.rows == []
-    assert any("no driver said a tactical word" in note for note in table.notes)
