@@ -62,12 +62,12 @@ TABLES = {
     "ablation-quantitative": Listed(
         "measures", "Quantitative measures across prompt ablations", "Table VII"
     ),
-    "contrasts": Listed("contrasts", "Differences between prompts"),
+    "contrasts": Listed("differences", "Differences between prompts"),
     "factors": Listed(
-        "factors", "Each factor's levels: every metric, and the difference from the reference"
+        "differences", "Each factor's levels: every metric, and the difference from the reference"
     ),
     "velocity-profiles": Listed(
-        "profiles", "Piecewise-linear velocity profiles (I5) and plan revisions"
+        "indicators", "Piecewise-linear velocity profiles (I5) and plan revisions"
     ),
     "criticality": Listed(
         "measures", "When conflicts are resolved, and how close the vehicles come"
