@@ -17,13 +17,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.reference_data import HUMAN_TRIALS, published
 from merge_runner_analysis.data.study import Group, Study, of_trials
 from merge_runner_analysis.figures.drawing import (
-    BLUE,
-    GREEN,
-    ORANGE,
     PAGE_IN,
-    PURPLE,
-    SKY_BLUE,
-    VERMILION,
     Point,
     Style,
     draw_points,
@@ -53,10 +47,7 @@ SEMI JOIN (FROM trials WHERE status = 'finished') USING (trial_id, spec_hash)
 WHERE time_s >= 0 AND side = ego GROUP BY ALL ORDER BY ALL
 """
 HUMAN_VELOCITIES_MPS = sorted({c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()})
-# Styles for the humans' relative velocities, in their order, and those left for others.
-STYLES = (Style(BLUE, "v"), Style(GREEN, "o"), Style(VERMILION, "^"))
-OTHER_COLOURS, OTHER_MARKERS = (PURPLE, SKY_BLUE, ORANGE), "sDP"
-Styles = dict[float, Style]
+Styles = dict[float, Style]  # of relative velocities in m/s
 HEADINGS = (
     "left first:\nv left (m/s)",
     "left second:\nv left (m/s)",
@@ -77,7 +68,7 @@ def figure_2(study: Study, chosen: list[Group]) -> Figure:
         group.part(lambda trials: trials["condition"].isin(study.conditions)) for group in chosen
     ]
     velocities = sorted({velocity for _, velocity in study.conditions.values()})
-    styles = _styles(velocities)
+    styles = {velocity: style(number) for number, velocity in enumerate(velocities)}
     names = [_name(group) for group in groups]
     figure, axes = _panels(names)
     for row, group, name in zip(axes, groups, names, strict=False):
@@ -162,14 +153,6 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
     headway = np.linspace(-farthest_m, farthest_m, 81)
     terms = published("paper_gap").query("driver == 'human'")["b"].to_numpy(float)
     return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
-
-
-def _styles(velocities: list[float]) -> Styles:
-    """Colour and marker of each relative velocity in m/s."""
-    known = dict(zip(HUMAN_VELOCITIES_MPS, STYLES, strict=True))
-    for number, velocity in enumerate(v for v in velocities if v not in HUMAN_VELOCITIES_MPS):
-        known[velocity] = style(number, OTHER_COLOURS, OTHER_MARKERS)
-    return {velocity: known[velocity] for velocity in velocities}
 
 
 def _name(group: Group) -> str:
