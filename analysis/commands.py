@@ -329,8 +329,8 @@ def view(
 
 
 def _serve(db: Path, port: int, reader: str | None) -> None:
+    from merge_runner_analysis.explorer.app import serve
     from merge_runner_analysis.explorer.notes import reader_of
-    from merge_runner_analysis.explorer.server import serve
 
     def announce(address: str) -> None:
         print_out(address)

@@ -41,19 +41,21 @@ class Firth:
     """Firth's penalised likelihood (1993), by Newton's steps, halved where they go too far."""
 
     def __init__(self, x: np.ndarray, y: np.ndarray):
-        self.x, self.y = x, y
+        # Equal rows together: ``n`` trials, of which ``y`` are successes.
+        self.x, row = np.unique(x, axis=0, return_inverse=True)
+        self.n, self.y = np.bincount(row), np.bincount(row, y)
         self.b, self.se = np.zeros(x.shape[1]), np.zeros(x.shape[1])
         self.b = self.fitted()
         self.se = np.sqrt(np.diag(np.linalg.inv(self.parts(self.b)[1])))
 
     def parts(self, b):
         p = special.expit(self.x @ b)
-        return p, self.x.T @ (self.x * (p * (1 - p))[:, None])
+        return p, self.x.T @ (self.x * (self.n * p * (1 - p))[:, None])
 
     def likelihood(self, b) -> float:
         eta = self.x @ b
         _, information = self.parts(b)
-        fit = self.y @ eta - np.logaddexp(0, eta).sum()
+        fit = self.y @ eta - self.n @ np.logaddexp(0, eta)
         return fit + np.linalg.slogdet(information)[1] / 2
 
     def fitted(self, column: int | None = None, value: float = 0.0) -> np.ndarray:
@@ -72,20 +74,20 @@ class Firth:
         return max(found, key=self.likelihood)
 
     def _climbed(self, b: np.ndarray, column: int | None) -> np.ndarray:
-        x, y = self.x, self.y
+        x, y, n = self.x, self.y, self.n
         free = np.setdiff1d(np.arange(x.shape[1]), [column])
-        for _ in range(5000):
+        for _ in range(1000):
             p, information = self.parts(b)
-            w = p * (1 - p)
+            w = n * p * (1 - p)
             leverage = w * np.einsum("ij,ij->i", x @ np.linalg.inv(information), x)
-            score = (x.T @ (y - p + leverage * (0.5 - p)))[free]
-            if np.abs(score).max() < 1e-10:
-                break
+            score = (x.T @ (y - n * p + leverage * (0.5 - p)))[free]
             step = np.zeros_like(b)
             step[free] = np.linalg.solve(information[np.ix_(free, free)], score)
             while self.likelihood(b + step) < self.likelihood(b) - 1e-12:
                 step /= 2
             b = b + step
+            if np.abs(step).max() < 1e-9:
+                break
         return b
 
     def lost(self, column: int, value: float) -> float:
