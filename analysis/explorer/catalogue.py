@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
@@ -15,115 +17,73 @@ import duckdb
 from pydantic import ValidationError
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.errors import MergeRunnerError, StoreLocked, UsageError
+from merge_runner.errors import MergeRunnerError, StoreLocked
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, schema_sql
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import ALIASES, others_among
-from merge_runner.text_safety import csv_writer
+from merge_runner.text_safety import csv_writer, quoted
 from merge_runner_analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
 from merge_runner_analysis.accounts.course import Course
+from merge_runner_analysis.data.derived_cache import program
 from merge_runner_analysis.data.driver_words import language_models, stand_in, unresponsive
 from merge_runner_analysis.explorer.details import scenario_of
 from merge_runner_analysis.explorer.display_text import csv_cell
-from merge_runner_analysis.explorer.reading import PATIENCE_S, Row, reading, records
+from merge_runner_analysis.explorer.reading import PATIENCE_S, Row, reading, records, stamp_of
 
 PAGE = 100
-# Equal where the same trials are listed; unlike a stamp it does not change when a table is kept.
 State = tuple[int, int]
-# Trials of a variant and of its driver's baseline in equal conditions and repetitions; ``fate`` is
-# what is compared.
+"""The number of trials and a sum over them: equal where the same trials are listed."""
+# Trials of a variant and of its driver's baseline in equal conditions and repetitions.
 PAIRS = """
-SELECT one.condition, one.rep, one.trial_id, one.spec_hash, one.outcome, one.{fate} AS fate,
-    base.trial_id AS base_id, base.spec_hash AS base_hash, base.outcome AS base_outcome,
-    base.{fate} AS base_fate
+SELECT one.condition, one.rep, one.trial_id, one.spec_hash, one.outcome,
+    base.trial_id AS base_id, base.spec_hash AS base_hash, base.outcome AS base_outcome
 FROM listed AS one JOIN listed AS base USING (model, model_left, condition, rep)
 WHERE one.model = ? AND one.variant = ? AND base.variant = 'baseline' AND one.source <> 'human'
-    AND one.{fate} IS NOT NULL AND base.{fate} IS NOT NULL
 ORDER BY one.trial_id, one.spec_hash, base.spec_hash
 """
-# ``tried`` are a trial's attempts, counted where they are alike.
-BEGUN = """
-CREATE SEQUENCE numbers;
-{staged}
-CREATE TABLE listed AS {listing};
-CREATE TABLE levels (number INTEGER, factor VARCHAR, level VARCHAR);
-CREATE VIEW tried AS SELECT number, unnest(tried, recursive := true) FROM listed;
-CREATE TABLE noted (trial_id VARCHAR, spec_hash VARCHAR, tag VARCHAR);
-CREATE VIEW tagged AS SELECT number, tag FROM noted JOIN listed USING (trial_id, spec_hash);
-CREATE TABLE planned (sweep VARCHAR, trial_id VARCHAR, spec_hash VARCHAR);
-CREATE TABLE others (requested VARCHAR, served VARCHAR);
+# Differs where what was stored of a trial does: another program may have played it anew.
+PRINTS = """
+SELECT trial_id, spec_hash,
+    xor(hash(trials), xor(coalesce(of_decisions, 0), coalesce(of_calls, 0))) AS print
+FROM trials LEFT JOIN (
+    SELECT trial_id, spec_hash, bit_xor(hash(side, decision, valid, failure, tactical, applied,
+        fallback, call_key)) AS of_decisions FROM decisions GROUP BY ALL
+) USING (trial_id, spec_hash) LEFT JOIN (
+    SELECT trial_id, spec_hash, bit_xor(hash(call_key, side, decision, attempt, http_status,
+        model_requested, model_served, outcome, cost_usd, scripted)) AS of_calls
+    FROM calls GROUP BY ALL
+) USING (trial_id, spec_hash)
 """
-# The trials of each sweep, and how often what went wrong in a trial. Equal failures are counted
-# together: an error is named by its words before the particulars, without numbers and hashes.
-GROUPED = """
-CREATE OR REPLACE TABLE members AS
-    SELECT sweep, number FROM planned JOIN listed USING (trial_id, spec_hash);
-CREATE OR REPLACE TABLE causes AS
-SELECT number, 'trial: ' || left(regexp_replace(regexp_replace(split_part(
-        regexp_replace(coalesce(error, 'no reason is known'), '^(left|right): ', ''), ' (', 1),
-        '[0-9a-f]{16,}', '…', 'g'), '(^| )[0-9]+', '\\1…', 'g'), 70) AS cause, 1 AS times
-FROM listed WHERE status = 'failed'
-UNION ALL SELECT number, 'plan: ' || flaw, count(*)
-FROM (SELECT number, unnest(flaws) AS flaw FROM listed) GROUP BY ALL
-UNION ALL SELECT number, 'attempt: ' || outcome, sum(times)::BIGINT
-FROM tried WHERE outcome <> 'ok' GROUP BY ALL
-UNION ALL SELECT number, 'model: ' || requested || ' → ' || served, sum(times)::BIGINT
-FROM tried SEMI JOIN others USING (requested, served) WHERE answered GROUP BY ALL;
+# Of each trial its attempts, counted where they are alike.
+TRIED = """
+SELECT trial_id, spec_hash, sum(times)::BIGINT AS attempts, sum(cost_usd) AS cost_usd,
+    list({requested: requested, served: served, answered: answered, outcome: outcome,
+        unpriced: unpriced, times: times}) AS tried
+FROM (
+    SELECT trial_id, spec_hash, model_requested AS requested, model_served AS served,
+        http_status = 200 AS answered, outcome, count(*) FILTER (cost_usd IS NULL) AS unpriced,
+        count(*) AS times, sum(cost_usd) AS cost_usd
+    FROM calls GROUP BY ALL
+) GROUP BY ALL
 """
-# A failed trial may be played anew, and fail again; a file may be put in the place of another.
-FORGET = """
-DELETE FROM memory.listed WHERE status = 'failed' OR (trial_id, spec_hash, status, end_time_s)
-    NOT IN (SELECT (trial_id, spec_hash, status, end_time_s) FROM trials);
-DELETE FROM memory.levels WHERE number NOT IN (SELECT number FROM memory.listed);
-DELETE FROM memory.planned;
-INSERT INTO memory.planned SELECT DISTINCT * FROM sweep_trials;
-DELETE FROM memory.sweeps;
-INSERT INTO memory.sweeps BY NAME FROM sweeps WHERE coalesce(config->>'$.seat', '') = '';
+# About 24 samples of each vehicle's speed, and the range of all samples.
+SPEEDS = """
+SELECT trial_id, spec_hash,
+    left_all[1:-1:1 + len(left_all) // 24] AS left_mps,
+    right_all[1:-1:1 + len(right_all) // 24] AS right_mps,
+    [list_min(left_all), list_max(left_all)] AS left_range_mps,
+    [list_min(right_all), list_max(right_all)] AS right_range_mps
+FROM (
+    SELECT trial_id, spec_hash,
+        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'left') AS left_all,
+        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'right') AS right_all
+    FROM states WHERE time_s >= 0 GROUP BY ALL
+)
 """
-# The next 2,000: the file is not held for longer than that takes. What was only asked is no trial
-# to look at.
-TAKE = """
-INSERT INTO memory.trials BY NAME
-    FROM trials ANTI JOIN memory.listed USING (trial_id, spec_hash) WHERE source <> 'seat'
-    ORDER BY trial_id, spec_hash LIMIT 2000;
-INSERT OR IGNORE INTO memory.specs
-    FROM specs SEMI JOIN memory.trials USING (spec_hash);
-INSERT INTO memory.trial_factors FROM trial_factors SEMI JOIN memory.trials
-    USING (trial_id, spec_hash);
-INSERT INTO memory.states BY NAME
-    FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
-"""
-# Of their decisions and calls what is listed. Texts and prompts stay in the database.
-STAGED = """
-CREATE OR REPLACE TABLE memory.decided AS
-    SELECT trial_id, spec_hash, count(*) AS decisions, count(call_key) AS asked,
-        count(*) FILTER (NOT valid) AS invalid, count(*) FILTER (fallback) AS fallbacks,
-        list(failure) FILTER (failure IS NOT NULL) AS flaws
-    FROM decisions SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL;
-CREATE OR REPLACE TABLE memory.driven AS
-    SELECT trial_id, spec_hash, list({side: side, time_s: time_s, fallback: fallback}
-        ORDER BY decision) AS made
-    FROM decisions SEMI JOIN (FROM memory.decided WHERE fallbacks > 0) USING (trial_id, spec_hash)
-        SEMI JOIN (FROM memory.trials WHERE status = 'collided') USING (trial_id, spec_hash)
-    GROUP BY ALL;
-CREATE OR REPLACE TABLE memory.called AS
-    SELECT trial_id, spec_hash, sum(times)::BIGINT AS attempts, sum(cost_usd) AS cost_usd,
-        list(DISTINCT side ORDER BY side) FILTER (scripted) AS posed,
-        list({requested: requested, served: served, answered: answered, outcome: outcome,
-            unpriced: unpriced, times: times}) AS tried
-    FROM (
-        SELECT trial_id, spec_hash, side, scripted, model_requested AS requested,
-            model_served AS served, http_status = 200 AS answered, outcome,
-            count(*) FILTER (cost_usd IS NULL) AS unpriced, count(*) AS times,
-            sum(cost_usd) AS cost_usd
-        FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash) GROUP BY ALL
-    ) GROUP BY ALL;
-"""
-# A trial as it is listed. A fallback follows every invalid reply, and nothing else: see the audit.
-# ``levels`` are those of its study's own factors, ``flaws`` says of each invalid reply what is
-# wrong with it, and ``posed`` on which sides a stand-in answered. A sparkline has about 24 points;
-# its words give the slowest and the fastest of all samples.
+# Of the levels of its study's factors a trial has a text each, but not of the prompt; a reply is
+# known by its call and attempt, since trials may share it. A fallback follows every invalid reply,
+# and nothing else: see the audit.
 LISTING = f"""
 SELECT nextval('numbers')::INTEGER AS number, trials.trial_id, trials.spec_hash, source,
     CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' ELSE 'drivers' END
@@ -132,70 +92,131 @@ SELECT nextval('numbers')::INTEGER AS number, trials.trial_id, trials.spec_hash,
     if(source = 'human', 'human', driver) AS model,
     variant, condition, projected_headway_m, relative_velocity_mps, rep, pair, status,
     merged_first, end_time_s, error, scripted,
-    NULL::VARCHAR AS stand_in, NULL::VARCHAR AS caution,
+    stand_in, caution,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'
         ELSE 'all valid' END AS validity,
-    time_to_merge_s, gap_m, rmse_mps, joint, min_ttc_s, {OTHER_ACCOUNTS} AS account,
+    time_to_merge_s, gap_m, rmse_mps, joint, min_ttc_s,
+    coalesce(collision, {OTHER_ACCOUNTS}) AS account,
     coalesce(decisions, 0) AS decisions, coalesce(asked, 0) AS asked,
     coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
     coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps, left_range_mps,
-    right_range_mps, flaws, posed, tried, levels
+    right_range_mps, print, flaws, tried, replies, factors,
+    [f.factor || '=' || f.level FOR f IN factors IF f.factor <> 'model'] AS levels
 FROM trials
+JOIN judged USING (trial_id, spec_hash)
+JOIN ({PRINTS}) USING (trial_id, spec_hash)
 JOIN trial_metrics USING (trial_id, spec_hash)
 JOIN trial_drivers USING (trial_id, spec_hash)
-LEFT JOIN decided USING (trial_id, spec_hash)
-LEFT JOIN called USING (trial_id, spec_hash)
+LEFT JOIN (
+    SELECT trial_id, spec_hash, count(*) AS decisions, count(call_key) AS asked,
+        count(*) FILTER (NOT valid) AS invalid, count(*) FILTER (fallback) AS fallbacks,
+        list(failure) FILTER (failure IS NOT NULL) AS flaws
+    FROM decisions GROUP BY ALL
+) USING (trial_id, spec_hash)
+LEFT JOIN ({TRIED}) USING (trial_id, spec_hash)
+LEFT JOIN (
+    SELECT trial_id, spec_hash, list({{reply: hash(call_key, attempt), usd: cost_usd}}) AS replies
+    FROM calls GROUP BY ALL
+) USING (trial_id, spec_hash)
 LEFT JOIN ({ALONE}) USING (trial_id, spec_hash)
 LEFT JOIN (
-    SELECT trial_id, spec_hash, list(factor || '=' || value ORDER BY factor) AS levels
-    FROM trial_factors WHERE factor <> 'prompt' GROUP BY ALL
+    SELECT trial_id, spec_hash, list({{factor: factor, level: value}} ORDER BY factor) AS factors
+    FROM trial_levels WHERE factor <> 'prompt' GROUP BY ALL
 ) USING (trial_id, spec_hash)
-LEFT JOIN (
-    SELECT trial_id, spec_hash,
-        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'left' AND drawn) AS left_mps,
-        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'right' AND drawn) AS right_mps,
-        [min(velocity_mps) FILTER (side = 'left'), max(velocity_mps) FILTER (side = 'left')]
-            AS left_range_mps,
-        [min(velocity_mps) FILTER (side = 'right'), max(velocity_mps) FILTER (side = 'right')]
-            AS right_range_mps
-    FROM (SELECT *, (step - first) % every = 0 AS drawn
-        FROM states JOIN (SELECT trial_id, spec_hash, min(step) AS first,
-                1 + (max(step) - min(step)) // 24 AS every FROM states GROUP BY ALL)
-            USING (trial_id, spec_hash))
-    WHERE time_s >= 0 GROUP BY ALL
-) USING (trial_id, spec_hash)
+LEFT JOIN ({SPEEDS}) USING (trial_id, spec_hash)
 """  # noqa: S608 # constants
-LIST = f"""
-INSERT INTO listed BY NAME {LISTING};
-INSERT INTO levels SELECT number, factor, value FROM trial_levels
-    JOIN listed USING (trial_id, spec_hash) WHERE factor <> 'prompt';
-"""  # noqa: S608 # constants
-# Of the trials that were listed last, the collisions; those without a fallback need no decisions.
-CRASHES = """
-SELECT number, listed.source, spec::VARCHAR AS spec, made,
-    list(time_s ORDER BY step) FILTER (side = 'left') AS times_s,
-    list(position_m ORDER BY step) FILTER (side = 'left') AS left_m,
-    list(position_m ORDER BY step) FILTER (side = 'right') AS right_m,
-    list(velocity_mps ORDER BY step) FILTER (side = 'left') AS left_mps,
-    list(velocity_mps ORDER BY step) FILTER (side = 'right') AS right_mps
-FROM trials JOIN listed USING (trial_id, spec_hash) JOIN states USING (trial_id, spec_hash)
-LEFT JOIN specs USING (spec_hash) LEFT JOIN driven USING (trial_id, spec_hash)
-WHERE trials.status = 'collided' AND time_s >= 0 GROUP BY ALL HAVING len(left_m) = len(right_m)
-"""
-# What else their specs tell of the trials that were listed last.
-DRIVEN_BY = """
-SELECT model_left AS left, model_right AS right, spec::VARCHAR AS spec, scripted, posed,
-    list(number) AS numbers
-FROM listed SEMI JOIN trials USING (trial_id, spec_hash) LEFT JOIN specs USING (spec_hash)
-GROUP BY ALL
-"""
-TAKEN = "TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states;"
-# Before the name of a factor: its facet.
-FACTOR = "factor."
 # Facets of which a trial may have several values, and the tables that hold these.
 SEVERAL = {"sweep": "members", "cause": "causes", "tag": "tagged"}
+# Before the name of a factor: its facet.
+FACTOR = "factor."
+BEGUN = f"""
+CREATE SEQUENCE numbers;
+CREATE TABLE judged (trial_id VARCHAR, spec_hash VARCHAR, collision VARCHAR, stand_in VARCHAR,
+    caution VARCHAR);
+CREATE TABLE listed AS {LISTING};
+CREATE TABLE noted (trial_id VARCHAR, spec_hash VARCHAR, tag VARCHAR);
+CREATE TABLE others (requested VARCHAR, served VARCHAR);
+CREATE VIEW tried AS SELECT number, unnest(tried, recursive := true) FROM listed;
+CREATE VIEW replies AS SELECT number, unnest(replies, recursive := true) FROM listed;
+CREATE VIEW levels AS SELECT number, unnest(factors, recursive := true) FROM listed;
+CREATE VIEW tagged AS SELECT number, tag FROM noted JOIN listed USING (trial_id, spec_hash);
+CREATE VIEW members AS SELECT DISTINCT sweep_id AS sweep, number
+    FROM sweep_trials JOIN listed USING (trial_id, spec_hash);
+CREATE VIEW causes AS
+    SELECT number, 'plan: ' || flaw AS cause, count(*) AS times
+    FROM (SELECT number, unnest(flaws) AS flaw FROM listed) GROUP BY ALL
+    UNION ALL SELECT number, 'attempt: ' || outcome, sum(times)::BIGINT
+    FROM tried WHERE outcome <> 'ok' GROUP BY ALL
+    UNION ALL SELECT number, 'model: ' || requested || ' → ' || served, sum(times)::BIGINT
+    FROM tried SEMI JOIN others USING (requested, served) WHERE answered GROUP BY ALL;
+CREATE VIEW several AS
+    SELECT number, '{FACTOR}' || factor AS facet, level AS value FROM levels
+    UNION ALL SELECT number, 'sweep', sweep FROM members
+    UNION ALL SELECT number, 'cause', cause FROM causes
+    UNION ALL SELECT number, 'tag', tag FROM tagged;
+"""  # noqa: S608 # constants
+# What is listed no longer as it is stored goes, and is taken again before anybody else can hold the
+# file. What was only asked is no trial to look at.
+FORGET = f"""
+DELETE FROM memory.listed
+    WHERE (trial_id, spec_hash, print) NOT IN (SELECT (trial_id, spec_hash, print) FROM ({PRINTS}));
+TRUNCATE memory.sweep_trials;
+INSERT INTO memory.sweep_trials FROM sweep_trials;
+TRUNCATE memory.sweeps;
+INSERT INTO memory.sweeps BY NAME FROM sweeps WHERE coalesce(config->>'$.seat', '') = '';
+INSERT OR IGNORE INTO memory.specs FROM specs;
+"""  # noqa: S608 # constants
+# Of the next 2,000 what is measured: the file is not held for longer than copying takes. Texts and
+# prompts stay in the database.
+TAKE = """
+INSERT INTO memory.trials BY NAME
+    FROM trials ANTI JOIN memory.listed USING (trial_id, spec_hash) WHERE source <> 'seat'
+    ORDER BY trial_id, spec_hash LIMIT 2000;
+INSERT INTO memory.trial_factors
+    FROM trial_factors SEMI JOIN memory.trials USING (trial_id, spec_hash);
+INSERT INTO memory.states BY NAME
+    FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
+INSERT INTO memory.decisions BY NAME SELECT * EXCLUDE (prompt, rationale, plan)
+    FROM decisions SEMI JOIN memory.trials USING (trial_id, spec_hash);
+INSERT INTO memory.calls BY NAME SELECT * EXCLUDE (request, reply, error)
+    FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash);
+"""
+TAKEN = """
+TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states; TRUNCATE decisions; TRUNCATE calls;
+TRUNCATE judged;
+"""
+# What was measured by the rules of this very program.
+RECALL = """
+INSERT INTO listed BY NAME
+    SELECT nextval('numbers') AS number, * EXCLUDE rules FROM read_parquet(?) WHERE rules = ?
+"""
+# What SQL cannot judge of the trials that were copied last: collisions by both courses and, after a
+# fallback, by the decisions; by the spec who drove, and on which sides a stand-in ``posed``.
+JUDGED = """
+SELECT trial_id, spec_hash, source, status, scripted, model_left AS left, model_right AS right,
+    coalesce(spec::VARCHAR, '{}') AS spec, posed, made, times_s, left_m, right_m, left_mps,
+    right_mps
+FROM trials LEFT JOIN specs USING (spec_hash)
+LEFT JOIN (
+    SELECT trial_id, spec_hash, list(DISTINCT side ORDER BY side) AS posed
+    FROM calls WHERE scripted GROUP BY ALL
+) USING (trial_id, spec_hash) LEFT JOIN (
+    SELECT trial_id, spec_hash, list({side: side, time_s: time_s, fallback: fallback}
+        ORDER BY decision) AS made
+    FROM decisions GROUP BY ALL HAVING bool_or(fallback)
+) USING (trial_id, spec_hash) LEFT JOIN (
+    SELECT trial_id, spec_hash, list(time_s ORDER BY step) FILTER (side = 'left') AS times_s,
+        list(position_m ORDER BY step) FILTER (side = 'left') AS left_m,
+        list(position_m ORDER BY step) FILTER (side = 'right') AS right_m,
+        list(velocity_mps ORDER BY step) FILTER (side = 'left') AS left_mps,
+        list(velocity_mps ORDER BY step) FILTER (side = 'right') AS right_mps
+    FROM states SEMI JOIN (FROM trials WHERE status = 'collided') USING (trial_id, spec_hash)
+    WHERE time_s >= 0 GROUP BY ALL HAVING len(left_m) = len(right_m)
+) USING (trial_id, spec_hash)
+"""
+NOTE_JUDGED = f"INSERT INTO judged SELECT {', '.join(['unnest(?::VARCHAR[])'] * 5)}"
 SORTS = {
     "trial": "trial_id",
     "outcome": "outcome",
@@ -215,11 +236,11 @@ coalesce(sum(invalid), 0)::BIGINT AS invalid,
 coalesce(sum(fallbacks), 0)::BIGINT AS fallbacks, coalesce(sum(cost_usd), 0) AS cost_usd,
 avg(gap_m) AS gap_m, avg(rmse_mps) AS rmse_mps, string_agg(DISTINCT stand_in, '; ') AS stand_in
 """
-SHOWN = "* EXCLUDE (flaws, posed, tried)"
-SPEEDS = "left_mps, right_mps, left_range_mps, right_range_mps"
+COUNTED = "print, flaws, tried, replies, factors"
+SHOWN = f"* EXCLUDE ({COUNTED})"
 EXPORTED = (
-    "* EXCLUDE (who, flaws, posed, tried, levels, number, asked, model_left, model_right, "
-    f"{SPEEDS})"
+    f"* EXCLUDE ({COUNTED}, who, levels, number, asked, model_left, model_right, "
+    "left_mps, right_mps, left_range_mps, right_range_mps)"
 )
 
 
@@ -248,21 +269,17 @@ class Filter:
     def where(self, leave_out: str = "") -> tuple[str, list[Any]]:
         """The filter as SQL with its values; without one facet, to count its alternatives."""
         parts, values = ["true"], list[Any]()
-        for name in FACETS:
-            if (value := getattr(self, name)) and name != leave_out:
-                parts.append(
-                    f"number IN (SELECT number FROM {SEVERAL[name]} WHERE {name} = ?)"  # noqa: S608 # constants
-                    if name in SEVERAL
-                    else f"{name} = ?"
-                )
-                values.append(value)
-        for factor, level in self.levels:
-            if f"{FACTOR}{factor}" != leave_out:
-                parts.append("number IN (SELECT number FROM levels WHERE factor = ? AND level = ?)")
-                values += [factor, level]
-        if self.q:
-            parts.append("contains(lower(trial_id), lower(?))")
-            values.append(self.q)
+        for name, value in self.chosen.items():
+            if name == leave_out:
+                continue
+            if name == "q":
+                parts.append("contains(lower(trial_id), lower(?))")
+            elif name in FACETS and name not in SEVERAL:
+                parts.append(f"{name} = ?")
+            else:
+                parts.append("number IN (SELECT number FROM several WHERE facet = ? AND value = ?)")
+                values.append(name)
+            values.append(value)
         if self.trials is not None:
             parts.append("(trial_id, spec_hash) IN (SELECT (unnest(?::VARCHAR[]), "
                          "unnest(?::VARCHAR[])))")  # fmt: skip
@@ -283,7 +300,9 @@ FACETS = tuple(f.name for f in fields(Filter) if f.name not in {"q", "levels", "
 class Catalogue:
     """All trials of a database. Threads take turns.
 
-    ``held``: another program holds the database, and what is listed may be old.
+    What is measured of a trial is kept in a file beside the database, so that the next program that
+    opens it measures the new ones alone. ``held``: another program holds the database, and what is
+    listed may be old.
     """
 
     db: Path
@@ -311,15 +330,13 @@ class Catalogue:
             if self._connection is None or stamp[0] != self._file:
                 self._begin(stamp[0])
             try:
-                # What is forgotten is taken again before anybody else can hold the file.
-                waiting = self._reading(FORGET + TAKE + STAGED)
+                waiting = measured = self._reading(FORGET + TAKE)
                 while waiting:
                     # With the file closed: measuring takes longer than copying.
-                    self._memory.execute(LIST)
-                    self._account_for_collisions()
-                    self._name_drivers()
-                    self._memory.execute(TAKEN)
-                    waiting = self._reading(TAKE + STAGED)
+                    judged = [_judged(row) for row in records(self._memory, JUDGED, ())]
+                    self._memory.execute(NOTE_JUDGED, [*map(list, zip(*judged, strict=True))])
+                    self._memory.execute(f"INSERT INTO listed BY NAME {LISTING}; {TAKEN}")
+                    waiting = self._reading(TAKE)
             except StoreLocked:
                 if self._stamp is None:
                     raise
@@ -329,33 +346,30 @@ class Catalogue:
                 raise
             else:
                 self._stamp, self.held = stamp, False
+                if measured:
+                    self._remember()
             self._note_others()
-            self._memory.execute(GROUPED)
             return not self.held
 
     def keep(self, numbers: Sequence[int]) -> None:
         """List no trials but those with these numbers."""
         with self._lock:
-            for table in ("listed", "levels"):
-                self._memory.execute(
-                    f"DELETE FROM {table} WHERE number NOT IN (SELECT unnest(?))",  # noqa: S608 # constants
-                    [numbers],
-                )
-            self._memory.execute(GROUPED)
+            self._memory.execute(
+                "DELETE FROM listed WHERE number NOT IN (SELECT unnest(?))", [numbers]
+            )
 
     def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
         """Each facet's values with how many trials they would leave, the other facets as wanted."""
-        factors = [f"{FACTOR}{name}" for name in self.factors()]
-        found: dict[str, list[tuple[str, int]]] = {name: [] for name in (*FACETS, *factors)}
+        found: dict[str, list[tuple[str, int]]] = {
+            name: [] for name in (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
+        }
         counts, values = [], list[Any]()
         for name in found:
             where, wants = wanted.where(leave_out=name)
             table, value = "listed", name
-            if name in SEVERAL:
-                table = f"listed JOIN {SEVERAL[name]} USING (number)"
-            elif name in factors:
-                table, value = "listed JOIN (FROM levels WHERE factor = ?) USING (number)", "level"
-                wants = [name.removeprefix(FACTOR), *wants]
+            if name not in FACETS or name in SEVERAL:
+                table = "listed JOIN (FROM several WHERE facet = ?) USING (number)"
+                value, wants = "value", [name, *wants]
             counts.append(
                 f"SELECT ? AS facet, {value} AS value, count(*) AS trials FROM {table} "  # noqa: S608 # constants
                 f"WHERE {where} AND {value} IS NOT NULL GROUP BY ALL"
@@ -415,17 +429,19 @@ class Catalogue:
         )
         return found[0] if found else None
 
-    def pairs(self, model: str, variant: str, fate: str) -> list[Row]:
-        """Trials of a variant beside those of the baseline; ``fate``: outcome or joint."""
-        return self.ask(PAIRS.format(fate=fate), model, variant)
+    def pairs(self, model: str, variant: str) -> list[Row]:
+        """Trials of a variant beside those of the baseline."""
+        return self.ask(PAIRS, model, variant)
 
     def state(self) -> State:
-        """What is listed now, as a number of trials and a sum over their names and ends."""
-        (row,) = self.ask(
-            "SELECT count(*) AS trials, coalesce(sum(hash(trial_id, spec_hash, status, end_time_s, "
-            "error)), 0) AS sum FROM listed"
+        """What is listed now."""
+        ((trials, prints),) = map(
+            dict.values,
+            self.ask(
+                "SELECT count(*) AS trials, coalesce(bit_xor(print), 0) AS prints FROM listed"
+            ),
         )
-        return int(row["trials"]), int(row["sum"])
+        return int(trials), int(prints)
 
     @property
     def others(self) -> set[tuple[str, str]]:
@@ -470,12 +486,26 @@ class Catalogue:
         return lines.getvalue()
 
     def _begin(self, file: int) -> None:
-        """Forget everything."""
+        """Forget everything but what was measured before."""
         self._instance.drop()
         self._connection = self._instance.cursor()
-        self._connection.execute(schema_sql())
-        self._connection.execute(BEGUN.format(staged=STAGED, listing=LISTING) + GROUPED)
+        self._connection.execute(schema_sql() + BEGUN)
         self._file, self._stamp, self._tags = file, None, ()
+        # Without the file, or where it is damaged, all is measured anew.
+        with suppress(duckdb.Error):
+            self._connection.execute(RECALL, [str(measured_beside(self.db)), program()])
+
+    def _remember(self) -> None:
+        """Keep what was measured; where nothing can be written it is measured again next time."""
+        path = measured_beside(self.db)
+        made = path.with_name(f"{path.name}.{os.getpid()}")
+        with suppress(duckdb.Error, OSError):
+            self._memory.execute(
+                f"COPY (SELECT * EXCLUDE number, ? AS rules FROM listed) TO {quoted(made)} "  # noqa: S608 # constants
+                "(FORMAT parquet)",
+                [program()],
+            )
+            made.replace(path)
 
     def _reading(self, sql: str) -> int:
         """Run statements on the database and ours; returns how many trials wait to be listed."""
@@ -486,27 +516,6 @@ class Catalogue:
             (waiting,) = connection.execute("SELECT count(*) FROM memory.trials").fetchall()
         count: int = waiting[0]
         return count
-
-    def _account_for_collisions(self) -> None:
-        """Note how each collision among the trials that were listed last came about."""
-        crashes = records(self._memory, CRASHES, ())
-        self._memory.execute(
-            "UPDATE listed SET account = found.account "
-            "FROM (SELECT unnest(?::INTEGER[]) AS number, unnest(?::VARCHAR[]) AS account) "
-            "AS found WHERE listed.number = found.number",
-            [[crash["number"] for crash in crashes], [_how(crash) for crash in crashes]],
-        )
-
-    def _name_drivers(self) -> None:
-        """Note which model a stand-in stood in for, and that a replayed human does not react."""
-        for group in records(self._memory, DRIVEN_BY, ()):
-            spec = json.loads(group["spec"] or "{}")
-            models = language_models({side: group[side] for side in SIDES}, spec)
-            posed = stand_in(models, group["posed"] or SIDES) if group["scripted"] else None
-            self._memory.execute(
-                "UPDATE listed SET stand_in = ?, caution = ? WHERE number IN (SELECT unnest(?))",
-                [posed, unresponsive(spec) or None, group["numbers"]],
-            )
 
     def _note_others(self) -> None:
         """Find out where another model answered, by the aliases of all sweeps."""
@@ -522,20 +531,26 @@ class Catalogue:
         return self._connection
 
 
-def _how(crash: Row) -> str | None:
-    """The class of a collision; None where its spec cannot be read, which the audit tells."""
-    try:
-        scenario = _task(crash["source"], crash["spec"] or "{}")
-    except ValidationError:
-        return None
-    course = Course(
-        scenario,
-        TRACK,
-        crash["times_s"],
-        {side: crash[f"{side}_m"] for side in SIDES},
-        {side: crash[f"{side}_mps"] for side in SIDES},
-    )
-    return collision_class(course, crash["made"] or [])
+def _judged(trial: Row) -> tuple[str, str, str | None, str | None, str | None]:
+    """The key of a trial, how it collided, who answered instead of a model, and who cannot react.
+
+    Where its spec cannot be read, which the audit tells, nobody knows how it collided.
+    """
+    spec = json.loads(trial["spec"])
+    models = language_models({side: trial[side] for side in SIDES}, spec)
+    posed = stand_in(models, trial["posed"] or SIDES) if trial["scripted"] else None
+    collision = None
+    if trial["times_s"]:
+        with suppress(ValidationError):
+            course = Course(
+                _task(trial["source"], trial["spec"]),
+                TRACK,
+                trial["times_s"],
+                {side: trial[f"{side}_m"] for side in SIDES},
+                {side: trial[f"{side}_mps"] for side in SIDES},
+            )
+            collision = collision_class(course, trial["made"] or [])
+    return trial["trial_id"], trial["spec_hash"], collision, posed, unresponsive(spec) or None
 
 
 @lru_cache
@@ -544,26 +559,13 @@ def _task(source: str, spec: str) -> ScenarioConfig:
     return scenario_of(source, json.loads(spec).get("scenario"))
 
 
+def measured_beside(db: Path) -> Path:
+    """The file that keeps what was measured of the trials of a database."""
+    return db.with_name(f"{db.name}.trials.parquet")
+
+
 def order_by(sort: str) -> str:
     """A sort as SQL: what has no value comes last, and equal ones by name."""
     column = SORTS.get(sort.removeprefix("-"), "trial_id")
     direction = "DESC" if sort.startswith("-") else "ASC"
     return f"{column} {direction} NULLS LAST, trial_id, spec_hash"
-
-
-def stamp_of(db: Path) -> tuple[int, ...]:
-    """What changes when a database does; raises UsageError where there is none."""
-    found: list[int] = []
-    for path in (db, db.with_name(f"{db.name}.wal")):
-        try:
-            stat = path.stat()
-        except FileNotFoundError:
-            found += [0, 0, 0]
-        else:
-            found += [stat.st_ino, stat.st_mtime_ns, stat.st_size]
-    if not found[0]:
-        raise UsageError(
-            f"there is no database {db}; `merge-runner sweep baseline` makes one, --db names "
-            "another"
-        )
-    return tuple(found)

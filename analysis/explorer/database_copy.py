@@ -16,8 +16,7 @@ from pathlib import Path
 import duckdb
 
 from merge_runner.errors import StoreLocked, UsageError
-from merge_runner_analysis.explorer.catalogue import stamp_of
-from merge_runner_analysis.explorer.reading import reading
+from merge_runner_analysis.explorer.reading import reading, stamp_of
 
 LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 import unicodedata
 from datetime import datetime
 from decimal import Decimal
 
 from merge_runner.text_safety import in_spreadsheet
 
+MINUS = "−"
+NEGATIVE = re.compile(r"(?<![\w-])-(?=\d)")
 SHOWN = 20_000
 BEGINNING = 800
 # What Python gets for infinite timestamps.
@@ -18,6 +21,16 @@ _HIDDEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 # Letters and marks that show nothing either: fillers, joiners, and selectors of variants.
 _BLANK = {0x034F, 0x115F, 0x1160, 0x17B4, 0x17B5, 0x2800, 0x3164, 0xFFA0}
 _BLANK.update(range(0x180B, 0x1810), range(0xFE00, 0xFE10), range(0xE0100, 0xE01F0))
+
+
+def shown_number(value: float | None, decimals: int = 2, unit: str = "") -> str:
+    """A number with its unit, as all pages print it; an en dash where there is none."""
+    return "–" if value is None else f"{value:.{decimals}f}{unit}".replace("-", MINUS)
+
+
+def with_minus(text: str) -> str:
+    """A text whose negative numbers have a true minus sign; hyphens stay, also those of names."""
+    return NEGATIVE.sub(MINUS, text)
 
 
 def visible(text: str) -> str:
@@ -63,19 +76,17 @@ def text_of(value: object) -> str | None:
             text = value.isoformat(" ")
             return INFINITE.get(text, text)
         case list() | tuple() | dict():
-            return json.dumps(_plain(value), ensure_ascii=False)
+            return json.dumps(_plain(value), ensure_ascii=False, default=text_of)
         case _:
             return str(value)
 
 
 def _plain(value: object) -> object:
-    """A nested value as JSON can say it."""
+    """A nested value whose keys JSON can say."""
     match value:
         case list() | tuple():
             return [_plain(item) for item in value]
         case dict():
             return {str(text_of(key)): _plain(item) for key, item in value.items()}
-        case bool() | int() | float():
-            return value
         case _:
-            return text_of(value)
+            return value

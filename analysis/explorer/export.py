@@ -11,8 +11,9 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
-from functools import partial
+from functools import cache, partial
 from html import unescape
+from itertools import count
 from pathlib import Path, PurePosixPath
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -24,22 +25,20 @@ from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.assets import STATIC
 from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, Filter
 from merge_runner_analysis.explorer.guard import LOOPBACK
-from merge_runner_analysis.explorer.leaks import Leaks
+from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.offline import offline, page_of_trials
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.site import SCOPE, Site
 from merge_runner_analysis.explorer.urls import query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
-# The pages of an export by the first part of their path, with what their addresses may ask for.
+# The pages of an export by the first part of their path, and what their addresses ask for. They
+# are of all trials, so that a link within a scope leads to the page without it.
 FOLLOWED: dict[str, Collection[str]] = {
-    "": (),
-    "drivers": ("prompt",),
+    **dict.fromkeys(("", "sweeps", "tables", "figures", "prompts", "notes", "glossary"), ()),
+    "drivers": ("variant",),
     "trials": ("spec", "page", *FACETS),
-    "conditions": ("by",),
     "discordant": ("model", "variant"),
-    **dict.fromkeys(("sweeps", "tables", "figures", "prompts", "notes", "notes.csv"), ()),
-    "glossary": (),
 }
 OF_TRIALS = ("trials", "glossary")
 MOMENT = ("side", "decision")  # the script of a trial's page reads these
@@ -56,18 +55,19 @@ _STATIC = re.compile(r'="/static/([^"]+)"')
 _ODD = re.compile(r"[^A-Za-z0-9_.]+")
 LONGEST_NAME = 120
 
-Told = Callable[[int], object]
-"""Gets the number of pages so far."""
-
 
 def export_folder(
-    db: Path, folder: Path, wanted: Sequence[str] = (), told: Told = lambda _: None
+    db: Path,
+    folder: Path,
+    wanted: Sequence[str] = (),
+    told: Callable[[int], object] = lambda _: None,
 ) -> Path:
     """Write the pages of a study into a folder; returns the first of them.
 
     ``wanted`` are names of trials, in which * stands for anything: then it is their list and their
-    pages alone. An earlier export in the folder goes. Raises UsageError; then, as where a page
-    holds a key or a path of this machine, the folder stays as it was.
+    pages alone. ``told`` gets the number of pages so far. An earlier export in the folder goes.
+    Raises UsageError; then, as where a page holds a key or a path of this machine, the folder stays
+    as it was.
     """
     index, files = folder / INDEX, folder / FILES
     if folder.is_file():
@@ -75,15 +75,12 @@ def export_folder(
     refuse_another_kind(index, OURS, "exported study")
     if files.exists() and not index.exists():
         raise UsageError(f"{files} is there, and is no exported study's: name another folder")
+    begin, heads = ("/trials", OF_TRIALS) if wanted else ("/", FOLLOWED)
     with _opened(db, wanted) as (site, rows), _staged(folder) as stage:
-        (stage / FILES).mkdir()
         if wanted:
             site.catalogue.keep([row["number"] for row in rows])
-            found = asyncio.run(_crawled(site, "/trials", OF_TRIALS, stage, told))
-        else:
-            site.computing.begin()
-            found = asyncio.run(_crawled(site, "/", FOLLOWED, stage, told))
-        _rewrite(db, stage, found)
+        (stage / FILES).mkdir()
+        _rewrite(db, stage, asyncio.run(_crawled(site, begin, heads, stage, told)))
     return index
 
 
@@ -96,10 +93,10 @@ def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
 
 
 async def _crawled(
-    site: Site, begin: str, heads: Collection[str], stage: Path, told: Told
+    site: Site, begin: str, heads: Collection[str], stage: Path, told: Callable[[int], object]
 ) -> dict[str, str]:
     """Save the pages to which links lead, as they are served; returns their files by address."""
-    files, waiting = {begin: INDEX}, deque([begin])
+    files, absent, waiting = {begin: INDEX}, set[str](), deque([begin])
     transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
     plain = {"accept-encoding": "identity"}
     async with httpx.AsyncClient(
@@ -109,97 +106,103 @@ async def _crawled(
             address = waiting.popleft()
             whole = {"as": "whole"} if address.startswith("/trials/") else {}
             reply = await client.get(httpx.URL(address).copy_merge_params(whole))
-            is_page = reply.headers["content-type"].startswith("text/html")
-            if reply.status_code != httpx.codes.OK:
+            if reply.is_error:  # no page is there, or a figure cannot be drawn
                 if files[address].endswith(".html") and reply.status_code != httpx.codes.NOT_FOUND:
                     raise UsageError(
                         f"nothing was written: {address} answers {reply.status_code}; "
                         "`merge-runner view` shows why"
                     )
-                files[address] = ""  # as of a figure that cannot be drawn
+                absent.add(address)
                 continue
-            for link in _LINKS.findall(reply.text) if is_page else ():
-                page, _ = _page_of(unescape(link), heads)
-                if page and page not in files and not page.endswith(".png"):
+            text = reply.text if reply.headers["content-type"].startswith("text/html") else ""
+            for link in _LINKS.findall(text):
+                page, _ = _page_of(unescape(link))
+                if (
+                    page
+                    and page not in files
+                    and _head(page) in heads
+                    and not page.endswith(".png")
+                ):
                     files[page] = _file_of(page, files.values())
                     waiting.append(page)
-            if is_page and BUSY in reply.text:
+            if BUSY in text:
                 waiting.append(address)
                 await asyncio.sleep(POLL_S)
                 continue
             (stage / files[address]).write_bytes(reply.content)
             told(len(files) - len(waiting))
-    return {address: file for address, file in files.items() if file}
+    return {address: file for address, file in files.items() if address not in absent}
 
 
-def _page_of(address: str, heads: Collection[str]) -> tuple[str, str]:
+@cache  # a link is read when it is followed, and when it is rewritten
+def _page_of(address: str) -> tuple[str, str]:
     """Split an address into a page and the moment it shows; two empty texts for other pages."""
     parts = urlsplit(address)
+    known = FOLLOWED.get(_head(address)) if parts.path.startswith("/") else None
     asked = dict(parse_qsl(parts.query))
     moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
-    head = parts.path.removeprefix("/").partition("/")[0]
-    known = FOLLOWED[head] if parts.path.startswith("/") and head in heads else None
-    if known is None or any(name not in known and not name.startswith(FACTOR) for name in asked):
+    if known is None or parts.netloc:
         return "", ""
-    return parts.path + query_of(asked), moment + (f"#{parts.fragment}" if parts.fragment else "")
+    kept = {name: asked[name] for name in asked if name in known or name.startswith(FACTOR)}
+    if asked.keys() - kept.keys() - {*SCOPE}:
+        return "", ""
+    return parts.path + query_of(kept), moment + (f"#{parts.fragment}" if parts.fragment else "")
+
+
+def _head(address: str) -> str:
+    """The first part of a path."""
+    return urlsplit(address).path.removeprefix("/").partition("/")[0]
 
 
 def _file_of(page: str, taken: Collection[str]) -> str:
     """Return a name for the file of a page that no other one has, whatever the page is called."""
     parts = urlsplit(page)
     path = PurePosixPath(unquote(parts.path))
-    suffix = path.suffix if page.startswith(("/tables/", "/figures/", "/notes.")) else ""
+    suffix = path.suffix if page.startswith(("/tables/", "/figures/")) else ""
     asked = [part for pair in parse_qsl(parts.query) if pair[0] != "spec" for part in pair]
     words = "-".join([str(path).removesuffix(suffix), *asked])
     name = f"{FILES}/{_ODD.sub('-', words).strip('-')[:LONGEST_NAME]}"
     others = {file.lower() for file in taken}
-    number = 1
-    while (
-        file := name + (f"-{number}" if number > 1 else "") + (suffix or ".html")
-    ).lower() in others:
-        number += 1
-    return file
+    ends = ("" if number == 1 else f"-{number}" for number in count(1))
+    named = (name + end + (suffix or ".html") for end in ends)
+    return next(file for file in named if file.lower() not in others)
 
 
 def _rewrite(db: Path, stage: Path, files: dict[str, str]) -> None:
     """Have the links of all pages lead to files, and put the files beside them that they need."""
-    leaks, needed = Leaks(db), set[str]()
+    needed = set[str]()
+    ways = {
+        folder: {page: os.path.relpath(file, folder) for page, file in files.items()}
+        for folder in (".", FILES)
+    }
     for file in files.values():
+        folder = str(PurePosixPath(file).parent)
         path = stage / file
         text = path.read_text(encoding="utf-8")
         if file.endswith(".html"):
-            text = offline(text, db.name, POLICY, partial(_leads, files, file))
+            text = offline(text, db.name, POLICY, partial(_leads, ways[folder]))
             needed.update(_STATIC.findall(text))
-            beside = os.path.relpath(f"{FILES}/static", PurePosixPath(file).parent)
-            text = _STATIC.sub(rf'="{beside}/\1"', text)
+            text = _STATIC.sub(rf'="{os.path.relpath(f"{FILES}/static", folder)}/\1"', text)
             path.write_text(text, encoding="utf-8")
-        leaks.refuse(file, [text])
+        refuse_leaks(db, file, text)
     for name in needed:
         copy = stage / FILES / "static" / name
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(STATIC / name, copy)
 
 
-def _leads(files: dict[str, str], file: str, address: str) -> str:
-    """Return the way from a file to that of an address; empty where there is none."""
-    page, moment = _page_of(address, FOLLOWED)
-    if page not in files:
-        return ""
-    return os.path.relpath(files[page], PurePosixPath(file).parent) + moment
-
-
-class _Still(Site):
-    """A site that does not look for news, so that its pages are of the same trials."""
-
-    def refresh(self) -> None:
-        """Do nothing."""
+def _leads(ways: dict[str, str], address: str) -> str:
+    """Return the way to the file of an address; empty where there is none."""
+    page, moment = _page_of(address)
+    return ways[page] + moment if page in ways else ""
 
 
 @contextmanager
 def _opened(db: Path, wanted: Sequence[str]) -> Iterator[tuple[Site, list[Row]]]:
     """Give a site and the wanted trials, by name; raises UsageError for none or too many."""
-    site = _Still(db)
-    Site.refresh(site)
+    site = Site(db)
+    site.refresh()
+    site.is_still = True  # so that all pages are of the same trials
     rows = [
         row
         for row in site.catalogue.every(Filter())

@@ -8,7 +8,6 @@ from __future__ import annotations
 import fcntl
 import getpass
 import os
-import secrets
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +32,6 @@ class Note:
     The spec says which trial is meant in a copy of the study, too.
     """
 
-    id: str
     at: AwareDatetime
     reader: Name
     trial_id: str
@@ -43,32 +41,22 @@ class Note:
     tags: Annotated[tuple[Tag, ...], Field(max_length=MOST_TAGS)]
     text: Annotated[str, StringConstraints(max_length=LONGEST_TEXT)]
 
-    @property
-    def trial(self) -> tuple[str, str]:
-        """The trial and its spec."""
-        return self.trial_id, self.spec_hash
 
-
-@dataclass(frozen=True, slots=True)
-class Withdrawal:
-    """A reader takes back what they noted; the line of the note stays."""
-
-    withdraws: str
-    at: AwareDatetime
-    reader: Name
-
-
-ENTRY: TypeAdapter[Note | Withdrawal] = TypeAdapter(Note | Withdrawal)
+LINE = TypeAdapter(Note)
 
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """What a file holds: the notes that stand, the earliest first, and what could not be read."""
+    """The notes of a file, the earliest first, and what could not be read."""
 
     notes: tuple[Note, ...] = ()
     damage: tuple[str, ...] = ()
-    tags: tuple[tuple[str, str, str], ...] = ()
-    """Of each trial and its decisions: (trial, spec, tag), each once."""
+
+    @property
+    def tags(self) -> tuple[tuple[str, str, str], ...]:
+        """Of each trial and its decisions: (trial, spec, tag), each once."""
+        tagged = {(note.trial_id, note.spec_hash, tag) for note in self.notes for tag in note.tags}
+        return tuple(sorted(tagged))
 
 
 class Notes:
@@ -96,54 +84,20 @@ class Notes:
 
     def of(self, trial_id: str, spec_hash: str) -> list[Note]:
         """The notes of a trial."""
-        return [note for note in self.kept().notes if note.trial == (trial_id, spec_hash)]
+        at = trial_id, spec_hash
+        return [note for note in self.kept().notes if (note.trial_id, note.spec_hash) == at]
 
     def add(
-        self,
-        trial: tuple[str, str],
-        at: tuple[Side, int] | None,
-        tags: Sequence[str],
-        text: str,
+        self, trial: tuple[str, str], at: tuple[Side, int] | None, tags: Sequence[str], text: str
     ) -> None:
         """Note something of a trial, or of a decision by its side and number; raises UsageError."""
         if not tags and not text:
             raise UsageError("nothing was noted: write a note, or a tag")
         side, decision = at or (None, None)
-        now = datetime.now(UTC)
-        self._append(
-            Note(secrets.token_hex(8), now, self.reader, *trial, side, decision, tuple(tags), text)
-        )
-
-    def withdraw(self, name: str) -> None:
-        """Take back a note of this reader; raises UsageError."""
-        mine = [note for note in self.kept().notes if note.id == name]
-        if not mine or mine[0].reader != self.reader:
-            raise UsageError(f"there is no note {name} of {self.reader}")
-        self._append(Withdrawal(name, datetime.now(UTC), self.reader))
-
-    def _parsed(self) -> Kept:
-        notes: dict[str, Note] = {}
-        damage = []
-        for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
-            if not line.strip():
-                continue
-            try:
-                entry = ENTRY.validate_json(line)
-            except ValidationError:
-                damage.append(f"line {number} of {self.path.name} is damaged, and is left out")
-                continue
-            if isinstance(entry, Note):
-                notes.setdefault(entry.id, entry)
-            elif entry.withdraws in notes and notes[entry.withdraws].reader == entry.reader:
-                del notes[entry.withdraws]
-        tags = sorted({(*note.trial, tag) for note in notes.values() for tag in note.tags})
-        return Kept(tuple(notes.values()), tuple(damage), tuple(tags))
-
-    def _append(self, entry: Note | Withdrawal) -> None:
-        """Add a line; raises UsageError."""
+        note = Note(datetime.now(UTC), self.reader, *trial, side, decision, tuple(tags), text)
         try:
-            line = ENTRY.dump_json(entry)
-            ENTRY.validate_json(line)
+            line = LINE.dump_json(note)
+            LINE.validate_json(line)
         except ValueError as exc:  # also of letters that are none
             raise UsageError(
                 f"nothing was noted: a note has up to {LONGEST_TEXT:,} characters and up to "
@@ -160,24 +114,25 @@ class Notes:
         except OSError as exc:
             raise UsageError(f"nothing was noted: {self.path}: {exc.strerror}") from exc
 
+    def _parsed(self) -> Kept:
+        notes, damage = [], []
+        for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
+            try:
+                if line.strip():
+                    notes.append(LINE.validate_json(line))
+            except ValidationError:
+                damage.append(f"line {number} of {self.path.name} is damaged, and is left out")
+        return Kept(tuple(notes), tuple(damage))
+
 
 def reader_of(given: str | None) -> str:
     """Who writes: the name that is given, or the system's; raises UsageError."""
-    name = " ".join((_user() if given is None else given).split())
+    if given is None:
+        try:
+            given = getpass.getuser()
+        except (KeyError, OSError):  # the system knows no name, as in some containers
+            given = "reader"
+    name = " ".join(given.split())
     if not 0 < len(name) <= LONGEST_NAME:
         raise UsageError(f"--reader needs a name of up to {LONGEST_NAME} characters")
     return name
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # the system knows no name, as in some containers
-        return "reader"
-
-
-def tags_of(text: str) -> list[str]:
-    """The tags in a text, separated by commas, without regard to case."""
-    return list(
-        dict.fromkeys(tag for part in text.split(",") if (tag := " ".join(part.split()).lower()))
-    )

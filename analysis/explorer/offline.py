@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape, unescape
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -13,8 +13,7 @@ from markupsafe import Markup
 
 from merge_runner_analysis.explorer.assets import STATIC
 from merge_runner_analysis.explorer.display_text import visible
-from merge_runner_analysis.explorer.leaks import Leaks
-from merge_runner_analysis.explorer.pages.comparing import At, offered
+from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.pages.trial import trial_page
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.site import Site
@@ -81,34 +80,17 @@ def page_of_trials(site: Site, rows: Sequence[Row]) -> str:
     forms = (HELP, COMPARE) if len(held) > 1 else (HELP,)
     pages = []
     for trial_id, spec_hash in held:
-        page = trial_page(site, trial_id, {"spec": spec_hash, "as": "whole"})
-        pages.append(offline(page, site.db.name, "POLICY", address, forms))
+        served = trial_page(site, trial_id, {"spec": spec_hash, "as": "whole"})
+        pages.append(offline(served, site.db.name, "POLICY", address, forms))
     page = pages[0]
     if len(pages) > 1:
-        several = site.render("_several.html", held=list(_held(site, held, pages)))
+        parts = [found[2] for each in pages if (found := _MAIN.search(each))]
+        # Rendered by templates of ours.
+        trials = zip(held.values(), map(Markup, parts), strict=True)
+        several = site.render("_several.html", held=list(trials))
         page = _MAIN.sub(lambda found: found[1] + several + found[3], page)
-    Leaks(site.db).refuse("the page", [page])
+    refuse_leaks(site.db, "the page", page)
     return _inlined(page)
-
-
-def _held(
-    site: Site, held: Mapping[At, Row], pages: Sequence[str]
-) -> Iterator[tuple[Row, str, Markup, dict[str, str]]]:
-    """Give each trial of a page, its address there, its main part, and what is offered beside it.
-
-    What is offered are keys of others that the page holds, by kind.
-    """
-    found: dict[At, dict[str, At]] = {}
-    for condition in {row["condition"] for row in held.values()}:
-        alike = [key for key, row in held.items() if row["condition"] == condition]
-        found |= offered(site, condition, alike)
-    for (key, row), page in zip(held.items(), pages, strict=True):
-        trial_id, spec_hash = key
-        offers = {kind: "@".join(at) for kind, at in found.get(key, {}).items() if at in held}
-        main = _MAIN.search(page)
-        assert main is not None
-        address = query_of({"trial": trial_id, "spec": spec_hash})
-        yield row, address, Markup(main[2]), offers  # noqa: S704 # rendered by a template of ours
 
 
 def _inlined(page: str) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, floor, log10
+from math import ceil, floor
 
 from merge_runner.records import SIDES
 from merge_runner_analysis.explorer.reading import Row
@@ -31,11 +31,6 @@ class Scale:
         """The place of a value."""
         inside = min(max(value, self.low), self.high)
         return self.from_ + (self.to - self.from_) * (inside - self.low) / (self.high - self.low)
-
-    def whole(self, values: Sequence[float]) -> list[int]:
-        """The places of values that all lie between the ends, in whole units."""
-        unit = (self.to - self.from_) / (self.high - self.low)
-        return [round(self.from_ + unit * (value - self.low)) for value in values]
 
 
 def speed_range(rows: Sequence[Row]) -> tuple[int, int]:
@@ -76,39 +71,3 @@ def step_points(values: Sequence[float], width: float, height: float, steps: int
     return " ".join(
         [f"{x(i):.1f},{y(v):.1f} {x(i + 1):.1f},{y(v):.1f}" for i, v in enumerate(values)]
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """An axis of a panel, and the values of its ticks."""
-
-    scale: Scale
-    ticks: Sequence[float]
-
-    @classmethod
-    def of(cls, ends: tuple[float, float], places: tuple[float, float]) -> Axis:
-        """An axis between two places that shows at least these ends; see ``ends_and_ticks``."""
-        low, high, ticks = ends_and_ticks(*ends)
-        return cls(Scale(low, high, *places), ticks)
-
-    @property
-    def marks(self) -> list[tuple[float, str]]:
-        """Where the ticks are drawn, and as what."""
-        return [(self.y(tick), f"{tick:g}") for tick in self.ticks]
-
-    def y(self, value: float) -> float:
-        """Where a value is drawn."""
-        return round(self.scale(value), 1)
-
-
-def ends_and_ticks(low: float, high: float) -> tuple[float, float, list[float]]:
-    """Both ends of an axis that holds these, and its ticks: round steps, with 0 in it."""
-    low, high = min(low, 0.0), max(high, 0.0)
-    high = high if high > low else low + 1.0
-    rough = (high - low) / 4
-    size = 10.0 ** floor(log10(rough))
-    step = next(size * m for m in (1, 2, 2.5, 5, 10) if size * m >= rough * 0.999)
-    # Against rounding: 0.3 / 0.1 is a little less than 3, and would make one step more.
-    first, last = floor(low / step + 1e-9), ceil(high / step - 1e-9)
-    last = max(last, first + 1)
-    return first * step, last * step, [round(i * step, 6) for i in range(first, last + 1)]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Literal
 
 from merge_runner.prompts.blocks import BLOCKS
@@ -49,37 +49,31 @@ def parts_of(prompt: str, before: str | None) -> list[Part]:
 def _blocks(prompt: str) -> list[tuple[str, str]]:
     """Name and text of each block; what belongs to none that is known here has no name."""
     found: list[tuple[str, str]] = []
-    paragraphs_to_come = 0
     paragraphs = prompt.rstrip("\n").split("\n\n")
-    for place, paragraph in enumerate(paragraphs):
-        begun = _begun(paragraphs[place:])
-        if begun is not None:
-            name, paragraphs_to_come = begun
-            found.append((name, paragraph))
-        elif found and (paragraphs_to_come > 0 or not found[-1][0]):
-            paragraphs_to_come -= 1
-            found[-1] = (found[-1][0], f"{found[-1][1]}\n\n{paragraph}")
-        else:
-            found.append(("", paragraph))
+    while paragraphs:
+        _, name, length = max(_beginning(paragraphs), default=(0, "", 1))
+        text = "\n\n".join(paragraphs[:length])
+        if found and name == found[-1][0] == "":
+            text = f"{found.pop()[1]}\n\n{text}"
+        found.append((name, text))
+        del paragraphs[:length]
     return found
 
 
-def _begun(paragraphs: Sequence[str]) -> tuple[str, int] | None:
-    """The block whose first paragraph begins like this one, and how many of its own follow.
-
-    One block may begin with another one's words: the one that agrees farthest, and in the most of
-    its paragraphs, is meant.
-    """
-    agreeing = []
+def _beginning(paragraphs: Sequence[str]) -> Iterator[tuple[int, str, int]]:
+    """The blocks whose paragraphs begin like these: characters that agree, name, paragraphs."""
     for name, block in BLOCKS.items():
         for template in filter(None, (block.merge, block.straight)):
-            # A paragraph is known by its text up to its first value.
-            begun = [part.partition("{")[0] for part in template.split("\n\n")]
-            if begun[0] and paragraphs[0].startswith(begun[0]):
-                pairs = zip(begun, paragraphs, strict=False)
-                agree = sum(paragraph.startswith(beginning) for beginning, paragraph in pairs)
-                agreeing.append((len(begun[0]), agree, name, len(begun) - 1))
-    return max(agreeing)[2:] if agreeing else None
+            begun = _begun(template)
+            pairs = zip(paragraphs, begun, strict=False)
+            if begun[0] and all(text.startswith(beginning) for text, beginning in pairs):
+                yield sum(map(len, begun)), name, len(begun)
+
+
+@cache
+def _begun(template: str) -> list[str]:
+    """The text of each paragraph up to its first value, by which it is known."""
+    return [paragraph.partition("{")[0] for paragraph in template.split("\n\n")]
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:

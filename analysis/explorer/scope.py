@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
@@ -10,29 +11,26 @@ from starlette.datastructures import QueryParams
 from merge_runner.prompts.blocks import title_of
 from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.conditions import ordered
-from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.explorer.site import SCOPE, NotThere, Site
 from merge_runner_analysis.names import BASELINE
 
 # The number of trials of each run, driver, prompt and condition; each once for its prompt.
 OFFERED = """
 SELECT DISTINCT model, variant, condition FROM listed WHERE who <> 'humans' ORDER BY ALL
 """
+# What the analysis adds to the names of drivers that have several tasks, prompts or stand-ins.
+MARKS = re.compile(r"( \[([0-9a-f]{8}|scripted)\])+$")
 SWEEPS = "SELECT sweep_id, name, started_at FROM sweeps ORDER BY started_at DESC"
 
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """A part of the trials; what is empty leaves nothing out, and there is always one prompt."""
+    """A part of the trials; what is empty leaves nothing out."""
 
     sweep: str = ""
     drivers: tuple[str, ...] = ()
     prompt: str = BASELINE
     condition: str = ""
-
-    @property
-    def state(self) -> dict[str, str]:
-        """Sweep and condition as an address has them."""
-        return {"sweep": self.sweep, "condition": self.condition}
 
     def filter(self, driver: str = "", prompt: str = "", outcome: str = "") -> Filter:
         """Its trials of a driver and a prompt, or of all."""
@@ -44,26 +42,40 @@ class Scope:
             outcome=outcome,
         )
 
+    def where(self) -> tuple[str, list[object]]:
+        """The trials of all its drivers as SQL over the list, with its values."""
+        where, values = self.filter(prompt=self.prompt).where()
+        if not self.drivers:
+            return where, values
+        return f"{where} AND model IN (SELECT unnest(?::VARCHAR[]))", [*values, list(self.drivers)]
+
     def trials(self, driver: str, prompt: str) -> dict[str, str]:
         """A driver's trials with a prompt, as the list of trials filters them."""
-        return {"model": unmarked(driver), "variant": prompt, **self.state}
+        chosen = {"sweep": self.sweep, "condition": self.condition}
+        return {"model": unmarked(driver), "variant": prompt, **chosen}
 
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """The form that sets a scope: (value, text) of each choice."""
+    """The form that sets a scope: (value, text) of each choice.
+
+    ``any_prompt``: trials of all prompts may be seen together.
+    """
 
     scope: Scope
+    any_prompt: bool
     sweeps: list[tuple[str, str]]
     drivers: list[str]
     prompts: list[tuple[str, str]]
     conditions: list[tuple[str, str]]
 
 
-def scope_of(site: Site, asked: Mapping[str, str], driver: str = "") -> Bar:
+def scope_of(
+    site: Site, asked: Mapping[str, str], driver: str = "", *, any_prompt: bool = False
+) -> Bar:
     """The scope that an address names, with what may be chosen; raises NotThere.
 
-    ``driver``: of this one alone.
+    ``driver``: of this one alone. Unless it may be of ``any_prompt``, it has one.
     """
     rows = site.catalogue.ask(OFFERED)
     drivers = list(dict.fromkeys(row["model"] for row in rows))
@@ -75,14 +87,16 @@ def scope_of(site: Site, asked: Mapping[str, str], driver: str = "") -> Bar:
         for row in site.catalogue.ask(SWEEPS)
     }
     usual = BASELINE if BASELINE in prompts else next(iter(prompts), BASELINE)
+    usual = "" if any_prompt else usual
     scope = Scope(
         _known("sweep", asked.get("sweep", ""), sweeps),
-        tuple(_known("driver", name, drivers) for name in _every(asked, "driver")),
-        _known("prompt", asked.get("prompt", "") or usual, [*prompts, usual]),
+        tuple(_known("driver", name, drivers) for name in every(asked, "model")),
+        _known("prompt", asked.get("variant", "") or usual, [*prompts, usual]),
         _known("condition", asked.get("condition", ""), conditions),
     )
     return Bar(
         scope,
+        any_prompt,
         list(sweeps.items()),
         drivers,
         [(name, title_of(name)) for name in prompts],
@@ -90,12 +104,20 @@ def scope_of(site: Site, asked: Mapping[str, str], driver: str = "") -> Bar:
     )
 
 
+def carried(asked: Mapping[str, str]) -> dict[str, list[str]]:
+    """The scope in an address, as the addresses of other pages take it on."""
+    return {name: values for name in SCOPE if (values := every(asked, name))}
+
+
 def unmarked(driver: str) -> str:
-    """The name by which the list of trials knows a driver, without a mark of its settings."""
-    return driver.partition(" [")[0]
+    """The name by which the list of trials knows a driver, without the marks of a group.
+
+    The levels of a study's factors, which stand in brackets too, are part of both names.
+    """
+    return MARKS.sub("", driver)
 
 
-def _every(asked: Mapping[str, str], name: str) -> list[str]:
+def every(asked: Mapping[str, str], name: str) -> list[str]:
     """All values of one name in an address."""
     several = asked.getlist(name) if isinstance(asked, QueryParams) else [asked.get(name, "")]
     return [value for value in several if value]

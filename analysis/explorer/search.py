@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,10 +13,13 @@ import duckdb
 from merge_runner_analysis.explorer.catalogue import SEVERAL, Catalogue, Filter
 from merge_runner_analysis.explorer.database_copy import Copies
 from merge_runner_analysis.explorer.reading import Row, records
-from merge_runner_analysis.explorer.snippets import Snippet, snippet
 
 PAGE = 50
 LONGEST = 65_536  # characters of a text that are searched
+MOST_TERMS, LONGEST_QUERY = 12, 300
+TERM = re.compile(r'"([^"]*)"?|([^\s"]+)')
+AROUND = 70  # characters on each side of a match
+MOST_MATCHES = 20  # that are shown of a text
 # Within this part of the greatest acceleration a driver holds its speed, beyond it goes or brakes.
 HOLDS = 0.08
 # What is searched: a column of a table, and which of the table's rows is that of a decision.
@@ -24,7 +28,13 @@ KINDS = {
     "replies": ("calls", "reply", "arg_max(rowid, attempt) FILTER (reply IS NOT NULL)"),
 }
 OWN_FACETS = ("tactical", "planned", "driven", "switch", "failure")
-TRIAL_FACETS = ("model", "variant", "condition", "outcome", "account", "tag")
+# In figures: the least or the most of a mean, as a part of the greatest acceleration.
+LIMITS = {
+    f"{name}_{end}": f"{column} {'>=' if end == 'from' else '<='} ?"
+    for name, column in (("planned", "plan_mean"), ("driven", "drive_mean"))
+    for end in ("from", "to")
+}
+TRIAL_FACETS = ("sweep", "model", "variant", "condition", "outcome", "account", "tag")
 ACTION = (
     f"CASE WHEN list_avg({{0}}) < -{HOLDS} THEN 'brake' WHEN list_avg({{0}}) > {HOLDS} THEN 'go' "
     "WHEN list_avg({0}) IS NOT NULL THEN 'hold' END"
@@ -39,16 +49,18 @@ WITH decided AS (
     SELECT trial_id, spec_hash, side, decision, time_s, coalesce(tactical, 'none') AS tactical,
         CASE WHEN tactical <> lag(tactical IGNORE NULLS) OVER said
             THEN lag(tactical IGNORE NULLS) OVER said || ' to ' || tactical END AS switch,
-        failure, {ACTION.format("plan")} AS planned, {ACTION.format("applied")} AS driven
+        failure, {ACTION.format("plan")} AS planned, {ACTION.format("applied")} AS driven,
+        list_avg(plan) AS plan_mean, list_avg(applied) AS drive_mean
     FROM copied.decisions WHERE call_key IS NOT NULL
     WINDOW said AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
 ), places AS (
     SELECT trial_id, spec_hash, side, decision, {{place}} AS place
     FROM copied.{{table}} GROUP BY ALL
 )
-SELECT number, side, decision, time_s, {", ".join(OWN_FACETS)}, place
+SELECT number, side, decision, time_s, {", ".join(OWN_FACETS)}, plan_mean, place
 FROM decided JOIN listed USING (trial_id, spec_hash)
     LEFT JOIN places USING (trial_id, spec_hash, side, decision)
+WHERE {{limits}}
 """  # noqa: S608 # constants
 
 
@@ -61,6 +73,8 @@ class Wanted:
     trials: Filter
     own: Mapping[str, str]
     """By the names of ``OWN_FACETS``."""
+    limits: Mapping[str, float] = field(default_factory=dict)
+    """By the names of ``LIMITS``."""
 
     def where(self, leave_out: str = "") -> tuple[str, list[Any]]:
         """The filter but for the words as SQL with its values; without one facet."""
@@ -73,22 +87,18 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True)
-class Hit:
-    """A decision with its trial, and what of its words was looked for; None: it said nothing."""
-
-    row: Row
-    snippet: Snippet | None
-
-
-@dataclass(frozen=True, slots=True)
 class Found:
-    """A page of hits, and how many there are in how many trials."""
+    """A page of decisions, with the ``pieces`` of their words, and how many there are.
 
-    hits: list[Hit]
+    ``crossed`` counts them by what was said, M or Y, and by what was planned.
+    """
+
+    hits: list[Row]
     decisions: int
     trials: int
     page: int
     facets: dict[str, list[tuple[str, int]]]
+    crossed: dict[str, dict[str, int]]
 
     @property
     def last_page(self) -> int:
@@ -117,49 +127,49 @@ class Words:
 
 def _searched(connection: duckdb.DuckDBPyConnection, wanted: Wanted, page: int) -> Found:
     table, column, place = KINDS[wanted.kind]
-    folded = FOLDED.format(column=column)
-    hits, values = HITS.format(table=table, place=place), list[Any]()
+    limits = " AND ".join(["true", *map(LIMITS.__getitem__, wanted.limits)])
+    hits = HITS.format(table=table, place=place, limits=limits)
+    values: list[Any] = [*wanted.limits.values()]
     if wanted.terms:
-        holds = " AND ".join([f"contains({folded}, lower(?))"] * len(wanted.terms))
-        hits += f"WHERE place IN (SELECT rowid FROM copied.{table} WHERE {holds})"  # noqa: S608 # constants
+        holds = " AND ".join(
+            [f"contains({FOLDED.format(column=column)}, lower(?))"] * len(wanted.terms)
+        )
+        hits += f"AND place IN (SELECT rowid FROM copied.{table} WHERE {holds})"  # noqa: S608 # constants
         values += wanted.terms
     connection.execute(hits, values)
-    connection.execute(
-        "CREATE TEMP TABLE counted AS "  # noqa: S608 # constants
-        f"SELECT number, {', '.join(OWN_FACETS)}, count(*) AS times "
-        "FROM hits GROUP BY ALL"
-    )
     where, values = wanted.where()
+    chosen = f"FROM hits JOIN listed USING (number) WHERE {where}"
     (totals,) = records(
         connection,
-        "SELECT coalesce(sum(times), 0)::BIGINT AS decisions, count(DISTINCT number) AS trials "  # noqa: S608 # constants
-        f"FROM counted JOIN listed USING (number) WHERE {where}",
+        f"SELECT count(*) AS decisions, count(DISTINCT number) AS trials {chosen}",
         values,
     )
+    crossed: dict[str, dict[str, int]] = {}
+    for letter, plan, times in connection.execute(
+        f"SELECT tactical, planned, count(*) {chosen} AND tactical <> 'none' "
+        "AND planned IS NOT NULL GROUP BY ALL",
+        values,
+    ).fetchall():
+        crossed.setdefault(letter, {})[plan] = times
     number = min(page, max(1, -(-totals["decisions"] // PAGE)))
     rows = records(
         connection,
-        "SELECT trial_id, spec_hash, model, variant, condition, outcome, hits.* "  # noqa: S608 # constants
-        f"FROM hits JOIN listed USING (number) WHERE {where} "
+        f"SELECT trial_id, spec_hash, outcome, hits.* {chosen} "
         f"ORDER BY trial_id, spec_hash, hits.decision, hits.side LIMIT {PAGE} OFFSET ?",
         [*values, PAGE * (number - 1)],
     )
     texts = connection.execute(
-        f"SELECT rowid, left({column}, {LONGEST}), {folded} FROM copied.{table} "  # noqa: S608 # constants
+        f"SELECT rowid, left({column}, {LONGEST}) FROM copied.{table} "  # noqa: S608 # constants
         f"WHERE {column} IS NOT NULL AND rowid IN (SELECT unnest(?::BIGINT[]))",
         [[row["place"] for row in rows]],
     ).fetchall()
-    said = {place: (text, folded) for place, text, folded in texts}
-    lowered = connection.execute("SELECT lower(unnest(?::VARCHAR[]))", [wanted.terms]).fetchall()
-    terms = [term for (term,) in lowered]
+    pieces = {place: pieces_of(text, wanted.terms) for place, text in texts}
     return Found(
-        [
-            Hit(row, snippet(*said[row["place"]], terms) if row["place"] in said else None)
-            for row in rows
-        ],
+        [{**row, "pieces": pieces.get(row["place"])} for row in rows],
         **totals,
         page=number,
         facets=_facets(connection, wanted),
+        crossed=crossed,
     )
 
 
@@ -172,8 +182,44 @@ def _facets(
         where, values = wanted.where(leave_out=name)
         table = f"listed JOIN {SEVERAL[name]} USING (number)" if name in SEVERAL else "listed"
         found[name] = connection.execute(
-            f"SELECT {name}, sum(times)::BIGINT FROM counted JOIN {table} USING (number) "  # noqa: S608 # constants
+            f"SELECT {name}, count(*) FROM hits JOIN {table} USING (number) "  # noqa: S608 # constants
             f"WHERE {where} AND {name} IS NOT NULL GROUP BY ALL ORDER BY ALL",
             values,
         ).fetchall()
     return found
+
+
+def terms_of(query: str) -> tuple[str, ...]:
+    """The words of a query, and its phrases in quotes.
+
+    >>> terms_of('yield "collision course')
+    ('yield', 'collision course')
+    """
+    words = (
+        " ".join((quoted or word).split()) for quoted, word in TERM.findall(query[:LONGEST_QUERY])
+    )
+    return tuple(dict.fromkeys(filter(None, words)))[:MOST_TERMS]
+
+
+def pieces_of(text: str, terms: Sequence[str]) -> list[tuple[str, bool]]:
+    """A text cut into what stands around the terms and, True, the terms; far from them is left out.
+
+    Without one it is the beginning.
+    """
+    longest_first = sorted(terms, key=len, reverse=True)
+    looked_for = "|".join(re.escape(term).replace(r"\ ", r"\s") for term in longest_first)
+    cut = re.split(f"({looked_for})", text, flags=re.IGNORECASE) if terms else [text]
+    if len(cut) == 1:
+        return [(_around(text, 3 * AROUND, 0), False)]
+    last = min(len(cut) - 1, 2 * MOST_MATCHES)
+    return [
+        (part if i % 2 else _around(part, AROUND * (i > 0), AROUND * (i < last)), bool(i % 2))
+        for i, part in enumerate(cut[: last + 1])
+    ]
+
+
+def _around(text: str, first: int, last: int) -> str:
+    """The first and the last characters of a text, in whole words."""
+    if len(text) <= first + last:
+        return text
+    return f"{text[:first].rpartition(' ')[0]} … {text[len(text) - last :].partition(' ')[2]}"

@@ -13,19 +13,21 @@ import jinja2
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
-from merge_runner_analysis.explorer.analysis_process import Computing
 from merge_runner_analysis.explorer.assets import STYLES
 from merge_runner_analysis.explorer.catalogue import Catalogue
+from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.conditions import condition_texts
 from merge_runner_analysis.explorer.database_copy import Copies
-from merge_runner_analysis.explorer.display_text import visible
+from merge_runner_analysis.explorer.display_text import MINUS, shown_number, visible, with_minus
 from merge_runner_analysis.explorer.glossary import sections
 from merge_runner_analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
 from merge_runner_analysis.explorer.queries import Queries
+from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.explorer.search import Words
 from merge_runner_analysis.explorer.urls import HOME, Links
 from merge_runner_analysis.explorer.views import clock, condition_text
 from merge_runner_analysis.metrics import METRICS
+from merge_runner_analysis.verdict_words import TABLE
 
 TEMPLATES = Path(__file__).with_name("templates")
 PAGES = {
@@ -37,6 +39,8 @@ PAGES = {
     "Runs": "sweeps",
     "SQL": "sql",
 }
+# The parts of a scope in an address; the list of trials filters by the same names.
+SCOPE = ("sweep", "model", "variant", "condition")
 # What hangs under these, each with one list of all.
 LISTS = {"Tables and figures": "tables", "Notes": "notes"}
 
@@ -67,6 +71,8 @@ class Site:
     """What to type to run this program."""
     reader: str = "reader"
     """Who writes notes."""
+    is_still: bool = False
+    """Whether no news is taken in."""
 
     def __post_init__(self) -> None:
         self._first_reading: threading.Thread | None = None
@@ -85,8 +91,13 @@ class Site:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        # Jinja's own makes markup of its pattern, and escapes number by number.
-        self._environment.filters["format"] = lambda text, *values: str(text) % values
+        # Jinja's own format makes markup of its pattern, and escapes number by number.
+        self._environment.filters.update(
+            format=lambda text, *values: (str(text) % values).replace("-", MINUS),
+            num=shown_number,
+            whole="{:,}".format,
+            minus=lambda text: with_minus(str(text)),
+        )
         self._environment.globals.update(
             at=self.at,
             metrics=METRICS,
@@ -100,6 +111,8 @@ class Site:
             styles=STYLES,
             study=str(self.db),
             visible=visible,
+            carried={},
+            scope_names=SCOPE,
             clock=clock,
             condition_text=condition_text,
             in_words=self.in_words,
@@ -107,8 +120,8 @@ class Site:
         )
 
     def begin(self) -> None:
-        """Read the trials for the first time in the background, since it may take a while."""
-        self.computing.begin()
+        """Read the trials and make the first page's table, before anything is asked."""
+        self.computing.ask(("table", TABLE, "", ""), stamp_of(self.db))
         self._first_reading = threading.Thread(target=self._read_first, daemon=True)
         self._first_reading.start()
 
@@ -119,6 +132,8 @@ class Site:
 
     def refresh(self) -> None:
         """Take in what is new: in the database, and in the notes beside it."""
+        if self.is_still:
+            return
         if self.catalogue.refresh():
             self._conditions = {}
         self.catalogue.tag(self.notes.kept().tags)

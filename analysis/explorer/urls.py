@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
+from functools import partialmethod
 from typing import Any
 from urllib.parse import quote, urlencode
-
-# Without exponents and names: float() also reads "1e999" and "nan".
-_SECONDS = re.compile(r"[0-9]{1,12}(\.[0-9]{1,6})?")
-
 
 # The page to begin at.
 HOME = "index"
@@ -22,35 +18,33 @@ class Links:
         """A page of its own: ``trials``, ``sql``."""
         return f"/{'' if name == HOME else name}" + query_of(state)
 
-    def trial(self, row: Mapping[str, Any], **state: object) -> str:
-        """A trial's page; ``row`` has its name and its spec."""
-        return f"/trials/{quote(row['trial_id'])}" + query_of({"spec": row["spec_hash"], **state})
+    def _named(self, kind: str, name: str, /, **state: object) -> str:
+        return f"/{kind}/{quote(name)}" + query_of(state)
 
-    def decision(self, row: Mapping[str, Any], side: str, number: int) -> str:
-        """What a decision's panel shows."""
-        state = {"spec": row["spec_hash"], "side": side, "decision": number}
-        return f"/decisions/{quote(row['trial_id'])}" + query_of(state)
+    # What has a name. A table and a figure with a suffix is the file.
+    table = partialmethod(_named, "tables")
+    figure = partialmethod(_named, "figures")
+    sweep = partialmethod(_named, "sweeps")
+    driver = partialmethod(_named, "drivers")
+    static = partialmethod(_named, "static")
 
-    def others(self, row: Mapping[str, Any]) -> str:
-        """Where a trial's page asks for others to lay beside it."""
-        return f"/others/{quote(row['trial_id'])}" + query_of({"spec": row["spec_hash"]})
+    def _of_trial(self, kind: str, row: Mapping[str, Any], /, **state: object) -> str:
+        return self._named(kind, row["trial_id"], spec=row["spec_hash"], **state)
 
-    def raw(self, row: Mapping[str, Any], side: str, number: int) -> str:
-        """A reply as a plain text."""
-        state = {"spec": row["spec_hash"], "side": side, "decision": number}
-        return f"/raw/{quote(row['trial_id'])}" + query_of(state)
+    # A trial's page, and where it asks for others to lay beside it; ``row`` has its name and spec.
+    trial = partialmethod(_of_trial, "trials")
+    others = partialmethod(_of_trial, "others")
 
-    def table(self, name: str, **state: object) -> str:
-        """A table of the analysis."""
-        return f"/tables/{quote(name)}" + query_of(state)
+    def _of_decision(self, kind: str, row: Mapping[str, Any], side: str, number: int, /) -> str:
+        return self._of_trial(kind, row, side=side, decision=number)
 
-    def table_file(self, name: str, suffix: str) -> str:
-        """A table as a file to download."""
-        return f"/tables/{quote(name)}.{suffix}"
+    # What a decision's panel shows, and its reply as a plain text.
+    decision = partialmethod(_of_decision, "decisions")
+    raw = partialmethod(_of_decision, "raw")
 
-    def figure(self, name: str, suffix: str = "") -> str:
-        """A figure's page, or the figure as a file."""
-        return f"/figures/{quote(name)}{suffix}"
+    def condition(self, name: str) -> str:
+        """The trials of a condition."""
+        return self.to("trials", condition=name)
 
     def cell(self, table: str, row: str, column: str) -> str:
         """The trials behind a cell.
@@ -59,34 +53,13 @@ class Links:
         """
         return self.to("trials", cell=f"{table}/{row}:{column}")
 
-    def sweep(self, sweep_id: str) -> str:
-        """A sweep's page."""
-        return f"/sweeps/{quote(sweep_id)}"
-
-    def condition(self, name: str, **state: object) -> str:
-        """All trials of a condition in one picture."""
-        return f"/conditions/{quote(name)}" + query_of(state)
-
-    def driver(self, name: str, **state: object) -> str:
-        """A driver's page."""
-        return f"/drivers/{quote(name)}" + query_of(state)
-
-    def static(self, name: str) -> str:
-        """A script or a style."""
-        return f"/static/{name}"
-
 
 def query_of(state: Mapping[str, Any]) -> str:
     """The part of an address after the path; what is empty is left out."""
     given = {name: value for name, value in state.items() if value is not None and value != ""}
-    return f"?{urlencode(given)}" if given else ""
+    return f"?{urlencode(given, doseq=True)}" if given else ""
 
 
 def whole(text: str) -> int | None:
     """A number of up to 7 digits; None for anything else."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 8 else None
-
-
-def seconds(text: str) -> float:
-    """A time in s since 1970; 0 for anything else."""
-    return float(text) if _SECONDS.fullmatch(text) else 0.0

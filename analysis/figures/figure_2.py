@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from merge_runner.prompts.blocks import title_of
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.reference_data import HUMAN_TRIALS, published
-from merge_runner_analysis.data.study import Group, Study, of_group
+from merge_runner_analysis.data.study import Group, Study, of_trials
 from merge_runner_analysis.figures.drawing import (
     PAGE_IN,
     Point,
@@ -39,6 +39,14 @@ LABEL_IN, ROW_IN = 1.15, 0.62
 FEW_ROWS_IN, HIGHEST_ROW_IN = 4.4, 1.1
 LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = LABEL_IN + 0.35, 0.08, 0.4, 0.62
 BETWEEN_ROWS_IN, BETWEEN_COLUMNS_IN = 0.16, 0.3
+# One row a finished trial: the ego's speeds.
+EGO_SPEEDS = """
+SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s,
+    list(velocity_mps ORDER BY step) AS velocity_mps
+FROM states JOIN trial_drivers USING (trial_id, spec_hash)
+SEMI JOIN (FROM trials WHERE status = 'finished') USING (trial_id, spec_hash)
+WHERE time_s >= 0 AND side = ego GROUP BY ALL ORDER BY ALL
+"""
 HUMAN_VELOCITIES_MPS = sorted({c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()})
 Styles = dict[float, Style]  # of relative velocities in m/s
 HEADINGS = (
@@ -131,7 +139,7 @@ def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Arra
         return {}
     found: dict[float, list[Array]] = {}
     for velocity, trials in group.finished.groupby("relative_velocity_mps"):
-        rows = of_group(study.ego_speeds, group, trials[trials["merged_first"] == first])
+        rows = of_trials(study.read(EGO_SPEEDS), trials[trials["merged_first"] == first])
         times, speeds = rows["time_s"], rows["velocity_mps"]
         found[float(velocity)] = [
             np.column_stack(trace) for trace in zip(times, speeds, strict=True)

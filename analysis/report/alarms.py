@@ -72,9 +72,9 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
 
 def _of_answers(study: Study, origin: Provenance) -> Iterator[Alarm]:
     """First, since no number is what it claims to be if another model drove."""
-    for one in origin.mismatches:
+    for one in origin.mismatches.itertuples():
         answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
-        sweeps = f"sweep{'s' * (len(one.sweeps) != 1)} {', '.join(one.sweeps) or 'unknown'}"
+        sweeps = f"sweep{'s' * (', ' in one.sweeps)} {one.sweeps}"
         yield Alarm(
             "Another model answered",
             f"{one.requested} was asked for, {one.served} answered: {answers}, {sweeps}. "

@@ -66,9 +66,7 @@ TABLES = {
     "factors": Listed(
         "differences", "Each factor's levels: every metric, and the difference from the reference"
     ),
-    "velocity-profiles": Listed(
-        "indicators", "Piecewise-linear velocity profiles (I5) and plan revisions"
-    ),
+    "velocity-profiles": Listed("indicators", "Piecewise-linear velocity profiles (I5)"),
     "criticality": Listed(
         "measures", "When conflicts are resolved, and how close the vehicles come"
     ),

@@ -9,24 +9,18 @@ from math import isinf
 
 from merge_runner.registry import require
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.data.study import Group, Study, in_one_study, levels_of
-from merge_runner_analysis.metrics import METRICS, RULES_NOTE, Metric, compared, intervals_of
-from merge_runner_analysis.stats.contrasts import (
-    contrast_cells,
-    contrast_means,
-    corrected,
-    shared_cells,
-)
+from merge_runner_analysis.data.study import Group, Study, levels_of
+from merge_runner_analysis.metrics import METRICS, RULES_NOTE, Metric, intervals_of, shown_in
+from merge_runner_analysis.stats.contrasts import contrast, corrected
 from merge_runner_analysis.stats.factors import (
     Level,
     balance,
     difference,
     difference_of_medians,
-    interaction,
     levels_by_factor,
 )
 from merge_runner_analysis.stats.intervals import Difference
-from merge_runner_analysis.stats.measures import estimate, trials_of, undecided, undecided_note
+from merge_runner_analysis.stats.measures import estimate, trials_of, undecided_note
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 
 DIFFERENCES = (
@@ -53,7 +47,8 @@ def contrasts(study: Study) -> Table:
     rows = [
         row
         for driver in dict.fromkeys(group.driver for group in study.models)
-        for metric in compared()
+        for metric in shown_in("tables")
+        if metric.estimator != "median"
         for row in _family(study, driver, metric)
     ]
     judged = "judged " if study.unjudged else ""
@@ -68,7 +63,6 @@ def contrasts(study: Study) -> Table:
             interval("ci", "Newcombe; least squares"),
             Column("p", "p", "p", 3, "Fisher's exact test or t test"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
-            Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
             Optional("detectable", "detectable", "number", 2, "at p < .05 with power .8"),
             Column("n", "n", "count", 0, "trials of the setting in the shared conditions"),
             Column("n_reference", "n ref.", "count", 0, "trials of the reference in these"),
@@ -95,35 +89,20 @@ def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
     groups = {group.setting: group for group in study.models if group.driver == driver}
     other = groups.pop(study.reference, None)
     found = [
-        (group, other, contrast)
+        (group, other, difference)
         for group in groups.values()
-        if other and in_one_study(study, group, other)
-        if (contrast := _contrast(group, other, metric))
+        if other and (difference := contrast(study, (group, other), metric))
     ]
-    if found:
-        families = zip(*corrected([contrast.p for *_, contrast in found]), strict=True)
-        for pair, (holm, bh) in zip(found, families, strict=True):
-            yield _prompt_row(*pair, metric, {"p_holm": float(holm), "p_bh": float(bh)})
+    for pair, p in zip(found, corrected([difference.p for *_, difference in found]), strict=True):
+        yield _prompt_row(*pair, metric, p)
 
 
-def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
-    """The difference between two prompts; None if they share no condition or are undecided."""
-    if undecided(group, metric) or undecided(other, metric):
-        return None
-    if not metric.rate:
-        return contrast_means(group.trials, other.trials, metric.column)
-    both = shared_cells(group.trials, other.trials, metric.column)
-    return contrast_cells(both) if both else None
-
-
-def _prompt_row(
-    group: Group, other: Group, contrast: Difference, metric: Metric, p: dict[str, Value]
-) -> Row:
+def _prompt_row(group: Group, other: Group, found: Difference, metric: Metric, holm: float) -> Row:
     first, second = (
         trials_of(one, metric).dropna(subset=[metric.column])["condition"] for one in (group, other)
     )
     named = ", ".join(quoted(name) for name in sorted({*first} & {*second}))
-    factor, least = 100 if metric.rate else 1, contrast.detectable
+    factor, least = 100 if metric.rate else 1, found.detectable
     return Row(
         f"{group.id}/{other.setting}/{metric.name}",
         (group.id, other.id),
@@ -132,14 +111,14 @@ def _prompt_row(
             "setting": group.setting,
             "reference": other.setting,
             "measure": metric.heading,
-            "difference": factor * contrast.value,
-            "ci": contrast.bounds(factor),
-            "p": contrast.p,
-            **p,
+            "difference": factor * found.value,
+            "ci": found.bounds(factor),
+            "p": found.p,
+            "p_holm": holm,
             "detectable": None if least is None else factor * least,
             "n": int(first.isin(second).sum()),
             "n_reference": int(second.isin(first).sum()),
-            "freedom": None if isinf(contrast.freedom) else contrast.freedom,
+            "freedom": None if isinf(found.freedom) else found.freedom,
         },
         f"{metric.heading}: so few trials can show no difference, however large"
         if least is None
@@ -164,7 +143,7 @@ def factors(study: Study) -> Table:
     ]
     rows += _interactions(study, found) if by else []
     p = {row.id: value for row in rows if isinstance(value := row.values.get("p"), float)}
-    holm = dict(zip(p, corrected([*p.values()])[0].tolist(), strict=True)) if p else {}
+    holm = dict(zip(p, corrected([*p.values()]), strict=True))
     judged = "judged " if study.unjudged else ""
     return Table(
         "factors",
@@ -204,9 +183,9 @@ def _level_row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
     cells = _cells(level, metric) | {"n": found.n, "value": found.value, "ci": found.bounds()}
     if level is not first:
         if metric.estimator == "median":
-            cells |= {"difference": difference_of_medians(study, level, first, metric)}
+            cells |= {"difference": difference_of_medians(study, metric, level, first)}
         else:
-            found_difference = difference(study, level, first, metric)
+            found_difference = difference(study, metric, level, first)
             cells |= _difference(found_difference, metric, of=(level, first))
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
     return Row(
@@ -269,7 +248,7 @@ def _interaction(
         "factor": f"{level.factor} × {by}",
         "n": estimate(level.pooled, metric).n,
     }
-    found = interaction(study, pair, others, metric)
+    found = difference(study, metric, *pair, *others)
     return Row(
         f"{level.id}/interaction/{metric.name}",
         level.groups,

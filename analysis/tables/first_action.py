@@ -11,7 +11,6 @@ from merge_runner_analysis.data.reference_data import citation, published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.stats.first_action import (
     HOLD_MPS2,
-    Clustered,
     exchange_rate,
     first_actions,
     human_exchange_rate,
@@ -19,6 +18,7 @@ from merge_runner_analysis.stats.first_action import (
     seats,
     slope,
 )
+from merge_runner_analysis.stats.intervals import Estimate
 from merge_runner_analysis.tables.model import (
     ENDED,
     GROUP_COLUMNS,
@@ -99,7 +99,7 @@ def _rows(study: Study, group: Group) -> Iterator[Row]:
         yield row_of(group, values, *remarks, item=seat.side, counts=ENDED)
 
 
-def _values(rows: pd.DataFrame, rate: Clustered | None) -> dict[str, Value]:
+def _values(rows: pd.DataFrame, rate: Estimate | None) -> dict[str, Value]:
     action, sign = rows["first_mps2"], np.sign(rows["velocity_mps"].round(6))
     means = action.groupby(sign).mean()
     fitted = slope(rows)
@@ -134,7 +134,7 @@ def _published_row(group: Group) -> Row:
     return row_of(group, values, f"published ({citation(FILE)})", counts="")
 
 
-def _estimate(name: str, estimate: Clustered | None) -> dict[str, Value]:
+def _estimate(name: str, estimate: Estimate | None) -> dict[str, Value]:
     return {name: estimate.value, f"{name}_ci": estimate.bounds()} if estimate else {}
 
 

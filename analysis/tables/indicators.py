@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from merge_runner_analysis.data.intermittency import RANDOM_SECONDS, STEADY_MPS, random_gain
 from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M
-from merge_runner_analysis.data.study import Group, Study, of_group
+from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.stats.group_scores import Score, score, total
 from merge_runner_analysis.stats.indicators import (
-    GAP_MARGIN_M,
     INDICATORS,
     TESTED,
-    Verdict,
     disagree,
 )
 from merge_runner_analysis.stats.intervals import Estimate
-from merge_runner_analysis.stats.likeness import NO_ACTION, difference, gains, held, mean_gain
+from merge_runner_analysis.stats.likeness import NO_ACTION, gains, held, less_humans, mean_gain
 from merge_runner_analysis.stats.measures import outcomes_note
+from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
 from merge_runner_analysis.tables.measures import measured
 from merge_runner_analysis.tables.model import (
     ENDED,
@@ -118,7 +117,7 @@ def _group_row(study: Study, group: Group) -> Row:
     values: dict[str, Value] = {"n": len(group.ended_outcomes)}
     for name in INDICATORS:
         values |= _verdicts(found, name, f"{name.lower()}_")
-    values |= {"score_paper": _total(found.paper), "score_robust": _total(found.robust)}
+    values |= {"score_paper": total(found.paper), "score_robust": total(found.robust)}
     # A ceiling is for one data set of one size; indicators of different trials have no common size.
     remarks = [_verdict_note(found, *INDICATORS), no_ceiling(group)]
     if of_both := outcomes_note(group):
@@ -153,8 +152,8 @@ def _total_row(study: Study, group: Group) -> Row:
     found, of_both = score(study, group), outcomes_note(group)
     values: dict[str, Value] = {
         "indicator": "Score",
-        "paper": _total(found.paper),
-        "robust": _total(found.robust),
+        "paper": total(found.paper),
+        "robust": total(found.robust),
         "n": len(group.finished),
     }
     if not of_both:  # no single ceiling fits a score whose indicators rest on different trials
@@ -186,16 +185,11 @@ def _verdicts(found: Score, name: str, prefix: str = "") -> dict[str, Value]:
 
 def _ceilings(found: Score, name: str) -> dict[str, Value]:
     """Which percentages of human data sets pass an indicator, or ``I1-I4`` together, by rule."""
-    by_rule = {"paper": found.ceiling.paper, "robust": found.ceiling.robust}
     return {
-        f"ceiling_{rule}": 100 * shares[name] for rule, shares in by_rule.items() if name in shares
+        f"ceiling_{rule}": 100 * shares[name]
+        for rule, shares in found.ceiling.items()
+        if name in shares
     }
-
-
-def _total(judged: dict[str, Verdict]) -> str | None:
-    """``3 of 4``, or None where no indicator can be judged."""
-    found = total(judged)
-    return str(found) if found.judged else None
 
 
 def _verdict_note(found: Score, *names: str) -> str:
@@ -219,7 +213,7 @@ def no_ceiling(group: Group) -> str:
 
 
 def velocity_profiles(study: Study) -> Table:
-    """A row per group: how far accelerations are held, compared with humans, and plan revisions."""
+    """A row per group: how far accelerations are held, compared with humans."""
     return Table(
         "velocity-profiles",
         (
@@ -232,9 +226,6 @@ def velocity_profiles(study: Study) -> Table:
             Optional("clocked_gain", "gain at 1 Hz", "number", 2, "one acceleration a second"),
             Optional("difference_sd", "- humans (SD)", "number", 2, "within conditions"),
             interval("difference_sd_ci", "Welch, by pair"),
-            Optional("revision", "revision", "number", 3, "mean |new plan - old plan|"),
-            Optional("revised_percent", "> 0.1 (%)", "percent", 1, "revisions above 0.1"),
-            Optional("coarse_percent", "coarse plans (%)", "percent", 1, "of one or two values"),
         ),
         [_profile_row(study, group) for group in study.groups],
         (
@@ -245,8 +236,7 @@ def velocity_profiles(study: Study) -> Table:
             f"drawn by chance each second have {random_gain():.2f}, on average over "
             f"{RANDOM_SECONDS} s: so much the clock alone can make",
             "the difference from the humans, in human SD, is no part of I5, and needs human traces "
-            "of every condition; a revision is over the instants of both plans, in units of full "
-            "throttle",
+            "of every condition",
         ),
     )
 
@@ -263,16 +253,6 @@ def _profile_row(study: Study, group: Group) -> Row:
         "clocked_gain": mean_gain(study, group, "clocked_gain").value,
         "held_percent": None if share.value is None else 100 * share.value,
     }
-    if found := difference(study, group):
+    if found := less_humans(study, group):
         values |= {"difference_sd": found.value, "difference_sd_ci": found.bounds()}
-    # Plans are revised in trials that collide, too: ``ended`` here, ``finished`` above.
-    plans = of_group(study.plans, group, group.ended)[
-        ["plans", "coarse_plans", "revised_plans", "total_revision", "large_revisions"]
-    ].sum()
-    if plans["plans"]:
-        # Sums are divided at the end: every plan weighs the same, not every trial.
-        values["coarse_percent"] = float(100 * plans["coarse_plans"] / plans["plans"])
-    if plans["revised_plans"]:
-        values["revision"] = float(plans["total_revision"] / plans["revised_plans"])
-        values["revised_percent"] = float(100 * plans["large_revisions"] / plans["revised_plans"])
     return row_of(group, values, "" if share.n else NO_ACTION)

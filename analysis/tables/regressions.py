@@ -9,9 +9,9 @@ from typing import NamedTuple
 from merge_runner_analysis.data.reference_data import citation, printed_value, published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.stats.group_scores import fits
-from merge_runner_analysis.stats.indicators import GAP_MARGIN_M, equivalence_p, furthest_apart
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import (
+    GAP_MARGIN_M,
     GAP_TERMS,
     WHO_FIRST_TERMS,
     Regression,
@@ -165,9 +165,8 @@ def _rows(group: Group, term: str, every: tuple[Fit, ...], counts: str) -> Itera
         # I4 claims that these effects are absent. A large p is no evidence of that, so equivalence
         # is tested (Schuirmann 1987); HC3 errors (MacKinnon and White 1985) hold for unequal
         # variances.
-        if robust and robust.apart and term == "abs_relative_velocity":
-            furthest = robust.apart[furthest_apart(robust)]
-            values["equivalence_p"] = equivalence_p(furthest.b, furthest.se, robust.freedom)
+        if robust and term == "abs_relative_velocity":
+            values["equivalence_p"] = robust.equivalence_p
             values["velocity_p"] = robust.velocity_p
         problems = dict.fromkeys((main.problem, robust.problem if robust else main.remark))
         pooled = "" if fit.label or counts == WITH_GAP else outcomes_note(group)

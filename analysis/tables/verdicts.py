@@ -12,7 +12,7 @@ from merge_runner_analysis.data.driver_words import language_models
 from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.names import HUMAN
-from merge_runner_analysis.stats.verdicts import Comparison, Estimate, compared, of_humans
+from merge_runner_analysis.stats.verdicts import Comparison, Known, compared, of_humans
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.verdict_words import (
     HUMANS,
@@ -98,8 +98,8 @@ def _row(group: Group, kind: str, found: Comparison) -> Row:
     values: dict[str, Value] = _named(group, kind) | {
         "measure": measure.name,
         **_values(found.own),
-        "human": found.human.value,
-        "human_ci": found.human.ci,
+        "human": found.human.estimate.value,
+        "human_ci": found.human.estimate.bounds(),
         "state": found.state or None,
         "rule": measure.rule,
     }
@@ -123,11 +123,11 @@ def _human_rows(study: Study) -> Iterator[Row]:
         yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, counts)
 
 
-def _values(found: Estimate) -> dict[str, Value]:
+def _values(found: Known) -> dict[str, Value]:
     return {
-        "n": found.n,
+        "n": found.estimate.n,
         "k": found.k,
         "undecided": found.undecided or None,
-        "estimate": found.value,
-        "ci": found.ci,
+        "estimate": found.estimate.value,
+        "ci": found.estimate.bounds(),
     }

@@ -8,7 +8,7 @@ from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.intermittency import measure_profiles
 from merge_runner_analysis.data.load import SPEEDS
-from merge_runner_analysis.data.study import Study, of_group
+from merge_runner_analysis.data.study import Study, of_trials
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures.gallery import MAKERS
 from merge_runner_analysis.human.archive import open_files
@@ -39,7 +39,7 @@ def imported(tmp_path_factory):
                 files[name] = drive(played, yields=yields).csv()
     db = write_study(folder / "t.duckdb", yielding("o3", reps=2))
     with open_files(write_folder(folder / "recordings", files)) as found:
-        import_trials(sort_files(found).trials, Store(db))
+        import_trials(sort_files(found), Store(db))
     return Study(db)
 
 
@@ -136,7 +136,7 @@ def test_humans_are_not_compared_with_themselves(imported):
 def test_the_speeds_of_humans_are_judged_without_the_simulators_resistance(imported):
     speeds = imported._read(SPEEDS).assign(resisted=True)
     for group in imported.groups:
-        resisted = measure_profiles(of_group(speeds, group, group.trials))
+        resisted = measure_profiles(of_trials(speeds, group.trials))
         assert len(resisted) == 2 * len(group.trials)
         assert resisted.equals(imported.profiles_of(group)) == (group is imported.human)
 

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import uvicorn
 
-from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.server import listen
+from merge_runner_analysis.explorer.app import explorer, listen
 from merge_runner_analysis.explorer.site import Site
 
 

@@ -6,14 +6,16 @@ import csv
 import io
 import json
 import re
+import shutil
 
 import duckdb
 import pytest
 from starlette.testclient import TestClient
 
 from merge_runner.results.store import Store
+from merge_runner_analysis.explorer import catalogue as catalogue_module
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.catalogue import Catalogue, Filter
 from merge_runner_analysis.explorer.site import Site
 from tests.analysis.accounts.crashes import CLOSING_IN, EXAMPLES, drive
 from tests.analysis.studies import as_humans, played, write_study
@@ -90,6 +92,41 @@ def test_what_is_stored_later_has_its_account_too(db, tmp_path):
     ]
 
 
+def test_what_was_measured_once_is_measured_again_only_where_rows_or_rules_differ(
+    db, tmp_path, monkeypatch
+):
+    path = shutil.copy(db, tmp_path / "t.duckdb")
+    stored, measured = path.read_bytes(), []
+    judge = catalogue_module.collision_class
+    monkeypatch.setattr(
+        catalogue_module, "collision_class", lambda *of: measured.append(of) or judge(*of)
+    )
+
+    def listed():
+        measured.clear()
+        catalogue = Catalogue(path)
+        catalogue.refresh()
+        return catalogue.every(Filter()), len(measured)
+
+    def without_numbers(rows):
+        return [{**row, "number": 0} for row in rows]
+
+    rows, collisions = listed()
+    assert collisions > 3
+    assert path.read_bytes() == stored
+    again, measured_again = listed()
+    assert (without_numbers(again), measured_again) == (without_numbers(rows), 0)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE decisions SET fallback = true WHERE trial_id LIKE 'o4/%'")
+    changed, measured_again = listed()
+    assert measured_again == 1
+    assert {row["validity"] for row in changed if row["model"] == "o4"} == {"fallbacks"}
+    monkeypatch.setattr(catalogue_module, "program", lambda: "other rules")
+    assert listed()[1] == collisions
+    catalogue_module.measured_beside(path).write_text("no Parquet")
+    assert listed()[1] == collisions
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -111,7 +148,7 @@ def test_a_collision_that_cannot_be_judged_is_listed_without_an_account(tmp_path
 def test_the_list_is_filtered_by_account_and_downloaded_with_it(client):
     text = client.get("/trials?account=near+miss&model=o3").text
     assert len(re.findall(r'<th scope="row">', text)) == 1
-    assert '<span class="quiet small">near miss</span>' in text
+    assert re.search(r"<(span|small)[^>]*>near miss</", text)
     assert '<option value="near miss" selected>near miss (1)</option>' in text
     rows = csv.DictReader(io.StringIO(client.get("/trials.csv?account=both+insisted").text))
     assert [row["account"] for row in rows] == ["both insisted"] * 2

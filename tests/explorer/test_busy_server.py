@@ -69,15 +69,3 @@ async def test_forty_five_refused_queries_take_less_of_the_server_than_25_lists_
         await asyncio.gather(*tasks, return_exceptions=True)
 
     assert await cost(refused()) < await cost(lists())
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, raises=AssertionError, reason="2.6: a form of more than ten fields is a fault, 500"
-)
-async def test_a_form_of_too_many_fields_is_refused(site):
-    client, _ = site
-    form = {f"field{number}": "x" for number in range(11)}
-    origin = str(client.base_url).rstrip("/")
-    reply = await client.post("/notes", data=form, headers={"origin": origin})
-    assert reply.status_code == 400

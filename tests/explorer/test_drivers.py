@@ -17,7 +17,7 @@ from merge_runner_analysis.explorer.pages.home import home_page
 from merge_runner_analysis.explorer.pages.trial import trial_page
 from merge_runner_analysis.explorer.pages.trials import filter_of, trials_page
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.explorer.sweeps import list_sweeps
+from merge_runner_analysis.explorer.sweeps import list_runs
 from tests.harness import FAST
 
 SMALL = ("--reps", 1, "--conditions", "L_4_0,N_0_0", "--yes", *FAST)
@@ -80,9 +80,10 @@ def test_a_link_to_trials_of_a_driver_finds_them(site, hosts):
 def test_a_sweep_is_named_by_its_driver_and_says_that_a_stand_in_answered(site, hosts):
     client = browser(site)
     names = [f"o3 at {hosts[1]}+constant", f"o3 at {hosts[1]}", f"o3 at {hosts[0]}"]
-    assert [entry.config.driver for entry in list_sweeps(site.catalogue)] == names
+    runs = [run for run, _ in list_runs(site.catalogue)]
+    assert [run.driver for run in runs] == names
     shown = client.get("/sweeps").text
-    for entry, name in zip(list_sweeps(site.catalogue), names, strict=True):
+    for entry, name in zip(runs, names, strict=True):
         assert f"{name} (scripted stand-in, not o3)" in shown
         page = client.get(f"/sweeps/{entry.sweep_id}").text
         assert f"{name} drives" in page

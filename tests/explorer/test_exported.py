@@ -78,18 +78,15 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     page.reload()
     expect(page.locator(".decision-panel h2")).to_contain_text("decision 1 at 1.0 s")
     expect(page.locator("#charts .uplot")).to_have_count(3)
-    page.locator(".plan-table summary").click()
-    expect(page.locator(".plan-table tbody tr").first).to_be_visible()
+    expect(page.locator(".plan-values dd").first).to_be_visible()
     page.keyboard.press("Escape")
     expect(page.locator("#decision .decision-panel h2")).to_have_count(2)
     page.keyboard.press("Escape")
     page.wait_for_url("**/files/trials-*outcome-collided*.html")
-    expect(page.locator("tr.chosen")).to_contain_text("rep03")
     page.get_by_role("link", name="Trials", exact=True).click()
     expect(page.locator("h1")).to_have_text("Trials")
-    page.wait_for_load_state()  # keys are heard once the scripts have run
-    page.keyboard.press("j")
-    page.keyboard.press("Enter")
+    page.wait_for_load_state()  # clicks are heard once the scripts have run
+    page.locator("[data-list] tbody a").first.click()
     expect(page.locator("#next-trial")).to_be_visible()
     first = page.locator("h1").inner_text()
     page.keyboard.press("j")
@@ -106,8 +103,8 @@ def test_what_an_export_refers_to_lies_in_it_and_asks_no_server(exported):
     names = {path.relative_to(exported).as_posix() for path in exported.rglob("*")}
     assert names > {
         *("index.html", "files/trials.html", "files/trials-emulator-baseline-N_0_0-rep01.html"),
-        *("files/conditions-N_0_0.html", "files/tables-attempts.csv", "files/tables-attempts.tex"),
-        *("files/figures-ablation-matrix.svg", "files/notes.csv", "files/sweeps.html"),
+        *("files/tables-attempts.csv", "files/tables-attempts.tex"),
+        *("files/figures-ablation-matrix.svg", "files/sweeps.html"),
     }
     assert {str(page): found for page in pages if (found := broken(page))} == {}
     assert len(pages) > 30
@@ -202,13 +199,14 @@ def test_a_page_of_few_trials_lists_them_and_lays_them_beside_each_other(page, s
     expect(page.locator("h1")).to_have_text("emulator/baseline/N_0_0/rep02")
     page.locator("a.decision").nth(1).click()
     expect(page.locator(".decision-panel .block").first).to_contain_text("You drive a car")
-    page.get_by_role("button", name="next repetition").click()
+    page.locator("#compare").fill("rep03")
+    page.locator("#others button").click()
     expect(page.locator("#ghost-key")).to_contain_text("dashed: emulator, baseline, N_0_0, rep 3")
     page.keyboard.press("Escape")
     expect(page.locator("#decision .decision-panel h2")).to_have_count(4)
     address = page.url
     page.locator("#compare").fill("human")
-    page.locator("#others button").click()
+    page.locator("#compare").press("Enter")
     expect(page.locator("#ghost-key")).to_contain_text("human P1")
     page.goto(address)
     expect(page.locator("h1")).to_have_text("emulator/baseline/N_0_0/rep02")
@@ -247,25 +245,16 @@ def test_names_that_fit_no_trial_are_told(study, tmp_path):
 
 
 @pytest.mark.long
-def test_charts_are_tables_too_as_soon_as_they_are_opened(page, study, tmp_path):
+def test_a_plan_stands_in_figures_beside_its_picture(page, study, tmp_path):
     file = export_page(study, tmp_path / "one.html", ["emulator/baseline/N_0_0/*"])
     with duckdb.connect(str(study), read_only=True) as connection:
-        (last, samples) = connection.execute(
-            "SELECT max(position_m) FILTER (side = 'left'), count(*) // 2 FROM states "
-            "WHERE trial_id = 'emulator/baseline/N_0_0/rep01'"
-        ).fetchone()
         (plan,) = connection.execute(
             "SELECT plan FROM decisions WHERE trial_id = 'emulator/baseline/N_0_0/rep01' "
             "AND side = 'left' AND decision = 0"
         ).fetchone()
+    hardest = ScenarioConfig().max_acceleration_mps2
     for address in (f"file://{file}", "/trials/emulator/baseline/N_0_0/rep01"):
         page.goto(address)
-        page.locator("#samples summary").click()
-        rows = page.locator("#samples tbody tr")
-        expect(rows).to_have_count(samples)
-        expect(rows.last.locator("td").nth(1)).to_have_text(f"{last:.2f}")
         page.locator("a.decision[data-side=left]").first.click()
-        page.locator(".plan-table summary").click()
-        expect(page.locator(".plan-table tbody tr")).to_have_count(len(plan))
-        value = page.locator(".plan-table tbody tr").first.locator("td").nth(1)
-        expect(value).to_have_text(f"{plan[0] * ScenarioConfig().max_acceleration_mps2:+.2f}")
+        said = page.locator(".plan-values dd").first.inner_text().split()
+        assert said == [f"{value * hardest:+.2f}".replace("-", "−") for value in plan]

@@ -35,8 +35,6 @@ def test_the_panel_shows_what_both_say_now(page):
     expect(headings(page)).to_have_text(["left decision 2 at 2.0 s", "right decision 2 at 2.0 s"])
     expect(page.locator("a.decision[aria-current]")).to_have_count(0)
     assert "decision=" not in page.url
-    page.locator("#whose").select_option("right")
-    expect(headings(page)).to_have_text(["right decision 2 at 2.0 s"])
 
 
 @pytest.mark.long
@@ -181,5 +179,5 @@ def test_a_trial_is_accessible_while_it_is_followed_and_compared(page, scheme):
     page.goto(f"{TRIAL}?t=2.5&compare=emulator/baseline/L_4_0/rep01")
     expect(page.locator("#decision .decision-panel")).to_have_count(4)
     page.locator("#compare").click()
-    expect(page.locator("#others button").first).to_be_visible()
+    expect(page.locator("#others option").first).to_be_attached()
     assert serious(page) == []

@@ -15,9 +15,9 @@ from starlette.testclient import TestClient
 from merge_runner.errors import UsageError
 from merge_runner.results.store import results_digest
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.explorer.analysis_process import Computing
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.assets import STATIC, STYLES
+from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.pages.home import home_page
 from merge_runner_analysis.explorer.site import NothingNew, Site
 from merge_runner_analysis.figures import FIGURES
@@ -102,7 +102,7 @@ def test_a_row_has_the_sentence_and_the_values_of_the_table(client, verdicts):
     assert sentence(verdicts["o3/baseline"]) in text
     assert sentence(verdicts["o3/A1"]) not in text
     assert "Not shown: 1 other prompt." in text
-    cells = re.findall(r'href="/drivers/o3\?prompt=baseline#([\w-]+)"\s+title="([^"]+)"', text)
+    cells = re.findall(r'href="/drivers/o3\?variant=baseline#([\w-]+)"\s+title="([^"]+)"', text)
     told = dict(cells)
     for name in ("velocity", "collisions", "gap"):  # so few trials have no slope on headway
         values = verdicts["o3/baseline"][name]
@@ -112,10 +112,10 @@ def test_a_row_has_the_sentence_and_the_values_of_the_table(client, verdicts):
 
 
 def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
-    text = unescape(client.get("/?prompt=A1").text)
+    text = unescape(client.get("/?variant=A1").text)
     assert '<option value="A1" selected>' in text
-    assert "/drivers/o3?prompt=A1" in text
-    assert "/drivers/o3?prompt=baseline" not in text
+    assert "/drivers/o3?variant=A1" in text
+    assert "/drivers/o3?variant=baseline" not in text
     one = unescape(client.get(f"/?condition={WORST}").text)
     (link,) = set(re.findall(r'href="(/trials\?[^"]*variant=baseline[^"]*)">3</a>', one)) - set(
         re.findall(r'href="(/trials\?[^"]*outcome[^"]*)"', one)
@@ -125,8 +125,28 @@ def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
     rows = by_group(part.rows)
     assert rows["o3/baseline"]["collisions"]["n"] == 3
     assert rows["human"]["collisions"]["n"] == 90
-    for wrong in ("prompt=A9", "condition=nowhere", "sweep=none", "driver=nobody"):
+    for wrong in ("variant=A9", "condition=nowhere", "sweep=none", "model=nobody"):
         assert client.get(f"/?{wrong}").status_code == 404, wrong
+
+
+def test_links_take_the_scope_to_every_page(client):
+    part = f"variant=baseline&condition={WORST}"
+    for page in ("/", "/drivers", "/trials", "/words", "/prompts", "/sweeps", "/sql"):
+        text = unescape(client.get(f"{page}?{part}").text)
+        assert re.search(f'<option value="{WORST}"[^>]* selected', text), page
+        for other in ("/drivers", "/trials", "/words", "/prompts", "/sweeps", "/sql"):
+            assert f'href="{other}?{part}"' in text, (page, other)
+    assert f"condition in ('{WORST}')" in unescape(client.get(f"/sql?{part}").text)
+    runs = client.get(f"/sweeps?{part}").text
+    assert listed(client.get(f"/trials?{part}&sweep=sweep-1").text) == 3
+    assert re.search(r"all runs together</th><td class=\"n\">3</td>", runs)
+
+
+def test_a_number_has_a_true_minus_sign_on_pages(client):
+    for page in ("/", "/drivers/o3?variant=baseline", "/tables/verdicts", "/tables/gap"):
+        shown = re.sub(r"<(script|svg).*?</\1>|<[^>]*>", " ", client.get(page).text, flags=re.S)
+        assert not re.search(r"(?<![\w-])-\d+\.\d", shown), page
+        assert re.search(r"−\d", shown), page
 
 
 def test_a_sweep_is_a_scope(db):
@@ -136,9 +156,9 @@ def test_a_sweep_is_a_scope(db):
 
 
 def test_a_drivers_page_has_its_verdicts_with_the_trials_behind_them(client, verdicts):
-    text = unescape(client.get("/drivers/o3?prompt=baseline").text)
+    text = unescape(client.get("/drivers/o3?variant=baseline").text)
     assert sentence(verdicts["o3/baseline"]) in text
-    table = text.split('class="verdicts"')[1].split("</table>")[0]
+    table = text.split('class="verdicts ')[1].split("</table>")[0]
     for measure in MEASURES.values():
         assert measure.trait in table
     (link, n) = re.findall(r'<a href="([^"]*cell=verdicts[^"]*)">(\d+)</a>', table)[0]
@@ -167,8 +187,8 @@ def test_a_driver_that_is_not_judged_has_no_verdict(tmp_path):
     site.computing = Awaited(db, InProcess)
     text = client_of(site).get("/").text
     assert "Not judged: 46 of the 92 decisions of bad are invalid (50.0 %, more than 20 %)." in text
-    assert "/drivers/bad?prompt=baseline#" not in text
-    assert "/drivers/o3?prompt=baseline#" in text
+    assert "/drivers/bad?variant=baseline#" not in text
+    assert "/drivers/o3?variant=baseline#" in text
     assert "Not judged" in client_of(site).get("/drivers/bad").text
     site.computing.close()
 

@@ -96,7 +96,7 @@ def test_a_sparkline_cuts_nothing_and_the_page_says_its_scale(client, db):
     standing = next(row for row in rows if row["model"] == HIDDEN)
     assert sparkline(standing, (low, high))["left"].endswith(",22.0")
     text = client.get("/trials").text
-    assert f"{low} to {high} m/s</span></th>" in text
+    assert f"{low} to {high} m/s</small></th>" in text
     assert "speed of the left vehicle 0.0 to 10.0 m/s" in text
 
 

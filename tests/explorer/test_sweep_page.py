@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 import re
 from collections import Counter
 from dataclasses import replace
@@ -21,13 +20,7 @@ from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.pages import sweep as page
 from merge_runner_analysis.explorer.pages.trials import filter_of
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.explorer.sweeps import (
-    Config,
-    ListedSweep,
-    Model,
-    assessment_of,
-    config_of,
-)
+from merge_runner_analysis.explorer.sweeps import Run, assessment_of, list_runs, numbers_of
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import held
 from tests.run.standings import progress, runner
@@ -38,7 +31,16 @@ CONFIG = {
     "models": {
         "o3": {"id": "o3", "provider": "openai", "aliases": ["o3-alias"], "note": "retires soon"}
     },
-    "repetitions": {"baseline": 3},
+    "arms": [
+        {
+            "model": "o3",
+            "variant": "baseline",
+            "repetitions": 3,
+            "sides": {"left": "o3", "right": "o3"},
+            "factors": {},
+            "label": "baseline",
+        }
+    ],
     "conditions": list(CONDITIONS),
     "max_cost_usd": 9.0,
 }
@@ -100,11 +102,17 @@ def test_a_sweep_says_what_the_registry_says_of_its_model(written):
     assert "o3: retires soon." in text_of(browser(written))
 
 
-def test_runs_are_sorted_by_the_seconds_that_they_lasted(study):
+def test_a_run_says_how_long_it_lasted(study):
     with duckdb.connect(str(study)) as connection:
         connection.execute("UPDATE sweeps SET ended_at = started_at + INTERVAL 2 HOURS")
-    assert 'data-value="7200.0">2.0 h<' in browser(study).get("/sweeps").text
+    assert ">2.0 h<" in browser(study).get("/sweeps").text
     assert "lasted 2.0 h" in text_of(browser(study))
+
+
+def share(name, count, of, things):
+    """A row of the page, as text."""
+    part = f" ({100 * count / of:.1f} %)" if count else ""
+    return f"{name} {count} of {of}{part} {things}"
 
 
 def test_the_page_has_the_numbers_of_the_database(written):
@@ -113,28 +121,29 @@ def test_the_page_has_the_numbers_of_the_database(written):
         (answers,) = connection.execute(
             "SELECT count(*) FROM calls WHERE http_status = 200"
         ).fetchone()
-        (attempts,) = connection.execute("SELECT count(*) FROM attempts").fetchone()
+        attempts, failures = connection.execute(
+            "SELECT count(*), count(*) FILTER (outcome <> 'ok') FROM attempts"
+        ).fetchone()
     collided = dict(facts["outcomes"]).get("collided", 0)
     for said in (
-        f"collisions {collided} of 29 ended trials",
-        f"failed trials {len(facts['failed'])} of 30 stored trials",
-        f"invalid replies {facts['invalid']} of {facts['decisions']} decisions asked",
-        f"fallbacks {facts['fallbacks']} of {facts['decisions']} decisions asked",
-        f"refusals 1 of {attempts} attempts",
-        f"another model answered 1 of {answers} answers",
-        "asked for: o3 → another (1 answers)",
+        share("collisions", collided, 29, "ended trials"),
+        share("failed trials", len(facts["failed"]), 30, "stored trials"),
+        share("invalid replies", facts["invalid"], facts["decisions"], "decisions asked"),
+        share("fallbacks", facts["fallbacks"], facts["decisions"], "decisions asked"),
+        share("faults", failures, attempts, "attempts"),
+        share("another model answered", 1, answers, "answers"),
         "its runs could spend at most 9.00 USD; 1 attempts of unknown cost are not in it",
     ):
         assert said in text
     assert (facts["invalid"], facts["fallbacks"], len(facts["failed"])) == (2, 2, 1)
 
 
-def test_every_cell_and_every_cause_leads_to_the_trials_that_it_counts(written):
+def test_every_arm_and_every_cause_leads_to_the_trials_that_it_counts(written):
     site = Site(written)
     shown = page_of(site)
-    links = re.findall(r'href="(/trials\?[^"]*)"[^>]*>(\d+)( of 3| of 33| trials?)?<', shown)
+    links = re.findall(r'href="(/trials\?[^"]*)"[^>]*>(\d+)( of 33| trials?)?<', shown)
     kinds = [kind for _, _, kind in links]
-    assert (kinds.count(" of 3"), kinds.count(" of 33")) == (len(CONDITIONS), 1)
+    assert kinds.count(" of 33") == 1
     assert {kind for kind in kinds if "trial" in kind} == {" trial"}
     for url, count, _ in links:
         asked = {k: v[0] for k, v in parse_qs(urlsplit(html.unescape(url)).query).items()}
@@ -144,7 +153,7 @@ def test_every_cell_and_every_cause_leads_to_the_trials_that_it_counts(written):
     causes = {parse_qs(urlsplit(html.unescape(url)).query)["cause"][0]
               for url, _, kind in links if "trial" in kind}  # fmt: skip
     assert causes == {
-        "trial: no answer after … attempts",
+        "model: o3 → another",
         "plan: no_array",
         "plan: refusal",
         *(f"attempt: {name}" for name in ("refusal", "timeout", "rate_limit", "unknown")),
@@ -154,7 +163,7 @@ def test_every_cell_and_every_cause_leads_to_the_trials_that_it_counts(written):
 def test_every_rate_that_may_cost_trust_leads_to_its_trials(written):
     site = Site(written)
     shown = page_of(site)
-    links = dict(re.findall(r'id="((?:rate|model)-\d)" href="([^"]*)"', shown))
+    links = dict(re.findall(r'id="(rate-\d)" href="([^"]*)"', shown))
     trials = {}
     for name, url in links.items():
         asked = {k: v[0] for k, v in parse_qs(urlsplit(html.unescape(url)).query).items()}
@@ -164,12 +173,8 @@ def test_every_rate_that_may_cost_trust_leads_to_its_trials(written):
         invalid = connection.execute(
             "SELECT DISTINCT trial_id FROM decisions WHERE NOT valid ORDER BY ALL"
         ).fetchall()
-        other = connection.execute(
-            "SELECT DISTINCT trial_id FROM calls WHERE model_served = 'another'"
-        ).fetchall()
-    assert (len(invalid), len(other)) == (2, 1)
+    assert len(invalid) == 2
     assert trials["rate-3"] == trials["rate-4"] == [name for (name,) in invalid]
-    assert trials["rate-7"] == trials["model-1"] == [name for (name,) in other]
 
 
 def test_an_alias_is_nothing_that_went_wrong(study):
@@ -181,28 +186,26 @@ def test_an_alias_is_nothing_that_went_wrong(study):
     another = site.catalogue.totals(filter_of({"cause": "model: o3 → another"}))
     assert another["drivers"]["trials"] == 1
     with duckdb.connect(str(study)) as connection:
-        connection.execute("UPDATE calls SET outcome = 'ok'")
+        connection.execute("UPDATE calls SET outcome = 'ok', model_served = 'o3'")
         connection.execute("UPDATE decisions SET failure = NULL, valid = true, fallback = false")
         connection.execute("UPDATE trials SET status = 'finished' WHERE status = 'failed'")
-    assert "no trial failed, and no reply lacked a valid plan" in page_of(Site(study))
+    assert "What went wrong" not in page_of(Site(study))
 
 
 def test_two_other_models_have_a_line_and_a_list_each(study):
     with duckdb.connect(str(study)) as connection:
         connection.execute("UPDATE calls SET model_served = 'third' WHERE trial_id LIKE '%N_0_0%'")
     site = Site(study)
-    shown = page_of(site)
-    assert re.search(r'<th scope="row">another model answered</th>', shown)
-    for number, name in enumerate(("another", "third"), 1):
-        link = html.unescape(re.search(f'id="model-{number}" href="([^"]*)"', shown)[1])
-        asked = {k: v[0] for k, v in parse_qs(urlsplit(link).query).items()}
-        assert asked["cause"] == f"model: o3 → {name}"
-        assert site.catalogue.totals(filter_of(asked))["drivers"]["trials"] > 0
+    shown = html.unescape(page_of(site))
+    for name in ("another", "third"):
+        assert f"model: o3 → {name}</th>" in shown
+        totals = site.catalogue.totals(filter_of({"cause": f"model: o3 → {name}"}))
+        assert totals["drivers"]["trials"] > 0
 
 
 def page_of(site):
     site.catalogue.refresh()
-    return page.sweep_page(site, "sweep-1")
+    return page.sweep_page(site, "sweep-1", {})
 
 
 def test_what_a_server_wrote_is_shown_as_text(study):
@@ -213,7 +216,7 @@ def test_what_a_server_wrote_is_shown_as_text(study):
                            [hostile])  # fmt: skip
     running(study, rows=(("WARNING", f"another model answers: {hostile}"), ("waiting", hostile)))
     shown = browser(study).get(URL).text
-    assert shown.count("&lt;script&gt;alert(1)&lt;/script&gt;[U+202E]&lt;img src=x&gt;") >= 4
+    assert shown.count("&lt;script&gt;alert(1)&lt;/script&gt;[U+202E]&lt;img src=x&gt;") >= 3
     assert "<script>alert" not in shown
     assert "<img" not in shown
 
@@ -223,7 +226,7 @@ def test_while_it_runs_its_totals_are_its_progress_file_s_and_the_cells_those_st
     text = text_of(browser(study))
     assert "Running: 1 of 33 trials ended, 1 failed, about 20 s left." in text
     assert "cost 1.50 USD" in text
-    assert "all 29 of 33 1 failed" in text
+    assert "baseline 29 of 33 1 " in text
 
 
 @pytest.mark.parametrize(
@@ -240,20 +243,57 @@ def test_while_it_runs_its_totals_are_its_progress_file_s_and_the_cells_those_st
     ],
 )
 def test_the_verdict_says_how_it_ended_and_what_to_type(code, ended, failed, kind, words, goes_on):
-    row = {"sweep_id": "s", "name": "baseline", "exit_code": code, "trials": ended + failed,
-           "failed": failed, "ended_at": None if code is None else END}  # fmt: skip
-    entry = ListedSweep(row, config_of(json.dumps(CONFIG)), None)
-    verdict = assessment_of(entry, "", 0)
+    row = {"sweep_id": "s", "name": "baseline", "exit_code": code, "ended": ended,
+           "failed": failed, "others": 0, "ended_at": None if code is None else END}  # fmt: skip
+    run = Run(row, CONFIG, None)
+    verdict = assessment_of(run)
     assert verdict.kind == kind
     assert words in verdict.text
     assert verdict.command == ("merge-runner sweep baseline --model o3" if goes_on else "")
-    assert assessment_of(entry, "later", 0).command == ""
+    assert assessment_of(run, "later").command == ""
+
+
+def test_the_command_to_go_on_names_the_database(tmp_path):
+    row = {"sweep_id": "s", "name": "baseline", "exit_code": 130, "ended": 1, "failed": 0,
+           "ended_at": END}  # fmt: skip
+    command = assessment_of(Run(row, CONFIG, None, tmp_path / "t.duckdb")).command
+    assert command == f"merge-runner sweep baseline --model o3 --db {tmp_path}/t.duckdb"
 
 
 def test_a_finished_sweep_that_another_model_answered_is_doubtful():
-    row = {"sweep_id": "s", "name": "n", "exit_code": 0, "trials": 0, "failed": 0, "ended_at": END}
-    entry = ListedSweep(row, Config(models={"o3": Model(id="o3", provider="openai")}), None)
-    assert assessment_of(entry, "", 7).kind == "doubtful"
+    row = {"exit_code": 0, "ended": 0, "failed": 0, "others": 7, "ended_at": END}
+    assert assessment_of(Run(row, {}, None)).kind == "doubtful"
+
+
+def test_what_runs_and_trials_share_counts_once_over_all_runs(study):
+    with duckdb.connect(str(study)) as connection:
+        connection.execute(
+            "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id) FROM sweeps;"
+            "INSERT INTO sweep_trials SELECT 'newer', trial_id, spec_hash FROM sweep_trials;"
+            "INSERT INTO calls BY NAME SELECT * REPLACE (other.trial_id AS trial_id) FROM calls, "
+            "(SELECT max(trial_id) AS trial_id FROM trials) AS other WHERE calls.trial_id = "
+            "(SELECT min(trial_id) FROM trials)"
+        )
+        calls, usd, shared = connection.execute(
+            "SELECT count(*), sum(usd), count(*) FILTER (trials > 1) FROM (SELECT count(DISTINCT "
+            "trial_id) AS trials, any_value(cost_usd) AS usd FROM calls GROUP BY call_key, attempt)"
+        ).fetchone()
+    catalogue = Site(study).catalogue
+    assert len(list_runs(catalogue)) == 2
+    for row in numbers_of(catalogue).values():
+        assert (row["replies"], row["shared"], row["ended"]) == (calls, shared, 29)
+        assert row["usd"] == pytest.approx(usd)
+    assert shared > 0
+
+
+def test_a_scope_changes_what_is_counted_and_no_sentence(study):
+    client = browser(study)
+    whole, part = (text_of(client, f"/sweeps{scope}") for scope in ("", "?condition=N_0_0"))
+    said = re.search(r"How each ended .*", whole)[0]
+    assert said.split(" To go on")[0] in part
+    assert "30 (3.3 %)" in whole
+    assert "0 of 3 " in part
+    assert "0 of 3 " not in whole
 
 
 def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(study):
@@ -319,7 +359,7 @@ def test_a_page_that_looks_for_news_gets_them_once(study):
         connection.execute("DELETE FROM trials WHERE condition = 'N_0_0'")
     told = {page: client.get(look) for page, look in looks.items()}
     assert 'href="/sweeps/newer"' in told["/sweeps"].text
-    assert "There is a newer sweep" in told[URL].text
+    assert "the database holds only" in told[URL].text
     assert "The database has changed since" in told["/trials"].text
     for reply in told.values():
         assert client.get(news_of(reply.text)).status_code == 204

@@ -2,76 +2,84 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Any
 
-from merge_runner.errors import MergeRunnerError
-from merge_runner_analysis.explorer.analysis_process import Request, Result, Waiting
+from merge_runner.errors import MergeRunnerError, StoreError
+from merge_runner_analysis.explorer.computing import Request
+from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.explorer.site import NotThere, Site
-from merge_runner_analysis.explorer.urls import query_of, seconds
+from merge_runner_analysis.explorer.urls import query_of
+from merge_runner_analysis.tables.model import Table, from_text
 
 # What is kept comes within this time; what takes longer is asked for again.
 AT_ONCE_S = 0.3
-# CPU time of a first table in a new process, with its imports: 4 s of 110 trials, and of 11,000
-# between 6 s (who merged first) and 10 s (the contrasts).
-FIRST_TABLE_S, TRIALS_A_SECOND = 4.0, 2_000
+FILE_WAIT_S = 300.0
 
 
 @dataclass(frozen=True, slots=True)
 class Computed:
-    """A result, or None with the seconds that it takes so far, or with a failure.
+    """The content of a result, or None with the seconds that it takes so far, or with a failure.
 
-    ``listed`` is how many trials the database holds now, and ``older`` whether they are others than
-    those counted. ``again`` is the query of this page with everything computed anew.
+    It is ``older`` where the database has changed since; ``at`` is when it was begun, in s since
+    1970, ``here`` the query of this page, and ``again`` that with everything computed anew.
     """
 
-    result: Result | None
+    content: dict[str, Any] | None
     failure: str
-    elapsed_s: float
-    listed: int
+    at: float
     older: bool
     again: str
     here: str
 
     @property
-    def usual_s(self) -> float:
-        """How long a first result may take where nothing was read ahead."""
-        return FIRST_TABLE_S + self.listed / TRIALS_A_SECOND
+    def elapsed_s(self) -> float:
+        """How long it takes so far."""
+        return time.time() - self.at
 
     @property
     def clock(self) -> str:
         """When the result was made, in local time with its zone."""
-        assert self.result is not None
-        return f"{datetime.fromtimestamp(self.result.at).astimezone():%Y-%m-%d %H:%M:%S %Z}"
+        return f"{datetime.fromtimestamp(self.at).astimezone():%Y-%m-%d %H:%M:%S %Z}"
 
 
 def computed(
-    site: Site,
-    request: Request,
-    asked: Mapping[str, str],
-    *,
-    wait_s: float = AT_ONCE_S,
+    site: Site, request: Request, asked: Mapping[str, str], *, wait_s: float = AT_ONCE_S
 ) -> Computed:
     """Ask for something, and wait for it for a moment; raises NotThere where no table holds it."""
-    state = site.catalogue.state()
-    since, failure = seconds(asked.get("since", "")), ""
-    found: Result | Waiting | None = None
+    state, job, failure = stamp_of(site.db), None, ""
     try:
-        found = site.computing.ask(request, state, since=since, wait_s=wait_s)
+        job = site.computing.ask(request, state, anew="anew" in asked, wait_s=wait_s)
     except MergeRunnerError as exc:
         failure = str(exc)
-    result = found if isinstance(found, Result) else None
-    if result is not None and "absent" in result.content:
-        raise NotThere(result.content["absent"])
-    # Later than this one by the smallest step that an address shows.
-    later = {"since": f"{result.at + 0.001:.3f}"} if result else {}
+    content = job.content if job else None
+    if content is not None and "absent" in content:
+        raise NotThere(content["absent"])
+    here = {name: value for name, value in asked.items() if name != "anew"}
     return Computed(
-        result=result,
+        content=content,
         failure=failure,
-        elapsed_s=found.elapsed_s if isinstance(found, Waiting) else 0.0,
-        listed=state[0],
-        older=result is not None and result.state != state,
-        again=query_of({**asked, **later}),
-        here=query_of(asked),
+        at=job.at if job else time.time(),
+        older=job is not None and job.state != state,
+        again=query_of({**here, "anew": 1}),
+        here=query_of(here),
     )
+
+
+def computed_table(
+    site: Site, name: str, asked: Mapping[str, str], sweep: str = "", condition: str = ""
+) -> tuple[Computed, Table | None]:
+    """A table, of all trials or of a part of them, once it is computed."""
+    found = computed(site, ("table", name, sweep, condition), asked)
+    return found, from_text(found.content["table"]) if found.content else None
+
+
+def awaited(site: Site, request: Request, asked: Mapping[str, str]) -> dict[str, Any]:
+    """What a computation answers, however long that takes; raises NotThere and StoreError."""
+    found = computed(site, request, asked, wait_s=FILE_WAIT_S)
+    if found.content is None:
+        raise StoreError(found.failure or "it is still being computed: ask again in a minute")
+    return found.content

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
-from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.explorer.conditions import ordered
+from merge_runner_analysis.explorer.display_text import with_minus
+from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.pages.home import (
     KINDS,
     Driver,
     drivers_of,
+    humans_by_condition,
     humans_of,
     noted,
     verdicts_of,
+    with_merged,
 )
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.scope import Scope, scope_of, unmarked
+from merge_runner_analysis.explorer.scope import Scope, carried, scope_of, unmarked
+from merge_runner_analysis.explorer.search import Wanted
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.verdict_words import DIFFERS, MEASURES, OPEN, SHOWN
 
 # How attempts of a driver's trials with a prompt ended, and which model answered.
@@ -26,6 +33,12 @@ ATTEMPTS = """
 SELECT served, outcome, sum(times)::BIGINT AS times
 FROM tried SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (number)
 GROUP BY ALL ORDER BY ALL
+"""
+
+# What was sent with every prompt, as JSON.
+SENT = """
+SELECT any_value(coalesce(spec->'$.left.body', spec->'$.right.body'))::VARCHAR AS body
+FROM listed JOIN specs USING (spec_hash) WHERE model = ? AND variant = ?
 """
 
 
@@ -40,10 +53,12 @@ def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
         "drivers.html",
         here="drivers",
         bar=bar,
+        carried=carried(asked),
         computed=found,
         table=table,
         kinds=kinds,
         headings=KINDS,
+        measures=MEASURES,
         human=humans_of(table),
     )
 
@@ -60,6 +75,11 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
             f"no driver {name!r} was played with this prompt; there are: "
             f"{', '.join(by_name) or 'none'}"
         )
+    first, words = "", None
+    if own and own.facts and own.facts["asked"]:
+        first = _first(site, own, bar.scope, asked)
+        trials = bar.scope.filter(own.name, own.prompt)
+        words = site.words.search(Wanted("rationales", (), trials, {}), 1)
     return site.render(
         "driver.html",
         here="drivers",
@@ -68,10 +88,15 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         beside=beside,
         others=[one for one in by_name.values() if one is not own],
         bar=bar,
+        carried=carried(asked),
         computed=found,
         table=table,
         measures=MEASURES,
         human=humans_of(table),
+        first=first,
+        parameters=_parameters(site, own) if own else "",
+        found=words,
+        kept=bar.scope.trials(name, bar.scope.prompt),
         summary=_summary(own) if own else "",
         attempts=_attempts(site, own) if own else [],
         accounts=_accounts(site, own, bar.scope) if own else [],
@@ -97,6 +122,31 @@ def _summary(own: Driver) -> str:
     )
 
 
+def _first(site: Site, own: Driver, scope: Scope, asked: Mapping[str, str]) -> str:
+    """What the driver does first, by the table of first actions; empty until that is made."""
+    _, table = computed_table(site, "first-action", asked, scope.sweep, scope.condition)
+    told = []
+    for row in table.rows if table else []:
+        group = row.groups[0]
+        if table and group in {f"{own.name}/{own.prompt}", HUMAN} and row.values.get("slope_ci"):
+            of = printed(table, row)
+            told.append(
+                f"{of['driver']}: brakes in {of['brake_percent']} %, holds in {of['hold_percent']}"
+                f" %, goes in {of['go_percent']} % of {of['n']}; m/s² per m/s of own relative "
+                f"velocity: {of['slope']} {of['slope_ci']}."
+            )
+    return with_minus(" ".join(told)) if len(told) > 1 else ""
+
+
+def _parameters(site: Site, own: Driver) -> str:
+    """What was sent to the model beside its prompts; empty for a program."""
+    (row,) = site.catalogue.ask(SENT, unmarked(own.name), own.prompt)
+    body = json.loads(row["body"] or "{}")
+    return ", ".join(
+        f"{name} {value}" for name, value in body.items() if isinstance(value, str | int | float)
+    )
+
+
 def _attempts(site: Site, own: Driver) -> list[Row]:
     return site.catalogue.ask(ATTEMPTS, unmarked(own.name), own.prompt)
 
@@ -108,10 +158,14 @@ def _accounts(site: Site, own: Driver, scope: Scope) -> list[Row]:
 
 
 def _conditions(site: Site, own: Driver | None, scope: Scope) -> dict[str, Any]:
-    """What the driver's trials, or the humans', come to by condition."""
-    humans = human_counts()
-    if own is None:
-        return {"names": list(humans), "cells": {}, "humans": humans}
-    wanted = scope.filter(own.name, own.prompt)
-    rows = {row["condition"]: row for row in site.catalogue.counts(wanted, "condition")}
-    return {"names": ordered(rows), "cells": rows, "humans": humans}
+    """What the driver's trials, and the humans', come to by condition."""
+    rows: dict[str, Row] = {}
+    if own is not None:
+        counts = site.catalogue.counts(scope.filter(own.name, own.prompt), "condition")
+        rows = {row["condition"]: with_merged(row) for row in counts}
+    names = ordered(rows or human_counts())
+    return {
+        "names": names,
+        "own": [rows[name] for name in names] if rows else [],
+        "humans": humans_by_condition(names),
+    }

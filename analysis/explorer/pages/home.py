@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.data.studies import DESCRIPTIONS
 from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.conditions import ordered
 from merge_runner_analysis.explorer.marks import Cell, band, cells
-from merge_runner_analysis.explorer.pages.computed import Computed, computed
+from merge_runner_analysis.explorer.pages.computed import Computed, computed_table
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.scope import Bar, Scope, scope_of, unmarked
+from merge_runner_analysis.explorer.scope import Bar, Scope, carried, scope_of, unmarked
 from merge_runner_analysis.explorer.site import Site, news_of
 from merge_runner_analysis.explorer.sweeps import standing_of
 from merge_runner_analysis.names import HUMAN
-from merge_runner_analysis.tables.model import Table, from_text
+from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.verdict_words import (
     HUMANS,
     LANGUAGE_MODEL,
@@ -84,6 +84,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         seen=seen,
         descriptions=[row["description"] for row in site.catalogue.ask(DESCRIPTIONS)],
         bar=bar,
+        carried=carried(asked),
         computed=found,
         table=table,
         kinds={kind: [one for one in shown if one.kind == kind] for kind in KINDS},
@@ -103,21 +104,20 @@ def verdicts_of(
     site: Site, scope: Scope, asked: Mapping[str, str]
 ) -> tuple[Computed, Table | None]:
     """The table of verdicts of a scope, once it is computed."""
-    request = (TABLE, scope.sweep, scope.condition)
-    found = computed(site, request, asked)
+    part = scope.sweep, scope.condition
+    found, table = computed_table(site, TABLE, asked, *part)
     running = any(entry.followed for entry, _ in standing_of(site.catalogue))
-    if found.result and found.older and not running:  # else a new one would soon be old again
-        since = f"{found.result.at + 0.001:.3f}"
-        found = computed(site, request, {**asked, "since": since})
-    if found.result is None:
-        return found, None
-    return found, from_text(found.result.content["tables"][0])
+    if table and found.older and not running:  # else a new one would soon be old again
+        found, table = computed_table(site, TABLE, {**asked, "anew": "1"}, *part)
+    return found, table
 
 
 def humans_of(table: Table | None) -> dict[str, Any]:
-    """The humans' cells by measure, and where their bands lie."""
+    """The humans' cells by measure, where their bands lie, and which humans they are."""
     found = by_group(table.rows).get(HUMAN, {}) if table else {}
+    label = str(next(iter(found.values()))["driver"]) if found else HUMAN
     return {
+        "about": label.partition("(")[2].rstrip(")") or "990 trials of nine pairs, as published",
         "cells": cells(found),
         "bands": {name: band(measure, found.get(name, {})) for name, measure in MEASURES.items()},
     }
@@ -188,11 +188,22 @@ def _conditions(site: Site, bar: Bar, shown: list[Driver]) -> dict[str, Any]:
     names = ordered({name for _, _, name in counted})
     return {
         "names": names,
-        "humans": human_counts(),
+        "humans": humans_by_condition(names),
         "imported": bool(site.catalogue.counts(Filter(who="humans"), "who")),
-        "cells": {
-            (one.name, name): counted.get((unmarked(one.name), one.prompt, name))
+        "rows": [
+            (one, [counted.get((unmarked(one.name), one.prompt, name)) for name in names])
             for one in shown
-            for name in names
-        },
+        ],
     }
+
+
+def humans_by_condition(names: Iterable[str]) -> list[Row | None]:
+    """The published counts of conditions; None for one that no human drove."""
+    known = {name: with_merged(counts._asdict()) for name, counts in human_counts().items()}
+    return [known.get(name) for name in names]
+
+
+def with_merged(row: Row) -> Row:
+    """Counts of trials with how many merged, and without other counts how many ended."""
+    merged = row["left_first"] + row["right_first"]
+    return {"ended": merged + row["collided"], **row, "merged": merged}

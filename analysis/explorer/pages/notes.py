@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
-from merge_runner.text_safety import csv_writer
-from merge_runner_analysis.explorer.display_text import csv_cell
-from merge_runner_analysis.explorer.notes import Note, tags_of
+from merge_runner_analysis.explorer.notes import Note
 from merge_runner_analysis.explorer.pages.trial import find
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.explorer.urls import whole
-
-COLUMNS = ("at", "reader", "trial_id", "spec_hash", "side", "decision", "tags", "text")
 
 
 def notes_page(site: Site) -> str:
@@ -25,37 +20,26 @@ def notes_page(site: Site) -> str:
     return site.render("notes.html", here="notes", kept=kept, shown=shown)
 
 
-def notes_csv(site: Site) -> str:
-    """Return all notes as CSV."""
-    lines = io.StringIO()
-    csv_writer(lines).writerows(map(csv_cell, row) for row in note_rows(site.notes.kept().notes))
-    return lines.getvalue()
-
-
-def note_rows(notes: Sequence[Note]) -> Iterator[Sequence[object]]:
-    """The notes under their columns, the earliest first; tags are separated by commas."""
-    yield COLUMNS
-    for note in notes:
-        texts = {"at": note.at.isoformat(), "tags": ", ".join(note.tags)}
-        yield [texts.get(name, getattr(note, name)) for name in COLUMNS]
-
-
 def add_note(site: Site, given: Mapping[str, str]) -> Row:
     """Note what a form gives; returns the trial. Raises NotThere and UsageError."""
     row = find(site, given.get("trial", ""), given)
     side, number = given.get("side", ""), whole(given.get("decision", ""))
     if side not in {"", *SIDES} or (number is None) != (side == ""):
         raise UsageError("a note is of a trial, or of a decision: side left or right, and a number")
-    text = given.get("text", "").replace("\r\n", "\n").strip()
     at = None if number is None else (SIDES[SIDES.index(side)], number)
-    site.notes.add((row["trial_id"], row["spec_hash"]), at, tags_of(given.get("tags", "")), text)
+    # Tags are separated by commas, and have no capitals.
+    tags = [" ".join(tag.split()).lower() for tag in given.get("tags", "").split(",")]
+    text = given.get("text", "").replace("\r\n", "\n").strip()
+    trial = row["trial_id"], row["spec_hash"]
+    site.notes.add(trial, at, list(dict.fromkeys(filter(None, tags))), text)
     return row
 
 
 def _address(site: Site, note: Note) -> str:
     """Where a note belongs; nothing where the trial is not in this database."""
-    row = site.catalogue.find(*note.trial)
+    row = site.catalogue.find(note.trial_id, note.spec_hash)
     if row is None:
         return ""
     at = {} if note.decision is None else {"side": note.side, "decision": note.decision}
-    return site.at.trial(row, **at)
+    address: str = site.at.trial(row, **at)
+    return address

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.results.export import tables, units
+from merge_runner.text_safety import quoted
 from merge_runner_analysis.explorer.display_text import visible
-from merge_runner_analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST, QueryResult
+from merge_runner_analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST
+from merge_runner_analysis.explorer.scope import carried, scope_of
 from merge_runner_analysis.explorer.site import Site
 
-NUMBERS = ("TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
-           "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE", "DECIMAL", "BIGNUM")  # fmt: skip
+# Types of which values stand to the right.
+NUMBER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|BIGNUM|DECIMAL\(.*\)")
 
+# The parts of a scope as columns.
+SCOPED = {"sweep": "sweep_id", "model": "driver", "variant": "variant", "condition": "condition"}
 # Queries to begin with: those of the README.
 EXAMPLES = {
     "Who merged first, and how often did they collide?": """\
@@ -37,15 +41,6 @@ limit 20""",
 }
 
 
-@dataclass(frozen=True, slots=True)
-class ShownValue:
-    """A value as it is shown; no text: NULL. ``left_out`` counts characters."""
-
-    text: str | None
-    left_out: int = 0
-    link: str = ""
-
-
 def sql_page(
     site: Site, asked: Mapping[str, str], *, run: bool = True, problem: str | None = None
 ) -> str:
@@ -58,10 +53,13 @@ def sql_page(
             result = site.queries.result(query)
         except MergeRunnerError as exc:
             problem = str(exc)
+    names = [name for name, _ in result.columns] if result else []
     return site.render(
         "sql.html",
         here="sql",
-        query=query if is_asked else next(iter(EXAMPLES.values())),
+        bar=scope_of(site, asked, any_prompt=True),
+        carried=carried(asked),
+        query=query if is_asked else scoped_query(carried(asked)),
         asked=is_asked,
         run=run,
         hides=visible(query) != query,
@@ -71,41 +69,33 @@ def sql_page(
         units=units(),
         problem=None if problem is None else visible(problem),
         result=result,
-        rows=[] if result is None else _cells(site, result),
-        is_number=is_number,
+        spec=names.index("spec_hash") if "spec_hash" in names else None,
+        is_number=NUMBER.fullmatch,
         most=DOWNLOADED_ROWS,
     )
 
 
-def sql_csv(site: Site, asked: Mapping[str, str]) -> bytes:
-    """All that a query finds as CSV; raises MergeRunnerError."""
-    return site.queries.csv(query_in(asked))
+def scoped_query(chosen: Mapping[str, Sequence[str]]) -> str:
+    """A query of the trials of a scope; the first example where none is chosen."""
+    if not chosen:
+        return next(iter(EXAMPLES.values()))
+    members = (
+        "(trial_id, spec_hash) in (select trial_id, spec_hash from sweep_trials\n    where {})"
+    )
+    parts = {
+        name: f"{SCOPED[name]} in ({', '.join(map(quoted, values))})"
+        for name, values in chosen.items()
+    }
+    if "sweep" in parts:
+        parts["sweep"] = members.format(parts["sweep"])
+    return (
+        "select trial_id, status, merged_first, gap_m\n"
+        "from trials join trial_metrics using (trial_id, spec_hash)\n"
+        "    join trial_drivers using (trial_id, spec_hash)\nwhere "
+        + "\n    and ".join(parts.values())
+    )
 
 
 def query_in(asked: Mapping[str, str]) -> str:
     """The query in an address; a form ends its lines as the web does."""
     return asked.get("q", "").replace("\r\n", "\n")
-
-
-def is_number(kind: str) -> bool:
-    """Whether values of a type stand to the right."""
-    return kind.partition("(")[0] in NUMBERS and not kind.endswith("]")
-
-
-def _cells(site: Site, result: QueryResult) -> list[list[ShownValue]]:
-    """The rows of a result; a column ``trial_id`` leads to the trials, with the spec beside it."""
-    names = [name for name, _ in result.columns]
-    spec = names.index("spec_hash") if "spec_hash" in names else None
-
-    def shown(row: list[tuple[str, int] | None], place: int) -> ShownValue:
-        value = row[place]
-        if value is None:
-            return ShownValue(None)
-        text, left_out = value
-        link = ""
-        if names[place] == "trial_id" and text and not left_out:
-            of_spec = None if spec is None else row[spec]
-            link = site.at.trial({"trial_id": text, "spec_hash": of_spec and of_spec[0]})
-        return ShownValue(visible(text), left_out, link)
-
-    return [[shown(row, place) for place in range(len(names))] for row in result.rows]

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from importlib import metadata
-from typing import Any
 
-from merge_runner.errors import StoreError
-from merge_runner_analysis.explorer.analysis_process import Request
-from merge_runner_analysis.explorer.pages.computed import computed
+from merge_runner_analysis.explorer.pages.computed import awaited, computed, computed_table
+from merge_runner_analysis.explorer.scope import every
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES
-from merge_runner_analysis.tables.formats import render, table_view
-from merge_runner_analysis.tables.model import from_text
+from merge_runner_analysis.tables.formats import render, shown_columns, table_view
+from merge_runner_analysis.tables.model import Table, from_text
 
 # How a table can be downloaded, by the suffix of the file: its format, and the file's type.
 FILES = {
@@ -24,7 +23,6 @@ FILES = {
 }
 # How a figure can be downloaded, with the file's type.
 FORMS = {"svg": "image/svg+xml", "png": "image/png"}
-FILE_WAIT_S = 300.0
 PAPER = (
     "S. H. A. Mohammad, W. Mooi, A. Zgonnikov: General-purpose LLMs as Models of Human Driver "
     "Behavior: The Case of Simplified Merging. arXiv:2604.09609, 2026."
@@ -47,15 +45,15 @@ def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
     if suffix not in FILES:
         raise NotThere(f"a table comes as {' or '.join(FILES)}")
     form, kind = FILES[suffix]
-    (text,) = awaited(site, ("tables", _named(name, TABLES, "table")))["tables"]
-    return render([from_text(text)], form) + "\n", kind
+    content = awaited(site, ("table", _named(name, TABLES, "table"), "", ""), {})
+    return render([from_text(content["table"])], form) + "\n", kind
 
 
 def figure_file(site: Site, name: str, form: str) -> bytes:
     """A figure as a file; raises NotThere and StoreError."""
     if form not in FORMS:
         raise NotThere(f"a figure comes as {' or '.join(FORMS)}")
-    file: bytes = awaited(site, ("figure", _named(name, FIGURES, "figure"), form))["file"]
+    file: bytes = awaited(site, ("figure", _named(name, FIGURES, "figure"), form), {})["file"]
     return file
 
 
@@ -63,27 +61,19 @@ def figure_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """A figure with its caption, its files, and how it is cited; raises NotThere."""
     about = FIGURES[_named(name, FIGURES, "figure")]
     found = computed(site, ("figure", name, "svg"), asked)
-    numbers = site.at.table_file(about.table, "csv") if about.table else site.at.to("trials.csv")
+    numbers = site.at.table(f"{about.table}.csv") if about.table else site.at.to("trials.csv")
     return site.render(
         "figure.html",
         here="tables",
         name=name,
         about=about,
         computed=found,
-        image=b64encode(found.result.content["file"]).decode() if found.result else "",
-        files={"SVG": site.at.figure(name, ".svg"), "PNG": site.at.figure(name, ".png")}
+        image=b64encode(found.content["file"]).decode() if found.content else "",
+        files={"SVG": site.at.figure(f"{name}.svg"), "PNG": site.at.figure(f"{name}.png")}
         | {"CSV": numbers},
         sources=(PAPER, HUMANS),
         version=metadata.version("merge-runner"),
     )
-
-
-def awaited(site: Site, request: Request) -> dict[str, Any]:
-    """What a computation answers, however long that takes; raises StoreError."""
-    found = computed(site, request, {}, wait_s=FILE_WAIT_S)
-    if found.result is None:
-        raise StoreError(found.failure or "it is still being computed: ask again in a minute")
-    return found.result.content
 
 
 def _named(name: str, known: Collection[str], what: str) -> str:
@@ -94,24 +84,36 @@ def _named(name: str, known: Collection[str], what: str) -> str:
 
 def table_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     """One table; raises NotThere."""
-    found = computed(site, ("tables", _named(name, TABLES, "table")), asked)
-    shown = None
-    if found.result is not None:
-        table = from_text(found.result.content["tables"][0])
-        shown = table_view(
-            table,
-            lambda table, row, column: site.at.cell(table.name, row.id, column.name),
-        )
-    names = list(TABLES)
-    at = names.index(name)
+    found, table = computed_table(site, _named(name, TABLES, "table"), asked)
+    by, without = asked.get("sort", ""), every(asked, "without")
+    columns = shown_columns(table) if table else []
+    shown = table and table_view(
+        _sorted(table, by),
+        lambda table, row, column: site.at.cell(table.name, row.id, column.name),
+    )
+    places = [place for place, column in enumerate(columns) if column.name not in without]
     return site.render(
         "table.html",
         here="tables",
         name=name,
         about=TABLES[name].about,
-        files=[(suffix, site.at.table_file(name, suffix)) for suffix in FILES],
+        files=[(suffix, site.at.table(f"{name}.{suffix}")) for suffix in FILES],
         computed=found,
         table=shown,
-        before=names[at - 1] if at else None,
-        after=names[at + 1] if at + 1 < len(names) else None,
+        columns=columns,
+        places=places,
+        sort=by,
+        without=without,
     )
+
+
+def _sorted(table: Table, by: str) -> Table:
+    """The table by the values of a column, with ``-`` before its name the largest first.
+
+    What has no value comes last.
+    """
+    name = by.removeprefix("-")
+    told = [row for row in table.rows if row.values.get(name) is not None]
+    rest = [row for row in table.rows if row.values.get(name) is None]
+    told.sort(key=lambda row: row.values[name], reverse=by.startswith("-"))  # type: ignore[arg-type, return-value]  # a column's values are of one kind
+    return replace(table, rows=[*told, *rest])

@@ -6,15 +6,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from merge_runner.errors import StoreError
 from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
-from merge_runner_analysis.explorer.pages.computed import computed
+from merge_runner_analysis.explorer.pages.computed import awaited, computed
 from merge_runner_analysis.explorer.pictures import sparkline, speed_range
+from merge_runner_analysis.explorer.scope import carried
 from merge_runner_analysis.explorer.site import NotThere, Site, news_of
 from merge_runner_analysis.explorer.urls import whole
 from merge_runner_analysis.tables import TABLES
 
-EXPORT_WAIT_S = 300.0
+# What facets are called that have another name in an address.
+HEADINGS = {"sweep": "run", "model": "driver", "variant": "prompt"}
 
 
 def trials_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -28,9 +29,9 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     cell, named = asked.get("cell", ""), None
     if cell:
         named = computed(site, cell_request(cell), asked)
-        if named.result is None:
+        if named.content is None:
             return site.render("behind.html", here="trials", cell=cell, computed=named)
-        wanted = replace(wanted, trials=behind(named.result.content))
+        wanted = replace(wanted, trials=tuple(named.content["trials"]))
     totals = site.catalogue.totals(wanted)
     trials = sum(part["trials"] for part in totals.values())
     last = max(1, -(-trials // PAGE))
@@ -42,6 +43,8 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         here="trials",
         facets=facets,
         chosen=wanted.chosen,
+        headings=HEADINGS,
+        carried=carried(asked),
         kept={**wanted.chosen, "cell": cell},
         cell=cell,
         computed=named,
@@ -69,10 +72,8 @@ def export_filter(site: Site, asked: Mapping[str, str]) -> Filter:
     wanted, cell = filter_of(asked), asked.get("cell", "")
     if not cell:
         return wanted
-    named = computed(site, cell_request(cell), asked, wait_s=EXPORT_WAIT_S)
-    if named.result is None:
-        raise StoreError(named.failure or f"the trials behind {cell} are still being looked up")
-    return replace(wanted, trials=behind(named.result.content))
+    found = awaited(site, cell_request(cell), asked)
+    return replace(wanted, trials=tuple(found["trials"]))
 
 
 def cell_request(cell: str) -> tuple[str, str, str, str]:
@@ -82,11 +83,6 @@ def cell_request(cell: str) -> tuple[str, str, str, str]:
     if table not in TABLES or not row:
         raise NotThere(f"a cell is named TABLE/ROW:COLUMN; the tables are {', '.join(TABLES)}")
     return "cell", table, row, column
-
-
-def behind(content: dict[str, Any]) -> tuple[tuple[str, str], ...]:
-    """The (trial, spec) of all groups behind a cell."""
-    return tuple((name, spec) for source in content["sources"] for name, spec in source["trials"])
 
 
 def filter_of(asked: Mapping[str, str]) -> Filter:

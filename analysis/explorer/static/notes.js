@@ -4,32 +4,31 @@
   const form = document.getElementById("note");
   if (!form) return;
   const { text, tags, side, decision } = form.elements;
-  const about = () => {
+  const said = document.getElementById("note-said");
+  // While something is written, what it is about stays.
+  form.addEventListener("focusin", () => {
+    if (text.value || tags.value) return;
     const chosen = document.querySelector("a.decision[aria-current]")?.dataset;
     side.value = chosen?.side ?? "";
     decision.value = chosen?.n ?? "";
-    document.getElementById("note-about").textContent = chosen ? `on the ${chosen.side} decision ${chosen.n}` : "on the trial";
-  };
-  // While something is written, what it is about stays.
-  form.addEventListener("focusin", () => { if (!text.value && !tags.value) about(); });
+    document.getElementById("note-about").textContent = chosen
+      ? `on the ${chosen.side} decision ${chosen.n}`
+      : "on the trial";
+  });
   text.addEventListener("keydown", (event) => {
     if (event.key !== "Enter" || event.shiftKey || event.isComposing) return;
     event.preventDefault();
     form.requestSubmit();
   });
-  form.addEventListener("htmx:afterRequest", (event) => {
-    const said = document.getElementById("note-said");
-    said.textContent = event.detail.successful ? "saved" : event.detail.xhr.responseText || "not saved: no answer";
-    said.classList.toggle("bad", !event.detail.successful);
-    if (!event.detail.successful) return;
-    text.value = tags.value = "";
-    document.activeElement.blur();
+  form.addEventListener("htmx:afterRequest", ({ detail: { successful, xhr } }) => {
+    said.textContent = successful ? "saved" : xhr.responseText || "not saved: no answer";
+    if (successful) form.reset();
+    if (successful) document.activeElement.blur();
   });
   document.addEventListener("keydown", (event) => {
     const field = { n: text, t: tags }[event.key];
     if (!field || isElsewhere(event)) return;
     event.preventDefault();
     field.focus();
-    field.scrollIntoView({ block: "nearest" });
   });
 })();

@@ -6,26 +6,31 @@
   const find = (trial, spec) => held.find(({ dataset }) => dataset.trial === trial && (!spec || dataset.spec === spec));
   // An address names a trial by its name alone, or as NAME@SPEC.
   const named = (key) => find(key) ?? find(...key.split(/@(?=[^@]*$)/));
-  const asked = new URL(location.href).searchParams, name = asked.get("trial");
+  const asked = new URL(location.href).searchParams,
+    name = asked.get("trial");
   const chosen = find(name, asked.get("spec")) ?? find(name) ?? held[0];
   window.explorer = {
     panel: async (link, other) => replay.held(link, (other?.held ?? chosen).content),
     data: async (key) => {
-      const one = named(key), data = one?.content.getElementById("replay-data");
+      const one = named(key),
+        data = one?.content.getElementById("replay-data");
       if (!data) return null;
       const { trial, spec } = one.dataset;
       return {
-        ...JSON.parse(data.textContent), held: one, page: `?${new URLSearchParams({ trial, spec })}`,
+        ...JSON.parse(data.textContent),
+        held: one,
+        page: `?${new URLSearchParams({ trial, spec })}`,
         ribbons: one.content.getElementById("ribbons")?.innerHTML ?? "",
       };
     },
     search: async (text) => {
       const words = text.toLowerCase().split(/\s+/);
       const fit = held.filter((one) => one !== chosen && words.every((word) => one.dataset.words.includes(word)));
-      const found = fit.slice(0, FOUND).map(({ dataset: { trial, spec, name, outcome } }) => ({ key: `${trial}@${spec}`, name, outcome }));
+      const found = fit
+        .slice(0, FOUND)
+        .map(({ dataset: { trial, spec, name, outcome } }) => ({ key: `${trial}@${spec}`, name, outcome }));
       return { found, more: fit.length - found.length };
     },
-    offer: async (kind) => JSON.parse(chosen.dataset.offers)[kind] ?? null,
   };
   document.getElementById("shown").replaceChildren(chosen.content.cloneNode(true));
   document.title = `${chosen.dataset.name} · merge-runner`;

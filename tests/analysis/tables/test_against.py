@@ -74,7 +74,7 @@ def partly(tmp_path_factory):
     }
     db = write_study(folder / "t.duckdb", yielding("o3", reps=1))
     with open_files(write_folder(folder / "recordings", files)) as found:
-        import_trials(sort_files(found).trials, Store(db))
+        import_trials(sort_files(found), Store(db))
     return Study(db)
 
 

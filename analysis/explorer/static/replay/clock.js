@@ -4,17 +4,20 @@ replay.clock = (scene, { show, settled }) => {
   const SPEEDS = [0.25, 0.5, 1, 2, 4];
   const at = (id) => document.getElementById(id);
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  let speed = 1, last = 0;
+  let speed = 1,
+    last = 0;
   const tell = () => {
     at("scrub").max = scene.end;
     at("scrub").value = scene.now;
     at("scrub").setAttribute("aria-valuetext", `${scene.now.toFixed(1)} s`);
     at("clock").textContent = `${scene.now.toFixed(1)} s of ${scene.end.toFixed(1)} s`;
     const { sides } = scene.trial;
-    at("now").textContent = replay.SIDES.filter((side) => sides[side]).map((side) => {
-      const [v, x] = ["v", "x"].map((what) => replay.sampled(sides[side].t, sides[side][what], scene.now).toFixed(1));
-      return `${side} ${v} m/s at ${x} m`;
-    }).join("; ");
+    at("now").textContent = replay.SIDES.filter((side) => sides[side])
+      .map((side) => {
+        const [v, x] = ["v", "x"].map((what) => replay.sampled(sides[side].t, sides[side][what], scene.now).toFixed(1));
+        return `${side} ${v} m/s at ${x} m`;
+      })
+      .join("; ");
     show();
   };
   const seek = (t, keep = false) => {
@@ -33,7 +36,7 @@ replay.clock = (scene, { show, settled }) => {
   };
   const tick = (moment) => {
     if (!scene.playing) return;
-    const passed = speed * (moment - last) / 1000;
+    const passed = (speed * (moment - last)) / 1000;
     // Where the system asks for reduced motion, still pictures, two a second.
     if (!calm || passed >= 0.5 * speed) {
       last = moment;
@@ -53,7 +56,10 @@ replay.clock = (scene, { show, settled }) => {
   at("back").addEventListener("click", () => seek(scene.now - 0.1, true));
   at("on").addEventListener("click", () => seek(scene.now + 0.1, true));
   // What is chosen is done with: the keys are the replay's again.
-  at("speed").addEventListener("change", (event) => { setSpeed(Number(event.target.value)); event.target.blur(); });
+  at("speed").addEventListener("change", (event) => {
+    setSpeed(Number(event.target.value));
+    event.target.blur();
+  });
   return {
     seek,
     key: (event) => {

@@ -3,9 +3,14 @@
 replay.panel = (scene, ribbons) => {
   const PAUSE_MS = 120; // Between two looks at what drives now: a slider passes many decisions.
   const at = (id) => document.getElementById(id);
-  const box = at("panel"), shown = at("decision"), narrow = matchMedia("(max-width: 62rem)");
+  const box = at("panel"),
+    shown = at("decision"),
+    narrow = matchMedia("(max-width: 62rem)");
   const kept = new Map();
-  let chosen = null, waiting = 0, followed = null, standing = null;
+  let chosen = null,
+    waiting = 0,
+    followed = null,
+    standing = null;
 
   const read = (link) => {
     if (!kept.has(link)) {
@@ -22,18 +27,27 @@ replay.panel = (scene, ribbons) => {
     followed = null;
   };
   // Who has scrolled down to read, or holds something in the panel, is left alone.
-  const reading = () => box.scrollTop > 8 || box.getBoundingClientRect().top < -8
-    || (box !== document.activeElement && box.contains(document.activeElement) && !document.activeElement.closest(".panel-bar"));
+  const reading = () =>
+    box.scrollTop > 8 ||
+    box.getBoundingClientRect().top < -8 ||
+    (box !== document.activeElement &&
+      box.contains(document.activeElement) &&
+      !document.activeElement.closest(".panel-bar"));
   const said = () => {
     const still = chosen !== null || (followed !== null && reading());
     at("follow").hidden = !still;
-    at("whose").parentElement.hidden = still;
     box.setAttribute("aria-live", scene.playing ? "off" : "polite");
   };
-  const heading = (links, other) => (scene.ghost && links.some((link) => ribbons.ofOther(link) === other)
-    ? [replay.element("h2", { class: "of" }, other ? `The other: ${scene.ghost.label}` : "This trial")] : []);
+  const heading = (links, other) =>
+    scene.ghost && links.some((link) => ribbons.ofOther(link) === other)
+      ? [replay.element("h2", { class: "of" }, other ? `The other: ${scene.ghost.label}` : "This trial")]
+      : [];
   const brief = (html, link) => {
-    const whole = replay.element("a", { href: link.href, class: "last", "data-side": link.dataset.side, "data-n": link.dataset.n }, "what it was told, and all the rest");
+    const whole = replay.element(
+      "a",
+      { href: link.href, class: "last", "data-side": link.dataset.side, "data-n": link.dataset.n },
+      "what it was told, and all the rest",
+    );
     if (ribbons.ofOther(link)) whole.dataset.other = "true";
     const made = replay.element("div", { class: "brief" });
     made.innerHTML = html;
@@ -44,8 +58,10 @@ replay.panel = (scene, ribbons) => {
     waiting = 0;
     if (chosen || reading() || scene.now === standing) return said();
     const begun = scene.now > scene.begin + 1e-9 || scene.ghost;
-    const links = begun ? ribbons.current().filter((link) => ["both", link.dataset.side].includes(at("whose").value)) : [];
-    const names = links.map((link) => link.dataset.panel || `${link.dataset.side}/${link.dataset.n}`).join(" ") + Boolean(scene.ghost);
+    const links = begun ? ribbons.current() : [];
+    const names =
+      links.map((link) => link.dataset.panel || `${link.dataset.side}/${link.dataset.n}`).join(" ") +
+      Boolean(scene.ghost);
     if (names === followed) return said();
     followed = names;
     let pages;
@@ -59,8 +75,12 @@ replay.panel = (scene, ribbons) => {
     delete shown.dataset.of;
     if (!links.length) shown.innerHTML = at("unread").innerHTML;
     else {
-      shown.replaceChildren(...[false, true].flatMap((other) => [...heading(links, other),
-        ...links.flatMap((link, i) => (ribbons.ofOther(link) === other ? [brief(pages[i], link)] : []))]));
+      shown.replaceChildren(
+        ...[false, true].flatMap((other) => [
+          ...heading(links, other),
+          ...links.flatMap((link, i) => (ribbons.ofOther(link) === other ? [brief(pages[i], link)] : [])),
+        ]),
+      );
     }
     said();
   };
@@ -94,7 +114,6 @@ replay.panel = (scene, ribbons) => {
     return true;
   };
   box.addEventListener("scroll", said);
-  at("whose").addEventListener("change", (event) => { event.target.blur(); follow(); });
   at("to-replay").addEventListener("click", () => at("track").scrollIntoView({ block: "start" }));
   // What the page came with: of a decision, or that there is no such one.
   const come = (link) => {
@@ -104,5 +123,13 @@ replay.panel = (scene, ribbons) => {
     }
     if (!link) standing = scene.now;
   };
-  return { follow, choose, free, come, get chosen() { return chosen; } };
+  return {
+    follow,
+    choose,
+    free,
+    come,
+    get chosen() {
+      return chosen;
+    },
+  };
 };

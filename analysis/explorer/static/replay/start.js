@@ -1,7 +1,8 @@
 "use strict";
 // The replay of a trial: its parts, the keys, and the address, which tells the state.
 // Where panels and other trials come from; a page without a server holds them.
-replay.held = (link, part) => part.querySelector(`template[data-of="${link.dataset.side}/${link.dataset.n}"]`)?.innerHTML;
+replay.held = (link, part) =>
+  part.querySelector(`template[data-of="${link.dataset.side}/${link.dataset.n}"]`)?.innerHTML;
 window.explorer ??= (() => {
   const answer = async (address) => {
     const reply = await fetch(address);
@@ -25,8 +26,14 @@ window.startReplay = () => {
   const trial = JSON.parse(holder.textContent);
   const begin = Object.values(trial.sides)[0].t[0];
   const scene = {
-    trial, begin, now: begin, ghost: null, playing: false,
-    get end() { return Math.max(trial.end, scene.ghost?.end ?? 0); },
+    trial,
+    begin,
+    now: begin,
+    ghost: null,
+    playing: false,
+    get end() {
+      return Math.max(trial.end, scene.ghost?.end ?? 0);
+    },
   };
 
   // ---- the address tells the state
@@ -34,10 +41,14 @@ window.startReplay = () => {
   const address = () => new URL(location.href);
   const remember = (push) => {
     if (push === null) return; // what the address says is being done
-    const { chosen } = panel, wanted = address();
+    const { chosen } = panel,
+      wanted = address();
     const state = {
-      t: scene.now > begin ? scene.now.toFixed(1) : "", side: chosen?.dataset.side, decision: chosen?.dataset.n,
-      of: chosen && ribbons.ofOther(chosen) ? "other" : "", compare: scene.ghost?.named,
+      t: scene.now > begin ? scene.now.toFixed(1) : "",
+      side: chosen?.dataset.side,
+      decision: chosen?.dataset.n,
+      of: chosen && ribbons.ofOther(chosen) ? "other" : "",
+      compare: scene.ghost?.named,
     };
     for (const [name, value] of Object.entries(state)) {
       if (value) wanted.searchParams.set(name, value);
@@ -57,7 +68,8 @@ window.startReplay = () => {
   };
   const recall = async () => {
     const asked = address().searchParams;
-    if ((asked.get("compare") ?? "") !== (scene.ghost?.named ?? "")) await comparison.lay(asked.get("compare") ?? "", null);
+    if ((asked.get("compare") ?? "") !== (scene.ghost?.named ?? ""))
+      await comparison.lay(asked.get("compare") ?? "", null);
     const link = ribbons.find({ side: asked.get("side"), n: asked.get("decision"), other: asked.get("of") });
     if (asked.has("t")) clock.seek(Number(asked.get("t")) || begin);
     else clock.seek(link ? ribbons.begins(link) : begin);
@@ -119,8 +131,10 @@ window.startReplay = () => {
     if (clock.key(event)) event.preventDefault();
     else if (event.key === "]") step(1);
     else if (event.key === "[") step(-1);
-    else if (event.key === "c" && at("compare")) { at("compare").focus(); event.preventDefault(); }
-    else if (event.key === "Escape" && !free() && place.back()) location.href = place.back();
+    else if (event.key === "c" && at("compare")) {
+      at("compare").focus();
+      event.preventDefault();
+    } else if (event.key === "Escape" && !free() && place.back()) location.href = place.back();
   });
 
   const first = address().searchParams;

@@ -1,7 +1,8 @@
 "use strict";
 // The track, from left to right; the left branch is above.
 replay.track = (track, scene) => {
-  const { trial } = scene, road = trial.track;
+  const { trial } = scene,
+    road = trial.track;
   const draw = (name, attributes, parent, text) => {
     const made = document.createElementNS("http://www.w3.org/2000/svg", name);
     for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -10,11 +11,12 @@ replay.track = (track, scene) => {
     return made;
   };
   const sign = (side) => (side === "left" ? -1 : 1);
-  const place = (side, s) => s >= road.merge
-    ? [road.merge * road.forward + s - road.merge, 0]
-    : [s * road.forward, sign(side) * (road.merge - s) * road.lateral];
-  const turned = (side, s) => s >= road.merge ? 0
-    : -sign(side) * Math.atan2(road.lateral, road.forward) * 180 / Math.PI;
+  const place = (side, s) =>
+    s >= road.merge
+      ? [road.merge * road.forward + s - road.merge, 0]
+      : [s * road.forward, sign(side) * (road.merge - s) * road.lateral];
+  const turned = (side, s) =>
+    s >= road.merge ? 0 : (-sign(side) * Math.atan2(road.lateral, road.forward) * 180) / Math.PI;
 
   const vehicles = {};
   // A vehicle as large as its trial has it; about this trial's, what its collision rule looks at.
@@ -37,7 +39,8 @@ replay.track = (track, scene) => {
       draw("text", { x: 0, y: side === "left" ? -reach - 0.8 : reach + 3 }, group, side === "left" ? "L" : "R");
     }
   };
-  const [mergeX] = place("left", road.merge), [endX] = place("left", road.end);
+  const [mergeX] = place("left", road.merge),
+    [endX] = place("left", road.end);
   for (const kind of ["kerb", "lane"]) {
     for (const side of replay.SIDES) {
       const [x, y] = place(side, 0);
@@ -45,11 +48,22 @@ replay.track = (track, scene) => {
     }
   }
   for (const side of replay.SIDES) {
-    const [x0, y0] = place(side, 0), [x1, y1] = place(side, road.tunnel), middle = road.tunnel / 2;
+    const [x0, y0] = place(side, 0),
+      [x1, y1] = place(side, road.tunnel),
+      middle = road.tunnel / 2;
     draw("line", { class: "tunnel", x1: x0, y1: y0, x2: x1, y2: y1 }, track);
     draw("text", { class: "sign exit", x: x1 - 2, y: y1 + (side === "left" ? -5.8 : 8) }, track, "tunnel exit");
     // Towards the middle, where no vehicle drives over it.
-    draw("text", { class: "sign", y: side === "left" ? 6.4 : -4, transform: `translate(${place(side, middle).join(" ")}) rotate(${turned(side, middle)})` }, track, `${side} tunnel`);
+    draw(
+      "text",
+      {
+        class: "sign",
+        y: side === "left" ? 6.4 : -4,
+        transform: `translate(${place(side, middle).join(" ")}) rotate(${turned(side, middle)})`,
+      },
+      track,
+      `${side} tunnel`,
+    );
   }
   draw("line", { class: "merge", x1: mergeX, y1: -4, x2: mergeX, y2: 4 }, track);
   draw("text", { class: "sign", x: mergeX, y: -5.2 }, track, "merge point");
@@ -60,16 +74,22 @@ replay.track = (track, scene) => {
   }
   build("own", trial);
   const crash = draw("g", { class: "crash" }, track);
-  const between = draw("line", {}, crash), crashed = draw("text", { y: 13.5 }, crash);
+  const between = draw("line", {}, crash),
+    crashed = draw("text", { y: 13.5 }, crash);
 
   const move = (name, run) => {
     for (const side of replay.SIDES) {
-      const group = vehicles[name][side], samples = run?.sides[side];
+      const group = vehicles[name][side],
+        samples = run?.sides[side];
       group.toggleAttribute("hidden", !samples);
       group.setAttribute("display", samples ? "inline" : "none");
       if (!samples) continue;
-      const s = replay.sampled(samples.t, samples.x, scene.now), [x, y] = place(side, s);
-      group.setAttribute("transform", `translate(${x.toFixed(2)} ${y.toFixed(2)}) rotate(${turned(side, s).toFixed(1)})`);
+      const s = replay.sampled(samples.t, samples.x, scene.now),
+        [x, y] = place(side, s);
+      group.setAttribute(
+        "transform",
+        `translate(${x.toFixed(2)} ${y.toFixed(2)}) rotate(${turned(side, s).toFixed(1)})`,
+      );
       group.classList.toggle("over", !replay.inside(run, scene.now));
     }
   };
@@ -79,11 +99,13 @@ replay.track = (track, scene) => {
     for (const [name, value] of Object.entries({ x1, y1, x2, y2 })) between.setAttribute(name, value);
     // Beside the signs, and within the picture.
     crashed.setAttribute("x", Math.min(Math.max((x1 + x2) / 2, mergeX - 3), mergeX + 15));
-    crashed.textContent = `✸ collision, ${{
-      euclid2d: `${Math.hypot(x1 - x2, y1 - y2).toFixed(1)} m between the centres`,
-      rectangle: "the outlines overlap",
-      shared_lane: `${Math.abs(left - right).toFixed(1)} m apart along the road`,
-    }[road.rule]}`;
+    crashed.textContent = `✸ collision, ${
+      {
+        euclid2d: `${Math.hypot(x1 - x2, y1 - y2).toFixed(1)} m between the centres`,
+        rectangle: "the outlines overlap",
+        shared_lane: `${Math.abs(left - right).toFixed(1)} m apart along the road`,
+      }[road.rule]
+    }`;
   };
   return {
     lay: (other) => build("ghost", other),

@@ -1,0 +1,259 @@
+"""What the pages show of the analysis, computed in a process of its own and remembered.
+
+pandas and the fits hold a Python process for seconds, and no page may wait for another's numbers.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import duckdb
+
+from merge_runner.errors import UsageError
+from merge_runner.registry import in_use, use
+from merge_runner.results.database import read_database
+from merge_runner.results.store import results_digest
+from merge_runner.study.file import StudyFile
+from merge_runner.study.parts import catalogue_of
+from merge_runner.text_safety import first_line
+from merge_runner_analysis.data.derived_cache import (
+    finished,
+    keep_finished,
+    options_text,
+    present_state,
+)
+from merge_runner_analysis.explorer.reading import stamp_of
+from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.tables.model import from_text, to_text
+
+if TYPE_CHECKING:
+    from merge_runner_analysis.data.study import Study
+
+REMEMBERED = 100
+Request = tuple[str, ...]
+"""``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN`` or ``figure NAME FORM``."""
+
+
+class Numbers:
+    """Answers from one state of a database, whose trials are read once something needs them."""
+
+    def __init__(self, db: Path) -> None:
+        self.db = db
+        self.stamp = stamp_of(db)
+
+    def answer(self, request: Request) -> dict[str, Any]:
+        """What is asked for, with ``counted``: how many trials the database holds.
+
+        ``absent`` says that no table has a cell. Raises MergeRunnerError.
+        """
+        match request:
+            case ["table", name, *part]:
+                found: dict[str, Any] = {"table": self._table(name, *part)}
+            case ["cell", table, row, column]:
+                found = self._cell(table, row, column)
+            case ["figure", name, "svg" | "png" as form]:
+                from merge_runner_analysis.figures.gallery import rendered
+
+                found = {"file": rendered(self.study, name, form), "digest": self._digest}
+            case _:
+                raise UsageError(f"nothing answers {request!r}")
+        return {"counted": self._counted, **found}
+
+    @cached_property
+    def _counted(self) -> int:
+        with read_database(self.db) as connection:
+            rows = connection.execute("SELECT count(*) FROM trials WHERE source <> 'seat'")
+            return int(rows.fetchall()[0][0])
+
+    @cached_property
+    def study(self) -> Study:
+        """The study, once it is read."""
+        from merge_runner_analysis.data.study import Study
+
+        return Study(self.db)
+
+    @cached_property
+    def _digest(self) -> str:
+        return results_digest(self.db)[0]
+
+    @cached_property
+    def _state(self) -> str:
+        return present_state(self.db)
+
+    def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
+        """A table of all trials, or of those of a sweep and a condition; kept for the next time."""
+        options = options_text(self.db, sweep=sweep, condition=condition)
+        kept = finished(self.db, self._state, options, [name])
+        if not kept:
+            from merge_runner_analysis.data.study import Study
+
+            is_part = sweep or condition
+            study = Study(self.db, sweep=sweep, condition=condition) if is_part else self.study
+            kept = {name: to_text(make_tables(study, [name])[0])}
+            keep_finished(self.db, study.state, options, kept)
+        return kept[name]
+
+    def _cell(self, name: str, row: str, column: str) -> dict[str, Any]:
+        from merge_runner_analysis.explain import explain
+
+        table = from_text(self._table(name))
+        try:
+            found = explain(self.study, table, f"{row}:{column}")
+        except UsageError as exc:
+            return {"absent": str(exc)}
+        counts = any(one.counts for one in table.columns if one.name == column)
+        specs = {
+            group.id: dict(zip(trials["trial_id"], trials["spec_hash"], strict=True))
+            for group in (*self.study.measured, *self.study.unjudged)
+            for trials in [group.stored.trials]
+        }
+        trials = [
+            (trial, specs[source.group][trial])
+            for source in found.sources
+            for trial in (source.numerator if counts else source.trials)
+        ]
+        return {"explained": found, "trials": trials}
+
+
+_db: Path
+_numbers: Numbers | None = None
+
+
+def _begin(db: Path, text: str, plugins: Mapping[str, str]) -> None:
+    """Use the study of the explorer, whatever stands in its files by now."""
+    global _db  # noqa: PLW0603 # of a process that has no other use
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the explorer, which then ends it
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    if text:
+        use(catalogue_of(StudyFile.model_validate(tomllib.loads(text)), text, plugins))
+    _db = db
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(0)
+
+
+def _answer(request: Request) -> dict[str, Any]:
+    """The answer of the database as it is now; raises MergeRunnerError."""
+    global _numbers  # noqa: PLW0603 # what was read is read once
+    try:
+        if _numbers is None or _numbers.stamp != stamp_of(_db):
+            _numbers = None  # which makes room first
+            _numbers = Numbers(_db)
+        return _numbers.answer(request)
+    except duckdb.Error as exc:  # as where the file is replaced while it is read
+        raise UsageError(f"{_db} cannot be read: {first_line(exc)}") from exc
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A computation, of a state of the database (its stamp), begun at a time (s since 1970)."""
+
+    answer: Future[dict[str, Any]]
+    state: tuple[int, ...]
+    at: float
+
+    @property
+    def content(self) -> dict[str, Any] | None:
+        """The answer; None while it is not there, and where there will be none."""
+        is_there = self.answer.done() and self.answer.exception() is None
+        return self.answer.result() if is_there else None
+
+
+class Worker:
+    """A process that computes, with the same study's plug-ins as this one."""
+
+    def __init__(self, db: Path) -> None:
+        self._pool = ProcessPoolExecutor(
+            max_workers=1,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_begin,
+            initargs=(db, in_use().text, dict(in_use().plugins)),
+        )
+        self._pid = self._pool.submit(os.getpid)
+
+    def submit(self, request: Request) -> Future[dict[str, Any]]:
+        """Compute an answer after what was asked before."""
+        return self._pool.submit(_answer, request)
+
+    def close(self) -> None:
+        """End it, whatever is under way."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        with suppress(BrokenProcessPool, ProcessLookupError):
+            os.kill(self._pid.result(), signal.SIGKILL)
+
+
+class Computing:
+    """Answers by request. One computation goes on at a time, the others wait for it."""
+
+    def __init__(self, db: Path, start: Callable[[Path], Worker] = Worker) -> None:
+        self.db = db
+        self._start = start
+        self._lock = threading.Lock()
+        self._jobs: dict[Request, Job] = {}
+        self._worker: Worker | None = None
+
+    def ask(
+        self,
+        request: Request,
+        state: tuple[int, ...],
+        *,
+        anew: bool = False,
+        wait_s: float = 0.0,
+    ) -> Job:
+        """A computation, waiting at most ``wait_s`` for its answer; raises MergeRunnerError.
+
+        ``state`` is the present one. An answer of an earlier one will do, since it says which,
+        unless it is wanted ``anew``; what was absent may be there in another state.
+        """
+        with self._lock:
+            job = self._jobs.get(request)
+            content = job.content if job else None
+            if job is None or (
+                content is not None and job.state != state and (anew or "absent" in content)
+            ):
+                job = Job(self._submit(request), state, time.time())
+                self._jobs.pop(request, None)
+                self._jobs[request] = job
+                if len(self._jobs) > REMEMBERED:
+                    del self._jobs[next(iter(self._jobs))]
+        wait([job.answer], timeout=wait_s)
+        if not job.answer.done() or (failure := job.answer.exception()) is None:
+            return job
+        with self._lock:  # no failure stays
+            if self._jobs.get(request) is job:
+                del self._jobs[request]
+        if isinstance(failure, BrokenProcessPool):
+            raise UsageError(
+                "the computation ended without an answer; what it said stands where "
+                "`merge-runner view` was started"
+            ) from failure
+        raise failure
+
+    def _submit(self, request: Request) -> Future[dict[str, Any]]:
+        if self._worker is not None:
+            with suppress(BrokenProcessPool):  # another process takes its place
+                return self._worker.submit(request)
+        self._worker = self._start(self.db)
+        return self._worker.submit(request)
+
+    def close(self) -> None:
+        """Stop computing."""
+        if self._worker is not None:
+            self._worker.close()
