@@ -28,6 +28,7 @@ from merge_runner_analysis.figures.drawing import (
     wrapped,
 )
 from merge_runner_analysis.metrics import Bounded
+from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.stats.intervals import Estimate, mean, proportion
 from merge_runner_analysis.stats.regressions import gap_design
 
@@ -80,6 +81,8 @@ def figure_2(study: Study, chosen: list[Group]) -> Figure:
             _draw_traces(axis, study, group, first, styles)
         for axis, summary in zip(row[2:], SUMMARIES, strict=True):
             _draw_estimates(axis, group, summary, styles)
+            if group.setting and groups[0].driver == HUMAN:
+                _draw_humans(axis, groups[0], summary, styles)
     _scale(axes, groups, study, velocities)
     for axis, heading, panel in zip(axes[0], HEADINGS, "ABCDE", strict=True):
         axis.set_title(heading)
@@ -224,9 +227,21 @@ def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) 
     elif summary is deviation:
         say(axis, MISSING)
     elif summary is gap:
-        for velocity in {*styles} & {*HUMAN_VELOCITIES_MPS}:
-            line = published_gap_line(velocity)
-            axis.plot(*line, color=styles[velocity].colour, ls="--", lw=0.8)
+        _draw_humans(axis, group, summary, styles, "--")
+
+
+def _draw_humans(
+    axis: Axes, human: Group, summary: Summary, styles: Styles, dashes: str = ":"
+) -> None:
+    """The humans as lines, of gaps before an import as the paper's regression has them."""
+    for velocity in {*styles} & {*HUMAN_VELOCITIES_MPS}:
+        if summary is gap and not human.measured:
+            x, y = published_gap_line(velocity)
+        else:
+            found = points(human, velocity, summary)
+            x = np.array([point.x for point in found], dtype=float)
+            y = np.array([point.estimate.value for point in found], dtype=float)
+        axis.plot(x, y, color=styles[velocity].colour, ls=dashes, lw=0.8)
 
 
 def _scale(
@@ -262,11 +277,13 @@ def _limits(found: list[Bounded], lines: list[float]) -> tuple[float, float]:
 
 
 def _human_keys(study: Study) -> list[Line2D]:
-    """Remarks where humans are shown by something other than their own trials."""
+    """How humans are shown beside drivers, and by what other than their own trials."""
     if study.human not in study.groups:
         return []
+    keys = [Line2D([], [], color="#555555", ls=":", lw=0.8, label="humans")]
     if not study.human.measured:
-        return [Line2D([], [], color="#555555", ls="--", lw=0.8, label="published regression")]
+        dashed = Line2D([], [], color="#555555", ls="--", lw=0.8, label="published regression")
+        return [*keys, dashed]
     if study.human.published_outcomes is None:
-        return []
-    return [Line2D([], [], ls="", label=f"humans in C: the {HUMAN_TRIALS} published")]
+        return keys
+    return [*keys, Line2D([], [], ls="", label=f"humans in C: the {HUMAN_TRIALS} published")]
