@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from difflib import unified_diff
 from importlib.metadata import version
 from pathlib import Path
@@ -65,7 +65,11 @@ def write_report(
     tables = finished_tables(db, study=study)
     if files is not None:
         yield from write_figures(study, files)
-        yield from write_tables(tables, files)
+        for table in tables:
+            for form in TableFormat:
+                path = files / f"{table.name}.{form.suffix}"
+                path.write_text(render([table], form) + "\n", encoding="utf-8")
+                yield path
     text = report_html(study, tables, finished_figures(study))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -73,16 +77,6 @@ def write_report(
     except OSError as exc:
         raise UsageError(f"{out} cannot be written: {exc}") from exc
     yield out
-
-
-def write_tables(tables: list[Table], folder: Path) -> Iterator[Path]:
-    """Write each table in every format; yields the paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for table in tables:
-        for form in TableFormat:
-            path = folder / f"{table.name}.{form.suffix}"
-            path.write_text(render([table], form) + "\n", encoding="utf-8")
-            yield path
 
 
 def finished_figures(study: Study) -> dict[str, str]:
@@ -99,22 +93,14 @@ def finished_figures(study: Study) -> dict[str, str]:
     return {name: (found | drawn)[file] for file, name in files.items()}
 
 
-@dataclass
-class Links:
-    """The sources of all rows, numbered; rows with equal sources share a number."""
-
-    study: Study
-    found: dict[tuple[Source, ...], int] = field(default_factory=dict)
-
-    def to(self, table: Table, row: Row, _column: Column) -> int:
-        """The number under which the sources of a row are listed."""
-        sources = sources_of(self.study, table, row)
-        return self.found.setdefault(sources, len(self.found) + 1)
-
-
 def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> str:
     """The report as one HTML document; ``figures`` maps names to SVG in Base64."""
-    links = Links(study)
+    # Rows with equal sources share a number.
+    numbers: dict[tuple[Source, ...], int] = {}
+
+    def number(table: Table, row: Row, _column: Column) -> int:
+        return numbers.setdefault(sources_of(study, table, row), len(numbers) + 1)
+
     without_factors = not levels_by_factor(study)
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
@@ -128,7 +114,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     finished = next((table for table in tables if table.name == TABLE), None)
     said = sentences((finished or verdicts(study)).rows)
     views = {
-        table.name: table_view(table, links.to)
+        table.name: table_view(table, number)
         for table in tables
         if table.name != "factors" or not without_factors
     }
@@ -147,9 +133,9 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         factors=views.pop("factors", None),
         tables=list(views.values()),
         beside=[
-            table_view(against(table, study), links.to) for table in tables if table.name in FILES
+            table_view(against(table, study), number) for table in tables if table.name in FILES
         ],
-        sources=[(number, sources) for sources, number in links.found.items()],
+        sources=[(place, sources) for sources, place in numbers.items()],
         listed=LISTED,
         command=sql_command(study),
         libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),

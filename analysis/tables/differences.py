@@ -23,12 +23,14 @@ from merge_runner_analysis.stats.intervals import Difference
 from merge_runner_analysis.stats.measures import estimate, trials_of, undecided_note
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 
+WITHIN = (
+    "compared within the {} that both have: rates by the weights of Mantel and Haenszel, with "
+    "Newcombe's interval and Fisher's exact test; means by least squares, with its t test"
+)
 DIFFERENCES = (
-    "differences are from the reference, the level that stands first, in the cells that both have "
-    "(a cell is a condition with one level of each other factor): of rates by the weights of "
-    "Mantel and Haenszel, with Newcombe's interval and Fisher's exact test within cells; of means "
-    "by least squares with a level for each cell, and its t test; of medians without a test. So "
-    "they are within driver and condition; where a level lacks cells, they have no p"
+    f"Levels are {WITHIN.format('cells')}; medians without a test. The reference is the level that "
+    "stands first; a cell is a condition with one level of each other factor. Where a level lacks "
+    "cells, there is no p"
 )
 INTERACTIONS = (
     "an interaction (×) is the difference at that level minus the one at the first level of {by}, "
@@ -70,14 +72,10 @@ def contrasts(study: Study) -> Table:
         ),
         rows,
         (
-            "all are compared within the conditions that both have: rates by the weights of Mantel "
-            "and Haenszel, with Newcombe's interval and Fisher's exact test within conditions; "
-            "means by least squares, with its t test. A family is one measure of "
-            "one driver over its prompts",
-            "detectable: the smallest difference that is found at p < .05, before correction, with "
-            "a power of .8; rates: by the exact power of Fisher's test of all these trials as if "
-            "of one condition, the reference's true rate being the observed one, in the direction "
-            "in which less is enough; means: (t.975 + t.8) times the standard error",
+            f"{WITHIN.format('conditions')}. A family is one measure of one driver over its "
+            "prompts. Detectable: before correction; of rates by the exact power of Fisher's test "
+            "of all these trials as if of one condition, in the direction in which less is enough, "
+            "of means (t.975 + t.8) times the standard error",
             RULES_NOTE,
             *([] if rows else [f"there is no pair of {judged}groups to compare"]),
         ),

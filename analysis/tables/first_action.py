@@ -146,9 +146,5 @@ def _published_slope() -> pd.Series:
 def _human_notes(study: Study) -> Iterator[str]:
     if study.human not in study.groups:
         return
-    known = _published_slope()
-    yield (
-        f"human: slope {known['value']} [{known['low']}, {known['high']}] as published: "
-        f"{known['caution']}"
-    )
+    yield f"human: slope as published: {_published_slope()['caution']}"
     yield f"human: exchange rate: {citation('human_outcomes')}"

@@ -393,7 +393,7 @@ def test_the_ceiling_stands_beside_each_score_and_fits_its_size(study, tables):
     for group in study.models:
         found = score(study, group).ceiling
         row = next(r for r in tables["ablation-qualitative"].rows if r.id == group.id)
-        assert row.values["ceiling_paper"] == 100 * found.paper["I1-I4"]
+        assert row.values["ceiling_paper"] == 100 * found["paper"]["I1-I4"]
     small, large = (
         cell(tables["ablation-qualitative"], row, "ceiling_paper")
         for row in ("o3/A1", "o3/baseline")
