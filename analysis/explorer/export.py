@@ -28,19 +28,19 @@ from merge_runner_analysis.explorer.guard import LOOPBACK
 from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.offline import offline, page_of_trials
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.site import SCOPE, Site
 from merge_runner_analysis.explorer.urls import query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
-# The pages of an export by the first part of their path, and what their addresses may ask for.
-FOLLOWED = frozenset(
-    {
-        *("", "drivers", "trials", "discordant", "sweeps", "tables", "figures"),
-        *("prompts", "notes", "glossary"),
-    }
-)
-OF_TRIALS = frozenset({"trials", "glossary"})
-ASKED = {"prompt", "spec", "page", *FACETS}
+# The pages of an export by the first part of their path, and what their addresses ask for. They
+# are of all trials, so that a link within a scope leads to the page without it.
+FOLLOWED: dict[str, Collection[str]] = {
+    **dict.fromkeys(("", "sweeps", "tables", "figures", "prompts", "notes", "glossary"), ()),
+    "drivers": ("variant",),
+    "trials": ("spec", "page", *FACETS),
+    "discordant": ("model", "variant"),
+}
+OF_TRIALS = ("trials", "glossary")
 MOMENT = ("side", "decision")  # the script of a trial's page reads these
 POLICY = (
     "default-src 'none'; script-src 'self' file:; style-src 'self' file:; "
@@ -93,7 +93,7 @@ def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
 
 
 async def _crawled(
-    site: Site, begin: str, heads: frozenset[str], stage: Path, told: Callable[[int], object]
+    site: Site, begin: str, heads: Collection[str], stage: Path, told: Callable[[int], object]
 ) -> dict[str, str]:
     """Save the pages to which links lead, as they are served; returns their files by address."""
     files, absent, waiting = {begin: INDEX}, set[str](), deque([begin])
@@ -116,8 +116,13 @@ async def _crawled(
                 continue
             text = reply.text if reply.headers["content-type"].startswith("text/html") else ""
             for link in _LINKS.findall(text):
-                page, _ = _page_of(unescape(link), heads)
-                if page and page not in files and not page.endswith(".png"):
+                page, _ = _page_of(unescape(link))
+                if (
+                    page
+                    and page not in files
+                    and _head(page) in heads
+                    and not page.endswith(".png")
+                ):
                     files[page] = _file_of(page, files.values())
                     waiting.append(page)
             if BUSY in text:
@@ -130,16 +135,23 @@ async def _crawled(
 
 
 @cache  # a link is read when it is followed, and when it is rewritten
-def _page_of(address: str, heads: frozenset[str] = FOLLOWED) -> tuple[str, str]:
+def _page_of(address: str) -> tuple[str, str]:
     """Split an address into a page and the moment it shows; two empty texts for other pages."""
     parts = urlsplit(address)
+    known = FOLLOWED.get(_head(address)) if parts.path.startswith("/") else None
     asked = dict(parse_qsl(parts.query))
     moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
-    is_known = all(name in ASKED or name.startswith(FACTOR) for name in asked)
-    root, _, rest = parts.path.partition("/")
-    if root or not is_known or rest.partition("/")[0] not in heads:
+    if known is None or parts.netloc:
         return "", ""
-    return parts.path + query_of(asked), moment + (f"#{parts.fragment}" if parts.fragment else "")
+    kept = {name: asked[name] for name in asked if name in known or name.startswith(FACTOR)}
+    if asked.keys() - kept.keys() - {*SCOPE}:
+        return "", ""
+    return parts.path + query_of(kept), moment + (f"#{parts.fragment}" if parts.fragment else "")
+
+
+def _head(address: str) -> str:
+    """The first part of a path."""
+    return urlsplit(address).path.removeprefix("/").partition("/")[0]
 
 
 def _file_of(page: str, taken: Collection[str]) -> str:

@@ -15,7 +15,6 @@ PAGES = (
     "/",
     "/drivers",
     "/drivers/emulator?variant=baseline",
-    "/conditions/N_0_0",
     "/glossary",
     "/tables",
     "/tables/attempts",

@@ -67,7 +67,7 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
 ASK = """
 import sys
 from pathlib import Path
-from merge_runner_analysis.explorer.analysis_process import Worker
+from merge_runner_analysis.explorer.computing import Worker
 from merge_runner.study.parts import load_study
 
 load_study(sys.argv[2], trust=True)

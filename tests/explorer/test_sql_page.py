@@ -163,7 +163,7 @@ def test_a_result_is_a_table_with_types_and_links_to_trials(client, site, monkey
     page = client.get("/sql?q=select").text
     assert '<th scope="col" class="n">rep <small>INTEGER</small>' in page
     assert '<td class="n">1</td>' in page
-    assert spec or '<td><span class="none">NULL</span></td>' in page
+    assert spec or '<td><span class="quiet">NULL</span></td>' in page
     assert "<strong>1</strong> row, in 0.01 s" in page
     found = urlsplit(link(page, "/trials/"))
     assert (found.path, found.query) == (f"/trials/{name}", "spec=o3-baseline" if spec else "")
@@ -245,5 +245,5 @@ def test_the_schema_stands_beside_with_what_is_said_of_it(site, client, asked):
     assert columns["time_s"].kind == "DOUBLE"
     assert columns["time_s"].comment == "0 where the drivers take control"
     page = client.get("/sql").text
-    assert page.count("<details class=") == len(found)
+    assert page.count('<details class="schema"') == len(found)
     assert "<strong>trial_metrics</strong>" in page

@@ -205,7 +205,7 @@ def test_two_other_models_have_a_line_and_a_list_each(study):
 
 def page_of(site):
     site.catalogue.refresh()
-    return page.sweep_page(site, "sweep-1")
+    return page.sweep_page(site, "sweep-1", {})
 
 
 def test_what_a_server_wrote_is_shown_as_text(study):

@@ -121,13 +121,6 @@ def test_brackets_begin_where_the_replay_was_stopped(page):
     expect(driven.first).to_have_attribute("data-n", "2")
 
 
-@pytest.mark.long
-def test_the_rows_of_a_trials_tables_are_no_list(page):
-    page.goto(TRIAL)
-    page.keyboard.press("j")
-    expect(page.locator("tr.chosen")).to_have_count(0)
-
-
 def test_an_address_brings_everything_back(page):
     other = "emulator/baseline/N_0_0/rep02"
     page.goto(f"{TRIAL}?t=4.2&side=right&decision=3&compare={other}")
@@ -153,17 +146,6 @@ def test_keys_are_off_while_one_types(page):
     page.keyboard.press("Escape")
     page.keyboard.press("?")
     expect(page.locator("#help")).to_be_visible()
-
-
-@pytest.mark.long
-def test_j_k_and_enter_open_a_trial(page):
-    page.goto("/trials?q=emulator")
-    for key in "jjk":
-        page.keyboard.press(key)
-    expect(page.locator("tr.chosen")).to_have_count(1)
-    name = page.locator("tr.chosen a").inner_text()
-    page.keyboard.press("Enter")
-    expect(page.locator("h1")).to_have_text(name)
 
 
 @pytest.mark.long

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
-from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.explorer.conditions import ordered
-from merge_runner_analysis.explorer.display_text import MINUS
+from merge_runner_analysis.explorer.display_text import with_minus
 from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.pages.home import (
     KINDS,
     Driver,
     drivers_of,
+    humans_by_condition,
     humans_of,
     noted,
     verdicts_of,
+    with_merged,
 )
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.scope import Scope, carried, scope_of, unmarked
@@ -30,6 +33,12 @@ ATTEMPTS = """
 SELECT served, outcome, sum(times)::BIGINT AS times
 FROM tried SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (number)
 GROUP BY ALL ORDER BY ALL
+"""
+
+# What was sent with every prompt, as JSON.
+SENT = """
+SELECT any_value(coalesce(spec->'$.left.body', spec->'$.right.body'))::VARCHAR AS body
+FROM listed JOIN specs USING (spec_hash) WHERE model = ? AND variant = ?
 """
 
 
@@ -49,6 +58,7 @@ def drivers_page(site: Site, asked: Mapping[str, str]) -> str:
         table=table,
         kinds=kinds,
         headings=KINDS,
+        measures=MEASURES,
         human=humans_of(table),
     )
 
@@ -84,6 +94,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         measures=MEASURES,
         human=humans_of(table),
         first=first,
+        parameters=_parameters(site, own) if own else "",
         found=words,
         kept=bar.scope.trials(name, bar.scope.prompt),
         summary=_summary(own) if own else "",
@@ -124,7 +135,16 @@ def _first(site: Site, own: Driver, scope: Scope, asked: Mapping[str, str]) -> s
                 f" %, goes in {of['go_percent']} % of {of['n']}; m/s² per m/s of own relative "
                 f"velocity: {of['slope']} {of['slope_ci']}."
             )
-    return " ".join(told).replace("-", MINUS) if len(told) > 1 else ""
+    return with_minus(" ".join(told)) if len(told) > 1 else ""
+
+
+def _parameters(site: Site, own: Driver) -> str:
+    """What was sent to the model beside its prompts; empty for a program."""
+    (row,) = site.catalogue.ask(SENT, unmarked(own.name), own.prompt)
+    body = json.loads(row["body"] or "{}")
+    return ", ".join(
+        f"{name} {value}" for name, value in body.items() if isinstance(value, str | int | float)
+    )
 
 
 def _attempts(site: Site, own: Driver) -> list[Row]:
@@ -138,23 +158,14 @@ def _accounts(site: Site, own: Driver, scope: Scope) -> list[Row]:
 
 
 def _conditions(site: Site, own: Driver | None, scope: Scope) -> dict[str, Any]:
-    """What the driver's trials, and the humans', come to by condition; None where there are none.
-
-    Counts are of ``merged`` and of ``ended`` trials.
-    """
-    humans = {name: _as_counted(row._asdict()) for name, row in human_counts().items()}
-    own_rows: dict[str, Row] = {}
+    """What the driver's trials, and the humans', come to by condition."""
+    rows: dict[str, Row] = {}
     if own is not None:
-        rows = site.catalogue.counts(scope.filter(own.name, own.prompt), "condition")
-        own_rows = {row["condition"]: _as_counted(row) for row in rows}
-    names = ordered(own_rows or humans)
+        counts = site.catalogue.counts(scope.filter(own.name, own.prompt), "condition")
+        rows = {row["condition"]: with_merged(row) for row in counts}
+    names = ordered(rows or human_counts())
     return {
         "names": names,
-        "own": [own_rows[name] for name in names] if own_rows else [],
-        "humans": [humans.get(name) for name in names],
+        "own": [rows[name] for name in names] if rows else [],
+        "humans": humans_by_condition(names),
     }
-
-
-def _as_counted(row: Row) -> Row:
-    merged = row["left_first"] + row["right_first"]
-    return {"ended": merged + row["collided"], **row, "merged": merged}

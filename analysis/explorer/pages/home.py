@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.data.studies import DESCRIPTIONS
 from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.conditions import ordered
@@ -113,9 +113,11 @@ def verdicts_of(
 
 
 def humans_of(table: Table | None) -> dict[str, Any]:
-    """The humans' cells by measure, and where their bands lie."""
+    """The humans' cells by measure, where their bands lie, and which humans they are."""
     found = by_group(table.rows).get(HUMAN, {}) if table else {}
+    label = str(next(iter(found.values()))["driver"]) if found else HUMAN
     return {
+        "about": label.partition("(")[2].rstrip(")") or "990 trials of nine pairs, as published",
         "cells": cells(found),
         "bands": {name: band(measure, found.get(name, {})) for name, measure in MEASURES.items()},
     }
@@ -186,11 +188,22 @@ def _conditions(site: Site, bar: Bar, shown: list[Driver]) -> dict[str, Any]:
     names = ordered({name for _, _, name in counted})
     return {
         "names": names,
-        "humans": human_counts(),
+        "humans": humans_by_condition(names),
         "imported": bool(site.catalogue.counts(Filter(who="humans"), "who")),
-        "cells": {
-            (one.name, name): counted.get((unmarked(one.name), one.prompt, name))
+        "rows": [
+            (one, [counted.get((unmarked(one.name), one.prompt, name)) for name in names])
             for one in shown
-            for name in names
-        },
+        ],
     }
+
+
+def humans_by_condition(names: Iterable[str]) -> list[Row | None]:
+    """The published counts of conditions; None for one that no human drove."""
+    known = {name: with_merged(counts._asdict()) for name, counts in human_counts().items()}
+    return [known.get(name) for name in names]
+
+
+def with_merged(row: Row) -> Row:
+    """Counts of trials with how many merged, and without other counts how many ended."""
+    merged = row["left_first"] + row["right_first"]
+    return {"ended": merged + row["collided"], **row, "merged": merged}

@@ -1,67 +1,32 @@
 "use strict";
-// A list keeps its place: the row that was opened last is chosen, and a trial leads to its neighbours.
+// A trial leads to its neighbours in the list that led to it, and back to the list.
 (() => {
-  const rows = () => [...document.querySelectorAll("[data-list] tbody tr")];
-  const leads = (row) => row.querySelector("a")?.href;
-  const kept = () => JSON.parse(sessionStorage.getItem("list") ?? "null");
-  const keep = (list) => sessionStorage.setItem("list", JSON.stringify(list));
   // A page without a server may hold several trials; a name may have several specs.
-  const same = (a, b) => {
-    const [one, other] = [new URL(a), new URL(b)];
-    const [spec, another] = [one, other].map((url) => url.searchParams.get("spec"));
-    const named = (url) => url.pathname + url.searchParams.get("trial");
-    return named(one) === named(other) && (!spec || !another || spec === another);
+  const key = (href) => {
+    const { pathname, searchParams } = new URL(href);
+    return [pathname, searchParams.get("trial"), searchParams.get("spec")].join();
   };
-  // Where several rows are of one trial, as its decisions are, it counts once.
-  const distinct = (hrefs) =>
-    hrefs.filter((href, i) => href && !hrefs.slice(0, i).some((other) => other && same(href, other)));
+  const keep = (list) => sessionStorage.setItem("list", JSON.stringify(list));
   // A file cannot read another one.
   const page = (rel) =>
     location.protocol === "file:" ? undefined : document.querySelector(`.paging a[rel=${rel}]`)?.href;
 
-  // ---- in a list
-
-  let address = null;
-  const place = () => rows().findIndex((row) => row.classList.contains("chosen"));
-  const choose = (row, focus) => {
-    if (!row) return;
-    rows()[place()]?.classList.remove("chosen");
-    row.classList.add("chosen");
-    address = leads(row);
-    if (focus) row.querySelector("a")?.focus({ preventScroll: true });
-    row.scrollIntoView({ block: "nearest" });
-  };
-  // Rows that come anew are the same where only something in them has changed.
-  document.addEventListener("htmx:afterSwap", () => {
-    rows()
-      .find((row) => address && leads(row) === address)
-      ?.classList.add("chosen");
-  });
   document.addEventListener("click", (event) => {
     const row = event.target.closest("[data-list] tbody tr");
     if (!row || event.target.closest("a") !== row.querySelector("a")) return;
-    const hrefs = distinct(rows().map(leads));
-    keep({ address: location.href, rows: hrefs, open: leads(row), next: page("next"), prev: page("prev") });
-  });
-  addEventListener("pageshow", () => {
-    const list = kept();
-    if (list?.address === location.href)
-      choose(
-        rows().find((row) => leads(row) === list.open),
-        false,
-      );
+    const hrefs = [...document.querySelectorAll("[data-list] tbody tr")].map((one) => one.querySelector("a")?.href);
+    // Where several rows are of one trial, as its decisions are, it counts once.
+    const rows = [...new Map(hrefs.filter(Boolean).map((href) => [key(href), href])).values()];
+    keep({ address: location.href, rows, next: page("next"), prev: page("prev") });
   });
 
-  // ---- on the page of a trial
-
-  const here = (list) => list?.rows.findIndex((row) => same(row, location.href)) ?? -1;
-  const links = () => [document.getElementById("previous-trial"), document.getElementById("next-trial")];
+  const list = JSON.parse(sessionStorage.getItem("list") ?? "null");
+  const here = () => list?.rows.findIndex((href) => key(href) === key(location.href)) ?? -1;
+  const links = () => ["previous-trial", "next-trial"].map((id) => document.getElementById(id));
   window.place = {
     lead: () => {
-      const list = kept(),
-        at = here(list);
+      const at = here();
       if (at < 0) return;
-      keep({ ...list, open: list.rows[at] });
       const hrefs = [list.rows[at - 1] ?? list.prev, list.rows[at + 1] ?? list.next];
       links().forEach((link, i) => {
         link.hidden = !hrefs[i];
@@ -73,15 +38,11 @@
       const from = document.referrer && new URL(document.referrer);
       const led = from && from.origin === location.origin && !from.pathname.startsWith("/trials/");
       if (led && from.pathname !== location.pathname) return from.href;
-      return here(kept()) >= 0 ? kept().address : document.getElementById("trial").dataset.back;
+      return here() >= 0 ? list.address : document.getElementById("trial").dataset.back;
     },
     step: (by) => {
-      const all = rows();
-      if (!document.getElementById("trial")) choose(all[Math.min(Math.max(place() + by, 0), all.length - 1)], true);
-      else
-        links()
-          .find((link, i) => !link.hidden && i === (by > 0 ? 1 : 0))
-          ?.click();
+      const link = document.getElementById("trial") && links()[by > 0 ? 1 : 0];
+      if (link && !link.hidden) link.click();
     },
   };
 })();

@@ -9,7 +9,9 @@ replay.charts = (scene, { seek, marks, placed }) => {
   // Read anew at each drawing: the page may turn from light to dark, and paper is light.
   const colour = (name) => {
     holder.style.color = `var(--${name})`;
-    return getComputedStyle(holder).color;
+    const computed = getComputedStyle(holder).color;
+    holder.style.color = "";
+    return computed;
   };
   const plots = [];
   let times = [],

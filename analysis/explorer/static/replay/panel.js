@@ -36,7 +36,6 @@ replay.panel = (scene, ribbons) => {
   const said = () => {
     const still = chosen !== null || (followed !== null && reading());
     at("follow").hidden = !still;
-    at("whose").parentElement.hidden = still;
     box.setAttribute("aria-live", scene.playing ? "off" : "polite");
   };
   const heading = (links, other) =>
@@ -59,9 +58,7 @@ replay.panel = (scene, ribbons) => {
     waiting = 0;
     if (chosen || reading() || scene.now === standing) return said();
     const begun = scene.now > scene.begin + 1e-9 || scene.ghost;
-    const links = begun
-      ? ribbons.current().filter((link) => ["both", link.dataset.side].includes(at("whose").value))
-      : [];
+    const links = begun ? ribbons.current() : [];
     const names =
       links.map((link) => link.dataset.panel || `${link.dataset.side}/${link.dataset.n}`).join(" ") +
       Boolean(scene.ghost);
@@ -117,10 +114,6 @@ replay.panel = (scene, ribbons) => {
     return true;
   };
   box.addEventListener("scroll", said);
-  at("whose").addEventListener("change", (event) => {
-    event.target.blur();
-    follow();
-  });
   at("to-replay").addEventListener("click", () => at("track").scrollIntoView({ block: "start" }));
   // What the page came with: of a decision, or that there is no such one.
   const come = (link) => {
