@@ -61,7 +61,7 @@ def test_a_page_fits_its_window_and_axe_finds_nothing_serious(page, address):
 
 @pytest.mark.long
 def test_exported_pages_fit_and_axe_finds_nothing_serious(page, exported):
-    one = ("index", "trials", "trials-emulator-baseline-N_0_0-rep01", "conditions-N_0_0", "notes",
+    one = ("index", "trials", "trials-emulator-baseline-N_0_0-rep01", "notes",
            "sweeps", "tables", "tables-attempts", "prompts", "glossary")  # fmt: skip
     for path in sorted(exported.rglob("*.html")):
         if path.stem not in one:

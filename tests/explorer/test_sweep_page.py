@@ -232,7 +232,7 @@ def test_while_it_runs_its_totals_are_its_progress_file_s_and_the_cells_those_st
 @pytest.mark.parametrize(
     ("code", "ended", "failed", "kind", "words", "goes_on"),
     [
-        (0, 33, 0, "finished", "Finished: all 33 trials ended, and the audit found nothing.", 0),
+        (0, 33, 0, "finished", "Finished: all 33 trials ended, and no problems were found.", 0),
         (0, 30, 0, "stopped", "holds only 30 of its 33 trials", 0),
         (None, 30, 0, "stopped", "Stopped without a word", 1),
         (130, 30, 0, "stopped", "Stopped: it was interrupted (Ctrl-C). 30 of 33 trials", 1),

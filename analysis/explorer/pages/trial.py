@@ -115,6 +115,7 @@ def decision_panel(site: Site, row: Row, trial: Trial, decision: Row) -> Markup:
     panel = site.render(
         "_decision.html",
         d=decision,
+        driver=row[f"model_{decision['side']}"],
         clamped=clamped,
         went_on=views.older_plan(trial, decision) if decision["fallback"] else "",
         before=before,
