@@ -26,9 +26,8 @@
     search: async (text) => {
       const words = text.toLowerCase().split(/\s+/);
       const fit = held.filter((one) => one !== chosen && words.every((word) => one.dataset.words.includes(word)));
-      return {
-        found: fit.slice(0, FOUND).map(({ dataset: { trial, spec, outcome } }) => ({ key: `${trial}@${spec}`, outcome })),
-      };
+      const key = ({ dataset: { trial, spec } }) => `${trial}@${spec}`;
+      return { found: fit.slice(0, FOUND).map((one) => ({ key: key(one), outcome: one.dataset.outcome })) };
     },
   };
   document.getElementById("shown").replaceChildren(chosen.content.cloneNode(true));
