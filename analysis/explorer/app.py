@@ -33,7 +33,6 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from merge_runner.errors import MergeRunnerError, UsageError
-from merge_runner_analysis.explorer.assets import STATIC
 from merge_runner_analysis.explorer.guard import LOOPBACK, from_elsewhere, guarded
 from merge_runner_analysis.explorer.offline import page_of_trials
 from merge_runner_analysis.explorer.pages import (
@@ -50,7 +49,7 @@ from merge_runner_analysis.explorer.pages import (
     words,
 )
 from merge_runner_analysis.explorer.reading import reading
-from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site
+from merge_runner_analysis.explorer.site import STATIC, NothingNew, NotThere, Site
 from merge_runner_analysis.explorer.urls import whole
 
 LOG = logging.getLogger(__name__)
