@@ -26,10 +26,8 @@
     search: async (text) => {
       const words = text.toLowerCase().split(/\s+/);
       const fit = held.filter((one) => one !== chosen && words.every((word) => one.dataset.words.includes(word)));
-      const found = fit
-        .slice(0, FOUND)
-        .map(({ dataset: { trial, spec, name, outcome } }) => ({ key: `${trial}@${spec}`, name, outcome }));
-      return { found, more: fit.length - found.length };
+      const key = ({ dataset: { trial, spec } }) => `${trial}@${spec}`;
+      return { found: fit.slice(0, FOUND).map((one) => ({ key: key(one), outcome: one.dataset.outcome })) };
     },
   };
   document.getElementById("shown").replaceChildren(chosen.content.cloneNode(true));
