@@ -8,9 +8,8 @@ from difflib import unified_diff
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner_analysis.data.load import load_each
-from merge_runner_analysis.data.studies import DESCRIPTIONS
 from merge_runner_analysis.data.study import Study, levels_of
-from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.names import BASELINE, DESCRIPTIONS
 
 # What each variant asks first: of all of them in the same condition, as far as that was played.
 PROMPTS = """
