@@ -6,6 +6,7 @@ Libraries are imported where they are used, so that the runner's commands start 
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections import deque
 from collections.abc import Sequence
@@ -16,23 +17,23 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from merge_runner.cli import app, main
+from merge_runner.cli import options as cli
 from merge_runner.cli.options import (
     DbOption,
-    JsonOption,
     StudyOption,
     TrustOption,
     beside_study,
-    levels,
+    flag,
     listed,
+    option,
     print_out,
     terminal_width,
     use_study,
 )
 from merge_runner.errors import UsageError
-from merge_runner.paths import DEFAULT_DB, refuse_another_kind
+from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, refuse_another_kind
 from merge_runner.text_safety import say
 from merge_runner_analysis.human.commands import INTERRUPTED, human_app
-from merge_runner_analysis.power.commands import power
 from merge_runner_analysis.table_format import TableFormat
 
 if TYPE_CHECKING:
@@ -44,60 +45,26 @@ HTML = b"<!doctype html"
 TOLD_EVERY = 100  # pages
 
 app.add_typer(human_app, name="human")
-app.command()(power)
-
 
 ModelsOption = Annotated[
     str | None,
-    typer.Option(
-        "--models", metavar="A,B", help="Only these drivers, separated by commas; human is one."
-    ),
+    option("A,B", "Only these drivers, separated by commas; human is one.", "--models"),
 ]
 WhereOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "FACTOR=LEVEL",
+        "Only drivers' trials at this level of a factor of their study, or of model or prompt; may "
+        "be given more than once.",
         "--where",
-        metavar="FACTOR=LEVEL",
-        help="Only drivers' trials at this level of a factor of their study, or of model or "
-        "prompt; may be given more than once.",
     ),
 ]
-
-
 ByOption = Annotated[
     str | None,
-    typer.Option(
+    option(
+        "FACTOR",
+        "With the table factors: the others at each level of this one, and interactions.",
         "--by",
-        metavar="FACTOR",
-        help="With the table factors: the others at each level of this one, and interactions.",
-    ),
-]
-
-
-ColumnsOption = Annotated[
-    str | None,
-    typer.Option("--columns", metavar="A,B", help="Only these columns, by the names of CSV."),
-]
-AgainstOption = Annotated[
-    str | None,
-    typer.Option(
-        "--against",
-        metavar="paper",
-        help="Published values and differences, for drivers of that name.",
-    ),
-]
-AsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--as",
-        metavar="DRIVER",
-        help="With --against paper: every driver beside the paper's human, o3 or gemini-2.5-pro.",
-    ),
-]
-WithoutFallbacksOption = Annotated[
-    bool,
-    typer.Option(
-        "--without-fallbacks", help="Without the trials in which a reply held no valid plan."
     ),
 ]
 
@@ -124,35 +91,48 @@ def tables(
     output: Annotated[
         TableFormat, typer.Option("--format", help="Form of the tables.")
     ] = TableFormat.TEXT,
-    columns: ColumnsOption = None,
-    against: AgainstOption = None,
-    as_driver: AsOption = None,
+    columns: Annotated[
+        str | None, option("A,B", "Only these columns, by the names of CSV.", "--columns")
+    ] = None,
+    against: Annotated[
+        str | None,
+        option("paper", "Published values and differences, for drivers of that name.", "--against"),
+    ] = None,
     by: ByOption = None,
-    without_fallbacks: WithoutFallbacksOption = False,
-    as_json: JsonOption = False,
+    without_fallbacks: Annotated[
+        bool,
+        flag("--without-fallbacks", "Without the trials in which a reply held no valid plan."),
+    ] = False,
+    as_json: cli.JsonOption = False,
 ) -> None:
     """Print the paper's tables III to VII, and further ones."""
     if by is not None and list(names or ()) != ["factors"]:
         raise UsageError("--by FACTOR goes with the table factors: tables factors --by FACTOR")
-    if as_driver is not None and against is None:
-        raise UsageError("--as DRIVER goes with --against paper")
     use_study(study_file, trust=trust)
     from merge_runner_analysis.tables import finished_tables
     from merge_runner_analysis.tables.formats import render, with_columns
 
+    study = None
+    if against is not None:
+        from merge_runner_analysis.data.study import Study
+        from merge_runner_analysis.tables.against import PAPER
+        from merge_runner_analysis.tables.against import against as beside
+
+        if against != PAPER:
+            raise UsageError(f"--against {against}: valid is {PAPER}")
+        study = Study(db, drivers(models), _at(where), study_file, by, without_fallbacks)
     made = finished_tables(
         db,
         drivers(models),
         names or (),
+        study,
         where=_at(where),
         file=study_file,
         by=by,
         without_fallbacks=without_fallbacks,
     )
-    if against is not None:
-        from merge_runner_analysis.tables.against import against as beside
-
-        made = [beside(table, against, as_driver) for table in made]
+    if study is not None:
+        made = [beside(table, study) for table in made]
     if columns is not None:
         made = with_columns(made, listed(columns) or ())
     print_out(render(made, TableFormat.JSON if as_json else output, terminal_width()))
@@ -170,14 +150,13 @@ def explain(
     study_file: StudyOption = None,
     trust: TrustOption = False,
     by: ByOption = None,
-    as_json: JsonOption = False,
+    as_json: cli.JsonOption = False,
 ) -> None:
     """Explain a row of a table: its query and its trials."""
-    use_study(study_file, trust=trust)
+    study = _study(db, None, where, study_file, by, trust=trust)
     from merge_runner_analysis.explain import explain as explain_cell
     from merge_runner_analysis.tables import finished_tables
 
-    study = _study(db, None, where, study_file, by)
     (made,) = finished_tables(db, None, [table], study)
     found = explain_cell(study, made, cell)
     if as_json:
@@ -187,10 +166,50 @@ def explain(
 
 
 @app.command()
+def power(
+    study: Annotated[
+        str, typer.Argument(metavar="STUDY", help="experiments/STUDY.toml, or a path.")
+    ],
+    model: cli.ModelOption = None,
+    only: cli.OnlyOption = None,
+    reps: cli.RepsOption = None,
+    conditions: cli.ConditionsOption = None,
+    variants: cli.VariantsOption = None,
+    sims: Annotated[int, option("N", "Simulated studies a size.", min=20)] = 100,
+    db: DbOption = DEFAULT_DB,
+    cache: cli.CacheOption = DEFAULT_CACHE,
+    trust: TrustOption = False,
+    as_json: cli.JsonOption = False,
+) -> None:
+    """Say what a study could find and what it costs; send nothing."""
+    import asyncio
+
+    from merge_runner.run.plan import Options, make_plan
+    from merge_runner.run.sweep import unsent
+    from merge_runner_analysis.data.study import Study
+    from merge_runner_analysis.power import chances, power_table
+    from merge_runner_analysis.tables.formats import render
+
+    parts, wanted = (listed(conditions), listed(variants)), cli.levels(only or (), "--only")
+    plan = make_plan(study, model or (), reps, *parts, only=wanted, trust=trust)
+    expected = asyncio.run(unsent(plan, Options(db=db, cache=cache), say=say, whole=True))
+    cost_usd = 0.0 if expected.free else expected.cost_usd
+    played = Study(db).models if db.exists() else []
+    rows = list(chances(plan, cost_usd, played, sims))
+    if as_json:
+        facts = {"study": plan.name, "trials": plan.trials, "cost_usd": cost_usd}
+        print_out(json.dumps({**facts, "chances": [row.values for row in rows]}))
+        return
+    costs = "an unknown price" if cost_usd is None else f"about {cost_usd:.2f} USD"
+    about = f"{plan.name} ({plan.driver}, {plan.trials} trials, {costs}; {sims} simulated studies)"
+    table = power_table(f"What can be found by {about}", rows)
+    print_out(render([table], TableFormat.TEXT, terminal_width()))
+
+
+@app.command()
 def figures(
     out: Annotated[
-        Path,
-        typer.Option("--out", metavar="DIR", callback=beside_study, help="The folder to write to."),
+        Path, option("DIR", "The folder to write to.", "--out", callback=beside_study)
     ] = Path("results/figures"),
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
@@ -199,10 +218,10 @@ def figures(
     trust: TrustOption = False,
 ) -> None:
     """Draw all figures as PDF and PNG."""
-    use_study(study_file, trust=trust)
+    study = _study(db, models, where, study_file, trust=trust)
     from merge_runner_analysis.figures.gallery import write_figures
 
-    deque(write_figures(_study(db, models, where, study_file), out), maxlen=0)
+    deque(write_figures(study, out), maxlen=0)
     print_out(f"wrote the figures into {out}")
 
 
@@ -215,7 +234,7 @@ def export(
 ) -> None:
     """Write every table as Parquet and CSV, with all columns explained."""
     from merge_runner.results.export import export_tables
-    from merge_runner_analysis.data.human_counts import outcomes_table
+    from merge_runner_analysis.data.reference_data import outcomes_table
 
     export_tables(db, folder, [outcomes_table()])
     print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")
@@ -224,14 +243,10 @@ def export(
 @app.command()
 def report(
     out: Annotated[
-        Path,
-        typer.Option(
-            "--out", metavar="FILE", callback=beside_study, help="The HTML file to write."
-        ),
+        Path, option("FILE", "The HTML file to write.", "--out", callback=beside_study)
     ] = Path("results/report.html"),
     files: Annotated[
-        Path | None,
-        typer.Option("--files", metavar="DIR", help="Also write all tables and figures here."),
+        Path | None, option("DIR", "Also write all tables and figures here.", "--files")
     ] = None,
     db: DbOption = DEFAULT_DB,
     models: ModelsOption = None,
@@ -255,14 +270,17 @@ def _study(
     where: Sequence[str] | None,
     file: str | None,
     by: str | None = None,
+    *,
+    trust: bool,
 ) -> Study:
+    use_study(file, trust=trust)
     from merge_runner_analysis.data.study import Study
 
     return Study(db, drivers(models), _at(where), file, by)
 
 
 def _at(where: Sequence[str] | None) -> dict[str, list[str]] | None:
-    return levels(where, "--where") if where else None
+    return cli.levels(where, "--where") if where else None
 
 
 def drivers(text: str | None) -> list[str] | None:
@@ -273,40 +291,28 @@ def drivers(text: str | None) -> list[str] | None:
     """
     if text is None:
         return None
-    parts, depth = [""], 0
-    for character in text:
-        depth += {"[": 1, "]": -1}.get(character, 0)
-        if character == "," and depth <= 0:
-            parts.append("")
-        else:
-            parts[-1] += character
-    return [part.strip() for part in parts if part.strip()]
+    return [part.strip() for part in re.split(r",(?![^\[]*\])", text) if part.strip()]
 
 
 @app.command()
 def view(
-    port: Annotated[
-        int, typer.Option(metavar="N", help="0: any free port.", min=0, max=65535)
-    ] = 8700,
+    port: Annotated[int, option("N", "0: any free port.", min=0, max=65535)] = 8700,
     export: Annotated[
-        Path | None,
-        typer.Option("--export", metavar="DIR", help="Write a folder of pages instead of serving."),
+        Path | None, option("DIR", "Write a folder of pages instead of serving.", "--export")
     ] = None,
     single: Annotated[
-        Path | None,
-        typer.Option("--single", metavar="FILE", help="Write one page with the --trials."),
+        Path | None, option("FILE", "Write one page with the --trials.", "--single")
     ] = None,
     trials: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "NAMES",
+            "Which trials to write: names separated by commas, * for anything.",
             "--trials",
-            metavar="NAMES",
-            help="Which trials to write: names separated by commas, * for anything.",
         ),
     ] = None,
     reader: Annotated[
-        str | None,
-        typer.Option("--reader", metavar="NAME", help="Who writes notes; else your user name."),
+        str | None, option("NAME", "Who writes notes; else your user name.", "--reader")
     ] = None,
     db: DbOption = DEFAULT_DB,
     study_file: StudyOption = None,

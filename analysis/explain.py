@@ -8,8 +8,8 @@ from functools import cache
 
 import duckdb
 
-from merge_runner.errors import unknown_name
 from merge_runner.paths import DEFAULT_DB
+from merge_runner.registry import require
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.data.reference_data import citation
 from merge_runner_analysis.data.studies import KEYS
@@ -65,19 +65,16 @@ class Explanation:
 
 def explain(study: Study, table: Table, cell: str) -> Explanation:
     """Explain a ROW of a table, or ``ROW:COLUMN``; raises UsageError."""
-    row_id, _, name = cell.rpartition(":")
-    if not row_id or any(row.id == cell for row in table.rows):
-        row_id, name = cell, ""
-    row = _find(table, row_id)
-    column = _column(table, row, name) if name else None
-    shown = [column] if column else table.columns
-    values = {c.name: row.values[c.name] for c in shown if row.values.get(c.name) is not None}
-    texts = {
-        c.name: shown_value(c, values.get(c.name)) for c in shown if column or c.name in values
-    }
+    rows = {row.id: row for row in table.rows}
+    row_id, _, name = (cell, "", "") if cell in rows else cell.rpartition(":")
+    hint = f"`merge-runner tables {table.name} --format csv` shows all rows and columns"
+    row = require(rows, f"row of {table.name}", row_id or cell, hint)
+    columns = {c.name: c for c in table.columns if name or row.values.get(c.name) is not None}
+    column = require(columns, f"column of {table.name}", name) if name else None
+    texts = {name: shown_value(c, row.values.get(name)) for name, c in columns.items()}
     return Explanation(
         cell=f"{table.name} {cell}",
-        value=texts[name] if column else ", ".join(f"{n} {text}" for n, text in texts.items()),
+        value=texts[name] if name else ", ".join(f"{name} {text}" for name, text in texts.items()),
         meaning=table.heading + (f": {column.meaning or column.heading}" if column else ""),
         note=row.note,
         sources=sources_of(study, table, row, column),
@@ -167,19 +164,3 @@ def _trials(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
 def _database() -> duckdb.DuckDBPyConnection:
     """One for all groups: what a cursor registers is its own."""
     return duckdb.connect()
-
-
-def _find(table: Table, row_id: str) -> Row:
-    for row in table.rows:
-        if row.id == row_id:
-            return row
-    hint = f"`merge-runner tables {table.name} --format csv` shows all rows and columns"
-    raise unknown_name(f"row of {table.name}", row_id, (row.id for row in table.rows), hint)
-
-
-def _column(table: Table, row: Row, name: str) -> Column:
-    for column in table.columns:
-        if column.name == name:
-            return column
-    valid = (c.name for c in table.columns if row.values.get(c.name) is not None)
-    raise unknown_name(f"column of {table.name}", name, valid)

@@ -5,20 +5,22 @@ Tables, figures and pages ask this list, and name no metric that is not in it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 from merge_runner.errors import UsageError
 from merge_runner.registry import Registry
 from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 
 Estimator = Literal["proportion", "mean", "median"]
-# tables: Tables V and VII, the contrasts, and the sentences and pages made of these; criticality:
-# the table of this name; distributions: the figure.
-Place = Literal["tables", "criticality", "distributions"]
-PLACES: frozenset[Place] = frozenset(get_args(Place))
-EVERYWHERE = PLACES - {"criticality"}
+# By place the estimators of what it shows. tables: Tables V and VII, the contrasts and the pages
+# made of these; criticality: the table of this name; distributions: the figure.
+SHOWN = {
+    "tables": ("proportion", "mean"),
+    "criticality": ("median",),
+    "distributions": ("mean",),
+}
 # The trials that a metric may be of, in SQL.
 STATUS = {"finished": "status = 'finished'", "ended": "status <> 'failed'"}
 INTERVALS: dict[Estimator, str] = {
@@ -70,8 +72,7 @@ class Metric:
     and printed in percent. ``trials`` are those that count, unless their value is NULL.
 
     ``label`` and ``unit`` head a column, ``meaning`` says what the number of one trial is, or of
-    what a proportion is the share. ``phrase`` is what a sentence has as its subject. ``lowest`` and
-    ``highest`` are ends that an axis always has. Raises UsageError where these do not fit together.
+    what a proportion is the share. Raises UsageError where these do not fit together.
 
     ``human`` is a published value beside those of the paper: ``paper_of_drivers`` and
     ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``. ``humans_from`` says
@@ -87,29 +88,20 @@ class Metric:
     estimator: Estimator = "mean"
     trials: Literal["finished", "ended"] = "finished"
     decimals: int = 2
-    phrase: str = ""
-    lowest: float | None = None
-    highest: float | None = None
     human: HumanReference | None = None
     humans_from: Literal["outcomes", "recordings", "all recordings"] = "recordings"
     paper_of_drivers: str = ""
     paper_of_humans: str = ""
-    shown: frozenset[Place] = EVERYWHERE
+    shown: bool = True
 
     def __post_init__(self) -> None:
-        if wrong := next(self._mistakes(), None):
-            raise UsageError(f"the metric {self.name!r} {wrong}")
-
-    def _mistakes(self) -> Iterator[str]:
-        """What is wrong with it, in words that follow its name."""
+        wrong = ""
         if not self.name.isidentifier():
-            yield "needs a name of letters, digits and _"
-        if unknown := self.shown - PLACES:
-            yield f"is shown in {', '.join(sorted(unknown))}; valid: {', '.join(get_args(Place))}"
-        if self.rate and "criticality" in self.shown:
-            yield "is a share, and criticality shows medians and quartiles"
+            wrong = "needs a name of letters, digits and _"
         if self.value in JUDGED and self.trials != "ended":
-            yield f"is {self.value}, which ended trials are judged by: it needs trials='ended'"
+            wrong = f"is {self.value}, which ended trials are judged by: it needs trials='ended'"
+        if wrong:
+            raise UsageError(f"the metric {self.name!r} {wrong}")
 
     @property
     def heading(self) -> str:
@@ -137,26 +129,13 @@ class Metric:
         return f"{self.column} IS NOT NULL"
 
     @property
-    def counts_in_database(self) -> str:
-        """The same as a condition on ``trials JOIN trial_metrics``, unless it is JUDGED."""
+    def selected(self) -> str:
+        """Its column as an expression of SQL over ``trials JOIN trial_metrics``."""
+        typed = f"({self.value})::{'BOOLEAN' if self.rate else 'DOUBLE'}"
         there = f"{self.value} IS NOT NULL"
         if not self.value.isidentifier():  # what is no finite number is no value
-            there = f"({self.value}) IS NOT NULL" if self.rate else f"isfinite({self._typed})"
-        return f"{STATUS[self.trials]} AND {there}"
-
-    @property
-    def selected(self) -> str:
-        """Its column as an expression of SQL."""
-        return f"CASE WHEN {self.counts_in_database} THEN {self._typed} END AS {self.column}"
-
-    @property
-    def _typed(self) -> str:
-        return f"({self.value})::{'BOOLEAN' if self.rate else 'DOUBLE'}"
-
-    @property
-    def in_sentences(self) -> str:
-        """What it is as the subject of a sentence."""
-        return self.phrase or f"the {self.label}"
+            there = f"({self.value}) IS NOT NULL" if self.rate else f"isfinite({typed})"
+        return f"CASE WHEN {STATUS[self.trials]} AND {there} THEN {typed} END AS {self.column}"
 
 
 METRICS = Registry[Metric]("metric")
@@ -167,20 +146,15 @@ def register(metric: Metric) -> Metric:
     return METRICS.register(metric.name, metric)
 
 
-def shown_in(place: Place) -> list[Metric]:
-    """The metrics that a place shows, in the order of the list."""
-    return [metric for metric in METRICS.values() if place in metric.shown]
+def shown_in(place: str) -> list[Metric]:
+    """The metrics that a place of SHOWN has, in the order of the list."""
+    return [one for one in METRICS.values() if one.shown and one.estimator in SHOWN[place]]
 
 
 def intervals_of(metrics: Iterable[Metric]) -> str:
     """``Wilson for rates, Student's t for means``, as far as there are such."""
     used = {metric.estimator for metric in metrics}
     return ", ".join(text for estimator, text in INTERVALS.items() if estimator in used)
-
-
-def compared() -> list[Metric]:
-    """Those of the tables that are tested; there is no test of a difference of medians here."""
-    return [metric for metric in shown_in("tables") if metric.estimator != "median"]
 
 
 COLLISIONS = register(
@@ -193,11 +167,8 @@ COLLISIONS = register(
         value="collided",
         estimator="proportion",
         trials="ended",
-        phrase="collisions by the scenario's rule",
-        lowest=0.0,
         humans_from="all recordings",
         paper_of_drivers="collided_percent",
-        shown=frozenset({"tables"}),
     )
 )
 BOXES = register(
@@ -210,11 +181,8 @@ BOXES = register(
         value="collided_boxes",
         estimator="proportion",
         trials="ended",
-        phrase="collisions of boxes",
-        lowest=0.0,
         humans_from="outcomes",
         paper_of_humans="collided_percent",
-        shown=frozenset({"tables"}),
     )
 )
 LEFT_FIRST = register(
@@ -225,11 +193,8 @@ LEFT_FIRST = register(
         meaning="share of finished trials with a first merger in which it is the left vehicle",
         value="merged_first = 'left'",
         estimator="proportion",
-        phrase="the left vehicle merging first",
-        lowest=0.0,
-        highest=100.0,
         humans_from="outcomes",
-        shown=frozenset(),
+        shown=False,
     )
 )
 GAP = register(
@@ -251,8 +216,6 @@ RMSE = register(
         meaning="RMSE of the speed from the initial speed, mean of both vehicles, to the first "
         "merge",
         value="rmse_mps",
-        phrase="the RMSE of the speed",
-        lowest=0.0,
         paper_of_drivers="rmse_mps",
         paper_of_humans="rmse_mps",
     )
@@ -265,53 +228,39 @@ JOINT = register(
         meaning="share of finished trials with an RMSE of at least 0.5 m/s on both sides",
         value="joint",
         estimator="proportion",
-        phrase="joint contributions",
-        lowest=0.0,
         paper_of_drivers="joint_percent",
         paper_of_humans="joint_percent",
-        shown=frozenset({"tables"}),
     )
 )
 
 
 # Surrogate measures of safety: columns of ``trial_metrics``, summed up by their medians.
-for _name, _label, _unit, _meaning in (
-    (
-        "conflict_resolution_s",
+SURROGATES = {
+    "conflict_resolution_s": (
         "conflict resolution",
-        "s",
         "until the vehicles are first off a collision course",
     ),
-    ("time_to_merge_s", "time to merge", "s", "until the first vehicle reaches the merge point"),
-    (
-        "post_encroachment_s",
+    "time_to_merge_s": ("time to merge", "until the first vehicle reaches the merge point"),
+    "post_encroachment_s": (
         "PET",
-        "s",
         "from when the first vehicle has left the merge point to when the second reaches it",
     ),
-    (
-        "min_ttc_s",
+    "min_ttc_s": (
         "min. TTC",
-        "s",
         "smallest time to collision after the first merge, where the vehicles close in faster than "
         f"{NO_CONFLICT_MPS} m/s",
     ),
-    (
-        "max_acceleration_mps2",
-        "max |a|",
-        "m/s²",
-        "largest absolute acceleration of either vehicle",
-    ),
-):
+    "max_acceleration_mps2": ("max |a|", "largest absolute acceleration of either vehicle"),
+}
+for _name, (_label, _meaning) in SURROGATES.items():
     register(
         Metric(
             name=_name,
             label=_label,
-            unit=_unit,
+            unit="m/s²" if _name.endswith("_mps2") else "s",
             meaning=_meaning,
             value=_name,
             estimator="median",
-            shown=frozenset[Place]({"criticality"}),
         )
     )
 RULES_NOTE = (

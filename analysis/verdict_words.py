@@ -7,7 +7,7 @@ report and a terminal say the same. pandas is not needed to read them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from merge_runner_analysis.names import BASELINE
@@ -30,8 +30,9 @@ class Measure:
     ``trait`` names what humans do, ``label`` and ``unit`` head a column, ``counts`` is the SQL
     predicate of its trials and ``rule`` says how its state is set. ``told`` is the sentence of a
     difference, with the fields ``of`` (driver) and ``humans``, each a value with its interval, and
-    ``decimals`` are those of its values there. ``ends`` are those of its axis. ``margin``: so far
-    from the humans it still is alike.
+    ``decimals`` are those of its values there. ``says`` has by state the driver's part of a
+    sentence, with the values of its row as fields, its ``rate`` and ``more`` or less. ``ends`` are
+    those of its axis. ``margin``: so far from the humans it still is alike.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Measure:
     rule: str
     told: str
     ends: tuple[float, float]
+    says: Mapping[str, str] = field(default_factory=dict)
     decimals: int = 1
     margin: float | None = None
 
@@ -67,6 +69,12 @@ MEASURES = {
             "Firth's fit: above 0, likelihood-ratio test at 5 %",
             "gains {of} log-odds of going first per m of headway, humans {humans}",
             (-0.25, 2.5),
+            {
+                SHOWN: "goes first by headway as humans do",
+                WEAKER: "goes first by headway, less than humans",
+                STRONGER: "goes first by headway, more than humans",
+                UNLIKE: "does not go first by headway as humans do",
+            },
         ),
         Measure(
             "velocity",
@@ -78,6 +86,12 @@ MEASURES = {
             "changes its log-odds of going first by {of} per m/s of relative velocity, humans by "
             "{humans}",
             (-6.5, 3.0),
+            {
+                SHOWN: "when faster, yields as humans do",
+                WEAKER: "when faster, yields less than humans",
+                STRONGER: "when faster, yields more than humans",
+                UNLIKE: "when faster, does not yield as humans do",
+            },
         ),
         Measure(
             "collisions",
@@ -88,6 +102,7 @@ MEASURES = {
             "the difference excludes 0",
             "collides in {of} % of trials, humans in {humans} %",
             (0.0, 30.0),
+            {UNLIKE: "collides in {rate} % of trials"},
         ),
         Measure(
             "gap",
@@ -98,6 +113,7 @@ MEASURES = {
             "the difference excludes 0",
             "leaves a gap of {of} m, humans {humans} m",
             (0.0, 8.0),
+            {UNLIKE: "leaves {estimate:.1f} m, humans {human:.1f} m"},
         ),
         Measure(
             "gap-headway",
@@ -130,23 +146,10 @@ MEASURES = {
             "the interval within 0.5 SD of the humans, or beyond it",
             "holds its accelerations {of} human SD more than humans do",
             (-2.0, 3.0),
+            {UNLIKE: "holds accelerations {more}"},
             margin=0.5,
         ),
     )
-}
-WHO_FIRST = {
-    "headway": {
-        SHOWN: "goes first by headway as humans do",
-        WEAKER: "goes first by headway, less than humans",
-        STRONGER: "goes first by headway, more than humans",
-        UNLIKE: "does not go first by headway as humans do",
-    },
-    "velocity": {
-        SHOWN: "when faster, yields as humans do",
-        WEAKER: "when faster, yields less than humans",
-        STRONGER: "when faster, yields more than humans",
-        UNLIKE: "when faster, does not yield as humans do",
-    },
 }
 
 
@@ -155,28 +158,27 @@ def by_group(rows: Iterable[Any]) -> dict[str, dict[str, Values]]:
 
     ``row`` and ``note`` are added. A group that is not judged has one entry, without a measure.
     """
-    found: dict[str, dict[str, Values]] = {}
+    groups: dict[str, dict[str, Values]] = {}
     for row in rows:
         values = {**row.values, "note": row.note, "row": row.id}
-        found.setdefault(row.groups[0], {})[row.values.get("measure") or ""] = values
-    return found
+        groups.setdefault(row.groups[0], {})[row.values.get("measure") or ""] = values
+    return groups
 
 
 def sentences(rows: Iterable[Any]) -> list[str]:
     """The headline of a table's rows, then a sentence on each driver and prompt."""
     groups = by_group(rows)
-    kinds = {name: next(iter(of.values()))["kind"] for name, of in groups.items()}
+    kinds = {name: next(iter(verdicts.values()))["kind"] for name, verdicts in groups.items()}
     judged = {
-        name: of for name, of in groups.items() if kinds[name] == LANGUAGE_MODEL and "" not in of
+        name: verdicts
+        for name, verdicts in groups.items()
+        if kinds[name] == LANGUAGE_MODEL and "" not in verdicts
     }
-    baselines = {
-        name.removesuffix(f"/{BASELINE}"): of
-        for name, of in judged.items()
-        if name.endswith(f"/{BASELINE}")
-    }
-    models = baselines or judged  # a study may call its first prompt otherwise
+    suffix = f"/{BASELINE}"
+    models = {name.removesuffix(suffix): judged[name] for name in judged if name.endswith(suffix)}
     return [
-        " ".join(filter(None, headline(models))),
+        # A study may call its first prompt otherwise.
+        " ".join(filter(None, headline(models or judged))),
         *(f"{name}: {sentence(of)}" for name, of in groups.items() if kinds[name] != HUMANS),
     ]
 
@@ -186,34 +188,30 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
     if "" in verdicts:
         return f"{capital(verdicts['']['note'])}."
     state = {name: values.get("state") for name, values in verdicts.items()}
-    parts = [_who_first(state), _collides(verdicts), _leaves(verdicts), _holds(verdicts)]
+    parts = {name: _part(values) for name, values in verdicts.items()}
+    if state.get("headway") == state.get("velocity") == SHOWN:
+        parts |= {"headway": "goes first as humans do", "velocity": ""}
     if _least_percent(verdicts["collisions"]) > MOST_COLLISIONS:
-        parts[:2] = parts[1::-1]
+        parts = {"collisions": parts["collisions"], **parts}
     unclear = [
         MEASURES[name].label
         for name in ("headway", "velocity", "collisions", "gap")
         if state.get(name) == OPEN
     ]
     if unclear:
-        parts.append(f"{joined(unclear)}: no difference shown")
-    text = ". ".join(capital(part) for part in parts if part)
+        parts["unclear"] = f"{joined(unclear)}: no difference shown"
+    text = ". ".join(capital(part) for part in parts.values() if part)
     return f"{text or 'Nothing can be compared with humans'}."
 
 
-def _who_first(state: Mapping[str, Any]) -> str:
-    if state.get("headway") == state.get("velocity") == SHOWN:
-        return "goes first as humans do"
-    told = [texts.get(str(state.get(name)), "") for name, texts in WHO_FIRST.items()]
-    return "; ".join(filter(None, told))
-
-
-def _collides(verdicts: Mapping[str, Values]) -> str:
-    found = verdicts["collisions"]
-    return f"collides in {share(found, 0)} % of trials" if differs(found) else ""
+def _part(values: Values) -> str:
+    says = MEASURES[str(values["measure"])].says.get(str(values.get("state")), "")
+    more = "more" if (values.get("estimate") or 0.0) > 0 else "less"
+    return says.format(**values, more=more, rate=share(values, 0))
 
 
 def _least_percent(collisions: Values) -> float:
-    return 100 * (collisions["k"] or 0) / collisions["n"] if collisions["n"] else 0.0
+    return 100 * (collisions.get("k") or 0) / collisions["n"] if collisions["n"] else 0.0
 
 
 def share(collisions: Values, decimals: int = 1) -> str:
@@ -225,28 +223,9 @@ def share(collisions: Values, decimals: int = 1) -> str:
     return f"{number(least, decimals)} to {number(most, decimals)}"
 
 
-def _leaves(verdicts: Mapping[str, Values]) -> str:
-    found = verdicts["gap"]
-    if not differs(found):
-        return ""
-    return f"leaves {found['estimate']:.1f} m, humans {found['human']:.1f} m"
-
-
-def _holds(verdicts: Mapping[str, Values]) -> str:
-    found = verdicts["held"]
-    if not differs(found):
-        return ""
-    return f"holds accelerations {'more' if found['estimate'] > 0 else 'less'}"
-
-
 def differs(values: Values) -> bool:
     """Whether the driver is shown to differ from the humans in a measure."""
     return values.get("state") in DIFFERS
-
-
-def strongest(verdicts: Mapping[str, Values]) -> Values | None:
-    """The difference that is surest of a driver's, by its corrected p; None where none is shown."""
-    return min((one for one in verdicts.values() if differs(one)), key=_p, default=None)
 
 
 def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
@@ -254,28 +233,29 @@ def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
 
     ``drivers`` are those that are judged, by name: no mock model and no program.
     """
-    compared = [name for name, of in drivers.items() if any(v.get("state") for v in of.values())]
-    unlike = {name: found for name, of in drivers.items() if (found := strongest(of)) is not None}
     if not drivers:
         return "No language model is judged here.", ""
+    compared = [name for name, of in drivers.items() if any(v.get("state") for v in of.values())]
     if not compared:
         return "No language model can be compared with humans yet.", ""
+    unlike = [
+        (name, values) for name, of in drivers.items() for values in filter(differs, of.values())
+    ]
+    others = [name for name in compared if name not in dict(unlike)]
     if not unlike:
-        return f"No difference from humans is shown for {joined(compared)}.", ""
-    name, found = min(unlike.items(), key=lambda one: _p(one[1]))
-    rest = f"{name} {told(found)}."
+        return f"No difference from humans is shown for {joined(others)}.", ""
+    # The surest one by its corrected p; that of I5 has none.
+    name, values = min(
+        unlike, key=lambda one: 1.0 if one[1].get("p_holm") is None else one[1]["p_holm"]
+    )
     if len(drivers) == 1:
-        return f"{name} does not drive like humans:", f"it {told(found)}."
-    others = [name for name in compared if name not in unlike]
+        return f"{name} does not drive like humans:", f"it {told(values)}."
     if not others:
-        return "No language model here drives like humans:", rest
-    return f"No difference from humans is shown for {joined(others)};", f"but {rest}"
-
-
-def _p(values: Values) -> float:
-    """The corrected p; that of I5, which has none, is the largest."""
-    found = values.get("p_holm")
-    return 1.0 if found is None else float(found)
+        return "No language model here drives like humans:", f"{name} {told(values)}."
+    return (
+        f"No difference from humans is shown for {joined(others)};",
+        f"but {name} {told(values)}.",
+    )
 
 
 def told(values: Values) -> str:

@@ -173,9 +173,7 @@ async def test_objects_are_registered_and_a_cell_that_runs_again_replaces_them(f
         study.register_driver("steady", ConstantDriver, "keeps its speed")
         study.register(VARIANTS, "short", Variant(frozenset({"C1", "C2"})))
         study.register(CONDITIONS, "X_0_15", Condition(headway_m, 1.5))
-    stops = Metric(
-        name="stops", label="stops", unit="", meaning="m", phrase="p", value="end_time_s"
-    )
+    stops = Metric(name="stops", label="stops", unit="", meaning="m", value="end_time_s")
     study.register(METRICS, stops.name, stops)
     trials = (await study.arun()).trials()
     assert trials[["model_left", "variant", "projected_headway_m"]].values.tolist() == [

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-from pydantic import BaseModel, JsonValue, ValidationError
+from pydantic import ValidationError
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
@@ -81,14 +81,6 @@ FROM states JOIN trial_drivers USING (trial_id, spec_hash)
 SEMI JOIN (FROM trials WHERE source <> 'human' AND status <> 'failed')
 USING (trial_id, spec_hash) GROUP BY ALL
 """
-# One row a finished trial: the ego's speeds.
-EGO_SPEEDS = """
-SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s,
-    list(velocity_mps ORDER BY step) AS velocity_mps
-FROM states JOIN trial_drivers USING (trial_id, spec_hash)
-SEMI JOIN (FROM trials WHERE status = 'finished') USING (trial_id, spec_hash)
-WHERE time_s >= 0 AND side = ego GROUP BY ALL ORDER BY ALL
-"""
 # One row a vehicle: its speeds under control, and whether the simulator slowed it by itself. It
 # cruises until its first decision; those of humans are not on record.
 SPEEDS = """
@@ -103,59 +95,6 @@ FROM states JOIN (
     SELECT trial_id, spec_hash, side, min(time_s) AS first_s FROM decisions GROUP BY ALL
 ) USING (trial_id, spec_hash, side)
 WHERE time_s >= greatest(0, coalesce(first_s, 0)) GROUP BY ALL ORDER BY ALL
-"""
-# A plan's revision: |the new plan's first actions - the old plan's for the same instants|. Both
-# plans cover the horizon; the older one is `executed` actions ahead of the new one.
-PLANS = """
-WITH plans AS (
-    SELECT trial_id, spec_hash, side, decision, plan, len(applied) AS executed,
-        lag(plan) OVER driver AS before
-    FROM decisions WINDOW driver AS (PARTITION BY trial_id, spec_hash, side ORDER BY decision)
-), compared AS (
-    SELECT trial_id, spec_hash, side, decision,
-        len(list_distinct(plan)) <= 2 AS coarse,
-        CASE WHEN before IS NOT NULL AND len(before) > executed THEN list_avg(list_transform(
-            range(1, len(before) - executed + 1),
-            lambda i: abs(plan[i] - before[i + executed]))) END AS revision
-    FROM plans WHERE plan IS NOT NULL
-)
-SELECT trial_id, spec_hash, count(*) AS plans, count(*) FILTER (coarse) AS coarse_plans,
-    count(revision) AS revised_plans,
-    sum(revision ORDER BY side, decision) AS total_revision,
-    count(*) FILTER (revision > 0.1) AS large_revisions
-FROM compared GROUP BY ALL ORDER BY ALL
-"""
-# One row a decision with a tactical word: whether it is its driver's first, and the mean
-# acceleration of the second that follows it, NULL where the trial ends before.
-WORDS = """
-WITH speeds AS (
-    SELECT trial_id, spec_hash, side, round(time_s, 3)::DECIMAL(9, 3) AS time_s, velocity_mps
-    FROM states WHERE time_s >= 0
-), said AS (
-    SELECT trial_id, spec_hash, side, decision, tactical, round(time_s, 3)::DECIMAL(9, 3) AS time_s,
-        decision = min(decision) OVER (PARTITION BY trial_id, spec_hash, side) AS at_first
-    FROM decisions QUALIFY tactical IS NOT NULL
-)
-SELECT said.* EXCLUDE (time_s) REPLACE (if(said.side = ego, 'left', 'right') AS side),
-    later.velocity_mps - now.velocity_mps AS driven_mps2
-FROM said JOIN speeds AS now USING (trial_id, spec_hash, side, time_s)
-JOIN trial_drivers USING (trial_id, spec_hash)
-LEFT JOIN speeds AS later ON later.trial_id = said.trial_id AND later.spec_hash = said.spec_hash
-    AND later.side = said.side AND later.time_s = said.time_s + 1
-ORDER BY ALL
-"""
-# One row a vehicle: the acceleration of the first step that its driver controls, and the word of
-# the first decision. Where each driver takes control at its own exit the other one cruises yet:
-# that is no first action.
-FIRST_ACTIONS = """
-SELECT trial_id, spec_hash, if(side = ego, 'left', 'right') AS side, first_mps2, tactical
-FROM (
-    SELECT trial_id, spec_hash, side, arg_min(acceleration_mps2, step) AS first_mps2
-    FROM states WHERE time_s > 0 GROUP BY ALL
-) JOIN trial_drivers USING (trial_id, spec_hash)
-LEFT JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash, side)
-ANTI JOIN (FROM specs WHERE spec->>'$.scenario.control_start' = 'own_exit') USING (spec_hash)
-ORDER BY ALL
 """
 # Fates of the attempts that were answered, also without a plan.
 ANSWERED = ("driven", "fallback")
@@ -184,20 +123,6 @@ FROM specs JOIN trials USING (spec_hash) GROUP BY ALL ORDER BY ALL
 """
 
 
-class _Driver(BaseModel):
-    """What a spec says of a driver: a model has the body of its requests, a program has none."""
-
-    body: dict[str, JsonValue] = {}
-
-
-class _Spec(BaseModel):
-    """What is read of a spec; that of humans says none of this."""
-
-    scenario: ScenarioConfig = ScenarioConfig()
-    left: _Driver = _Driver()
-    right: _Driver = _Driver()
-
-
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     """The rows of one read-only query; raises UsageError."""
     return frames.load(Path(db), sql)
@@ -224,7 +149,7 @@ def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:
     for row in load_each({"specs": SPECS}, db)["specs"].itertuples():
         found[row.spec_hash] = json.loads(row.spec)
         try:
-            _Spec.model_validate(found[row.spec_hash])
+            ScenarioConfig.model_validate(found[row.spec_hash].get("scenario", {}))
         except ValidationError as exc:
             first = exc.errors()[0]
             place = ".".join(map(str, first["loc"])) or "all of it"

@@ -9,15 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import duckdb
 import pandas as pd
 
 from merge_runner.audit.checks import make_views
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
+from merge_runner.results import frames
 from merge_runner.results.database import read_database
 from merge_runner.served_model import other_models, sql_of
-from merge_runner_analysis.data.load import ANSWERED, load_each, load_specs
-from merge_runner_analysis.data.study import Group, Study, of_group
+from merge_runner_analysis.data.load import ANSWERED, load_specs
+from merge_runner_analysis.data.study import Group, Study, of_trials
 
 SWEEPS = """
 SELECT sweep_id, name, started_at, ended_at, git_commit, git_dirty, versions,
@@ -55,9 +57,9 @@ WHERE source NOT IN ('human', 'seat') ORDER BY ALL
 """
 # Answers by each other model than was asked for.
 SERVED = """
-SELECT model_requested, model_served,
+SELECT model_requested AS requested, model_served AS served,
     count(DISTINCT (trial_id, spec_hash, side, decision)) AS answers,
-    list_sort(list(DISTINCT sweep_id) FILTER (sweep_id IS NOT NULL)) AS sweeps
+    coalesce(string_agg(DISTINCT sweep_id, ', ' ORDER BY sweep_id), 'unknown') AS sweeps
 FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
 WHERE fate IN {answered} AND {others}
 GROUP BY ALL ORDER BY ALL
@@ -90,59 +92,47 @@ WHERE source = 'llm' AND NOT scripted ORDER BY ALL
 
 
 @dataclass(frozen=True, slots=True)
-class Mismatch:
-    """Answers by ``served`` to calls that asked for ``requested``, in these sweeps."""
-
-    requested: str
-    served: str
-    answers: int
-    sweeps: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class Provenance:
     """What the report says about the origin of its numbers.
 
-    ``sweeps``, ``calls``, ``sweep_costs`` and ``model_costs`` are rows of the queries here;
-    ``switches`` holds, by driver, variant and spec_hash, the settings of the driving task that
-    differ from the defaults;
-    ``mismatches`` says where another model answered than was asked for. ``alike`` has the drivers
-    all of whose answers to a prompt that was asked before are word for word as before, with their
-    number. ``sent`` holds what was sent to the models beside the prompt, by spec_hash and side.
+    ``sweeps``, ``calls``, ``sweep_costs``, ``model_costs`` and ``mismatches`` are rows of the
+    queries here. By driver, variant and spec_hash ``switches`` holds the settings of the driving
+    task that differ from the defaults, and by spec_hash and side ``sent`` what was sent to the
+    models beside the prompt. ``alike`` has the drivers all of whose answers to a prompt that was
+    asked before are word for word as before, with their number.
     """
 
     sweeps: pd.DataFrame
     calls: pd.DataFrame
     sweep_costs: pd.DataFrame
     model_costs: pd.DataFrame
+    mismatches: pd.DataFrame
     switches: dict[str, str]
-    mismatches: list[Mismatch]
     alike: dict[str, int]
     sent: dict[str, dict[str, dict[str, object]]]
 
 
 def provenance(db: Path) -> Provenance:
     """Read the origin of a database's results."""
-    names = ("sweeps", "calls", "sweep_costs", "model_costs")
-    found = load_each(dict(zip(names, (SWEEPS, CALLS, SWEEP_COSTS, MODEL_COSTS), strict=True)), db)
-    stored = load_specs(db)
     with read_database(db) as connection:
-        specs = {row: stored[row[2]] for row in connection.execute(SPECS).fetchall()}
         others = sql_of(other_models(connection))
-        served = connection.execute(SERVED.format(answered=ANSWERED, others=others)).fetchall()
-    return Provenance(
-        **found,
-        switches={
-            f"{driver}/{variant} ({name})": _switched(spec) or "defaults"
-            for (driver, variant, name), spec in specs.items()
-        },
-        mismatches=[
-            Mismatch(asked, by, answers, tuple(sweeps or ()))
-            for asked, by, answers, sweeps in served
-        ],
-        alike=_alike(db),
-        sent={name: _sent(spec) for (_, _, name), spec in specs.items()},
-    )
+        queries = {
+            "sweeps": SWEEPS,
+            "calls": CALLS,
+            "sweep_costs": SWEEP_COSTS,
+            "model_costs": MODEL_COSTS,
+            "mismatches": SERVED.format(answered=ANSWERED, others=others),
+        }
+        found = {name: frames.frame(connection.execute(sql)) for name, sql in queries.items()}
+        played = connection.execute(SPECS).fetchall()
+        alike = _alike(connection)
+    specs = load_specs(db)
+    switches = {
+        f"{driver}/{variant} ({name})": _switched(specs[name]) or "defaults"
+        for driver, variant, name in played
+    }
+    sent = {name: _sent(specs[name]) for *_, name in played}
+    return Provenance(**found, switches=switches, alike=alike, sent=sent)
 
 
 def tally(study: Study, group: Group) -> Counter[str]:
@@ -153,7 +143,7 @@ def tally(study: Study, group: Group) -> Counter[str]:
     valid plan, for a reason that has a count of its own, too. ``fallback`` counts the ``decisions``
     that were driven from an older plan, or none.
     """
-    trials = of_group(study.calls.trials, group, group.trials)
+    trials = of_trials(study.calls.trials, group.trials)
     counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
     failures = Counter("\n".join(trials["failures"].dropna()).splitlines())
     return Counter(
@@ -174,13 +164,12 @@ def _switched(spec: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v)
 
 
-def _alike(db: Path) -> dict[str, int]:
-    with read_database(db) as connection:
-        make_views(connection)
-        found = {}
-        for (driver,) in connection.execute(DRIVERS).fetchall():
-            connection.execute(OF_DRIVER, [driver])
-            ((found[driver],),) = connection.execute("FROM alike").fetchall()
+def _alike(connection: duckdb.DuckDBPyConnection) -> dict[str, int]:
+    make_views(connection)
+    found = {}
+    for (driver,) in connection.execute(DRIVERS).fetchall():
+        connection.execute(OF_DRIVER, [driver])
+        ((found[driver],),) = connection.execute("FROM alike").fetchall()
     return {driver: repeated for driver, repeated in found.items() if repeated}
 
 

@@ -40,13 +40,10 @@ from merge_runner_analysis.data.imported_humans import (
 from merge_runner_analysis.data.intermittency import measure_profiles
 from merge_runner_analysis.data.load import (
     ASKED_TRIALS,
-    EGO_SPEEDS,
-    FIRST_ACTIONS,
-    PLANS,
     SPEEDS,
     TRACES,
-    WORDS,
     Calls,
+    load,
     load_calls,
     load_each,
     load_specs,
@@ -55,11 +52,6 @@ from merge_runner_analysis.data.metric_values import outcomes_with_metrics, tria
 from merge_runner_analysis.data.studies import KEYS, Order, Studies, read_studies, study_name
 from merge_runner_analysis.names import BASELINE, HUMAN
 
-# What tells groups apart, and is no measure.
-COLUMNS_OF_GROUPS = [
-    "driver", "image", "task", "usual", "mark", "apart", "trace", "left_scripted",
-    "right_scripted",
-]  # fmt: skip
 MEAN_SPEED = "mean_speed_mps"
 # Factors that every study has, and levels that others are compared with.
 FIRST = (MODEL, PROMPT)
@@ -125,8 +117,8 @@ class Group:
 
     def label_of(self, model: str) -> str:
         """How tables name one driver of a mixed pair: a program is no stand-in."""
-        said = filter(None, (self.posing if model in self.posed else "", self.caution))
-        return _label(f"{model} of {self.driver}", "; ".join(said))
+        posing = self.posing if model in self.posed else ""
+        return _label(f"{model} of {self.driver}", posing, self.caution)
 
     @property
     def said(self) -> str:
@@ -233,7 +225,7 @@ class Study:
         ``condition`` all trials of one condition. Raises UsageError.
         """
         self.db = Path(db)
-        self.chosen = models
+        self._frames: dict[str, pd.DataFrame] = {}
         self.by = by
         self.without_fallbacks = without_fallbacks
         self.options = options_text(
@@ -251,7 +243,7 @@ class Study:
         self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
         driven, asked = trials[~recorded], found["asked"]
         if sweep:
-            driven = driven.merge(self._read(OF_SWEEP.format(sweep=quoted(sweep))))
+            driven = driven.merge(load(OF_SWEEP.format(sweep=quoted(sweep)), self.db))
         if condition:
             driven = driven[driven["condition"] == condition]
             self.human = self.human.part(lambda rows: rows["condition"] == condition)
@@ -260,21 +252,25 @@ class Study:
         self._sizes = every.value_counts(dropna=False).reset_index(name="trials")
         asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED), found)
         self.empty = not played
-        kept, human = self._chosen_groups(played, asked, where or {})
+        kept, human = self._chosen(played, asked, models, where or {})
         self.played = [group for group in played if group in kept]
         self.models, self.unjudged = _by_judgement(self.played)
         self.asked, self.unjudged_asked = _by_judgement([g for g in asked if g in kept])
         self.groups = [self.human, *self.models] if human else self.models
 
-    def _chosen_groups(
-        self, played: list[Group], asked: list[Group], where: Mapping[str, Sequence[str]]
+    def _chosen(
+        self,
+        played: list[Group],
+        asked: list[Group],
+        models: Sequence[str] | None,
+        where: Mapping[str, Sequence[str]],
     ) -> tuple[list[Group], bool]:
         """Those of the chosen drivers at these levels, and whether humans are among them."""
         # Those that were only asked are chosen by the names of their models.
         names = {group: group.driver for group in played}
         names |= {group: group.name.removesuffix(ONLY_ASKED) for group in asked}
-        valid = list(dict.fromkeys([HUMAN, *names.values()]))
-        wanted = valid if self.chosen is None else list(self.chosen)
+        valid = dict.fromkeys([HUMAN, *names.values()])
+        wanted = list(valid) if models is None else models
         for name in wanted or [""]:
             if name not in valid:
                 raise unknown_name("driver", name, valid, f"in {self.db}")
@@ -296,7 +292,9 @@ class Study:
         """The group, perhaps without its trials that had a fallback; it is judged by all."""
         if not self.without_fallbacks:
             return group
-        kept = group.part(lambda trials: ~trials["trial_id"].isin(self._with_fallbacks(group)))
+        calls = of_trials(self.calls.trials, group.trials)
+        fallen = calls.loc[calls["fallback"] > 0, "trial_id"]
+        kept = group.part(lambda trials: ~trials["trial_id"].isin(fallen))
         if kept.trials.empty:
             return replace(group, unjudged=group.unjudged or "every trial had a fallback")
         return kept
@@ -308,10 +306,6 @@ class Study:
         if group.setting:
             alike &= sizes["variant"] == group.setting
         return int(sizes.loc[alike, "trials"].sum()) > len(group.trials)
-
-    def _with_fallbacks(self, group: Group) -> set[str]:
-        trials = of_group(self.calls.trials, group, group.trials)
-        return set(trials.loc[trials["fallback"] > 0, "trial_id"])
 
     @property
     def reference(self) -> str:
@@ -342,13 +336,12 @@ class Study:
             for group in self.models
             for row in group.trials.drop_duplicates("condition").itertuples()
         }
-        own = {name: at for name, at in played.items() if name not in HUMAN_CONDITIONS}
         humans = {
             name: (condition.projected_headway_m, condition.relative_velocity_mps)
             for name, condition in HUMAN_CONDITIONS.items()
             if name in played or not played
         }
-        return humans | dict(sorted(own.items(), key=lambda one: (one[1], one[0])))
+        return humans | dict(sorted(played.items(), key=lambda item: (item[1], item[0])))
 
     @property
     def baselines(self) -> list[Group]:
@@ -363,44 +356,23 @@ class Study:
     def profiles_of(self, group: Group) -> pd.DataFrame:
         """One row a vehicle of a group: whether it acted, and how far its acceleration is held."""
         specs = ", ".join(quoted(name) for name in group.trials["spec_hash"].unique())
-        speeds = self._read(f"FROM ({SPEEDS}) WHERE list_contains([{specs}], spec_hash)")
-        return measure_profiles(of_group(speeds, group, group.trials))
+        speeds = load(f"FROM ({SPEEDS}) WHERE list_contains([{specs}], spec_hash)", self.db)
+        return measure_profiles(of_trials(speeds, group.trials))
 
-    @cached_property
-    def ego_speeds(self) -> pd.DataFrame:
-        """One row a finished trial: the ego's speeds under control, of equal drivers the left."""
-        return self._read(EGO_SPEEDS)
-
-    @cached_property
-    def plans(self) -> pd.DataFrame:
-        """One row a trial with valid plans: how coarse they are, how much they were revised."""
-        return self._read(PLANS)
-
-    @cached_property
-    def first_actions(self) -> pd.DataFrame:
-        """One row a vehicle: its first acceleration under control, and its driver's word then."""
-        return self._read(FIRST_ACTIONS)
-
-    @cached_property
-    def words(self) -> pd.DataFrame:
-        """One row a decision with a tactical word: the word, and what was driven in a second."""
-        return self._read(WORDS)
+    def read(self, sql: str) -> pd.DataFrame:
+        """The rows of a query of ours, by trial or vehicle; it is run once."""
+        if sql not in self._frames:
+            self._frames[sql] = load(sql, self.db)
+        return self._frames[sql]
 
     @cached_property
     def calls(self) -> Calls:
         """What became of the calls, by trial."""
         return load_calls(self.db)
 
-    def _read(self, sql: str) -> pd.DataFrame:
-        return load_each({"rows": sql}, self.db)["rows"]
 
-
-def of_group(frame: pd.DataFrame, group: Group, trials: pd.DataFrame) -> pd.DataFrame:
-    """The rows of a per-trial frame that belong to these trials of a group."""
-    return _of_trials(frame, trials)
-
-
-def _of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
+def of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
+    """The rows of a per-trial frame that belong to these trials."""
     # To join all rows takes longer than to leave out those of other groups first.
     near = frame["spec_hash"].isin(trials["spec_hash"].unique())
     return frame[near].merge(trials[KEYS], on=KEYS)
@@ -414,30 +386,24 @@ def _imported(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> I
 def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
     if known is None:
         return _published_group()
-    return Group(
-        HUMAN,
-        "",
-        str(trials["spec_hash"].iloc[0]),
-        trials,
-        label=known.label,
-        models=(HUMAN,),
-        name=HUMAN,
-        published_outcomes=None if known.complete else outcomes_with_metrics(),
-    )
+    outcomes = None if known.complete else outcomes_with_metrics()
+    spec = str(trials["spec_hash"].iloc[0])
+    return replace(
+        _published_group(), spec_hash=spec, trials=trials, label=known.label, measured=True,
+        published_outcomes=outcomes,
+    )  # fmt: skip
 
 
 @cache
 def _published_group() -> Group:
     """One object for all studies: what is computed from it is computed once."""
-    return Group(
-        HUMAN, "", None, outcomes_with_metrics(), label=HUMAN, models=(HUMAN,), name=HUMAN,
-        measured=False,
-    )  # fmt: skip
+    outcomes = outcomes_with_metrics()
+    return Group(HUMAN, "", None, outcomes, HUMAN, models=(HUMAN,), name=HUMAN, measured=False)
 
 
 def _levels(levels: pd.DataFrame, group: Group) -> dict[str, str]:
     """The levels of a group, model and prompt first."""
-    found = of_group(levels, group, group.trials).drop_duplicates("factor")
+    found = of_trials(levels, group.trials).drop_duplicates("factor")
     named = dict(zip(found["factor"], found["value"], strict=True))
     return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
 
@@ -532,8 +498,7 @@ class _Seen(NamedTuple):
     task: str
 
 
-def _seen(specs: Mapping[str, Mapping[str, Any]], name: str, ego: str) -> _Seen:
-    spec = specs.get(name)
+def _seen(spec: Mapping[str, Any] | None, name: str, ego: str) -> _Seen:
     if spec is None:
         return _Seen({}, name, name, name[:8])
     image = usual = name
@@ -564,11 +529,8 @@ def _model_groups(
     if trials.empty:
         return []
     pairs = [*zip(trials["spec_hash"], trials["ego"], strict=True)]
-    seen = {pair: _seen(specs, *pair) for pair in {*pairs}}
-    keyed = trials.assign(
-        **{name: [getattr(seen[pair], name) for pair in pairs] for name in ("image", "usual")},
-        task=[seen[pair].task for pair in pairs],
-    )
+    seen = {pair: _seen(specs.get(pair[0]), *pair) for pair in {*pairs}}
+    keyed = trials.join(pd.DataFrame([seen[pair] for pair in pairs], index=trials.index))
     # A condition that was driven at several mean speeds must not be mixed.
     speeds = keyed.groupby(["usual", "condition"])["image"].transform("nunique")
     mixed = keyed["usual"].isin(keyed.loc[speeds > 1, "usual"])
@@ -577,38 +539,33 @@ def _model_groups(
     keyed["mark"] += _marks(keyed, ["driver", "mark", "variant"], "usual")
     keyed["apart"] = keyed.groupby(["driver", "mark"])["scripted"].transform("nunique") > 1
     keys = ["driver", "mark", "apart", "scripted", "variant", "usual"]
-    groups = [
-        _model_group(
-            rows, seen[rows["spec_hash"].iloc[0], rows["ego"].iloc[0]].spec, specs, decisions
+    groups = []
+    for _, rows in keyed.groupby(keys):
+        group = _model_group(trials.loc[rows.index], rows.iloc[0])
+        counts = of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
+        reasons = (not_judged(row.Index, row.invalid, row.asked) for row in counts.itertuples())
+        group = replace(group, unjudged="; ".join(filter(None, reasons)))
+        groups.append(
+            _distinct(group, [specs.get(name, {}) for name in rows["spec_hash"].unique()])
         )
-        for _, rows in keyed.groupby(keys)
-    ]
     return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
 
 
-def _model_group(
-    rows: pd.DataFrame,
-    spec: Mapping[str, Any],
-    specs: Mapping[str, Mapping[str, Any]],
-    decisions: pd.DataFrame,
-) -> Group:
-    """The group of these trials, which have equal keys; ``spec`` is theirs as the ego sees it."""
-    first = rows.iloc[0]
+def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
+    """The group of these trials, which have the keys of the ``first`` of them."""
     scripted = bool(first["scripted"])
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
-    posing = stand_in(language_models(models, spec), sides or SIDES) if scripted else ""
-    caution = unresponsive(spec)
-    said = "; ".join(filter(None, (posing, caution)))
+    posing = stand_in(language_models(models, first["spec"]), sides or SIDES) if scripted else ""
+    caution = unresponsive(first["spec"])
     seats = rows["ego"].value_counts()
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
-    again = _again(rows)
-    group = Group(
+    return Group(
         driver,
         first["variant"],
         min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
-        rows.drop(columns=COLUMNS_OF_GROUPS),
-        label=_label(driver, said),
+        rows,
+        label=_label(driver, posing, caution),
         models=tuple(dict.fromkeys(models.values())),
         name=first["driver"],
         mark=first["mark"],
@@ -616,36 +573,28 @@ def _model_group(
         posing=posing,
         posed=frozenset(models[side] for side in sides),
         caution=caution,
-        equal=len(again) if first["source"] != "driver" else 0,
-        unjudged=_unjudged(decisions, rows),
     )
-    if again.empty or not _is_deterministic(rows, specs):
-        return group
-    return replace(group, trials=group.trials.drop(index=again), whole=group)
 
 
-def _unjudged(decisions: pd.DataFrame, rows: pd.DataFrame) -> str:
-    """Why nothing is concluded from these trials, for each of their models; empty: something is."""
-    counts = _of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
-    reasons = (not_judged(one.Index, one.invalid, one.asked) for one in counts.itertuples())
-    return "; ".join(filter(None, reasons))
+def _label(driver: str, *said: str) -> str:
+    text = "; ".join(filter(None, said))
+    return f"{driver} ({text})" if text else driver
 
 
-def _label(driver: str, said: str) -> str:
-    return f"{driver} ({said})" if said else driver
+def _distinct(group: Group, specs: list[Mapping[str, Any]]) -> Group:
+    """The group with its equal trials counted, or left out where its drivers have no chance.
 
-
-def _is_deterministic(rows: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> bool:
-    """Whether a pair declares that it has no chance, and its repetitions do not contradict it."""
-    ways = rows.groupby(["condition", "ego"])["trace"].nunique()
-    declared = not any(has_chance(specs.get(name, {})) for name in rows["spec_hash"].unique())
-    return declared and bool((ways <= 1).all())
-
-
-def _again(rows: pd.DataFrame) -> pd.Index:
-    """The trials that went the same way as an earlier repetition."""
+    They declare it, and their repetitions do not contradict it.
+    """
+    rows = group.trials
     ended = rows[rows["trace"].notna()].sort_values(["rep", "ego"], kind="stable")
-    return ended.index[ended.duplicated(["condition", "trace"])]
+    again = ended.index[ended.duplicated(["condition", "trace"])]
+    ways = rows.groupby(["condition", "ego"])["trace"].nunique()
+    program = rows["source"].iloc[0] == "driver"
+    whole = replace(group, equal=0 if program else len(again))
+    if again.empty or any(map(has_chance, specs)) or (ways > 1).any():
+        return whole
+    return replace(whole, trials=rows.drop(index=again), whole=whole)
 
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:

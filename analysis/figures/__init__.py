@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-OF_TWO = "Of two different drivers, the left vehicle is that of the one named first."
-
 
 @dataclass(frozen=True, slots=True)
 class About:
@@ -19,28 +17,25 @@ class About:
     table: str = ""
 
 
+OF_FIGURE_2 = (
+    "Collisions are left out. (A, B) Speed of the left vehicle from the start of control, where it "
+    "merges first and second. (C) How often the left vehicle merges first by projected headway, "
+    "with Wilson intervals. (D) Mean gap at the merge point and (E) mean RMSE of the speed from "
+    "the initial speed, two values a trial, with intervals of Student's t. Of two different "
+    "drivers, the left vehicle is that of the one named first. Colours and markers tell the "
+    "relative velocities apart; few very wide intervals of D and E are cut at the frame."
+)
 FIGURES = {
     "figure2": About(
         "the paper's Figure 2 for the baselines: speeds, who is first, gap and RMSE by condition",
-        "Baseline behaviour, collisions left out. (A, B) Speed of the left vehicle from the start "
-        "of control, where it merges first and second. (C) How often the left vehicle merges first "
-        "by projected headway and relative velocity, with Wilson intervals. (D) Mean gap at the "
-        "merge point and (E) mean RMSE of the speed from the initial speed, two values a trial, "
-        f"with intervals of Student's t. {OF_TWO}",
+        f"Baseline behaviour. {OF_FIGURE_2}",
     ),
     "figure2-variants": About(
-        "the same with a row for every driver and variant; relative velocities as colours and "
-        "markers",
-        "The same for every prompt variant, a row a driver and variant, collisions left out. (A, "
-        "B) Speed of the left vehicle from the start of control, where it merges first and second. "
-        "(C) How often the left vehicle merges first by projected headway, with Wilson intervals. "
-        "(D) Mean gap at the merge point and (E) mean RMSE of the speed from the initial speed, "
-        f"two values a trial, with intervals of Student's t. {OF_TWO} "
-        "Colours and markers tell the relative velocities apart; few very wide intervals of D and "
-        "E are cut at the frame.",
+        "the same with a row for every driver and prompt",
+        f"Behaviour by prompt, a row for each driver and prompt. {OF_FIGURE_2}",
     ),
     "ablation-matrix": About(
-        "I1 to I5 of every driver and variant",
+        "I1 to I5 of every driver and prompt",
         "Indicators of human behaviour by the paper's rule; where the robust tests disagree, their "
         "verdict stands after a stroke.",
         "ablation-qualitative",

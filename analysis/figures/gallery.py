@@ -1,9 +1,9 @@
-"""The figures: Figure 2 of arXiv 2604.09609, the ablation matrix, and distributions."""
+"""The figures, and how they are written: equal results give equal files."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from math import ceil
 from pathlib import Path
@@ -12,50 +12,39 @@ from typing import Any, Literal
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
 from merge_runner.errors import UsageError
+from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.figures.drawing import (
+    BLUE,
     COLUMN_IN,
-    LINE_IN,
-    MISSING,
+    HUMAN_STYLE,
+    ORANGE,
     PAGE_IN,
+    SKY_BLUE,
+    Point,
     draw_points,
-    draw_traces,
     key,
-    letter,
-    line_count,
     named,
-    remarks,
+    row_height_in,
     say,
-    velocity_text,
+    style,
     wrapped,
 )
-from merge_runner_analysis.figures.factor_figure import figure_of_factors
-from merge_runner_analysis.figures.first_action_figure import figure_of_first_actions
-from merge_runner_analysis.figures.panels import (
-    HUMAN_VELOCITIES_MPS,
-    Point,
-    deviations,
-    drawn_groups,
-    farthest_headway_m,
-    gaps,
-    left_first,
-    left_traces,
-    published_gap_line,
-    velocities_mps,
-)
-from merge_runner_analysis.figures.styles import HUMAN_STYLE, ORANGE, SKY_BLUE, Style, driver_style
-from merge_runner_analysis.figures.variant_figure import figure_2_variants
-from merge_runner_analysis.metrics import Metric, shown_in
+from merge_runner_analysis.figures.figure_2 import figure_2
+from merge_runner_analysis.metrics import METRICS, Metric, shown_in
+from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.stats.factors import Level, levels_by_factor
+from merge_runner_analysis.stats.first_action import Seat, first_actions, mean, seats
 from merge_runner_analysis.stats.group_scores import score
 from merge_runner_analysis.stats.indicators import INDICATORS
-from merge_runner_analysis.stats.measures import human_reference, known, values
+from merge_runner_analysis.stats.intervals import Estimate, interval
+from merge_runner_analysis.stats.measures import estimate, human_reference, known, values
 
-LEGEND_COLUMNS = 4
 PASSED, FAILED, UNKNOWN = SKY_BLUE, ORANGE, "#dddddd"
+MARKS = {None: "–", True: "✓", False: "✗"}
 # These settings are fixed, so that equal input gives equal files.
 SETTINGS: Any = {
     "font.size": 7,
@@ -68,41 +57,19 @@ SETTINGS: Any = {
     "svg.hashsalt": "merge-runner",
     "savefig.dpi": 300,
 }
-
-
-def figure_2(study: Study) -> Figure:
-    """Velocities of the left vehicle (A, B), who was first (C), gap (D), speed deviation (E)."""
-    groups = drawn_groups(study, study.baselines)
-    figure = Figure(figsize=(PAGE_IN, 8.2), layout="constrained")
-    parts: Any = figure.subfigures(2, 1, height_ratios=(2, 3))
-    traces, curves = parts
-    frames = traces.subplots(2, max(len(groups), 1), sharex=True, sharey=True, squeeze=False)
-    _traces(frames, study, groups)
-    velocities = velocities_mps(study)
-    axes = curves.subplots(3, len(velocities), sharex=True, sharey="row", squeeze=False)
-    _curves(axes[0], groups, left_first, velocities, "C", "P(left merges first)")
-    _curves(axes[1], groups, gaps, velocities, "D", "gap at merge (m)")
-    _curves(axes[2], groups, deviations, velocities, "E", "RMSE of speed (m/s)")
-    axes[0, 0].set_ylim(-0.05, 1.05)
-    unmeasured = not all(group.measured for group in groups)
-    for column, velocity in enumerate(velocities):
-        axes[0, column].set_title(f"Δv = {velocity_text(velocity)}")
-        axes[2, column].set_xlabel("projected headway (m)")
-        axes[2, column].set_xticks(np.linspace(-1, 1, 5) * farthest_headway_m(study))
-        if unmeasured and velocity in HUMAN_VELOCITIES_MPS:
-            axes[1, column].plot(*published_gap_line(velocity), color="black", ls="--", lw=0.8)
-            axes[2, column].margins(y=0.3)
-            say(axes[2, column], MISSING, 0.99)
-    _legend(curves, study, groups)
-    return figure
+METADATA: dict[str, dict[str, None]] = {
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+    "png": {"Software": None},
+    "svg": {"Date": None, "Creator": None},
+}
 
 
 def ablation_matrix(study: Study) -> Figure:
-    """Which indicators hold for which driver and variant; text and colour say the same."""
+    """Which indicators hold for which driver and prompt; text and colour say the same."""
     groups = study.groups
     names = [wrapped(named(group), COLUMN_IN / 2) for group in groups]
-    row_in = max(0.22, LINE_IN * line_count(names) + 0.04)
-    figure = Figure(figsize=(COLUMN_IN, 0.6 + row_in * len(groups)), layout="constrained")
+    height_in = 0.6 + row_height_in(names, 0.22) * len(groups)
+    figure = Figure(figsize=(COLUMN_IN, height_in), layout="constrained")
     axes = figure.subplots()
     for row, group in enumerate(groups):
         found = score(study, group)
@@ -112,9 +79,8 @@ def ablation_matrix(study: Study) -> Figure:
             axes.add_patch(
                 mpl.patches.Rectangle((column, row), 1, 1, facecolor=colour, edgecolor="white")
             )
-            text = _mark(passed)
-            if robust is not None and robust != passed:
-                text += f" / {_mark(robust)}"
+            differs = robust is not None and robust != passed
+            text = f"{MARKS[passed]} / {MARKS[robust]}" if differs else MARKS[passed]
             axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=6)
     axes.set(xlim=(0, len(INDICATORS)), ylim=(len(groups), 0))
     axes.set_xticks(np.arange(len(INDICATORS)) + 0.5, list(INDICATORS))
@@ -125,39 +91,76 @@ def ablation_matrix(study: Study) -> Figure:
 
 
 def distributions(study: Study) -> Figure:
-    """Each metric other than rates, for every group: median, quartiles, and every trial."""
-    groups, metrics = study.groups, _distributed()
-    names = [wrapped(named(group), PAGE_IN / 4) for group in groups]
-    row_in = max(0.28, LINE_IN * line_count(names) + 0.04)
-    lines = ceil(len(metrics) / 2)
-    size = (PAGE_IN, lines * (0.8 + row_in * len(groups)))
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(lines, 2, sharey=True, squeeze=False)
+    """Each metric but rates, whose values are only 0 and 1: quartiles, and every trial."""
+    metrics = [metric for metric in shown_in("distributions") if not metric.rate]
+    names = [wrapped(named(group), PAGE_IN / 4) for group in study.groups]
+
+    def draw(axis: Axes, row: int, metric: Metric) -> None:
+        _distribution(axis, row, study.groups[row], metric)
+
+    return _panels(metrics, names, range(len(names)), 2, draw)
+
+
+def figure_of_factors(study: Study) -> Figure:
+    """Each level's estimate with its interval; the levels of a factor stand together."""
+    found = levels_by_factor(study)
+    if not found:
+        figure = Figure(figsize=(PAGE_IN, 1.0))
+        say(figure.subplots(), "the trials of drivers differ in no factor")
+        return figure
+    rows = [(number, level) for number, levels in enumerate(found) for level in levels]
+    places = [place + 0.5 * number for place, (number, _) in enumerate(rows)]
+    names = [
+        wrapped(f"{level.factor}={level.name}" + f" ({level.posing})" * bool(level.posing), 1.1)
+        for _, level in rows
+    ]
+
+    def draw(axis: Axes, row: int, metric: Metric) -> None:
+        number, level = rows[row]
+        _estimate(axis, places[row], level, metric, style(number).colour)
+
+    return _panels([*METRICS.values()], names, places, 4, draw)
+
+
+def _panels(
+    metrics: list[Metric],
+    names: list[str],
+    places: Sequence[float],
+    columns: int,
+    draw: Callable[[Axes, int, Metric], None],
+) -> Figure:
+    """A panel per metric, with a row for each name at its place."""
+    lines = ceil(len(metrics) / columns)
+    height_in = lines * (0.7 + row_height_in(names, 0.24) * (places[-1] + 1))
+    figure = Figure(figsize=(PAGE_IN, height_in), layout="constrained")
+    axes = figure.subplots(lines, columns, sharey=True, squeeze=False)
     for axis, metric in zip(axes.flat, metrics, strict=False):
-        for row, group in enumerate(groups):
-            _distribution(axis, row, group, metric, _style(study.baselines, group).colour)
+        for row in range(len(names)):
+            draw(axis, row, metric)
         axis.set_xlabel(metric.heading)
     for axis in axes.flat[len(metrics) :]:
         axis.set_visible(False)
-    axes[0, 0].set_yticks(range(len(groups)), names)
-    axes[0, 0].set_ylim(len(groups) - 0.5, -0.5)
+    axes[0, 0].set_yticks(places, names)
+    axes[0, 0].set_ylim(places[-1] + 0.6, -0.6)
     return figure
 
 
-def _distributed() -> list[Metric]:
-    """The metrics whose values have a distribution to show; a rate's values are only 0 and 1."""
-    return [metric for metric in shown_in("distributions") if not metric.rate]
-
-
-def _distribution(axis: Axes, row: int, group: Group, metric: Metric, colour: str) -> None:
+def _distribution(axis: Axes, row: int, group: Group, metric: Metric) -> None:
+    colour = BLUE if group.setting else HUMAN_STYLE.colour
     if not known(group, metric):
-        _reference(axis, row, metric, colour)
+        reference = human_reference(metric)
+        if reference is None:
+            _remark(axis, row, "no published value")
+            return
+        axis.plot(reference.value, row, "D", color=colour, ms=4)
+        place = (reference.value, row)
+        text = f"published {metric.estimator}"
+        axis.annotate(text, place, (6, -2), textcoords="offset points", fontsize=6)
         return
     found = values(group, metric).to_numpy(float)
     if not len(found):
         there = group.ended if metric.trials == "ended" else group.finished
-        text = "no trial has it" if len(there) else f"no {metric.trials} trial"
-        axis.annotate(text, (0.02, row), xycoords=("axes fraction", "data"))
+        _remark(axis, row, "no trial has it" if len(there) else f"no {metric.trials} trial")
         return
     # Spread by rank, not by chance: the same trials give the same picture.
     spread = row + 0.36 * (np.arange(len(found)) % 7 / 6 - 0.5)
@@ -168,25 +171,60 @@ def _distribution(axis: Axes, row: int, group: Group, metric: Metric, colour: st
     )  # fmt: skip
 
 
-def _reference(axis: Axes, row: int, metric: Metric, colour: str) -> None:
-    """The published value of humans without traces, or a remark that there is none."""
-    found = human_reference(metric)
-    if found is None:
-        axis.annotate("no published value", (0.02, row), xycoords=("axes fraction", "data"))
+def _estimate(axis: Axes, place: float, level: Level, metric: Metric, colour: str) -> None:
+    found = estimate(level.pooled, metric)
+    if found.value is None:
+        _remark(axis, place, "no trial has it")
         return
-    axis.plot(found.value, row, "D", color=colour, ms=4)
-    text = f"published {metric.estimator}"
-    axis.annotate(text, (found.value, row), (6, -2), textcoords="offset points", fontsize=6)
+    low, high = found.bounds() or (found.value, found.value)
+    axis.errorbar(
+        found.value, place, xerr=[[found.value - low], [high - found.value]], color=colour,
+        marker="o", ms=3, elinewidth=0.8, capsize=1.5, mfc="white", mew=0.8,
+    )  # fmt: skip
 
 
-METADATA: dict[str, dict[str, None]] = {
-    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
-    "png": {"Software": None},
-    "svg": {"Date": None, "Creator": None},
-}
+def _remark(axis: Axes, place: float, text: str) -> None:
+    axis.annotate(text, (0.02, place), xycoords=("axes fraction", "data"))
+
+
+def figure_of_first_actions(study: Study) -> Figure:
+    """Means of first actions by own relative velocity, of every driver's baseline prompt."""
+    groups = [g for g in (*study.baselines, *study.asked) if g.setting == BASELINE]
+    drawn = [(HUMAN_STYLE, "humans", _human_first_actions(study))]
+    every = [seat for group in groups for seat in seats(group)]
+    for number, seat in enumerate(every):
+        drawn.append((style(number), seat.name, _first_actions(study, seat)))
+    figure = Figure(figsize=(COLUMN_IN, 2.7), layout="constrained")
+    axis = figure.subplots()
+    for place, (look, _, means) in enumerate(drawn):
+        draw_points(axis, means, 0.04 * place, look)
+    axis.set(xlabel="own relative velocity (m/s)", ylabel="first action (m/s²)")
+    handles = [key(look, wrapped(name, COLUMN_IN / 2 - 0.4)) for look, name, _ in drawn]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+def _human_first_actions(study: Study) -> list[Point]:
+    if study.complete:
+        return _first_actions(study, Seat(study.human, (0, 1)))
+    return [
+        Point(
+            row.relative_velocity_mps,
+            Estimate(row.mean_mps2, *interval(row.mean_mps2, row.se_mps2), row.n),
+        )
+        for row in published("human_first_actions").itertuples()
+    ]
+
+
+def _first_actions(study: Study, seat: Seat) -> list[Point]:
+    by_velocity = first_actions(study, seat).groupby("velocity_mps")
+    found = ((float(velocity), mean(rows)) for velocity, rows in by_velocity)
+    return [Point(velocity, estimate) for velocity, estimate in found if estimate]
+
+
 MAKERS: dict[str, Callable[[Study], Figure]] = {
-    "figure2": figure_2,
-    "figure2-variants": figure_2_variants,
+    "figure2": lambda study: figure_2(study, study.baselines),
+    "figure2-variants": lambda study: figure_2(study, study.groups),
     "ablation-matrix": ablation_matrix,
     "distributions": distributions,
     "factors": figure_of_factors,
@@ -224,66 +262,3 @@ def _figure(study: Study, name: str) -> Figure:
         engine.execute(figure)
         figure.set_layout_engine(None)  # or the figure would be laid out again for every form
     return figure
-
-
-def _traces(axes: NDArray[np.object_], study: Study, groups: list[Group]) -> None:
-    for column, group in enumerate(groups):
-        for row, (first, panel) in enumerate((("left", "A"), ("right", "B"))):
-            axis: Axes = axes[row, column]
-            found = left_traces(study, group, first)
-            colour = _style(groups, group).colour
-            draw_traces(axis, found, colour, len(found))
-            if not group.measured:
-                say(axis, MISSING)
-            elif not found:
-                say(axis, f"{first} never merged first")
-            if row == 0:
-                axis.set_title(wrapped(group.label, 0.85 * PAGE_IN / len(groups)))
-            if found:
-                axis.text(0.98, 0.04, f"n = {len(found)}", transform=axis.transAxes, ha="right")
-            if column == 0:
-                place = "first" if first == "left" else "second"
-                axis.set_ylabel(f"left merges {place}\nv left (m/s)")
-                letter(axis, panel, 1.06)
-            if row == 1:
-                axis.set_xlabel("time (s)")
-
-
-def _curves(
-    axes: NDArray[np.object_],
-    groups: list[Group],
-    points: Callable[[Group, float], list[Point]],
-    velocities: list[float],
-    panel: str,
-    label: str,
-) -> None:
-    axes[0].set_ylabel(label)
-    letter(axes[0], panel, 1.06)
-    for axis, velocity in zip(axes, velocities, strict=True):
-        for index, group in enumerate(groups):
-            found = points(group, velocity)
-            # Side by side, so that intervals do not hide each other.
-            shift = 0.16 * (index - (len(groups) - 1) / 2)
-            draw_points(axis, found, shift, _style(groups, group))
-
-
-def _legend(figure: SubFigure, study: Study, groups: list[Group]) -> None:
-    handles = []
-    for group in groups:
-        label = wrapped(group.label, PAGE_IN / LEGEND_COLUMNS - 0.4)
-        handles.append(key(_style(groups, group), label))
-    handles += remarks(study, "black")
-    figure.legend(handles=handles, loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False)
-
-
-def _style(groups: list[Group], group: Group) -> Style:
-    """The style of a driver, the same for all its variants."""
-    if not group.setting:
-        return HUMAN_STYLE
-    drivers = list(dict.fromkeys(g.driver for g in groups if g.setting))
-    index = drivers.index(group.driver) if group.driver in drivers else len(drivers)
-    return driver_style(index)
-
-
-def _mark(passed: bool | None) -> str:
-    return "–" if passed is None else "✓" if passed else "✗"

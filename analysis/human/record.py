@@ -1,9 +1,18 @@
-"""Converts a recorded trial for the database: its condition, its outcome, its states."""
+"""A recorded trial: read from its CSV file, and converted for the database.
+
+The experiment's recorder wrote series under dotted names, and scalars only in the first row.
+"""
 
 from __future__ import annotations
 
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
+
+import numpy as np
+import pandas as pd
 
 from merge_runner.records import (
     SIDES,
@@ -17,11 +26,15 @@ from merge_runner.records import (
 )
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.text_safety import one_line
 from merge_runner_analysis.data.imported_humans import VELOCITY_PAGES
 from merge_runner_analysis.data.reference_data import HUMAN_DOI, PAIRS
 from merge_runner_analysis.human.archive import Unreadable
-from merge_runner_analysis.human.trace import Trace
 
+POSITIONS: dict[Side, str] = {side: f"travelled_distance.{side}" for side in SIDES}
+VELOCITIES: dict[Side, str] = {side: f"velocities.{side}" for side in SIDES}
+SERIES = (*POSITIONS.values(), *VELOCITIES.values())
+NEEDED = ("dt", "end_state", *SERIES)
 STATUSES: dict[str, Status] = {
     "Finished": "finished",
     "Collided": "collided",
@@ -56,21 +69,69 @@ PAGE_SPEC = canonical_json(
     }
 )
 PAGE_SPEC_HASH = spec_hash(PAGE_SPEC)
+SPECS = {SPEC_HASH: SPEC, PAGE_SPEC_HASH: PAGE_SPEC}
 
 
-def trial_record(
-    trace: Trace, experiment: int, iteration: int, read_as: str = SPEC_HASH
-) -> TrialRecord:
-    """The record of trial ``iteration`` of an experiment; raises Unreadable."""
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """Both vehicles, one value per sample, in SI units; at least 2 samples, all finite.
+
+    ``step_s`` is the time between samples, ``end_state`` the recorder's word for how the trial
+    ended, ``positions_m`` the distances that each vehicle travelled along its own branch.
+    """
+
+    step_s: float
+    end_state: str
+    positions_m: dict[Side, list[float]]
+    velocities_mps: dict[Side, list[float]]
+
+
+def parse_csv(content: bytes) -> Trace:
+    """Read a trial's CSV file; raises Unreadable."""
+    try:
+        table = pd.read_csv(io.BytesIO(content), usecols=NEEDED.__contains__, dtype=str)
+        # pandas' own parser of numbers may miss the last bit.
+        numbers = [name for name in table if name != "end_state"]
+        table[numbers] = table[numbers].astype(float)
+    except (ValueError, MemoryError) as exc:  # pandas' own errors are ValueErrors
+        raise Unreadable(f"it is not the CSV table of a trial: {one_line(str(exc))}") from exc
+    if missing := sorted(set(NEEDED) - set(table)):
+        raise Unreadable(f"it lacks {', '.join(missing)}")
+    if len(table) < 2:
+        raise Unreadable("it has fewer than 2 rows")
+    for name in SERIES:
+        if not np.isfinite(table[name]).all():
+            row = int(np.argmin(np.isfinite(table[name])))  # the first is 0
+            raise Unreadable(f"{name} is {table[name][row]} in row {row}, not a finite number")
+    step_ms = float(table["dt"][0])
+    if not 0 < step_ms < inf:
+        raise Unreadable(f"dt is {step_ms:g}, not a time in ms")
+    return Trace(
+        step_s=step_ms / 1000,
+        end_state=str(table["end_state"][0]),
+        positions_m={side: table[name].tolist() for side, name in POSITIONS.items()},
+        velocities_mps={side: table[name].tolist() for side, name in VELOCITIES.items()},
+    )
+
+
+def trial_record(trace: Trace, experiment: int, iteration: int, page: str = "") -> TrialRecord:
+    """The record of trial ``iteration`` of an experiment; raises Unreadable.
+
+    ``page`` is the condition of the velocity page that shows it.
+    """
     status = _status(trace)
     condition = _condition(trace)
-    states = _states(trace, _control_start(trace))
+    if page not in ("", condition):
+        raise Unreadable(f"its speeds are not those of {page}")
+    states = tuple(_states(trace))
     pair = PAIRS.get(experiment, f"experiment_{experiment}")
-    decided = status not in ("collided", "failed")
+    arrivals = {side: _arrival(trace.positions_m[side]) for side in SIDES}
+    first = min(arrivals, key=arrivals.__getitem__)
+    decided = status not in ("collided", "failed") and arrivals[first] < inf
     return TrialRecord(
         spec=TrialSpec(
             trial_id=f"human/{pair}/{condition}/iter{iteration:03d}",
-            spec_hash=read_as,
+            spec_hash=PAGE_SPEC_HASH if page else SPEC_HASH,
             source="human",
             pair=pair,
             model_left="human",
@@ -82,7 +143,7 @@ def trial_record(
             order=0,
         ),
         status=status,
-        merged_first=_merged_first(trace) if decided else None,
+        merged_first=first if decided else None,
         end_time_s=states[-1].time_s,
         error=trace.end_state if status == "failed" else None,
         states=states,
@@ -102,33 +163,15 @@ def _status(trace: Trace) -> Status:
 
 def _condition(trace: Trace) -> str:
     """The condition from whose start the first sample is within the tolerances."""
-    firsts = [(trace.positions_m[side][0], trace.velocities_mps[side][0]) for side in SIDES]
+    at_m = [trace.positions_m[side][0] for side in SIDES]
+    mps = [trace.velocities_mps[side][0] for side in SIDES]
     for name, condition in HUMAN_CONDITIONS.items():
-        starts = zip(condition.starts_m(TRACK), condition.speeds_mps, strict=True)
-        if all(
-            abs(at_m - start_m) <= START_TOLERANCE_M and abs(mps - speed_mps) <= START_TOLERANCE_MPS
-            for (at_m, mps), (start_m, speed_mps) in zip(firsts, starts, strict=True)
-        ):
+        off_m = np.abs(np.subtract(at_m, condition.starts_m(TRACK)))
+        off_mps = np.abs(np.subtract(mps, condition.speeds_mps))
+        if off_m.max() <= START_TOLERANCE_M and off_mps.max() <= START_TOLERANCE_MPS:
             return name
-    shown = (
-        f"{side} at {at_m:.2f} m with {mps:.2f} m/s"
-        for side, (at_m, mps) in zip(SIDES, firsts, strict=True)
-    )
+    shown = (f"{s} at {m:.2f} m with {v:.2f} m/s" for s, m, v in zip(SIDES, at_m, mps, strict=True))
     raise Unreadable(f"it starts like none of the conditions: {', '.join(shown)}")
-
-
-def _control_start(trace: Trace) -> int:
-    """The first sample with both vehicles out of their tunnels: time 0."""
-    for sample, positions in enumerate(zip(*trace.positions_m.values(), strict=True)):
-        if min(positions) > TRACK.tunnel_exit_m:
-            return sample
-    raise Unreadable(f"its vehicles are never both beyond the tunnels ({TRACK.tunnel_exit_m:g} m)")
-
-
-def _merged_first(trace: Trace) -> Side | None:
-    arrivals = {side: _arrival(trace.positions_m[side]) for side in SIDES}
-    first = min(arrivals, key=arrivals.__getitem__)
-    return first if arrivals[first] < inf else None
 
 
 def _arrival(positions_m: list[float]) -> float:
@@ -139,19 +182,19 @@ def _arrival(positions_m: list[float]) -> float:
     return inf
 
 
-def _states(trace: Trace, start: int) -> tuple[StateRow, ...]:
-    states = []
+def _states(trace: Trace) -> Iterator[StateRow]:
+    """Every sample; time 0 is the first with both vehicles out of their tunnels."""
+    places = zip(*trace.positions_m.values(), strict=True)
+    out = (sample for sample, both in enumerate(places) if min(both) > TRACK.tunnel_exit_m)
+    if (start := next(out, None)) is None:
+        raise Unreadable(
+            f"its vehicles are never both beyond the tunnels ({TRACK.tunnel_exit_m:g} m)"
+        )
     for sample in range(len(trace.positions_m["left"])):
         # Rounded, because a product like 3 * 0.05 is not exactly 0.15 in binary.
         step, time_s = sample - start, round((sample - start) * trace.step_s, 9)
         for side in SIDES:
-            velocities = trace.velocities_mps[side]
-            changed_mps = velocities[sample] - velocities[max(sample - 1, 0)]
-            position_m, acceleration_mps2 = (
-                trace.positions_m[side][sample],
-                changed_mps / trace.step_s,
-            )
-            states.append(
-                StateRow(step, time_s, side, position_m, velocities[sample], acceleration_mps2)
-            )
-    return tuple(states)
+            mps = trace.velocities_mps[side]
+            acceleration_mps2 = (mps[sample] - mps[max(sample - 1, 0)]) / trace.step_s
+            position_m = trace.positions_m[side][sample]
+            yield StateRow(step, time_s, side, position_m, mps[sample], acceleration_mps2)

@@ -4,29 +4,34 @@ The pages docs/plots/CONDITION.html of github.com/tud-hri/simple-merging-experim
 of both vehicles of every trial at 20 Hz, from its start: the left vehicle in the first panel, the
 right one in the second, drawn solid where it went first, dashed where second, and dotted after a
 collision. Positions follow: the experiment moves a vehicle by the mean of its speeds before and
-after a step.
+after a step. Plotly's ``write_html`` made the pages; nothing of a page is run.
 """
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 from collections.abc import Iterator
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.data.reference_data import PAIRS
 from merge_runner_analysis.human.archive import Unreadable
-from merge_runner_analysis.human.plotly import numbers, traces
-from merge_runner_analysis.human.record import END_TOLERANCE_M
-from merge_runner_analysis.human.trace import Trace
+from merge_runner_analysis.human.record import END_TOLERANCE_M, Trace
 
 # The pages leave out the letter of a condition.
 PAGES = {f"{name.partition('_')[2]}.html": name for name in HUMAN_CONDITIONS}
+BEGIN = b"Plotly.newPlot("
+# The types that Plotly names; the bytes of base64 are little-endian.
+DTYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "i1": "i1", "u4": "<u4", "u2": "<u2",
+          "u1": "u1"}  # fmt: skip
 TRIAL = re.compile(r"([1-9])-([0-9]{1,4})(?:<extra></extra>)?")
 PANELS: dict[str, Side] = {"x": "left", "x2": "right"}
 FIRST, SECOND, COLLIDED = "solid", "dash", "dot"
@@ -34,6 +39,7 @@ TIME_OUT_S = 30.0
 # Times are written in s, so that equal steps differ by a rounding.
 STEP_TOLERANCE_S = 1e-6
 EXPERIMENTS = {int(pair.removeprefix("pair")): experiment for experiment, pair in PAIRS.items()}
+Lines = dict[Side, dict[str, Any]]
 
 
 def condition_of(name: str) -> str | None:
@@ -42,54 +48,72 @@ def condition_of(name: str) -> str | None:
     return PAGES.get(file) or PAGES.get(file.partition("_")[2])
 
 
-def trials_of(page: bytes, condition: str) -> Iterator[tuple[int, int, dict[Side, dict[str, Any]]]]:
-    """Experiment, iteration and both traces of each trial; raises Unreadable for a whole page."""
-    found: dict[tuple[int, int], dict[Side, dict[str, Any]]] = {}
-    for trace in traces(page):
-        label = TRIAL.fullmatch(_label(trace))
-        side = PANELS.get(trace.get("xaxis", "x"))
+def trials_of(page: bytes, condition: str) -> Iterator[tuple[int, int, Lines]]:
+    """Experiment, iteration and both lines of each trial; raises Unreadable for a whole page."""
+    try:
+        # The page holds all of Plotly before the last plot, whose lines are its first list.
+        call = page[page.rindex(BEGIN) + len(BEGIN) :].decode("utf-8")
+        lines, _ = json.JSONDecoder().raw_decode(call, call.index("["))
+        if not all(isinstance(line, dict) for line in lines):
+            raise ValueError("a line is no object")
+    except (ValueError, RecursionError) as exc:
+        raise Unreadable("it is no page that Plotly wrote, or is cut off") from exc
+    trials: dict[tuple[int, int], Lines] = {}
+    for line in lines:
+        # The words that the page shows at the pointer: pair-iteration.
+        words = line.get("hovertemplate") or line.get("text") or ""
+        label = TRIAL.fullmatch(str(words[0] if isinstance(words, list) else words))
+        side = PANELS.get(line.get("xaxis", "x"))
         if label is None or side is None:
-            continue  # the legend has traces of its own
-        trial = found.setdefault((EXPERIMENTS[int(label[1])], int(label[2])), {})
+            continue  # the legend has lines of its own
+        trial = trials.setdefault((EXPERIMENTS[int(label[1])], int(label[2])), {})
         if side in trial:
             raise Unreadable(f"it shows the {side} vehicle of trial {label[0]} twice")
-        trial[side] = trace
-    if not found:
+        trial[side] = line
+    if not trials:
         raise Unreadable(f"it shows no trial, as the page of {condition} does")
-    for (experiment, iteration), trial in sorted(found.items()):
+    for (experiment, iteration), trial in sorted(trials.items()):
         yield experiment, iteration, trial
 
 
-def trace_of(trial: dict[Side, dict[str, Any]], condition: str) -> Trace:
+def trace_of(trial: Lines, condition: str) -> Trace:
     """A trial's trace, with positions from its speeds; raises Unreadable."""
     if missing := [side for side in SIDES if side not in trial]:
         raise Unreadable(f"its {missing[0]} vehicle is not shown")
-    times_s = {side: numbers(trial[side], "x") for side in SIDES}
-    speeds_mps = {side: numbers(trial[side], "y") for side in SIDES}
-    step_s = _step(times_s["left"])
-    if any(len(each) != len(times_s["left"]) for each in (*times_s.values(), *speeds_mps.values())):
+    times_s, *others = (_numbers(trial[side], axis) for axis in "xy" for side in SIDES)
+    if any(len(values) != len(times_s) for values in others):
         raise Unreadable("its vehicles have samples of different times")
+    step_s = _step(times_s)
     starts_m = HUMAN_CONDITIONS[condition].starts_m(TRACK)
+    velocities_mps = dict(zip(SIDES, others[1:], strict=True))
     positions_m = {
         side: start_m + np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) / 2 * step_s)])
-        for side, start_m, v in zip(SIDES, starts_m, speeds_mps.values(), strict=True)
+        for (side, v), start_m in zip(velocities_mps.items(), starts_m, strict=True)
     }
     return Trace(
         step_s=step_s,
-        end_state=_end_state(trial, {side: float(s[-1]) for side, s in positions_m.items()},
-                             float(times_s["left"][-1])),
-        positions_m={side: list(map(float, s)) for side, s in positions_m.items()},
-        velocities_mps={side: list(map(float, v)) for side, v in speeds_mps.items()},
-    )  # fmt: skip
+        end_state=_end_state(trial, {side: s[-1] for side, s in positions_m.items()}, times_s[-1]),
+        positions_m={side: s.tolist() for side, s in positions_m.items()},
+        velocities_mps={side: v.tolist() for side, v in velocities_mps.items()},
+    )
 
 
-def _label(trace: dict[str, Any]) -> str:
-    """``pair-iteration``, of the words that the page shows at the pointer."""
-    words = trace.get("hovertemplate") or trace.get("text") or ""
-    return str(words[0] if isinstance(words, list) else words)
+def _numbers(line: dict[str, Any], axis: str) -> NDArray[np.float64]:
+    """The finite numbers of a line's ``x`` or ``y``: a list, or base64; raises Unreadable."""
+    try:
+        values = line[axis]
+        if isinstance(values, dict):
+            content = base64.b64decode(values["bdata"], validate=True)
+            values = np.frombuffer(content, DTYPES[values["dtype"]])
+        numbers = np.array(values, dtype=float)
+    except (KeyError, TypeError, ValueError) as exc:
+        raise Unreadable(f"the {axis} of a line is no list of numbers") from exc
+    if numbers.ndim != 1 or not np.isfinite(numbers).all():
+        raise Unreadable(f"the {axis} of a line is no list of finite numbers")
+    return numbers
 
 
-def _step(times_s: np.ndarray) -> float:
+def _step(times_s: NDArray[np.float64]) -> float:
     if len(times_s) < 2 or abs(times_s[0]) > STEP_TOLERANCE_S:
         raise Unreadable("it does not begin at 0 s")
     step_s = round(float(times_s[-1]) / (len(times_s) - 1), 9)
@@ -98,7 +122,7 @@ def _step(times_s: np.ndarray) -> float:
     return step_s
 
 
-def _end_state(trial: dict[Side, dict[str, Any]], ends_m: dict[Side, float], end_s: float) -> str:
+def _end_state(trial: Lines, ends_m: dict[Side, float], end_s: float) -> str:
     """The recorder's word for the end, of how the lines are drawn and where the vehicles are."""
     dashes = {side: (trial[side].get("line") or {}).get("dash", FIRST) for side in SIDES}
     if set(dashes.values()) == {COLLIDED}:

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from merge_runner.drivers.registry import MOCKS
-from merge_runner_analysis.data.provenance import Mismatch, Provenance, tally
+from merge_runner_analysis.data.provenance import Provenance, tally
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.tables.notes import equal_notes
 
 # The share of a group's decisions above which an alarm is raised: a convention.
 MANY_FALLBACKS = 0.05
@@ -24,34 +23,17 @@ class Alarm:
 
 def alarms(study: Study, origin: Provenance) -> list[Alarm]:
     """What casts doubt on the results of a study, the worst first."""
-    # Title, findings, and what they mean; an alarm without findings is not shown.
+    unjudged = (*study.unjudged, *study.unjudged_asked)
     found = (
         (
-            "A scripted stand-in answered",
-            [f"{group.id}: {group.posing}" for group in posing(study)],
-            "These rows stand last, are in no conclusion, and never beside the paper's row of that "
-            "model.",
-        ),
-        (
             "Too few valid decisions",
-            [f"{g.id}: {g.unjudged}" for g in (*study.unjudged, *study.unjudged_asked)],
+            [f"{group.id}: {group.unjudged}" for group in unjudged],
             "What was driven is mostly not what the model decided: no value, test or conclusion "
             "rests on these trials.",
         ),
         (
-            "Repetitions are the same trial",
-            [
-                f"{group.repeated} of {len(group.trials) + group.repeated} trials of {group.id} "
-                "repeat an earlier one to the last state"
-                for group in study.models
-                if group.repeated
-            ],
-            "They are of programs that declare no chance: equal trials count once, in every n, "
-            "interval and test.",
-        ),
-        (
-            "Some trials are equal",
-            equal_notes(study.models),
+            "Trials or answers repeat earlier ones",
+            [*_equal(study, origin)],
             "Where a cache on the way answered, or the temperature is 0, they are no samples, and "
             "intervals and tests claim too much.",
         ),
@@ -61,55 +43,64 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
             "They are no part of the published trials, and their rows say so.",
         ),
         (
-            "Answers are word for word as before",
-            [
-                f"all {repeated} answers of {driver} to prompts that it was asked before"
-                for driver, repeated in origin.alike.items()
-            ],
-            "A cache on the way or a temperature of 0 does this: the repetitions are no samples.",
-        ),
-        (
             "Trials failed",
             [_failures(group) for group in study.played if len(group.trials) > len(group.ended)],
             "They are in no measure; the same sweep again plays them anew.",
         ),
         (
             "Many fallbacks",
-            list(_fallbacks(study)),
+            [*_fallbacks(study)],
             "There the older plan was driven, or none: tables --without-fallbacks shows whether "
             "that changes the results.",
         ),
         (
             "Attempts of unknown fate",
-            list(_unknown(study)),
+            [*_unknown(study)],
             "A run was killed before their reply was seen: they may have been paid for.",
         ),
         (
             "Several settings under one name",
-            list(_mixed(study)),
+            [*_mixed(study)],
             "They are never pooled: all but the most frequent carry a mark.",
         ),
     )
     return [
-        # First, since no number is what it claims to be if another model drove.
-        *(Alarm("Another model answered", mismatch(one)) for one in origin.mismatches),
+        *_of_answers(study, origin),
         *(Alarm(title, f"{'; '.join(parts)}. {rest}") for title, parts, rest in found if parts),
     ]
 
 
-def mismatch(one: Mismatch) -> str:
-    """Which model answered in place of which other, how often, and in which sweeps."""
-    answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
-    sweeps = f"sweep{'s' * (len(one.sweeps) != 1)} {', '.join(one.sweeps) or 'unknown'}"
-    return (
-        f"{one.requested} was asked for, {one.served} answered: {answers}, {sweeps}. "
-        "These trials are not what they claim to be."
-    )
+def _of_answers(study: Study, origin: Provenance) -> Iterator[Alarm]:
+    """First, since no number is what it claims to be if another model drove."""
+    for one in origin.mismatches.itertuples():
+        answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
+        sweeps = f"sweep{'s' * (', ' in one.sweeps)} {one.sweeps}"
+        yield Alarm(
+            "Another model answered",
+            f"{one.requested} was asked for, {one.served} answered: {answers}, {sweeps}. "
+            "These trials are not what they claim to be.",
+        )
+    if groups := posing(study):
+        yield Alarm(
+            "A scripted stand-in answered",
+            f"{'; '.join(f'{group.id}: {group.posing}' for group in groups)}. These rows stand "
+            "last, are in no conclusion, and never beside the paper's row of that model.",
+        )
 
 
 def posing(study: Study) -> list[Group]:
     """Groups where a stand-in answered under a model's name; a mock model's own name is honest."""
     return [group for group in study.played if group.scripted and MOCKS.isdisjoint(group.models)]
+
+
+def _equal(study: Study, origin: Provenance) -> Iterator[str]:
+    if counts := [f"{g.id}: {g.equal} of {len(g.trials)}" for g in study.models if g.equal]:
+        yield f"{', '.join(counts)} trials are as an earlier one to the last state; each counts"
+    for driver, repeated in origin.alike.items():
+        yield (
+            f"all {repeated} answers of {driver} to prompts that it was asked before are word for "
+            "word as before"
+        )
 
 
 def _failures(group: Group) -> str:

@@ -18,7 +18,7 @@ from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.report.alarms import alarms, posing
 from merge_runner_analysis.report.design import design
 from merge_runner_analysis.stats.factors import levels_by_factor
-from merge_runner_analysis.tables.against import PAPER, against, in_paper
+from merge_runner_analysis.tables.against import FILES, against
 from merge_runner_analysis.tables.formats import table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
 from merge_runner_analysis.tables.verdicts import verdicts
@@ -79,7 +79,9 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         ],
         factors=views.pop("factors", None),
         tables=list(views.values()),
-        beside=[table_view(against(table, PAPER), links.to) for table in tables if in_paper(table)],
+        beside=[
+            table_view(against(table, study), links.to) for table in tables if table.name in FILES
+        ],
         sources=[(number, sources) for sources, number in links.found.items()],
         listed=LISTED,
         command=sql_command(study),

@@ -5,26 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from math import inf
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
+from merge_runner_analysis.data.study import Group, Study, in_one_study
+from merge_runner_analysis.metrics import Metric
 from merge_runner_analysis.stats.intervals import (
     LEVEL,
     POWER,
+    ROUNDING,
     Difference,
-    detectable,
     difference,
-    interval,
     newcombe,
+    tested,
     two_sided_p,
 )
-
-ROUNDING = 1e-12
+from merge_runner_analysis.stats.measures import trials_of, undecided
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +77,6 @@ def contrast_cells(both: Cells) -> Difference:
     (one, _), (other, _) = both.rates
     found = detectable_rate(int(both.n.sum()), int(both.m.sum()), other)
     return Difference(one - other, *newcombe(both.rates), both.p, found)
-
-
-def interaction_of_rates(one: Cells, other: Cells) -> Difference:
-    """Return how far two differences of rates differ."""
-    return difference_of_rates([*one.rates, *reversed(other.rates)])
 
 
 def difference_of_rates(rates: Sequence[tuple[float, float]]) -> Difference:
@@ -141,18 +135,12 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
     return found
 
 
-class Slope(NamedTuple):
-    """The first mean minus the second, its standard error, and the degrees of freedom."""
+def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Difference | None:
+    """Two means, compared within conditions by least squares.
 
-    value: float
-    se: float
-    freedom: int
-
-
-def slope_within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Slope | None:
-    """Return how two means differ, by least squares with a level for each condition.
-
-    None where the groups share no condition, or have too few trials for an error.
+    Difference, interval and Student's t are those of a linear model with a level for each
+    condition, so that another mix of conditions, as when one group collides more in some, makes no
+    difference. None where the groups share no condition, or have too few trials for an error.
     """
     both = pd.concat([first.assign(_first=1.0), second.assign(_first=0.0)]).dropna(subset=[measure])
     both = both.assign(_value=both[measure].astype(float))
@@ -165,33 +153,55 @@ def slope_within(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Slo
         return None
     slope = float(group @ value) / weight
     residual = value - slope * group
-    return Slope(slope, float(np.sqrt(residual @ residual / freedom / weight)), freedom)
+    return tested(slope, float(np.sqrt(residual @ residual / freedom / weight)), float(freedom))
 
 
-def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Difference | None:
-    """Two means, compared within conditions by least squares.
+def contrast(
+    study: Study, groups: Sequence[Group], metric: Metric, cell: str = "condition"
+) -> Difference | None:
+    """The first of two groups minus the second, within the cells that both have.
 
-    Difference, interval and Student's t are those of a linear model with a level for each
-    condition, so that another mix of conditions, as when one group collides more in some, makes no
-    difference. None where ``slope_within`` is.
+    Of four groups it is how far the difference of the first two differs from that of the others, in
+    the cells that all have. None where these are of several studies, share no cell or have
+    undecided trials; and for medians, which have no test.
     """
-    fit = slope_within(first, second, measure)
-    if fit is None:
+    frames = trials_by_cell(study, groups, metric, cell)
+    if frames is None or metric.estimator == "median":
         return None
-    value, se, freedom = fit
-    # Equal but for rounding is equal; where nothing varies, any other difference is sure.
-    statistic = 0.0 if abs(value) < ROUNDING else value / se if se else inf
-    p = two_sided_p(statistic, freedom)
-    return Difference(
-        value, *interval(value, se, freedom), p, detectable(se, freedom), float(freedom)
-    )
+    if len(frames) > 2:
+        frames = in_shared_cells(frames)
+    pairs = list(zip(frames[::2], frames[1::2], strict=True))
+    if metric.rate:
+        cells = [shared_cells(*pair, metric.column) for pair in pairs]
+        if None in cells:
+            return None
+        one, *other = filter(None, cells)
+        if not other:
+            return contrast_cells(one)
+        return difference_of_rates([*one.rates, *reversed(other[0].rates)])
+    one_mean, *other_mean = (contrast_means(*pair, metric.column) for pair in pairs)
+    if one_mean is None or not other_mean:
+        return one_mean
+    return difference(one_mean, other_mean[0]) if other_mean[0] else None
 
 
-def interaction_of_means(one: Slope | None, other: Slope | None) -> Difference | None:
-    """Return how far two differences of means differ, by Welch's test; None without errors."""
-    if one is None or other is None:
+def trials_by_cell(
+    study: Study, groups: Sequence[Group], metric: Metric, cell: str
+) -> list[pd.DataFrame] | None:
+    """The trials of each group with a measure, their cell as ``condition``.
+
+    None where the groups are of several studies or have undecided trials.
+    """
+    if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
         return None
-    return difference(one.value - other.value, one[1:], other[1:])
+    every = [trials_of(group, metric).dropna(subset=[metric.column]) for group in groups]
+    return [frame.assign(condition=frame[cell]) for frame in every]
+
+
+def in_shared_cells(frames: list[pd.DataFrame]) -> list[pd.DataFrame]:
+    """The trials in the conditions that all frames have."""
+    shared = set.intersection(*(set(frame["condition"]) for frame in frames))
+    return [frame[frame["condition"].isin(shared)] for frame in frames]
 
 
 def corrected(p: list[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

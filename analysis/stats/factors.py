@@ -9,18 +9,10 @@ from math import isnan
 
 import pandas as pd
 
-from merge_runner_analysis.data.study import Group, Study, in_one_study, levels_of
+from merge_runner_analysis.data.study import Group, Study, levels_of
 from merge_runner_analysis.metrics import Metric
-from merge_runner_analysis.stats.contrasts import (
-    contrast_cells,
-    contrast_means,
-    interaction_of_means,
-    interaction_of_rates,
-    shared_cells,
-    slope_within,
-)
+from merge_runner_analysis.stats.contrasts import contrast, in_shared_cells, trials_by_cell
 from merge_runner_analysis.stats.intervals import Difference
-from merge_runner_analysis.stats.measures import trials_of, undecided
 
 Cell = tuple[str, ...]
 
@@ -87,69 +79,18 @@ def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) 
     return Level(factor, name, tuple(group.id for group in groups), pooled, posing, mark, at)
 
 
-def difference(study: Study, level: Level, first: Level, metric: Metric) -> Difference | None:
-    """A level minus the first one, within the cells that both have.
-
-    None where these are of several studies, share no cell or have undecided trials; and for
-    medians, which have no test.
-    """
-    frames = _by_cell(study, metric, level, first)
-    if frames is None or metric.estimator == "median":
-        return None
-    one, other = frames
-    if metric.rate:
-        both = shared_cells(one, other, metric.column)
-        return contrast_cells(both) if both else None
-    return contrast_means(one, other, metric.column)
+def difference(study: Study, metric: Metric, *levels: Level) -> Difference | None:
+    """A level minus the first one, or how far that differs from the same of two others."""
+    return contrast(study, [level.pooled for level in levels], metric, "cell")
 
 
-def difference_of_medians(study: Study, level: Level, first: Level, metric: Metric) -> float | None:
+def difference_of_medians(study: Study, metric: Metric, level: Level, first: Level) -> float | None:
     """A level's median minus that of the first one, in the cells that both have."""
-    frames = _in_shared_cells(study, metric, level, first)
+    frames = trials_by_cell(study, [level.pooled, first.pooled], metric, "cell")
     if frames is None:
         return None
-    one, other = (frame[metric.column].median() for frame in frames)
+    one, other = (frame[metric.column].median() for frame in in_shared_cells(frames))
     return None if isnan(one) or isnan(other) else float(one - other)
-
-
-def interaction(
-    study: Study, pair: tuple[Level, Level], others: tuple[Level, Level], metric: Metric
-) -> Difference | None:
-    """How far the difference of a ``pair`` of levels differs from that of two ``others``.
-
-    It is taken in the cells that all four have; None as in ``difference``.
-    """
-    frames = _in_shared_cells(study, metric, *pair, *others)
-    if frames is None or metric.estimator == "median":
-        return None
-    a, b, c, d = frames
-    if metric.rate:
-        one, other = shared_cells(a, b, metric.column), shared_cells(c, d, metric.column)
-        return interaction_of_rates(one, other) if one and other else None
-    return interaction_of_means(
-        slope_within(a, b, metric.column), slope_within(c, d, metric.column)
-    )
-
-
-def _by_cell(study: Study, metric: Metric, *levels: Level) -> list[pd.DataFrame] | None:
-    """The trials of each level that have a measure, with their cell as condition.
-
-    None where these are of several studies or have undecided trials.
-    """
-    groups = [level.pooled for level in levels]
-    if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
-        return None
-    frames = [trials_of(group, metric).dropna(subset=[metric.column]) for group in groups]
-    return [frame.assign(condition=frame["cell"]) for frame in frames]
-
-
-def _in_shared_cells(study: Study, metric: Metric, *levels: Level) -> list[pd.DataFrame] | None:
-    """The same in the cells that all levels have."""
-    frames = _by_cell(study, metric, *levels)
-    if frames is None:
-        return None
-    shared = set.intersection(*(set(frame["condition"]) for frame in frames))
-    return [frame[frame["condition"].isin(shared)] for frame in frames]
 
 
 def balance(levels: list[Level]) -> str:

@@ -19,11 +19,23 @@ from numpy.typing import NDArray
 from merge_runner.records import SIDES
 from merge_runner_analysis.data.driver_words import has_chance
 from merge_runner_analysis.data.reference_data import human_outcomes
-from merge_runner_analysis.data.study import Group, Study, of_group
-from merge_runner_analysis.metrics import Bounded
-from merge_runner_analysis.stats.intervals import interval
+from merge_runner_analysis.data.study import Group, Study, of_trials
+from merge_runner_analysis.stats.intervals import Estimate, estimate
 from merge_runner_analysis.stats.regressions import Array, unfit_for_logit
 
+# One row a vehicle: the acceleration of the first step that its driver controls, and the word of
+# the first decision. Where each driver takes control at its own exit the other one cruises yet:
+# that is no first action.
+FIRST_ACTIONS = """
+SELECT trial_id, spec_hash, if(side = ego, 'left', 'right') AS side, first_mps2, tactical
+FROM (
+    SELECT trial_id, spec_hash, side, arg_min(acceleration_mps2, step) AS first_mps2
+    FROM states WHERE time_s > 0 GROUP BY ALL
+) JOIN trial_drivers USING (trial_id, spec_hash)
+LEFT JOIN (FROM decisions WHERE decision = 0) USING (trial_id, spec_hash, side)
+ANTI JOIN (FROM specs WHERE spec->>'$.scenario.control_start' = 'own_exit') USING (spec_hash)
+ORDER BY ALL
+"""
 # A human pedal seldom holds a speed exactly: within this a driver holds, beyond it goes or brakes.
 HOLD_MPS2 = 0.2
 # First actions are equal but for the last digits, as of a vehicle that drove on the other side.
@@ -47,13 +59,6 @@ class Seat:
         """The group's label, or that of one of a mixed pair."""
         model = self.group.models[self.sides[0]]
         return self.group.label_of(model) if self.side else self.group.label
-
-
-@dataclass(frozen=True, slots=True)
-class Clustered(Bounded):
-    """An estimate with its cluster-robust standard error and 95 % interval."""
-
-    se: float | None
 
 
 def seats(group: Group) -> list[Seat]:
@@ -99,23 +104,21 @@ def _stored(study: Study, seat: Seat) -> pd.DataFrame:
     columns = ["trial_id", "spec_hash", "condition", "projected_headway_m", "relative_velocity_mps",
                "pair", "ego"]  # fmt: skip
     trials = seat.group.ended[columns]
-    rows = of_group(study.first_actions, seat.group, trials).merge(
-        trials, on=["trial_id", "spec_hash"]
-    )
+    rows = of_trials(study.read(FIRST_ACTIONS), trials).merge(trials, on=["trial_id", "spec_hash"])
     return rows[rows["side"].isin([SIDES[side] for side in seat.sides])]
 
 
-def slope(rows: pd.DataFrame) -> Clustered | None:
+def slope(rows: pd.DataFrame) -> Estimate | None:
     """Return the slope of the first action on the own relative velocity, in m/s² per m/s."""
     return _least_squares(rows, np.column_stack([np.ones(len(rows)), rows["velocity_mps"]]))
 
 
-def mean(rows: pd.DataFrame) -> Clustered | None:
+def mean(rows: pd.DataFrame) -> Estimate | None:
     """Return the mean first action in m/s²."""
     return _least_squares(rows, np.ones((len(rows), 1)))
 
 
-def _least_squares(rows: pd.DataFrame, design: Array) -> Clustered | None:
+def _least_squares(rows: pd.DataFrame, design: Array) -> Estimate | None:
     """Return the last coefficient; None where the rows do not determine it or its error."""
     from statsmodels.regression.linear_model import OLS
 
@@ -126,11 +129,11 @@ def _least_squares(rows: pd.DataFrame, design: Array) -> Clustered | None:
     fit = OLS(rows["first_mps2"].to_numpy(float), design).fit(
         cov_type="cluster", cov_kwds=by_cluster, use_t=True
     )
-    low, high = map(float, fit.conf_int()[-1])
-    return Clustered(float(fit.params[-1]), low, high, float(fit.bse[-1]))
+    clusters = rows["cluster"].nunique()
+    return estimate(float(fit.params[-1]), float(fit.bse[-1]), clusters - 1, len(rows))
 
 
-def exchange_rate(rows: pd.DataFrame) -> Clustered | None:
+def exchange_rate(rows: pd.DataFrame) -> Estimate | None:
     """Return how many m of headway are worth 1 m/s of relative velocity in the word M.
 
     It is minus the ratio of two slopes of a logit, with the interval of the delta method; None
@@ -143,7 +146,7 @@ def exchange_rate(rows: pd.DataFrame) -> Clustered | None:
 
 
 @cache
-def human_exchange_rate() -> Clustered | None:
+def human_exchange_rate() -> Estimate | None:
     """Return the same of who merged first in the published human trials: 3.304 / 1.111."""
     trials = human_outcomes().query("status == 'finished'")
     points = trials[["projected_headway_m", "relative_velocity_mps"]].to_numpy(float)
@@ -151,7 +154,7 @@ def human_exchange_rate() -> Clustered | None:
     return _ratio(points, left, np.arange(len(trials)))
 
 
-def _ratio(points: Array, chosen: Array, cluster: NDArray[Any]) -> Clustered | None:
+def _ratio(points: Array, chosen: Array, cluster: NDArray[Any]) -> Estimate | None:
     from statsmodels.discrete.discrete_model import Logit
 
     design = np.column_stack([np.ones(len(points)), points])
@@ -161,5 +164,4 @@ def _ratio(points: Array, chosen: Array, cluster: NDArray[Any]) -> Clustered | N
     _, headway, velocity = map(float, fit.params)
     gradient = np.array([0.0, velocity / headway**2, -1 / headway])
     se = sqrt(float(gradient @ fit.cov_params() @ gradient))
-    rate = -velocity / headway
-    return Clustered(rate, *interval(rate, se, len(np.unique(cluster)) - 1), se)
+    return estimate(-velocity / headway, se, len(np.unique(cluster)) - 1, len(points))

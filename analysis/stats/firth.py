@@ -16,24 +16,11 @@ from scipy.special import expit
 
 Array = NDArray[np.float64]
 
-STEPS = 60
-HALVINGS = 8
-# Near separation a Newton step can leave the region where the information is regular.
-LONGEST_STEP = 5.0
-CONVERGED = 1e-8
-# Of a log-likelihood: what is smaller than this is no loss.
-ROUNDING = 1e-11
-WIDENINGS, WIDER = 40, 1.3
 # The largest slope of a likelihood at its top: what is aimed at, and what is still taken for one.
-FLAT, SLOPING = 1e-7, 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """The coefficients ``b`` (terms,) where the penalised log-likelihood ``best`` is maximal."""
-
-    b: Array
-    best: float
+FLAT, SLOPING = 1e-8, 1e-3
+# Below this logarithm of its determinant the information is singular but for rounding.
+SINGULAR = -600.0
+WIDENINGS, WIDER = 40, 1.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,99 +36,30 @@ class Counts:
     ) -> Fit | None:
         """Return the fit with some coefficients ``held``, or None where it does not converge.
 
-        Newton steps on Firth's score with the whole design's information, halved where they do not
-        increase the penalised likelihood (Heinze and Schemper 2002).
+        Quasi-Newton steps on Firth's score, since far from the estimate and under separation the
+        information misses the curvature of the penalty.
         """
         held = held or {}
         free = [term for term in range(self.design.shape[1]) if term not in held]
         b = np.zeros(self.design.shape[1]) if start is None else start.copy()
         b[[*held]] = [*held.values()]
-        best = self._penalised(b)
-        for _ in range(STEPS):
-            try:
-                step = self._step(b, free)
-            except np.linalg.LinAlgError:
-                return None
-            for _ in range(HALVINGS):
-                reached = self._penalised(b + step)
-                if reached >= best - ROUNDING:
-                    b, best = b + step, max(reached, best)
-                    break
-                step /= 2
-            else:
-                return Fit(b, best)  # no direction is uphill but for rounding
-            if np.abs(step).max(initial=0) < CONVERGED:
-                return Fit(b, best)
-        # Of a profile the likelihood alone counts, which the last small steps hardly change.
-        return self._climbed(b, free) or (Fit(b, best) if held else None)
 
-    def _climbed(self, b: Array, free: list[int]) -> Fit | None:
-        """Return the fit by quasi-Newton steps, for where the information misses the curvature.
-
-        That is so far from the estimate, and where data are separated.
-        """
-
-        def placed(values: Array) -> Array:
-            whole = b.copy()
-            whole[free] = values
-            return whole
-
-        try:
-            found = minimize(
-                lambda values: -self._penalised(placed(values)),
-                b[free],
-                jac=lambda values: -self._score(placed(values))[free],
-                method="BFGS",
-                options={"gtol": FLAT},
-            )
+        origin = b[free]
+        try:  # in these units the first step is Newton's
+            unit = np.linalg.inv(np.linalg.cholesky(self.information(b)[np.ix_(free, free)])).T
         except np.linalg.LinAlgError:
             return None
-        flat = np.abs(found.jac).max(initial=0) < SLOPING
-        return Fit(placed(found.x), -float(found.fun)) if flat else None
 
-    def p(self, fit: Fit, term: int) -> float | None:
-        """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""
-        without = self.fit({term: 0.0})
-        return None if without is None else float(stats.chi2.sf(2 * (fit.best - without.best), 1))
+        def loss(steps: Array) -> tuple[float, Array]:
+            b[free] = origin + unit @ steps
+            likelihood, score = self._penalised(b)
+            return -likelihood, -unit.T @ score[free]
 
-    def errors(self, fit: Fit) -> Array:
-        """Return Wald's standard errors, (terms,)."""
-        p = expit(self.design @ fit.b)
-        return np.sqrt(np.diag(np.linalg.inv(self._information(self.n * p * (1 - p)))))
-
-    def interval(self, fit: Fit, term: int, level: float) -> tuple[float, float] | None:
-        """Return the profile interval: what the penalised likelihood ratio does not reject.
-
-        None where no bound is found.
-        """
-        lost = stats.chi2.ppf(level, 1) / 2
-        near = fit.b  # the last profile: far out the other terms are far from the estimate, too
-
-        def excess(value: float) -> float:
-            nonlocal near
-            fits = [self.fit({term: value}, start) for start in (near, fit.b)]
-            profile = max(filter(None, fits), key=lambda each: each.best, default=None)
-            if profile is None:
-                return np.nan
-            near = profile.b
-            return float(fit.best - profile.best - lost)
-
-        bounds = []
-        for sign in (-1, 1):
-            near = fit.b
-            inside, width = float(fit.b[term]), sign * float(self.errors(fit)[term])
-            for _ in range(WIDENINGS):
-                outside = inside + width
-                if not excess(outside) < 0:
-                    break
-                inside, width = outside, WIDER * width
-            if not excess(outside) >= 0:
-                return None
-            try:
-                bounds.append(float(brentq(excess, inside, outside, xtol=1e-9)))
-            except ValueError:  # a profile in between does not converge
-                return None
-        return bounds[0], bounds[1]
+        start_at = np.zeros(len(free))
+        found = minimize(loss, start_at, jac=True, method="BFGS", options={"gtol": FLAT})
+        b[free] = origin + unit @ found.x
+        flat = np.isfinite(found.fun) and np.abs(found.jac).max(initial=0) < SLOPING
+        return Fit(self, b, -float(found.fun)) if flat else None
 
     def infinite(self) -> NDArray[np.bool_]:
         """Return which coefficients have no finite maximum likelihood estimate, (terms,).
@@ -155,36 +73,80 @@ class Counts:
         )
         return np.asarray(np.abs(found.x) > 1e-4)
 
-    def _information(self, weights: Array) -> Array:
-        return np.asarray((self.design.T * weights) @ self.design)
-
-    def _penalised(self, b: Array) -> float:
-        """Return the log-likelihood of ``b`` with Firth's penalty.
-
-        It is half the logarithm of the determinant of the information: Jeffreys' prior.
-        """
-        linear = self.design @ b
-        p = expit(linear)
-        determinant = np.linalg.det(self._information(self.n * p * (1 - p)))
-        likelihood = self.chosen @ linear - self.n @ np.logaddexp(0, linear)
-        return float(likelihood + np.log(max(determinant, 1e-300)) / 2)
-
-    def _step(self, b: Array, free: list[int]) -> Array:
-        """Return a Newton step of the ``free`` coefficients, (terms,)."""
+    def information(self, b: Array) -> Array:
+        """Return Fisher's information, (terms, terms)."""
         p = expit(self.design @ b)
-        information = self._information(self.n * p * (1 - p))
-        step = np.zeros_like(b)
-        step[free] = np.linalg.solve(information[np.ix_(free, free)], self._score(b)[free])
-        return np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+        return np.asarray((self.design.T * (self.n * p * (1 - p))) @ self.design)
 
-    def _score(self, b: Array) -> Array:
-        """Return the gradient of the penalised log-likelihood, (terms,).
+    def _penalised(self, b: Array) -> tuple[float, Array]:
+        """Return the log-likelihood of ``b`` with Firth's penalty, and its gradient, (terms,).
 
+        The penalty is half the logarithm of the determinant of the information: Jeffreys' prior.
         Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
         split, and half of its leverage had gone either way (Heinze and Schemper 2002).
         """
-        p = expit(self.design @ b)
-        weights = self.n * p * (1 - p)
-        inverse = np.linalg.inv(self._information(weights))
-        leverage = weights * ((self.design @ inverse) * self.design).sum(axis=1)
-        return np.asarray((self.chosen - self.n * p + leverage * (0.5 - p)) @ self.design)
+        linear, information = self.design @ b, self.information(b)
+        sign, log_determinant = np.linalg.slogdet(information)
+        if sign <= 0 or log_determinant < SINGULAR:
+            return -np.inf, np.zeros_like(b)
+        likelihood = self.chosen @ linear - self.n @ np.logaddexp(0, linear)
+        p = expit(linear)
+        spread = ((self.design @ np.linalg.inv(information)) * self.design).sum(axis=1)
+        leverage = self.n * p * (1 - p) * spread
+        score = (self.chosen - self.n * p + leverage * (0.5 - p)) @ self.design
+        return float(likelihood + log_determinant / 2), score
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The coefficients ``b`` (terms,) where the penalised log-likelihood ``best`` is maximal."""
+
+    counts: Counts
+    b: Array
+    best: float
+
+    @property
+    def errors(self) -> Array:
+        """Wald's standard errors, (terms,)."""
+        return np.sqrt(np.diag(np.linalg.inv(self.counts.information(self.b))))
+
+    def p(self, term: int) -> float:
+        """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""
+        without = self.counts.fit({term: 0.0})
+        return float(stats.chi2.sf(2 * (self.best - without.best), 1)) if without else np.nan
+
+    def interval(self, term: int, level: float) -> tuple[float, float] | None:
+        """Return the profile interval: what the penalised likelihood ratio does not reject.
+
+        None where no bound is found.
+        """
+        lost = stats.chi2.ppf(level, 1) / 2
+        near = self.b  # the last profile: far out the other terms are far from the estimate, too
+        errors = self.errors
+        aside = self.b + errors  # of symmetric data the best profile may lie beside the symmetry
+
+        def excess(value: float) -> float:
+            nonlocal near
+            fits = [self.counts.fit({term: value}, start) for start in (near, aside)]
+            profile = max(filter(None, fits), key=lambda each: each.best, default=None)
+            if profile is None:
+                return np.nan
+            near = profile.b
+            return float(self.best - profile.best - lost)
+
+        bounds = []
+        for sign in (-1, 1):
+            near = self.b
+            inside, width = float(self.b[term]), sign * float(errors[term])
+            for _ in range(WIDENINGS):
+                outside = inside + width
+                if not excess(outside) < 0:
+                    break
+                inside, width = outside, WIDER * width
+            if not excess(outside) >= 0:
+                return None
+            try:
+                bounds.append(float(brentq(excess, inside, outside, xtol=1e-9)))
+            except ValueError:  # a profile in between does not converge
+                return None
+        return bounds[0], bounds[1]

@@ -8,10 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 
+import numpy as np
+
 from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.stats.ceiling import Ceiling, ceiling
-from merge_runner_analysis.stats.indicators import INDICATORS, PAPER, ROBUST, Verdict, verdicts
+from merge_runner_analysis.stats.indicators import INDICATORS, Verdict, verdicts
 from merge_runner_analysis.stats.likeness import piecewise_constant
 from merge_runner_analysis.stats.regressions import (
     Regression,
@@ -59,27 +60,31 @@ class Score:
         return {PAPER_RULE: self.paper, ROBUST_RULE: self.robust}
 
     @property
-    def ceiling(self) -> Ceiling:
+    def ceiling(self) -> dict[str, dict[str, float]]:
         """The human ceiling for the group's size."""
         return ceiling(self.sizes)
 
 
-@dataclass(frozen=True, slots=True)
-class Total:
-    """How many indicators hold, of those that can be judged; ``open`` names the others."""
+def ceiling(sizes: tuple[int, ...]) -> dict[str, dict[str, float]]:
+    """Return by rule the shares of human data sets that pass each indicator, and ``I1-I4`` at once.
 
-    passed: int
-    judged: int
-    open: tuple[str, ...]
+    It is that of the mean of ``sizes``, the trials in the conditions of the humans: of a shipped
+    curve, which ``benchmarks/ceiling.py`` computed once from the published counts and the published
+    regression of the gap with normal residuals; linear between its sizes, and constant beyond the
+    largest. Without a trial in some condition there is no share.
+    """
+    shares: dict[str, dict[str, float]] = {"paper": {}, "robust": {}}
+    if min(sizes):
+        curves = published("human_ceiling").groupby(["rule", "indicator"], sort=False)
+        for (rule, indicator), curve in curves:
+            shares[rule][indicator] = float(np.interp(np.mean(sizes), curve["n"], curve["share"]))
+    return shares
 
-    def __str__(self) -> str:
-        return f"{self.passed} of {self.judged}"
 
-
-def total(judged: dict[str, Verdict]) -> Total:
-    """The score of a group by one rule."""
-    known = {name: v.passed for name, v in judged.items() if v.passed is not None}
-    return Total(sum(known.values()), len(known), tuple(n for n in judged if n not in known))
+def total(judged: dict[str, Verdict]) -> str | None:
+    """How many indicators hold by one rule, ``3 of 4``; None where none can be judged."""
+    known = [verdict.passed for verdict in judged.values() if verdict.passed is not None]
+    return f"{sum(known)} of {len(known)}" if known else None
 
 
 def unjudged(found: Score, *names: str) -> dict[str, tuple[list[str], list[str]]]:
@@ -97,7 +102,8 @@ def unjudged(found: Score, *names: str) -> dict[str, tuple[list[str], list[str]]
 def score(study: Study, group: Group) -> Score:
     """Judge a group's indicators."""
     fit = fits(group)
-    paper, robust = verdicts(PAPER, fit.logit, fit.ols), verdicts(ROBUST, fit.firth, fit.hc3)
+    paper = verdicts(fit.logit, fit.ols, robust=False)
+    robust = verdicts(fit.firth, fit.hc3, robust=True)
     if not group.measured:
         row = published("paper_ablation_qualitative").query("driver == 'human'").iloc[0]
         for name in ("I3", "I4"):

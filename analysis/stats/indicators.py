@@ -17,20 +17,12 @@ and slower, so that no further term is needed. Each difference is tested by two 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from scipy import stats
-
-from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, Regression, Term, VelocityPair
+from merge_runner_analysis.stats.regressions import Regression
 
 ALPHA = 0.05
-# Equivalence margin of I4: how far relative velocity alone may move the gap.
-GAP_MARGIN_M = 1.0
-# Instead of a term: the differences ``Regression.apart``.
-APART = "apart"
 NONE_APART = "no two played conditions differ in relative velocity alone"
-
 INDICATORS = {
     "I1": "The probability of merging first increases with projected headway advantage.",
     "I2": "The probability of merging first decreases with relative velocity advantage.",
@@ -38,56 +30,13 @@ INDICATORS = {
     "I4": "The safety gap is not affected by initial relative velocity difference.",
     "I5": "Conflicts are resolved with intermittent, piecewise-linear velocity profiles.",
 }
-
-
-def equivalence_p(b: float, se: float, freedom: float) -> float:
-    """The p-value of |difference| < GAP_MARGIN_M, by two one-sided t tests (Schuirmann 1987).
-
-    It is the larger of the two, that against the nearer margin. A difference without an error, as
-    of a driver without spread, is sure: it lies within the margin or it does not.
-    """
-    inside = GAP_MARGIN_M - abs(b)
-    if se == 0:
-        return float(inside <= 0)
-    return float(stats.t.sf(inside / se, freedom))
-
-
-def _increases(term: Term, freedom: float) -> bool:
-    return term.b > 0 and term.p < ALPHA
-
-
-def _decreases(term: Term, freedom: float) -> bool:
-    return term.b < 0 and term.p < ALPHA
-
-
-@dataclass(frozen=True, slots=True)
-class Criterion:
-    """Which term decides an indicator, and whether it ``holds``; of APART each difference has to.
-
-    ``holds`` takes the term and the degrees of freedom of its fit.
-    """
-
-    term: str
-    holds: Callable[[Term, float], bool]
-
-    @property
-    def of_who_first(self) -> bool:
-        """Whether it is a term of the regression of who merges first, and not of the gap's."""
-        return self.term in WHO_FIRST_TERMS
-
-
-PAPER = {
-    "I1": Criterion("projected_headway", _increases),
-    "I2": Criterion("relative_velocity", _decreases),
-    "I3": Criterion("abs_projected_headway", _increases),
-    "I4": Criterion("abs_relative_velocity", lambda term, _: term.p >= ALPHA),
+# By indicator: the term that decides it, and the sign that it needs; I4's is to have no effect.
+TESTED = {
+    "I1": ("projected_headway", 1),
+    "I2": ("relative_velocity", -1),
+    "I3": ("abs_projected_headway", 1),
+    "I4": ("abs_relative_velocity", 0),
 }
-# The same rules for better tests; only I4 differs: a large p shows nothing, so that the absence
-# of an effect has to be shown.
-ROBUST = PAPER | {
-    "I4": Criterion(APART, lambda term, freedom: equivalence_p(term.b, term.se, freedom) < ALPHA)
-}
-TESTED = tuple(PAPER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,32 +52,23 @@ def disagree(one: Verdict, other: Verdict) -> bool:
     return None not in {one.passed, other.passed} and one.passed != other.passed
 
 
-def verdicts(
-    criteria: Mapping[str, Criterion], who_first: Regression, gap: Regression
-) -> dict[str, Verdict]:
-    """I1 to I4 by these criteria; ROBUST ones need Firth's fit and HC3 errors."""
+def verdicts(who_first: Regression, gap: Regression, *, robust: bool) -> dict[str, Verdict]:
+    """I1 to I4 by the paper's rule, or by the ``robust`` one, for Firth's fit and HC3 errors."""
     return {
-        name: judged(criterion, who_first if criterion.of_who_first else gap)
-        for name, criterion in criteria.items()
+        name: _judged(who_first if name in {"I1", "I2"} else gap, name, robust=robust)
+        for name in TESTED
     }
 
 
-def judged(criterion: Criterion, fit: Regression) -> Verdict:
-    """The verdict on one fit."""
+def _judged(fit: Regression, name: str, *, robust: bool) -> Verdict:
     if fit.problem:
         return Verdict(None, fit.problem)
-    if criterion.term == APART and not fit.apart:
+    name_of_term, sign = TESTED[name]
+    term = fit.terms[name_of_term]
+    if sign:
+        return Verdict(sign * term.b > 0 and term.p < ALPHA)
+    if not robust:
+        return Verdict(term.p >= ALPHA)
+    if fit.equivalence_p is None:
         return Verdict(None, NONE_APART)
-    tested = fit.apart.values() if criterion.term == APART else [fit.terms[criterion.term]]
-    return Verdict(all(criterion.holds(term, fit.freedom) for term in tested))
-
-
-def furthest_apart(fit: Regression) -> VelocityPair:
-    """Of the differences ``fit.apart`` the one that I4 fails by first."""
-    return max(
-        fit.apart,
-        key=lambda pair: (
-            equivalence_p(fit.apart[pair].b, fit.apart[pair].se, fit.freedom),
-            abs(fit.apart[pair].b),
-        ),
-    )
+    return Verdict(fit.equivalence_p < ALPHA)

@@ -17,14 +17,22 @@ from merge_runner_analysis.metrics import Bounded
 
 LEVEL = 0.95
 POWER = 0.8
+ROUNDING = 1e-12
 Z = float(stats.norm.ppf((1 + LEVEL) / 2))
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate(Bounded):
-    """A value with its interval and the number it rests on."""
+    """A value with its interval and the number it rests on.
+
+    ``se`` is its standard error, and ``freedom`` that of its Student's t. A rate has none of these
+    but a ``weight``: the trials that it is as good as.
+    """
 
     n: int
+    se: float | None = None
+    freedom: float = inf
+    weight: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,15 +40,15 @@ class Difference(Bounded):
     """A difference (first minus second) with its interval and a two-sided p-value.
 
     ``detectable`` is the smallest true difference, in either direction, that one test at 5 % finds
-    with a power of POWER; None where none is. ``freedom`` is that of its t test, infinite where the
-    test is another one. ``by`` names the fits that are compared.
+    with a power of POWER; None where none is. ``se`` is its standard error, and ``freedom`` that of
+    its t test, infinite where the test is another one.
     """
 
     value: float
     p: float
     detectable: float | None
     freedom: float = inf
-    by: str = ""
+    se: float | None = None
 
 
 def proportion(successes: int, n: int) -> Estimate:
@@ -84,8 +92,12 @@ def mean(values: Sequence[float] | NDArray[np.float64]) -> Estimate:
     n = len(sample)
     if n < 2:
         return Estimate(float(sample[0]) if n else None, None, None, n)
-    value = float(sample.mean())
-    return Estimate(value, *interval(value, standard_error(sample), n - 1), n)
+    return estimate(float(sample.mean()), standard_error(sample), n - 1, n)
+
+
+def estimate(value: float, se: float, freedom: float, n: int) -> Estimate:
+    """An estimate with its interval of Student's t."""
+    return Estimate(value, *interval(value, se, freedom), n, se, freedom)
 
 
 def finite(values: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
@@ -112,19 +124,27 @@ def two_sided_p(statistic: float, freedom: float = inf) -> float:
     return float(2 * stats.t.sf(abs(statistic), freedom))
 
 
-def difference(value: float, *errors: tuple[float, float], by: str = "") -> Difference | None:
-    """A difference of independent estimates, from the standard error and freedom of each.
+def tested(value: float, se: float, freedom: float) -> Difference:
+    """A difference with this standard error, against none by Student's t."""
+    # Equal but for rounding is equal; where nothing varies, any other difference is sure.
+    statistic = 0.0 if abs(value) < ROUNDING else value / se if se else inf
+    p = two_sided_p(statistic, freedom)
+    ends = interval(value, se, freedom)
+    return Difference(value, *ends, p, detectable(se, freedom), freedom, se)
+
+
+def difference(one: Estimate | Difference, other: Estimate | Difference) -> Difference | None:
+    """One independent estimate less another.
 
     It is tested as Welch (1947) does, so that the 5 % hold also where the groups differ in size and
-    in variance. None where no estimate has an error: there is nothing to test.
+    in variance. None where a value or an error is missing, and where neither has an error: there is
+    nothing to test.
     """
-    se = hypot(*(error for error, _ in errors))
-    if se == 0:
+    if one.value is None or other.value is None or one.se is None or other.se is None:
         return None
-    freedom = satterthwaite(*errors)
-    low, high = interval(value, se, freedom)
-    p = two_sided_p(value / se, freedom)
-    return Difference(value, low, high, p, detectable(se, freedom), freedom, by)
+    se = hypot(one.se, other.se)
+    errors = (one.se, one.freedom), (other.se, other.freedom)
+    return tested(one.value - other.value, se, satterthwaite(*errors)) if se else None
 
 
 def satterthwaite(*errors: tuple[float, float]) -> float:

@@ -11,16 +11,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.stats.indicators import Verdict
-from merge_runner_analysis.stats.intervals import Estimate, finite, mean, proportion, standard_error
-
-Array = NDArray[np.float64]
+from merge_runner_analysis.stats.intervals import Estimate, difference, mean, proportion
 
 NO_ACTION = "no finished trial with control action"
 
@@ -51,7 +46,7 @@ def held(study: Study, group: Group) -> Estimate:
     return proportion(int((found > 0).sum()), len(found))
 
 
-def difference(study: Study, group: Group) -> Estimate | None:
+def less_humans(study: Study, group: Group) -> Estimate | None:
     """The mean gain less that of humans in the same conditions, in human standard deviations.
 
     None for the humans, and without a spread of human trials in every condition.
@@ -70,28 +65,20 @@ def compared(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
     usual = human.groupby("condition")["gain"].mean()
     human = human.assign(apart=human["gain"] - human["condition"].map(usual))
     spread = float((human["apart"] ** 2).sum() / max(len(human) - len(usual), 1)) ** 0.5
-    apart = (driver["gain"] - driver["condition"].map(usual)).to_numpy(float)
-    return _in_spreads(finite(apart), finite(_independent(human, "apart")), spread)
+    apart = (driver["gain"] - driver["condition"].map(usual)).dropna()
+    if not spread:
+        return Estimate(None, None, None, len(apart))
+    own, pairs = mean(apart / spread), mean(_independent(human, "apart") / spread)
+    if own.value is None or own.se is None or pairs.se is None:
+        return Estimate(own.value, None, None, own.n)
+    found = difference(own, replace(pairs, value=0.0))
+    low, high = (found and found.bounds()) or (own.value, own.value)
+    return replace(own, low=low, high=high)
 
 
-def _in_spreads(driver: Array, pairs: Array, spread: float) -> Estimate:
-    """The mean of ``driver`` in units of ``spread``, with the uncertainty of both means."""
-    n = len(driver)
-    if not spread or not n:
-        return Estimate(None, None, None, n)
-    value = float(driver.mean()) / spread
-    if min(n, len(pairs)) < 2:
-        return Estimate(value, None, None, n)
-    errors = ((standard_error(part) / spread, len(part) - 1) for part in (driver, pairs))
-    found = intervals.difference(value, *errors)
-    low, high = (found and found.bounds()) or (value, value)
-    return Estimate(value, low, high, n)
-
-
-def _independent(trials: pd.DataFrame, column: str) -> Array:
+def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
     """Values that do not hang together: of trials, or the means of human pairs."""
-    units = trials.groupby(trials["pair"].fillna(trials["trial_id"]))
-    return np.asarray(units[column].mean(), dtype=float)
+    return trials.groupby(trials["pair"].fillna(trials["trial_id"]))[column].mean()
 
 
 def piecewise_constant(study: Study, group: Group) -> Verdict:

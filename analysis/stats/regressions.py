@@ -14,6 +14,7 @@ from math import inf, sqrt
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy import stats
 
 from merge_runner_analysis.stats import firth, intervals
 
@@ -29,6 +30,8 @@ GAP_TERMS = (
 MIN_PAIRS = 3  # fewer say nothing of how pairs vary
 # Gaps of a program can be equal but for the rounding of a step: that is no effect.
 STEADY_GAP_M = 0.01
+# Equivalence margin of I4: how far relative velocity alone may move the gap.
+GAP_MARGIN_M = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,19 +44,16 @@ class Term:
     p: float
 
 
-# A projected headway in m, and two relative velocities in m/s, the higher one first.
-VelocityPair = tuple[float, float, float]
-
-
 @dataclass(frozen=True, slots=True)
 class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms, and is else empty.
 
     ``freedom`` is the residual degrees of freedom of a linear fit, infinite where tests are normal;
-    ``remark`` is what to know of a fit that has terms. Of a gap alone: ``apart``, by how much the
-    predicted gaps of two played conditions differ that differ in relative velocity alone, and
-    ``velocity_p``, the p-value that no term with relative velocity has an effect (an F test of all
-    of them; None where their errors are not two, as without residuals).
+    ``remark`` is what to know of a fit that has terms. Of a gap alone: ``equivalence_p``, that
+    relative velocity alone moves it by less than GAP_MARGIN_M, and ``velocity_p``, that no term
+    with relative velocity has an effect (an F test of all of them). These are None where no two
+    played conditions differ in relative velocity alone, and where the errors of the terms are not
+    two, as without residuals.
     """
 
     n: int
@@ -61,14 +61,17 @@ class Regression:
     problem: str = ""
     freedom: float = inf
     remark: str = ""
-    apart: dict[VelocityPair, Term] = field(default_factory=dict)
+    equivalence_p: float | None = None
     velocity_p: float | None = None
+    profile: firth.Fit | None = field(default=None, compare=False)
 
+    def interval(self, term: str) -> tuple[float, float] | None:
+        """Return the 95 % interval of a term of Firth's fit, which agrees with its test.
 
-def wald_term(b: float, se: float, freedom: float = inf) -> Term:
-    """A coefficient by Wald's test; one without an error is sure."""
-    statistic = b / se if se else inf
-    return Term(b, se, statistic, intervals.two_sided_p(statistic, freedom))
+        None where its profile does not converge.
+        """
+        assert self.profile is not None
+        return self.profile.interval([*self.terms].index(term), intervals.LEVEL)
 
 
 def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:
@@ -109,18 +112,14 @@ def gap_design(headway_m: Array, velocity_mps: Array) -> Array:
     )
 
 
-def velocity_contrasts(
-    headway_m: Array, velocity_mps: Array
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Pairs of conditions that differ in relative velocity alone, and by how much in regressors.
+def equivalence_p(b: float, se: float, freedom: float) -> float:
+    """The p-value of |difference| < GAP_MARGIN_M, by two one-sided t tests (Schuirmann 1987).
 
-    The conditions with the higher relative velocity, those with the lower one, and the differences
-    of their rows of ``gap_design``.
+    It is the larger of the two, that against the nearer margin. A difference without an error, as
+    of a driver without spread, is sure: it lies within the margin or it does not.
     """
-    alike = headway_m[:, None] == headway_m
-    more, less = np.nonzero(alike & (velocity_mps[:, None] > velocity_mps))
-    design = gap_design(headway_m, velocity_mps)
-    return more, less, design[more] - design[less]
+    inside = GAP_MARGIN_M - abs(b)
+    return float(stats.t.sf(inside / se, freedom)) if se else float(inside <= 0)
 
 
 def who_first_logit(trials: pd.DataFrame) -> Regression:
@@ -143,62 +142,28 @@ def who_first_logit(trials: pd.DataFrame) -> Regression:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Penalised:
-    """Firth's fit of who merged first: finite under separation (Firth 1993).
+def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Regression:
+    """The same by Firth's penalised likelihood (1993), which is finite under separation.
 
-    ``first`` is the column of the design that holds the first of the terms.
-    """
-
-    n: int
-    counts: firth.Counts
-    fit: firth.Fit
-    first: int = 0
-
-    @property
-    def terms(self) -> dict[str, Term]:
-        """Return the terms with penalised likelihood-ratio tests (Heinze and Schemper 2002)."""
-        errors = self.counts.errors(self.fit)
-        terms = {}
-        for place, name in enumerate(WHO_FIRST_TERMS, start=self.first):
-            if (p := self.counts.p(self.fit, place)) is not None:
-                terms[name] = Term(float(self.fit.b[place]), float(errors[place]), None, p)
-        return terms
-
-    def interval(self, term: str) -> tuple[float, float] | None:
-        """Return the profile interval of a term, which agrees with its test."""
-        place = self.first + WHO_FIRST_TERMS.index(term)
-        return self.counts.interval(self.fit, place, intervals.LEVEL)
-
-
-def penalised(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Penalised | str:
-    """Return Firth's fit to trials, or why there is none.
-
-    Its terms are the coefficients of ``trials``, less those of other trials where these are given:
-    then it is one model of both in which every term may differ.
+    Its tests are penalised likelihood ratios (Heinze and Schemper 2002). With other trials its
+    terms are the coefficients ``less`` theirs, of one model of both in which every term may differ.
     """
     design, left = who_first_data(trials)
     n, problem = len(left), _unidentified(design, left)
     if less is not None:
         rest, rest_left = who_first_data(less)
         problem = problem or _unidentified(rest, rest_left)
-        design = np.block([[rest, 0 * rest], [design, design]])
-        left = np.concatenate([rest_left, left])
+        design = np.block([[design, design], [0 * rest, rest]])
+        left = np.concatenate([left, rest_left])
     if problem:
-        return problem
-    counts = _cells(design, left)
-    fit = counts.fit()
-    if fit is None:
-        return "Firth's penalised fit does not converge"
-    return Penalised(n, counts, fit, 0 if less is None else len(WHO_FIRST_TERMS))
-
-
-def who_first_firth(trials: pd.DataFrame) -> Regression:
-    """The same by Firth's penalised likelihood, with penalised likelihood-ratio tests."""
-    fit = penalised(trials)
-    if isinstance(fit, str):
-        return Regression(len(who_first_data(trials)[1]), {}, fit)
-    return Regression(fit.n, fit.terms)
+        return Regression(n, {}, problem)
+    fit = _cells(design, left).fit()
+    tests = [fit.p(place) for place in range(len(WHO_FIRST_TERMS))] if fit else [np.nan]
+    if fit is None or not np.isfinite(tests).all():
+        return Regression(n, {}, "Firth's penalised fit does not converge")
+    found = zip(WHO_FIRST_TERMS, fit.b, fit.errors, tests, strict=False)
+    terms = {name: Term(float(b), float(se), None, p) for name, b, se, p in found}
+    return Regression(n, terms, profile=fit)
 
 
 def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = False) -> Regression:
@@ -221,28 +186,36 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
         if fit.get_influence().hat_matrix_diag.max() > 1 - 1e-9:
             return Regression(len(gap), {}, "a single trial decides a coefficient: no HC3 errors")
         fit = fit.get_robustcov_results("HC3", use_t=True)
-    played = chosen[["projected_headway_m", "relative_velocity_mps"]].drop_duplicates()
-    headways, velocities = played.to_numpy(float).T
     covariance = np.asarray(fit.cov_params())
-    apart = {
-        (float(headways[i]), float(velocities[i]), float(velocities[j])): wald_term(
-            # Rounding leaves variances just below 0 where nothing varies.
-            float(row @ fit.params),
-            sqrt(max(float(row @ covariance @ row), 0.0)),
-            freedom,
-        )
-        for i, j, row in zip(*velocity_contrasts(headways, velocities), strict=True)
-    }
     with_velocity = np.eye(len(GAP_TERMS))[2:]
     told_apart = np.linalg.matrix_rank(covariance[2:, 2:]) == len(with_velocity)
-    velocity_p = float(fit.f_test(with_velocity).pvalue) if told_apart else None
     return Regression(
         len(gap),
         _terms(GAP_TERMS, fit.params, fit.bse, fit.tvalues, fit.pvalues),
         freedom=freedom,
-        apart=apart,
-        velocity_p=velocity_p,
+        equivalence_p=_velocity_alone(chosen, fit.params, covariance, freedom),
+        velocity_p=float(fit.f_test(with_velocity).pvalue) if told_apart else None,
     )
+
+
+def _velocity_alone(
+    trials: pd.DataFrame, b: Array, covariance: Array, freedom: int
+) -> float | None:
+    """The p-value that relative velocity alone moves no predicted gap by the margin.
+
+    That of an intersection-union test (Berger 1982), the largest over all pairs of played
+    conditions that differ in relative velocity alone; None where there is no such pair.
+    """
+    played = trials[["projected_headway_m", "relative_velocity_mps"]].drop_duplicates()
+    headway, velocity = played.to_numpy(float).T
+    design = gap_design(headway, velocity)
+    more, less = np.nonzero((headway[:, None] == headway) & (velocity[:, None] > velocity))
+    tests = [
+        # Rounding leaves variances just below 0 where nothing varies.
+        equivalence_p(float(row @ b), sqrt(max(float(row @ covariance @ row), 0.0)), freedom)
+        for row in design[more] - design[less]
+    ]
+    return max(tests, default=None)
 
 
 def by_pairs(
@@ -266,7 +239,9 @@ def by_pairs(
     terms = {}
     for name, term in whole.terms.items():
         moved = sum((part.terms[name].b - term.b) ** 2 for part in parts.values())
-        terms[name] = wald_term(term.b, sqrt(moved * freedom / len(pairs)), freedom)
+        se = sqrt(moved * freedom / len(pairs))
+        statistic = term.b / se if se else inf
+        terms[name] = Term(term.b, se, statistic, intervals.two_sided_p(statistic, freedom))
     remark = f"errors by jackknife over {len(pairs)} pairs"
     return Regression(whole.n, terms, freedom=freedom, remark=remark)
 

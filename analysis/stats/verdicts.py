@@ -16,27 +16,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from math import inf
-
-import numpy as np
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import HUMAN_GAP_PAIR_SD_M, PAIRS, published
+from merge_runner_analysis.data.reference_data import PAIRS, human_gap_pair_sd_m, published
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.metrics import BOXES
-from merge_runner_analysis.stats import intervals, likeness
+from merge_runner_analysis.metrics import BOXES, GAP
+from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.stats.contrasts import corrected, detectable_rate, difference_of_rates
 from merge_runner_analysis.stats.group_scores import fits, score
-from merge_runner_analysis.stats.indicators import Verdict
-from merge_runner_analysis.stats.intervals import Difference, newcombe, wilson
-from merge_runner_analysis.stats.measures import counts, undecided, undecided_note
+from merge_runner_analysis.stats.indicators import TESTED, Verdict
+from merge_runner_analysis.stats.intervals import Difference, Estimate, wilson
+from merge_runner_analysis.stats.likeness import less_humans
+from merge_runner_analysis.stats.measures import counts, undecided, undecided_note, values
 from merge_runner_analysis.stats.regressions import (
     GAP_TERMS,
     MIN_PAIRS,
+    Regression,
+    Term,
     by_pairs,
     gap_ols,
-    penalised,
-    who_first_data,
+    who_first_firth,
 )
 from merge_runner_analysis.verdict_words import (
     MEASURES,
@@ -48,32 +47,23 @@ from merge_runner_analysis.verdict_words import (
     Measure,
 )
 
-# By measure: the term of its regression, the factor to its unit, and the indicator that tests it.
-SLOPES = {
-    "headway": ("projected_headway", 1.0, "I1"),
-    "velocity": ("relative_velocity", 1.0, "I2"),
-    "gap-headway": ("abs_projected_headway", 1.0, "I3"),
-    "gap-velocity": ("abs_relative_velocity", 0.8, "I4"),
-}
+# By measure: the indicator that tests it.
+SLOPES = {"headway": "I1", "velocity": "I2", "gap-headway": "I3", "gap-velocity": "I4"}
 WHO_FIRST = ("headway", "velocity")
+# Relative velocities of the conditions are 0 or so many m/s: what it does to the gap there.
+VELOCITY_MPS = 0.8
+PUBLISHED = "humans as published"
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
-    """A value of ``n`` trials with its 95 % interval ``ci``, and with its standard error.
+class Known:
+    """What is known of a measure: an estimate, why there is no value, and what to know of it.
 
-    ``freedom`` is that of Student's t. ``rate`` is a rate as a share, and the trials that it is as
-    good as. ``problem`` says why there is no value, ``remark`` what to know of it. A rate counts
-    ``k`` trials; with ``undecided`` ones it has no value, and the interval holds whether none or
-    all of them count (Manski 1989).
+    A rate counts ``k`` trials; with ``undecided`` ones it has no value, and its interval holds
+    whether none or all of them count (Manski 1989).
     """
 
-    value: float | None
-    n: int
-    ci: tuple[float, float] | None = None
-    se: float | None = None
-    freedom: float = inf
-    rate: tuple[float, float] | None = None
+    estimate: Estimate
     problem: str = ""
     remark: str = ""
     k: int | None = None
@@ -85,8 +75,8 @@ class Comparison:
     """A driver beside the humans in one measure; ``p_holm`` is corrected over its measures."""
 
     measure: Measure
-    own: Estimate
-    human: Estimate
+    own: Known
+    human: Known
     difference: Difference | None
     state: str
     note: str
@@ -96,7 +86,15 @@ class Comparison:
 @cache
 def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     """Compare a driver with the humans by every measure."""
-    found = [_compared(study, group, measure) for measure in MEASURES.values()]
+    # Conditions that no human drove would pass for another behaviour.
+    alike = group
+    if not group.trials["condition"].isin(HUMAN_CONDITIONS).all():
+        alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
+    robust = score(study, group).robust
+    found = [
+        _compared(study, alike, measure, robust.get(SLOPES.get(measure.name, "")))
+        for measure in MEASURES.values()
+    ]
     tested = [one.difference.p for one in found if one.difference]
     holm = iter(corrected(tested)[0] if tested else ())
     return tuple(
@@ -105,240 +103,192 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
 
 
 @cache
-def of_humans(study: Study) -> dict[str, Estimate]:
+def of_humans(study: Study) -> dict[str, Known]:
     """The humans by measure, over all conditions."""
     return {name: _human(study, study.human, name) for name in MEASURES}
 
 
-def _compared(study: Study, group: Group, measure: Measure) -> Comparison:
-    # Conditions that no human drove would pass for another behaviour.
-    alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
-    own, human = _own(study, alike, measure.name), _human(study, alike, measure.name)
-    difference = _difference(own, human)
-    if own.undecided:
-        difference = _of_worst_cases(own, human)
+def _compared(study: Study, group: Group, measure: Measure, verdict: Verdict | None) -> Comparison:
+    own, human = _own(study, group, measure.name), _human(study, group, measure.name)
+    if measure.name == "collisions":
+        difference = _of_rates(own, human)
     elif measure.name in WHO_FIRST:
-        difference = _of_slopes(alike, study.human, SLOPES[measure.name][0])
-    verdict = score(study, group).robust.get(SLOPES[measure.name][2]) if measure.is_slope else None
-    state = _state(measure, own, human, difference, verdict)
+        difference = _of_slopes(group, study.human, measure.name)
+    else:
+        difference = intervals.difference(own.estimate, human.estimate)
+    state = _state(measure, own, human.estimate, difference, verdict)
     notes = [own.problem, human.problem]
-    if measure.name in SLOPES and verdict and verdict.passed is None and not own.problem:
+    if verdict and verdict.passed is None and not own.problem:
         notes.append(verdict.why)
     return Comparison(measure, own, human, difference, state, "; ".join(filter(None, notes)))
 
 
 def _state(
     measure: Measure,
-    own: Estimate,
+    own: Known,
     human: Estimate,
     difference: Difference | None,
     verdict: Verdict | None,
 ) -> str:
     """The state of a measure, empty where it cannot be judged; see ``Measure.rule``."""
-    if own.ci is None or (own.value is None and not own.undecided):
+    value, ends = own.estimate.value, own.estimate.bounds()
+    if ends is None or (value is None and not own.undecided):
         return ""
-    low, high = own.ci
     if measure.margin is not None:
-        alike = verdict.passed if verdict else max(-low, high) < measure.margin
-        if alike:
+        low, high = ends
+        if verdict.passed if verdict else max(-low, high) < measure.margin:
             return SHOWN
         return UNLIKE if max(low, -high) > measure.margin else OPEN
-    if difference is None or human.value is None:
+    if difference is None or human.value is None or (verdict and verdict.passed is None):
         return ""
-    assert difference.low is not None
-    assert difference.high is not None
-    differs = not difference.low <= 0 <= difference.high
+    low, high = difference.bounds() or ends
+    differs = not low <= 0 <= high
     if verdict is None or not verdict.passed:
-        return "" if verdict and verdict.passed is None else UNLIKE if differs else OPEN
+        return UNLIKE if differs else OPEN
     if not differs:
         return SHOWN
-    return WEAKER if abs(own.value or 0.0) < abs(human.value) else STRONGER
+    return WEAKER if abs(value or 0.0) < abs(human.value) else STRONGER
 
 
-def _of_worst_cases(own: Estimate, human: Estimate) -> Difference | None:
-    """The difference whether no undecided trial collided or all did, with the larger p.
-
-    Its value is the one nearer to 0.
-    """
-    if own.k is None or human.rate is None:
-        return None
-    counts_of = (own.k, own.k + own.undecided)
-    cases = [_of_rates(_rate(k / own.n, own.n, own.n), human) for k in counts_of]
-    least, most = cases
-    nearest = min(cases, key=lambda one: abs(one.value))
-    return replace(nearest, low=least.low, high=most.high, p=max(one.p for one in cases))
-
-
-def _difference(own: Estimate, human: Estimate) -> Difference | None:
-    """The driver's value less the humans'; None where one of them, or every error, is missing."""
-    if own.value is None or human.value is None:
-        return None
-    if own.rate and human.rate:
-        return _of_rates(own, human)
-    if own.se is None or human.se is None:
-        return None
-    value = own.value - human.value
-    return intervals.difference(value, (own.se, own.freedom), (human.se, human.freedom))
-
-
-def _of_slopes(group: Group, human: Group, term: str) -> Difference | None:
+def _of_slopes(group: Group, human: Group, name: str) -> Difference | None:
     """How a slope of who goes first differs, by Firth's fit of one model of both."""
-    fit = penalised(group.outcomes, less=human.outcomes)
-    bounds = None if isinstance(fit, str) else fit.interval(term)
-    if isinstance(fit, str) or bounds is None or term not in fit.terms:
+    term, _ = TESTED[SLOPES[name]]
+    fit = who_first_firth(group.outcomes, less=human.outcomes)
+    ends = fit.interval(term) if fit.terms else None
+    if ends is None:
         return None
     slope = fit.terms[term]
-    return Difference(slope.b, *bounds, slope.p, intervals.detectable(slope.se))
+    return Difference(slope.b, *ends, slope.p, intervals.detectable(slope.se))
 
 
-def _of_rates(own: Estimate, human: Estimate) -> Difference:
-    """How two rates differ, in percent."""
-    assert own.rate is not None
-    assert human.rate is not None
-    found = difference_of_rates([own.rate, human.rate])
-    low, high = newcombe([own.rate, human.rate])
-    least = detectable_rate(own.n, human.n, human.rate[0])
-    least = None if least is None else 100 * least
-    return Difference(100 * found.value, 100 * low, 100 * high, found.p, least)
+def _of_rates(own: Known, human: Known) -> Difference | None:
+    """How two rates differ, in percent.
+
+    With undecided trials it is that of both worst cases: the value nearer to 0, and the larger p.
+    """
+    n, humans = own.estimate.n, human.estimate
+    if own.k is None or humans.value is None or humans.weight is None:
+        return None
+    rate = humans.value / 100
+    cases = [
+        difference_of_rates([((own.k + more) / n, n), (rate, humans.weight)])
+        for more in (0, own.undecided)
+    ]
+    (low, _), (_, high) = (case.bounds(100) or (0.0, 0.0) for case in cases)
+    value = min((case.value for case in cases), key=abs)
+    least = detectable_rate(n, humans.n, rate)
+    p = max(case.p for case in cases)
+    return Difference(100 * value, low, high, p, None if least is None else 100 * least)
 
 
-def _own(study: Study, group: Group, name: str) -> Estimate:
+def _own(study: Study, group: Group, name: str) -> Known:
     """A driver's estimate, of its trials in the humans' conditions."""
     if name == "collisions":
         return _collided(group)
-    if name == "gap":
-        return _mean(group.finished["gap_m"].dropna().to_numpy(float))
     if name == "held":
         return _held(study, group)
-    return _slope(group, name)
+    if name in WHO_FIRST:
+        return _slope(group, name)
+    if name == "gap":
+        found = intervals.mean(values(group, GAP).to_numpy(float))
+        problem = "a single trial has no error" if found.n else "no trial finished with a gap"
+        return Known(found, problem if found.se is None else "")
+    return _gap_slope(fits(group).hc3, name)
 
 
-def _human(study: Study, group: Group, name: str) -> Estimate:
+def _human(study: Study, group: Group, name: str) -> Known:
     """The humans' estimate beside a group's: rates and means of the same conditions."""
     human = study.human
     if name == "collisions":
         return _standardised(human, group)
     if name == "held":
-        return Estimate(0.0, len(human.finished))
+        return Known(Estimate(0.0, None, None, len(human.finished)))
     if name in WHO_FIRST:
         return _slope(human, name)
-    if study.imported and not study.imported.contradicting and _pairs(human) >= MIN_PAIRS:
-        return _gap_of_pairs(human, group) if name == "gap" else _gap_slope_of_pairs(human, name)
-    return _published_gap(group) if name == "gap" else _published_gap_slope(name)
+    pairs = human.finished["pair"].nunique() if "pair" in human.finished else 0
+    if study.imported is None or study.imported.contradicting or pairs < MIN_PAIRS:
+        return _published_gap(group) if name == "gap" else _published_gap_slope(name)
+    if name == "gap":
+        alike = human.finished["condition"].isin(group.trials["condition"].unique())
+        trials = human.finished[alike].dropna(subset=["gap_m"])
+        found = intervals.mean(trials.groupby("pair")["gap_m"].mean().to_numpy(float))
+        return Known(replace(found, n=len(trials)))
+    return _gap_slope(by_pairs(gap_ols, human.trials, "gap_m"), name, "humans: ")
 
 
 @cache
-def _slope(group: Group, name: str) -> Estimate:
-    """A slope of who goes first by Firth's fit, or of the gap with HC3 errors."""
-    term, factor, _ = SLOPES[name]
-    if name in WHO_FIRST:
-        model = penalised(group.outcomes)
-        if isinstance(model, str):
-            return Estimate(None, len(who_first_data(group.outcomes)[1]), problem=model)
-        slope, ci = model.terms.get(term), model.interval(term)
-        if slope is None or ci is None:
-            return Estimate(None, model.n, problem="no profile of Firth's likelihood converges")
-        return Estimate(slope.b, model.n, ci, slope.se)
-    fit = fits(group).hc3
+def _slope(group: Group, name: str) -> Known:
+    """A slope of who goes first by Firth's fit."""
+    fit, (term, _) = fits(group).firth, TESTED[SLOPES[name]]
+    ends = fit.interval(term) if fit.terms else None
+    if ends is None:
+        problem = fit.problem or "no profile of Firth's likelihood converges"
+        return Known(Estimate(None, None, None, fit.n), problem)
+    return Known(Estimate(fit.terms[term].b, *ends, fit.n, fit.terms[term].se))
+
+
+def _gap_slope(fit: Regression, name: str, whose: str = "") -> Known:
+    """A slope of the gap, on relative velocity what that of the conditions does."""
     if fit.problem:
-        return Estimate(None, fit.n, problem=fit.problem)
-    return _by_t(factor * fit.terms[term].b, factor * fit.terms[term].se, fit.freedom, fit.n)
+        return Known(Estimate(None, None, None, fit.n), whose + fit.problem)
+    term = fit.terms[TESTED[SLOPES[name]][0]]
+    factor = VELOCITY_MPS if name == "gap-velocity" else 1.0
+    return Known(intervals.estimate(factor * term.b, factor * term.se, fit.freedom, fit.n))
 
 
-def _by_t(value: float, se: float, freedom: float, n: int, remark: str = "") -> Estimate:
-    """An estimate with Student's t."""
-    ci = intervals.interval(value, se, freedom)
-    return Estimate(value, n, ci, se, freedom, remark=remark)
+def _published_gap_slope(name: str) -> Known:
+    rows = published("paper_gap").query("driver == 'human'")
+    terms = {row.term: Term(float(row.b), float(row.se), None, 1.0) for row in rows.itertuples()}
+    n = int(rows["n"].iloc[0])
+    fit = Regression(n, terms, freedom=n - len(GAP_TERMS))
+    return replace(_gap_slope(fit, name), remark=PUBLISHED)
 
 
-def _collided(group: Group) -> Estimate:
+def _published_gap(group: Group) -> Known:
+    """The published mean of all conditions, with the spread of the nine pairs."""
+    row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
+    n = int(published("paper_gap").query("driver == 'human'")["n"].iloc[0])
+    if {*HUMAN_CONDITIONS} - {*group.trials["condition"]}:
+        problem = "the published human gap is that of all 11 conditions"
+        return Known(Estimate(None, None, None, n), problem)
+    se = human_gap_pair_sd_m() / len(PAIRS) ** 0.5
+    found = intervals.estimate(float(row["gap_m"]), se, len(PAIRS) - 1, n)
+    return Known(found, remark=PUBLISHED)
+
+
+def _collided(group: Group) -> Known:
     """The share of ended trials with a collision by the humans' rule, in percent."""
     k, decided = counts(group, BOXES)
     n = decided + (cut_off := undecided(group, BOXES))
     if not n:
-        return Estimate(None, 0, problem=f"no trial ended: {group.left_out}")
-    least, most = (_rate((k + more) / n, n, n) for more in (0, cut_off))
-    if not cut_off:
-        return replace(least, k=k)
-    assert least.ci is not None
-    assert most.ci is not None
-    ends = least.ci[0], most.ci[1]
-    note = undecided_note(group, BOXES)
-    return Estimate(None, n, ends, problem=note, k=k, undecided=cut_off)
+        return Known(Estimate(None, None, None, 0), f"no trial ended: {group.left_out}")
+    (low, _), (_, high) = (wilson((k + more) / n, n) for more in (0, cut_off))
+    value = None if cut_off else 100 * k / n
+    found = Estimate(value, 100 * low, 100 * high, n, weight=n)
+    return Known(found, undecided_note(group, BOXES), k=k, undecided=cut_off)
 
 
-def _rate(rate: float, as_good_as: float, n: int) -> Estimate:
-    """A rate in percent with Wilson's interval of so many trials."""
-    low, high = wilson(rate, as_good_as)
-    return Estimate(100 * rate, n, (100 * low, 100 * high), rate=(rate, as_good_as))
-
-
-def _standardised(human: Group, group: Group) -> Estimate:
+def _standardised(human: Group, group: Group) -> Known:
     """The humans' collisions in the conditions of a group, which weigh as they do there."""
     trials = human.outcomes.dropna(subset=[BOXES.column])
     by_condition = trials.astype({BOXES.column: bool}).groupby("condition")[BOXES.column]
     rates, sizes = by_condition.mean(), by_condition.size()
-    played = group.outcomes.dropna(subset=[BOXES.column])["condition"]
+    played = group.ended_outcomes["condition"]  # with those that are undecided
     weights = played.value_counts(normalize=True).reindex(rates.index).dropna()
     if weights.empty:
-        return Estimate(None, 0, problem="no human drove its conditions")
+        return Known(Estimate(None, None, None, 0), "no human drove its conditions")
     weights /= weights.sum()
     as_good_as = 1 / float((weights**2 / sizes[weights.index]).sum())
-    rate = float((weights * rates[weights.index]).sum())
-    return _rate(rate, as_good_as, int(sizes[weights.index].sum()))
+    rate, n = float((weights * rates[weights.index]).sum()), int(sizes[weights.index].sum())
+    low, high = wilson(rate, as_good_as)
+    return Known(Estimate(100 * rate, 100 * low, 100 * high, n, weight=as_good_as))
 
 
-def _mean(values: np.ndarray, n: int | None = None, remark: str = "") -> Estimate:
-    """A mean with Student's t."""
-    if len(values) < 2:
-        problem = "a single trial has no error" if len(values) else "no trial finished with a gap"
-        return Estimate(float(values[0]) if len(values) else None, len(values), problem=problem)
-    se = intervals.standard_error(values)
-    return _by_t(float(values.mean()), se, len(values) - 1, n or len(values), remark)
-
-
-def _held(study: Study, group: Group) -> Estimate:
+def _held(study: Study, group: Group) -> Known:
     """How far accelerations are held, less the humans, in human standard deviations (I5)."""
-    found = likeness.difference(study, group) if group.measured and len(group.finished) else None
+    found = less_humans(study, group) if group.measured and len(group.finished) else None
     if found is None or found.value is None:
         why = "too few human recordings are imported" if not study.calibrated else "no trial acted"
-        return Estimate(None, len(group.finished), problem=f"I5 is not compared: {why}")
-    return Estimate(found.value, found.n, found.bounds())
-
-
-def _pairs(human: Group) -> int:
-    return int(human.finished["pair"].nunique()) if "pair" in human.finished else 0
-
-
-def _gap_of_pairs(human: Group, group: Group) -> Estimate:
-    """The humans' mean gap in the conditions of a group, over the means of their pairs."""
-    alike = human.finished["condition"].isin(group.trials["condition"].unique())
-    trials = human.finished[alike].dropna(subset=["gap_m"])
-    return _mean(trials.groupby("pair")["gap_m"].mean().to_numpy(float), len(trials))
-
-
-def _published_gap(group: Group) -> Estimate:
-    """The published mean of all conditions, with the spread of the nine pairs."""
-    row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
-    value, se = float(row["gap_m"]), HUMAN_GAP_PAIR_SD_M / len(PAIRS) ** 0.5
-    n = int(published("paper_gap").query("driver == 'human'")["n"].iloc[0])
-    if {*HUMAN_CONDITIONS} - {*group.trials["condition"]}:
-        return Estimate(None, n, problem="the published human gap is that of all 11 conditions")
-    return _by_t(value, se, len(PAIRS) - 1, n, "humans as published")
-
-
-def _gap_slope_of_pairs(human: Group, name: str) -> Estimate:
-    term, factor, _ = SLOPES[name]
-    fit = by_pairs(gap_ols, human.trials, "gap_m")
-    if fit.problem:
-        return Estimate(None, fit.n, problem=f"humans: {fit.problem}")
-    return _by_t(factor * fit.terms[term].b, factor * fit.terms[term].se, fit.freedom, fit.n)
-
-
-def _published_gap_slope(name: str) -> Estimate:
-    term, factor, _ = SLOPES[name]
-    rows = published("paper_gap").query("driver == 'human'").set_index("term")
-    row = rows.loc[term]
-    n = int(row["n"])
-    value, se = factor * float(row["b"]), factor * float(row["se"])
-    return _by_t(value, se, n - len(GAP_TERMS), n, "humans as published")
+        nothing = Estimate(None, None, None, len(group.finished))
+        return Known(nothing, f"I5 is not compared: {why}")
+    return Known(found)

@@ -55,22 +55,20 @@ TABLES = {
         "Table V",
     ),
     "ablation-qualitative": Listed(
-        "ablations",
+        "indicators",
         "Alignment with qualitative indicators of human behaviour across prompt ablations",
         "Table VI",
     ),
     "ablation-quantitative": Listed(
-        "ablations", "Quantitative measures across prompt ablations", "Table VII"
+        "measures", "Quantitative measures across prompt ablations", "Table VII"
     ),
     "contrasts": Listed("contrasts", "Differences between prompts"),
     "factors": Listed(
         "factors", "Each factor's levels: every metric, and the difference from the reference"
     ),
-    "velocity-profiles": Listed(
-        "profiles", "Piecewise-linear velocity profiles (I5) and plan revisions"
-    ),
+    "velocity-profiles": Listed("profiles", "Piecewise-linear velocity profiles (I5)"),
     "criticality": Listed(
-        "conflicts", "When conflicts are resolved, and how close the vehicles come"
+        "measures", "When conflicts are resolved, and how close the vehicles come"
     ),
     "attempts": Listed("attempts", "What became of the calls"),
     "first-action": Listed(
@@ -84,11 +82,10 @@ OF_ASKED = "first-action"
 
 def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
     """Compute the named tables, or all of them; raises UsageError for an unknown name."""
-    from merge_runner_analysis.tables.against import placed
     from merge_runner_analysis.tables.notes import footnoted
 
-    made = [_with_unjudged(_made(name, study), study) for name in _valid(names)]
-    return [placed(footnoted(table, study), study) for table in made]
+    made = (_with_unjudged(_made(name, study), study) for name in _valid(names))
+    return [footnoted(table, study) for table in made]
 
 
 def _with_unjudged(table: Table, study: Study) -> Table:

@@ -8,7 +8,6 @@ from merge_runner.text_safety import quoted
 from merge_runner_analysis.data.provenance import tally
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Table, row_of
-from merge_runner_analysis.tables.notes import sample_notes
 
 NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
 # Failures with a share of the answers beside their number, and how they are called; the others are
@@ -55,7 +54,6 @@ def attempts(study: Study) -> Table:
             "fallback: an older plan was driven, or none, of all decisions",
             "unknown: attempts that were under way when a run was killed, whose reply nobody saw; "
             "other model: answers of another model than the one asked for, by no declared alias",
-            *sample_notes(study, study.played),
         ),
     )
 

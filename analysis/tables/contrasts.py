@@ -5,18 +5,12 @@ from __future__ import annotations
 from math import isinf
 
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.data.study import Group, Study, in_one_study
-from merge_runner_analysis.metrics import RULES_NOTE, Metric, compared
-from merge_runner_analysis.stats.contrasts import (
-    contrast_cells,
-    contrast_means,
-    corrected,
-    shared_cells,
-)
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
+from merge_runner_analysis.stats.contrasts import contrast, corrected
 from merge_runner_analysis.stats.intervals import Difference
-from merge_runner_analysis.stats.measures import trials_of, undecided
-from merge_runner_analysis.tables.model import Column, Row, Table
-from merge_runner_analysis.tables.notes import sample_notes
+from merge_runner_analysis.stats.measures import trials_of
+from merge_runner_analysis.tables.model import Column, Optional, Row, Table, interval
 
 
 def contrasts(study: Study) -> Table:
@@ -25,7 +19,7 @@ def contrasts(study: Study) -> Table:
     for driver in dict.fromkeys(group.driver for group in study.models):
         # A family is one question asked of several variants. Correcting over all metrics at once
         # would make the result depend on how many are registered.
-        for metric in compared():
+        for metric in shown_in("tables"):
             rows += _family(study, driver, metric)
     judged = "judged " if study.unjudged else ""
     return Table(
@@ -36,23 +30,14 @@ def contrasts(study: Study) -> Table:
             Column("reference", "against"),
             Column("measure", "measure"),
             Column("difference", "difference", "number", 2, "first minus second"),
-            Column("ci", "95 % CI", "interval", 2, "Newcombe; least squares", optional=True),
+            interval("ci", "Newcombe; least squares"),
             Column("p", "p", "p", 3, "Fisher's exact test or t test"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
             Column("p_bh", "BH", "p", 3, "corrected by Benjamini and Hochberg"),
-            Column(
-                "detectable",
-                "detectable",
-                "number",
-                2,
-                "smallest difference, in either direction, found at p < .05 with power .8",
-                optional=True,
-            ),
+            Optional("detectable", "detectable", "number", 2, "at p < .05 with power .8"),
             Column("n", "n", "count", 0, "trials of the setting in the shared conditions"),
-            Column(
-                "n_reference", "n ref.", "count", 0, "trials of the reference in these conditions"
-            ),
-            Column("freedom", "df", "number", 0, "of a t test", optional=True),
+            Column("n_reference", "n ref.", "count", 0, "trials of the reference in these"),
+            Optional("freedom", "df", "number", 0, "of a t test"),
         ),
         rows,
         (
@@ -63,10 +48,8 @@ def contrasts(study: Study) -> Table:
             "detectable: the smallest difference that is found at p < .05, before correction, with "
             "a power of .8; rates: by the exact power of Fisher's test of all these trials as if "
             "of one condition, the reference's true rate being the observed one, in the direction "
-            "in which less is enough; means: (t.975 + t.8) times the standard error of the linear "
-            "model, with its degrees of freedom",
+            "in which less is enough; means: (t.975 + t.8) times the standard error",
             RULES_NOTE,
-            *sample_notes(study, study.groups, pooled=False),
             *([] if rows else [f"there is no pair of {judged}groups to compare"]),
         ),
     )
@@ -78,32 +61,22 @@ def _family(study: Study, driver: str, metric: Metric) -> list[Row]:
     other = groups.pop(study.reference, None)
     if other is None:
         return []
-    found = {
-        group: contrast
+    contrasts = {
+        group: found
         for group in groups.values()
-        if in_one_study(study, group, other) and (contrast := _contrast(group, other, metric))
+        if (found := contrast(study, (group, other), metric))
     }
-    if not found:
+    if not contrasts:
         return []
-    families = zip(*corrected([contrast.p for contrast in found.values()]), strict=True)
+    families = zip(*corrected([found.p for found in contrasts.values()]), strict=True)
     return [
-        _row(group, other, metric, contrast, float(holm), float(bh))
-        for (group, contrast), (holm, bh) in zip(found.items(), families, strict=True)
+        _row(group, other, metric, found, float(holm), float(bh))
+        for (group, found), (holm, bh) in zip(contrasts.items(), families, strict=True)
     ]
 
 
-def _contrast(group: Group, other: Group, metric: Metric) -> Difference | None:
-    """The difference between two prompts; None if they share no condition or are undecided."""
-    if undecided(group, metric) or undecided(other, metric):
-        return None
-    if not metric.rate:
-        return contrast_means(group.trials, other.trials, metric.column)
-    both = shared_cells(group.trials, other.trials, metric.column)
-    return contrast_cells(both) if both else None
-
-
 def _row(
-    group: Group, other: Group, metric: Metric, contrast: Difference, holm: float, bh: float
+    group: Group, other: Group, metric: Metric, found: Difference, holm: float, bh: float
 ) -> Row:
     first, second = (
         trials_of(one, metric).dropna(subset=[metric.column])["condition"] for one in (group, other)
@@ -120,16 +93,16 @@ def _row(
             "setting": group.setting,
             "reference": other.setting,
             "measure": metric.heading,
-            "difference": contrast.value * factor,
-            "ci": contrast.bounds(factor),
-            "p": contrast.p,
+            "difference": found.value * factor,
+            "ci": found.bounds(factor),
+            "p": found.p,
             "p_holm": holm,
             "p_bh": bh,
-            "detectable": None if contrast.detectable is None else contrast.detectable * factor,
+            "detectable": None if found.detectable is None else found.detectable * factor,
             "n": int(first.isin(second).sum()),
             "n_reference": int(second.isin(first).sum()),
-            "freedom": None if isinf(contrast.freedom) else contrast.freedom,
+            "freedom": None if isinf(found.freedom) else found.freedom,
         },
-        powerless if contrast.detectable is None else "",
+        powerless if found.detectable is None else "",
         counts=f"{metric.counts} AND condition IN ({named})",
     )

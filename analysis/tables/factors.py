@@ -15,13 +15,11 @@ from merge_runner_analysis.stats.factors import (
     balance,
     difference,
     difference_of_medians,
-    interaction,
     levels_by_factor,
 )
 from merge_runner_analysis.stats.intervals import Difference
 from merge_runner_analysis.stats.measures import estimate, undecided_note
-from merge_runner_analysis.tables.model import Column, Kind, Row, Table, Value
-from merge_runner_analysis.tables.notes import sample_notes
+from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 
 DIFFERENCES = (
     "differences are from the reference, the level that stands first, in the cells that both have "
@@ -59,17 +57,17 @@ def factors(study: Study) -> Table:
         (
             *([Column("at", by)] if by else []),
             Column("factor", "factor"),
-            Column("drivers", "drivers", optional=True),
+            Optional("drivers", "drivers"),
             Column("measure", "measure"),
             Column("level", "level"),
             Column("trials", "trials", "count", 0, "trials of the level that ended"),
             Column("n", "n", "count", 0, "of these, trials that count for the measure"),
-            Column("value", "value", "number", 2, "the measure", optional=True),
-            Column("ci", "95 % CI", "interval", 2, "of the measure", optional=True),
-            _compared("difference", "difference", "number", "from the factor's reference"),
-            _compared("difference_ci", "95 % CI", "interval", "of the difference"),
-            _compared("p", "p", "p", "exact or t test"),
-            _compared("p_holm", "Holm", "p", "corrected by Holm"),
+            Optional("value", "value", "number", 2, "the measure"),
+            interval("ci", "of the measure"),
+            Optional("difference", "difference", "number", 2, "from the factor's reference"),
+            interval("difference_ci", "of the difference"),
+            Optional("p", "p", "p", 3, "exact or t test"),
+            Optional("p_holm", "Holm", "p", 3, "corrected by Holm"),
         ),
         list(_corrected(rows, tested)),
         (
@@ -79,14 +77,8 @@ def factors(study: Study) -> Table:
             *([f"Holm: corrected for all {len(tested)} p of the table"] if tested else []),
             *(f"{_named(levels[0])}: {balance(levels)}" for levels in found),
             RULES_NOTE,
-            *sample_notes(study, study.models),
         ),
     )
-
-
-def _compared(name: str, heading: str, kind: Kind, meaning: str) -> Column:
-    digits = 3 if kind == "p" else 2
-    return Column(name, heading, kind, digits, meaning, optional=True)
 
 
 def _named(level: Level) -> str:
@@ -113,9 +105,9 @@ def _row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
     cells = _cells(level, metric) | {"n": found.n, "value": found.value, "ci": found.bounds()}
     if level is not first:
         if metric.estimator == "median":
-            cells |= {"difference": difference_of_medians(study, level, first, metric)}
+            cells |= {"difference": difference_of_medians(study, metric, level, first)}
         else:
-            found_difference = difference(study, level, first, metric)
+            found_difference = difference(study, metric, level, first)
             cells |= _difference(found_difference, metric, of=(level, first))
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
     return Row(
@@ -178,7 +170,7 @@ def _interaction(
         "factor": f"{level.factor} × {by}",
         "n": estimate(level.pooled, metric).n,
     }
-    found = interaction(study, pair, others, metric)
+    found = difference(study, metric, *pair, *others)
     return Row(
         f"{level.id}/interaction/{metric.name}",
         level.groups,

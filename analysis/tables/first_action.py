@@ -12,7 +12,6 @@ from merge_runner_analysis.data.reference_data import citation, published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.stats.first_action import (
     HOLD_MPS2,
-    Clustered,
     exchange_rate,
     first_actions,
     human_exchange_rate,
@@ -20,6 +19,7 @@ from merge_runner_analysis.stats.first_action import (
     seats,
     slope,
 )
+from merge_runner_analysis.stats.intervals import Estimate
 from merge_runner_analysis.tables.model import (
     ENDED,
     GROUP_COLUMNS,
@@ -29,7 +29,6 @@ from merge_runner_analysis.tables.model import (
     Value,
     row_of,
 )
-from merge_runner_analysis.tables.notes import sample_notes
 
 FILE = "human_first_actions"
 NOTHING = (
@@ -83,7 +82,6 @@ def first_action(study: Study) -> Table:
             "the first word, of humans in one of who merged first; empty where a driver has no "
             "word, or the logit no finite estimate",
             *_human_notes(study),
-            *sample_notes(study, (*study.models, *study.asked), pooled=False, whole=False),
         ),
     )
 
@@ -105,7 +103,7 @@ def _rows(study: Study, group: Group) -> Iterator[Row]:
         yield row_of(group, values, *remarks, item=seat.side, counts=ENDED)
 
 
-def _values(rows: pd.DataFrame, rate: Clustered | None) -> dict[str, Value]:
+def _values(rows: pd.DataFrame, rate: Estimate | None) -> dict[str, Value]:
     action, sign = rows["first_mps2"], np.sign(rows["velocity_mps"].round(6))
     means = action.groupby(sign).mean()
     fitted = slope(rows)
@@ -140,7 +138,7 @@ def _published_row(group: Group) -> Row:
     return row_of(group, values, f"published ({citation(FILE)})", counts="")
 
 
-def _estimate(name: str, estimate: Clustered | None) -> dict[str, Value]:
+def _estimate(name: str, estimate: Estimate | None) -> dict[str, Value]:
     return {name: estimate.value, f"{name}_ci": estimate.bounds()} if estimate else {}
 
 

@@ -1,98 +1,166 @@
-"""Table V: qualitative and quantitative indicators beside the human ceiling."""
+"""Tables V and VI: the indicators of human behaviour beside the human ceiling."""
 
 from __future__ import annotations
 
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.metrics import RULES_NOTE, HumanReference, Metric, shown_in
+from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.stats.group_scores import Score, score, total, unjudged
 from merge_runner_analysis.stats.indicators import (
-    GAP_MARGIN_M,
     INDICATORS,
     TESTED,
-    Verdict,
     disagree,
 )
-from merge_runner_analysis.stats.likeness import difference, gains, held, mean_gain
-from merge_runner_analysis.stats.measures import (
-    estimate_or_reference,
-    no_human_value,
-    outcomes_note,
-    undecided_note,
+from merge_runner_analysis.stats.intervals import Estimate
+from merge_runner_analysis.stats.likeness import gains, mean_gain
+from merge_runner_analysis.stats.measures import outcomes_note
+from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
+from merge_runner_analysis.tables.measures import measured
+from merge_runner_analysis.tables.model import (
+    ENDED,
+    FINISHED,
+    GROUP_COLUMNS,
+    Column,
+    Optional,
+    Row,
+    Table,
+    Value,
+    interval,
+    row_of,
 )
-from merge_runner_analysis.tables.model import Column, Row, Table, Value, row_of
-from merge_runner_analysis.tables.notes import (
-    ceiling_notes,
-    intermittency_notes,
-    no_ceiling,
-    sample_notes,
-)
-from merge_runner_analysis.tables.profiles import gain_values
+from merge_runner_analysis.tables.notes import CEILING, GAIN
 
 # The indicators that rest on who merged first.
 OF_OUTCOMES = ("I1", "I2")
-BESIDE_I5 = {"held": "I5 held (%)", "clock": "I5 at 1 Hz", "humans": "I5 - humans (SD)"}
-RULES = (
+RESAMPLED = "share of resampled human data sets of this size that pass"
+NOTES = (
     "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
     "Firth's fit (I1, I2), HC3 errors (I3), gaps that relative velocity alone moves by less than "
-    f"{GAP_MARGIN_M:g} m (I4), gains above 0 (I5, which the paper judged by eye)"
+    f"{GAP_MARGIN_M:g} m (I4), gains above 0 (I5, which the paper judged by eye)",
+    *(f"{name}: {text}" for name, text in INDICATORS.items()),
+    CEILING,
+    GAIN,
 )
 
 
 def indicators(study: Study) -> Table:
     """Table V: I1 to I5 and the quantitative measures, each with a row per driver."""
-    rows = []
-    for name in INDICATORS:
-        rows += [_verdict_row(study, group, name) for group in study.baselines]
-    beside = [_beside_i5(study, group) for group in study.baselines if group.measured]
-    rows += [found[name] for name in BESIDE_I5 for found in beside if name in found]
-    rows += [_total_row(study, group) for group in study.baselines]
-    for metric in shown_in("tables"):
-        rows += [_metric_row(group, metric) for group in study.baselines]
+    groups = study.baselines
     return Table(
         "indicators",
         (
             Column("indicator", "indicator"),
             Column("driver", "driver"),
-            Column(
-                "paper", "paper's rule", "verdict", meaning="by the paper's rule", optional=True
+            Optional("paper", "paper's rule", "verdict", meaning="by the paper's rule"),
+            Optional("robust", "robust", "verdict", meaning="by robust tests"),
+            Optional("differ", "", meaning="where the two rules disagree"),
+            Optional("value", "value", "number", 2, "mean gain (I5) or measure"),
+            interval("interval", "Wilson for rates, t for means"),
+            Optional(
+                "ceiling_paper", "humans pass (%)", "percent", 0, f"{RESAMPLED} the paper's rule"
             ),
-            Column("robust", "robust", "verdict", meaning="by robust tests", optional=True),
-            Column("differ", "", meaning="where the two rules disagree", optional=True),
-            Column("value", "value", "number", 2, "mean gain (I5) or measure", optional=True),
-            Column(
-                "interval", "95 % CI", "interval", 2, "Wilson for rates, t for means", optional=True
+            Optional(
+                "ceiling_robust", "humans, robust (%)", "percent", 0, f"{RESAMPLED} the robust rule"
             ),
-            Column(
-                "ceiling_paper",
-                "humans pass (%)",
-                "percent",
-                0,
-                "share of resampled human data sets of this size that pass the paper's rule",
-                optional=True,
-            ),
-            Column(
-                "ceiling_robust",
-                "humans, robust (%)",
-                "percent",
-                0,
-                "share of resampled human data sets of this size that pass the robust rule",
-                optional=True,
-            ),
-            Column("n", "n", "count", 0, "trials", optional=True),
+            Optional("n", "n", "count", 0, "trials"),
         ),
-        rows,
-        (
-            RULES,
-            *(f"{name}: {text}" for name, text in INDICATORS.items()),
-            RULES_NOTE,
-            *ceiling_notes(),
-            *intermittency_notes(study),
-            *sample_notes(study, study.baselines),
-        ),
+        [
+            *(_verdict_row(study, group, name) for name in INDICATORS for group in groups),
+            *(_total_row(study, group) for group in groups),
+            *(_metric_row(group, metric) for metric in shown_in("tables") for group in groups),
+        ],
+        (*NOTES, RULES_NOTE),
     )
 
 
-def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value]:
+def ablation_qualitative(study: Study) -> Table:
+    """Table VI: I1 to I5 of every driver and prompt."""
+    columns = [*GROUP_COLUMNS, Column("n", "n", "count", 0, "trials that ended")]
+    for name, text in INDICATORS.items():
+        prefix = name.lower()
+        columns += [
+            Optional(f"{prefix}_paper", name, "verdict", meaning=text),
+            Optional(f"{prefix}_robust", f"{name} rob.", "verdict", meaning="by robust tests"),
+            Optional(f"{prefix}_differ", "", meaning="where the two rules disagree"),
+        ]
+    hold = "indicators that hold, of those that can be judged, by"
+    columns += [
+        Optional("score_paper", "S", meaning=f"{hold} the paper's rule"),
+        Optional("score_robust", "S rob.", meaning=f"{hold} the robust rule"),
+        Column(
+            "ceiling_paper",
+            "humans I1-I4 (%)",
+            "percent",
+            0,
+            f"{RESAMPLED} I1 to I4 by the paper's rule",
+        ),
+        Column("ceiling_robust", "humans, rob. (%)", "percent", 0, "the same by the robust rule"),
+    ]
+    rows = [_group_row(study, group) for group in study.groups]
+    return Table("ablation-qualitative", columns, rows, NOTES)
+
+
+def _group_row(study: Study, group: Group) -> Row:
+    found = score(study, group)
+    values: dict[str, Value] = {"n": len(group.ended_outcomes)}
+    for name in INDICATORS:
+        values |= _verdicts(found, name, f"{name.lower()}_")
+    values |= {"score_paper": total(found.paper), "score_robust": total(found.robust)}
+    # A ceiling is for one data set of one size; indicators of different trials have no common size.
+    remarks = [_verdict_note(found, *INDICATORS), no_ceiling(group)]
+    if of_both := outcomes_note(group):
+        remarks += [of_both, "no ceiling: the indicators rest on different trials"]
+    else:
+        values |= _ceilings(found, "I1-I4")
+    return row_of(group, values, *remarks, counts=ENDED)
+
+
+def _verdict_row(study: Study, group: Group, name: str) -> Row:
+    found = score(study, group)
+    of_outcomes = name in OF_OUTCOMES
+    trials = group.outcomes if of_outcomes else group.trials
+    values: dict[str, Value] = {"indicator": name, **_verdicts(found, name)}
+    # A ceiling is drawn for as many trials as there are outcomes. It does not fit indicators of the
+    # gap or the speeds where only some of these trials have traces.
+    if of_outcomes or not outcomes_note(group):
+        values |= _ceilings(found, name)
+    # I5 compares with human traces directly and has no ceiling.
+    remarks = [_verdict_note(found, name), no_ceiling(group) if name in TESTED else ""]
+    if name == "I5" and group.measured:
+        gain, still = mean_gain(study, group), int(gains(study, group)["steady"].sum())
+        values |= {"value": gain.value, "interval": gain.bounds()}
+        if still:
+            of = f"{still} of {len(group.finished)} trials"
+            remarks.append(f"I5 without {of}: no control action")
+    values["n"] = int((trials["status"] == "finished").sum())
+    return row_of(group, values, *remarks, outcomes_note(group), item=name)
+
+
+def _total_row(study: Study, group: Group) -> Row:
+    found, of_both = score(study, group), outcomes_note(group)
+    values: dict[str, Value] = {
+        "indicator": "Score",
+        "paper": total(found.paper),
+        "robust": total(found.robust),
+        "n": len(group.finished),
+    }
+    if not of_both:  # no single ceiling fits a score whose indicators rest on different trials
+        values |= _ceilings(found, "I1-I4")
+    return row_of(group, values, of_both, no_ceiling(group), item="score")
+
+
+def _metric_row(group: Group, metric: Metric) -> Row:
+    found, remarks = measured(group, [metric])
+    values: dict[str, Value] = {"indicator": metric.heading}
+    of_trials = False
+    if one := found.get(metric.name):
+        of_trials = isinstance(one, Estimate)
+        n = one.n if isinstance(one, Estimate) else None
+        values |= {"value": one.value, "interval": one.bounds(), "n": n}
+    counts = metric.counts if of_trials else FINISHED
+    return row_of(group, values, *remarks, item=metric.name, counts=counts)
+
+
+def _verdicts(found: Score, name: str, prefix: str = "") -> dict[str, Value]:
     """An indicator by both rules, and whether they disagree."""
     paper, robust = found.paper[name], found.robust[name]
     return {
@@ -102,23 +170,22 @@ def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value
     }
 
 
-def ceiling_values(found: Score, name: str) -> dict[str, Value]:
+def _ceilings(found: Score, name: str) -> dict[str, Value]:
     """Which percentages of human data sets pass an indicator, or ``I1-I4`` together, by rule."""
-    by_rule = {"paper": found.ceiling.paper, "robust": found.ceiling.robust}
     return {
-        f"ceiling_{rule}": 100 * shares[name] if name in shares else None
-        for rule, shares in by_rule.items()
+        f"ceiling_{rule}": 100 * shares[name]
+        for rule, shares in found.ceiling.items()
+        if name in shares
     }
 
 
-def verdict_note(found: Score, *names: str) -> str:
+def _verdict_note(found: Score, *names: str) -> str:
     """Why a verdict is missing, or what it rests on if not on a test."""
     known: dict[str, dict[str, None]] = {}
     for name in names:
         for judged in found.rules.values():
-            verdict = judged[name]
-            if verdict.why and verdict.passed is not None:
-                known.setdefault(verdict.why, {})[name] = None
+            if judged[name].why and judged[name].passed is not None:
+                known.setdefault(judged[name].why, {})[name] = None
     return "; ".join(
         [
             *(f"{', '.join(which)} {why}" for why, which in known.items()),
@@ -130,124 +197,11 @@ def verdict_note(found: Score, *names: str) -> str:
     )
 
 
-def score_text(judged: dict[str, Verdict]) -> str | None:
-    """``3 of 4``, or None where no indicator can be judged."""
-    found = total(judged)
-    return str(found) if found.judged else None
-
-
-def score_note(found: Score) -> str:
-    """Which indicators a score leaves out of both its numbers, by rule.
-
-    But for those that a rule never judges, whatever is driven.
-    """
-    rules: dict[tuple[str, ...], list[str]] = {}
-    for rule, judged in found.rules.items():
-        if left_out := tuple(name for name in total(judged).open if judged[name].why):
-            rules.setdefault(left_out, []).append(rule)
-    return "; ".join(
-        f"the score {' and '.join(which)} leaves out {', '.join(left_out)}"
-        for left_out, which in rules.items()
-    )
-
-
-def _verdict_row(study: Study, group: Group, name: str) -> Row:
-    found = score(study, group)
-    of_outcomes = name in OF_OUTCOMES
-    trials = group.outcomes if of_outcomes else group.trials
-    # A ceiling is drawn for as many trials as there are outcomes. It does not fit indicators of the
-    # gap or the speeds where only some of these trials have traces.
-    drawn = of_outcomes or not outcomes_note(group)
-    remarks = (
-        verdict_note(found, name),
-        _inaction(study, group, name),
-        outcomes_note(group),
-        # I5 compares with human traces directly and has no ceiling.
-        no_ceiling(group) if name in TESTED else "",
-    )
-    return row_of(
-        group,
-        {
-            "indicator": name,
-            **verdict_values(found, name),
-            **(gain_values(study, group, "value", "interval") if name == "I5" else {}),
-            **(ceiling_values(found, name) if drawn else {}),
-            "n": int((trials["status"] == "finished").sum()),
-        },
-        *remarks,
-        item=name,
-    )
-
-
-def _beside_i5(study: Study, group: Group) -> dict[str, Row]:
-    """The numbers beside the gain of I5, by name; none of them decides."""
-    share, clock = held(study, group), mean_gain(study, group, "clocked_gain")
-    if share.value is None or share.low is None or share.high is None:
-        return {}
-    numbers: dict[str, tuple[Value, Value]] = {
-        "held": (100 * share.value, (100 * share.low, 100 * share.high)),
-        "clock": (clock.value, clock.bounds()),
-    }
-    if found := difference(study, group):
-        numbers["humans"] = (found.value, found.bounds())
-    return {
-        name: row_of(
-            group,
-            {
-                "indicator": BESIDE_I5[name],
-                "value": value,
-                "interval": bounds,
-                "n": len(group.finished),
-            },
-            _inaction(study, group, "I5"),
-            item=f"I5-{name}",
-        )
-        for name, (value, bounds) in numbers.items()
-    }
-
-
-def _inaction(study: Study, group: Group, name: str) -> str:
-    """How many trials do not count for I5."""
-    still = int(gains(study, group)["steady"].sum()) if name == "I5" and group.measured else 0
-    return f"I5 without {still} of {len(group.finished)} trials: no control action" * bool(still)
-
-
-def _total_row(study: Study, group: Group) -> Row:
-    found = score(study, group)
-    of_both = outcomes_note(group)
-    return row_of(
-        group,
-        {
-            "indicator": "Score",
-            "paper": score_text(found.paper),
-            "robust": score_text(found.robust),
-            # No single ceiling fits a score whose indicators rest on different trials.
-            **({} if of_both else ceiling_values(found, "I1-I4")),
-            "n": len(group.finished),
-        },
-        score_note(found),
-        of_both,
-        no_ceiling(group),
-        item="score",
-    )
-
-
-def _metric_row(group: Group, metric: Metric) -> Row:
-    item = metric.name
-    values: dict[str, Value] = {"indicator": metric.heading}
-    found = estimate_or_reference(group, metric)
-    if found is None:
-        return row_of(group, values, no_human_value(metric), item=item)
-    values |= {"value": found.value, "interval": found.bounds()}
-    if isinstance(found, HumanReference):
-        source = f"published value, no human traces are imported ({found.source})"
-        return row_of(group, values, source, item=item)
-    return row_of(
-        group,
-        values | {"n": found.n},
-        "" if found.n or found.bounds() else f"{metric.heading}: no trial has it",
-        undecided_note(group, metric),
-        outcomes_note(group),
-        item=item,
-        counts=metric.counts,
-    )
+def no_ceiling(group: Group) -> str:
+    """Why a group has no human ceiling; empty where it has one."""
+    if min(group.sizes):
+        return ""
+    if any(group.sizes):
+        return "not all conditions of the humans were played: no ceiling"
+    played = len(group.ended_outcomes)
+    return f"{'no human drove its conditions' if played else 'no trial ended'}: no ceiling"

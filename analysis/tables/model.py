@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from math import isnan
 from typing import TYPE_CHECKING, Literal
 
@@ -39,14 +40,19 @@ class Column:
     optional: bool = False
 
 
+Optional = partial(Column, optional=True)
+
+
+def interval(name: str, meaning: str, digits: int = 2) -> Column:
+    """The column of a 95 % interval."""
+    return Optional(name, "95 % CI", "interval", digits, meaning)
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """One row: its readable id, the groups whose trials it rests on, values by column, a note.
 
-    ``counts`` is the SQL predicate for its trials, empty where it rests on none. ``beside`` is the
-    paper's driver whose row it is compared with, if any, and None where a scripted stand-in
-    answered in the name of a model. ``printed`` says that values are published ones, which have no
-    difference from these.
+    ``counts`` is the SQL predicate for its trials, empty where it rests on none.
     """
 
     id: str
@@ -54,8 +60,6 @@ class Row:
     values: Mapping[str, Value]
     note: str = ""
     counts: str = FINISHED
-    beside: str | None = ""
-    printed: bool = False
 
 
 GROUP_COLUMNS = (Column("driver", "driver"), Column("setting", "setting"))
@@ -116,13 +120,19 @@ def to_text(table: Table) -> str:
 def from_text(text: str) -> Table:
     """The table that ``to_text`` wrote."""
     content = json.loads(text)
-    columns = tuple(Column(**column) for column in content["columns"])
     # JSON has no tuples: without these conversions the table would not equal the original.
-    intervals = {column.name for column in columns if column.kind == "interval"}
-    for row in content["rows"]:
-        for name in intervals & row["values"].keys():
-            if row["values"][name] is not None:
-                row["values"][name] = tuple(row["values"][name])
-        row["groups"] = tuple(row["groups"])
-    rows = [Row(**row) for row in content["rows"]]
+    rows = [
+        Row(
+            **row
+            | {
+                "groups": tuple(row["groups"]),
+                "values": {
+                    name: tuple(value) if isinstance(value, list) else value
+                    for name, value in row["values"].items()
+                },
+            }
+        )
+        for row in content["rows"]
+    ]
+    columns = tuple(Column(**column) for column in content["columns"])
     return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterator
 from functools import cache
+from typing import NamedTuple
 
 from merge_runner_analysis.data.reference_data import citation, printed_value, published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.stats.group_scores import fits
-from merge_runner_analysis.stats.indicators import GAP_MARGIN_M, equivalence_p, furthest_apart
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import (
+    GAP_MARGIN_M,
     GAP_TERMS,
     WHO_FIRST_TERMS,
     Regression,
@@ -21,13 +22,12 @@ from merge_runner_analysis.stats.regressions import (
 from merge_runner_analysis.tables.model import (
     GROUP_COLUMNS,
     Column,
-    Kind,
+    Optional,
     Row,
     Table,
     Value,
     row_of,
 )
-from merge_runner_analysis.tables.notes import sample_notes
 
 TERM_NAMES = {
     "intercept": "Intercept",
@@ -43,7 +43,6 @@ TESTED_ELSEWHERE = (
     "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
     "table verdicts tests it"
 )
-RANDOM_INTERCEPT = "random intercept per pair"
 KEYS = (
     Column("term", "term"),
     *GROUP_COLUMNS,
@@ -54,6 +53,19 @@ KEYS = (
 P = Column("p", "p", "p", 3, "Wald test")
 
 
+class Fit(NamedTuple):
+    """A fit of a group's trials, and a robust one whose values' names begin with ``prefix``.
+
+    ``item`` and ``label`` tell a further fit of the same trials from the first.
+    """
+
+    main: Regression
+    robust: Regression | None = None
+    prefix: str = ""
+    item: str = ""
+    label: str = ""
+
+
 def who_first(study: Study) -> Table:
     """Table III: logistic regression of left-first on h (m) and dv (m/s)."""
     return Table(
@@ -62,109 +74,103 @@ def who_first(study: Study) -> Table:
             *KEYS,
             Column("z", "z", "number", 2, "b / SE"),
             P,
-            _optional("firth_b", "Firth b", "Firth's penalised estimate", digits=2),
-            _optional("firth_se", "SE", "its standard error"),
-            _optional("firth_p", "LR p", "its likelihood-ratio test"),
+            Optional("firth_b", "Firth b", "number", 2, "Firth's penalised estimate"),
+            Optional("firth_se", "SE", "number", 3, "its standard error"),
+            Optional("firth_p", "LR p", "p", 3, "its likelihood-ratio test"),
         ),
-        _rows(study, WHO_FIRST_TERMS, _who_first_row, _who_first_clustered),
-        (TESTED_ELSEWHERE, *sample_notes(study, study.groups), *_mixed_notes(study, "S4")),
+        [
+            row
+            for term in WHO_FIRST_TERMS
+            for group in study.groups
+            for row in _rows(group, term, _who_first_fits(group), WITH_MERGER)
+        ],
+        (TESTED_ELSEWHERE, *_mixed_note(study, "S4", "random intercept per pair")),
     )
 
 
 def gap(study: Study) -> Table:
     """Table IV: linear regression of the gap (m) on |h|, |dv| and h*dv."""
+    rows: list[Row] = []
+    for term in GAP_TERMS:
+        for group in study.groups:
+            if group.measured:
+                rows += _rows(group, term, _gap_fits(group), WITH_GAP)
+            else:
+                rows.append(_published_gap(group, term))
     return Table(
         "gap",
         (
             *KEYS,
             Column("t", "t", "number", 2, "b / SE"),
             P,
-            _optional("hc3_se", "HC3 SE", "HC3 standard error"),
-            _optional("hc3_p", "HC3 p", "its t test"),
-            _optional(
-                "equivalence_p",
-                "equiv. p",
-                "two one-sided tests: relative velocity alone moves no gap by the margin",
-            ),
-            _optional(
-                "velocity_p",
-                "joint p",
-                "F test of all terms with relative velocity, HC3 errors",
-            ),
+            Optional("hc3_se", "HC3 SE", "number", 3, "HC3 standard error"),
+            Optional("hc3_p", "HC3 p", "p", 3, "its t test"),
+            Optional("equivalence_p", "equiv. p", "p", 3, "two one-sided tests of the margin"),
+            Optional("velocity_p", "joint p", "p", 3, "F test of all terms with relative velocity"),
         ),
-        _rows(study, GAP_TERMS, _gap_row, _gap_clustered),
+        rows,
         (
             "of all terms with relative velocity together: equiv. p, that the predicted gaps of "
             "any two played conditions that differ in relative velocity alone are less than "
             f"{GAP_MARGIN_M:g} m apart (two one-sided tests of each with HC3 errors, the largest "
-            "p: a small one shows it); joint p, that none of them has an effect (F test)",
+            "p: a small one shows it); joint p, that none of them has an effect",
             TESTED_ELSEWHERE,
-            *sample_notes(study, study.groups),
-            *_mixed_notes(study, "S6"),
+            *_mixed_note(
+                study, "S6", "random intercept per pair, gap where the mean position reaches 100 m"
+            ),
         ),
     )
 
 
-def _optional(name: str, heading: str, meaning: str, digits: int = 3) -> Column:
-    kind: Kind = "p" if name.endswith("_p") else "number"
-    return Column(name, heading, kind, digits, meaning, optional=True)
-
-
-def _rows(
-    study: Study,
-    terms: Iterable[str],
-    row: Callable[[Group, str], Row],
-    clustered: Callable[[Group], dict[str, tuple[str, Regression]]],
-) -> list[Row]:
-    return [
-        one
-        for term in terms
-        for group in study.groups
-        for one in (row(group, term), *_clustered_rows(group, term, clustered))
-    ]
-
-
-def _who_first_row(group: Group, term: str) -> Row:
-    """The row of a term of who merged first: by maximum likelihood, and by Firth's fit."""
+@cache
+def _who_first_fits(group: Group) -> tuple[Fit, ...]:
+    """By maximum likelihood and by Firth's fit, the humans also with errors by pair."""
     # Wald's p fails where conditions nearly separate the outcomes, as those of humans do (Hauck and
     # Donner 1977); Firth's penalty (1993) keeps estimates finite there.
-    fit = fits(group)
-    return row_of(
-        group,
-        {
-            "term": TERM_NAMES[term],
-            "n": fit.logit.n,
-            **_values(fit.logit, term),
-            **_values(fit.firth, term, "firth_"),
-        },
-        _problems(fit.logit, fit.firth),
-        outcomes_note(group),
-        item=term,
-        counts=WITH_MERGER,
+    fit = Fit(fits(group).logit, fits(group).firth, "firth_")
+    if group.setting or not group.measured:
+        return (fit,)
+    # Repeated trials of a pair are alike, which the pooled fit ignores.
+    paired = by_pairs(who_first_logit, group.trials, "merged_first")
+    return (fit, Fit(paired, item="clustered/", label=", errors by pair"))
+
+
+@cache
+def _gap_fits(group: Group) -> tuple[Fit, ...]:
+    """By least squares and with HC3 errors, the humans also with errors by pair."""
+    fit = Fit(fits(group).ols, fits(group).hc3, "hc3_")
+    if group.setting:
+        return (fit,)
+    mean100 = "gap_mean100_m"  # the definition of the gap that the published mixed model uses
+    paired = by_pairs(gap_ols, group.trials, "gap_m")
+    of_mean = by_pairs(lambda trials: gap_ols(trials, mean100), group.trials, mean100)
+    return (
+        fit,
+        Fit(paired, item="clustered/", label=", errors by pair"),
+        Fit(of_mean, item="clustered-mean100/", label=", errors by pair, mean at 100 m"),
     )
 
 
-def _gap_row(group: Group, term: str) -> Row:
-    """The row of a term of the gap: by least squares, and with HC3 errors.
-
-    Before an import, the humans' row holds what the paper prints.
-    """
-    if not group.measured:
-        return _published_gap(group, term)
-    fit = fits(group)
-    values: dict[str, Value] = {
-        "term": TERM_NAMES[term],
-        "n": fit.ols.n,
-        **_values(fit.ols, term),
-        **_values(fit.hc3, term, "hc3_"),
-    }
-    # I4 claims that these effects are absent. A large p is no evidence of that, so equivalence is
-    # tested (Schuirmann 1987); HC3 errors (MacKinnon and White 1985) hold for unequal variances.
-    if term == "abs_relative_velocity" and fit.hc3.apart:
-        furthest = fit.hc3.apart[furthest_apart(fit.hc3)]
-        values["equivalence_p"] = equivalence_p(furthest.b, furthest.se, fit.hc3.freedom)
-        values["velocity_p"] = fit.hc3.velocity_p
-    return row_of(group, values, _problems(fit.ols, fit.hc3), item=term, counts=WITH_GAP)
+def _rows(group: Group, term: str, every: tuple[Fit, ...], counts: str) -> Iterator[Row]:
+    """The rows of a term."""
+    for fit in every:
+        main, robust = fit.main, fit.robust
+        values = {
+            "term": TERM_NAMES[term],
+            "driver": group.label + fit.label,
+            "n": main.n,
+            **_values(main, term),
+            **(_values(robust, term, fit.prefix) if robust else {}),
+        }
+        # I4 claims that these effects are absent. A large p is no evidence of that, so equivalence
+        # is tested (Schuirmann 1987); HC3 errors (MacKinnon and White 1985) hold for unequal
+        # variances.
+        if robust and term == "abs_relative_velocity":
+            values["equivalence_p"] = robust.equivalence_p
+            values["velocity_p"] = robust.velocity_p
+        problems = dict.fromkeys((main.problem, robust.problem if robust else main.remark))
+        pooled = "" if fit.label or counts == WITH_GAP else outcomes_note(group)
+        yield row_of(group, values, *problems, pooled, item=fit.item + term, counts=counts)
 
 
 def _values(fit: Regression, term: str, prefix: str = "") -> dict[str, Value]:
@@ -181,85 +187,21 @@ def _values(fit: Regression, term: str, prefix: str = "") -> dict[str, Value]:
     }
 
 
-def _problems(*found: Regression) -> str:
-    """Why fits have no coefficients; empty where all have them."""
-    return "; ".join(dict.fromkeys(fit.problem for fit in found if fit.problem))
-
-
-def _clustered_rows(
-    group: Group, term: str, clustered: Callable[[Group], dict[str, tuple[str, Regression]]]
-) -> list[Row]:
-    """The humans again, with errors clustered by pair; none before an import."""
-    # Only humans drove in pairs: repeated trials of a pair are alike, which the pooled fit ignores.
-    if group.setting or not group.measured:
-        return []
-    return [
-        row_of(
-            group,
-            {
-                "term": TERM_NAMES[term],
-                "driver": f"{group.label}, {label}",
-                "n": fit.n,
-                **_values(fit, term),
-            },
-            fit.problem or fit.remark,
-            item=f"{name}/{term}",
-            counts=WITH_MERGER if clustered is _who_first_clustered else WITH_GAP,
-        )
-        for name, (label, fit) in clustered(group).items()
-    ]
-
-
-@cache
-def _who_first_clustered(group: Group) -> dict[str, tuple[str, Regression]]:
-    """The logit by pairs: its label and fit by the name of its rows; once for all terms."""
-    fit = by_pairs(who_first_logit, group.trials, "merged_first")
-    return {"clustered": ("errors by pair", fit)}
-
-
-@cache
-def _gap_clustered(group: Group) -> dict[str, tuple[str, Regression]]:
-    """The same for our gap, and for the definition that the published mixed model uses."""
-    mean100 = "gap_mean100_m"
-    return {
-        "clustered": ("errors by pair", by_pairs(gap_ols, group.trials, "gap_m")),
-        "clustered-mean100": (
-            "errors by pair, mean at 100 m",
-            by_pairs(lambda trials: gap_ols(trials, mean100), group.trials, mean100),
-        ),
-    }
-
-
-def _mixed_notes(study: Study, table: str) -> tuple[str, ...]:
+def _mixed_note(study: Study, table: str, model: str) -> Iterator[str]:
     """A note with the published mixed model, for comparison with the human rows."""
-    if study.human not in study.groups:
-        return ()
-    terms = published("human_mixed_models").query("table == @table")
-    values = "; ".join(
-        f"{TERM_NAMES[row.term]} {row.estimate:g} (SE {row.std_error:g})"
-        for row in terms.itertuples()
-    )
-    return (
-        f"published human mixed model ({RANDOM_INTERCEPT}, gap where the mean position reaches "
-        f"100 m): {values}"
-        if table == "S6"
-        else f"published human mixed model ({RANDOM_INTERCEPT}): {values}",
-    )
+    if study.human in study.groups:
+        values = "; ".join(
+            f"{TERM_NAMES[row.term]} {row.estimate:g} (SE {row.std_error:g})"
+            for row in published("human_mixed_models").query("table == @table").itertuples()
+        )
+        yield f"published human mixed model ({model}): {values}"
 
 
 def _published_gap(group: Group, term: str) -> Row:
     """The humans' row of Table IV as the paper prints it."""
     printed = published("paper_gap").query("driver == 'human' and term == @term").iloc[0]
+    values = {name: printed_value(printed[name]) for name in ("b", "se", "t", "p")}
+    note = f"published values, no human traces are imported ({citation('paper_gap')})"
     return row_of(
-        group,
-        {
-            "term": TERM_NAMES[term],
-            "n": int(printed["n"]),
-            "b": float(printed["b"]),
-            "se": float(printed["se"]),
-            "t": float(printed["t"]),
-            "p": printed_value(printed["p"]),
-        },
-        f"published values, no human traces are imported ({citation('paper_gap')})",
-        item=term,
+        group, {"term": TERM_NAMES[term], "n": int(printed["n"]), **values}, note, item=term
     )

@@ -12,9 +12,8 @@ from merge_runner_analysis.data.driver_words import language_models
 from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.names import HUMAN
-from merge_runner_analysis.stats.verdicts import Comparison, Estimate, compared, of_humans
-from merge_runner_analysis.tables.model import Column, Row, Table, Value
-from merge_runner_analysis.tables.notes import pair_notes, replayed_notes
+from merge_runner_analysis.stats.verdicts import Comparison, Known, compared, of_humans
+from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.verdict_words import (
     HUMANS,
     LANGUAGE_MODEL,
@@ -29,28 +28,21 @@ COLUMNS = (
     Column("driver", "driver"),
     Column("setting", "prompt"),
     Column("kind", "kind", meaning="language model, program or mock model"),
-    Column("measure", "measure", optional=True),
-    Column("n", "n", "count", 0, "trials that the estimate rests on", optional=True),
-    Column("k", "k", "count", 0, "trials that collided", "collided_boxes", optional=True),
-    Column("undecided", "undecided", "count", 0, "ended by another rule", optional=True),
+    Optional("measure", "measure"),
+    Optional("n", "n", "count", 0, "trials that the estimate rests on"),
+    Optional("k", "k", "count", 0, "trials that collided", "collided_boxes"),
+    Optional("undecided", "undecided", "count", 0, "ended by another rule"),
     Column("estimate", "estimate", "number", 2, "in the unit of the measure"),
-    Column("ci", "95 % CI", "interval", 2, "of the same model", optional=True),
-    Column("human", "humans", "number", 2, "in the same conditions", optional=True),
-    Column("human_ci", "95 % CI", "interval", 2, "of the humans", optional=True),
-    Column("difference", "difference", "number", 2, "driver minus humans", optional=True),
-    Column("difference_ci", "95 % CI", "interval", 2, "of the difference", optional=True),
-    Column("p", "p", "p", 3, "of no difference, by the same model", optional=True),
-    Column("p_holm", "Holm", "p", 3, "corrected over the measures of the driver", optional=True),
-    Column(
-        "detectable",
-        "detectable",
-        "number",
-        2,
-        "smallest difference that is found at 5 % with power .8",
-        optional=True,
-    ),
-    Column("state", "verdict", meaning="what is shown", optional=True),
-    Column("rule", "rule", meaning="how the verdict is set", optional=True),
+    interval("ci", "of the same model"),
+    Optional("human", "humans", "number", 2, "in the same conditions"),
+    interval("human_ci", "of the humans"),
+    Optional("difference", "difference", "number", 2, "driver minus humans"),
+    interval("difference_ci", "of the difference"),
+    Optional("p", "p", "p", 3, "of no difference, by the same model"),
+    Optional("p_holm", "Holm", "p", 3, "corrected over the measures of the driver"),
+    Optional("detectable", "detectable", "number", 2, "smallest difference found with power .8"),
+    Optional("state", "verdict", meaning="what is shown"),
+    Optional("rule", "rule", meaning="how the verdict is set"),
 )
 
 
@@ -80,8 +72,11 @@ def verdicts(study: Study) -> Table:
             "20 Hz; the humans' share weighs conditions as the driver's trials do",
             f"intervals take trials as independent. The {HUMAN_TRIALS} human trials are of nine "
             "pairs who differ, which only the mean gap and imported gaps allow for",
-            *pair_notes(study.models),
-            *replayed_notes(study),
+            *(
+                f"{group.id}: {group.caution}: it is not judged, nor compared with the humans"
+                for group in study.baselines
+                if group.caution
+            ),
         ),
     )
 
@@ -103,8 +98,8 @@ def _row(group: Group, kind: str, found: Comparison) -> Row:
     values: dict[str, Value] = _named(group, kind) | {
         "measure": measure.name,
         **_values(found.own),
-        "human": found.human.value,
-        "human_ci": found.human.ci,
+        "human": found.human.estimate.value,
+        "human_ci": found.human.estimate.bounds(),
         "state": found.state or None,
         "rule": measure.rule,
     }
@@ -128,11 +123,11 @@ def _human_rows(study: Study) -> Iterator[Row]:
         yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, counts)
 
 
-def _values(found: Estimate) -> dict[str, Value]:
+def _values(found: Known) -> dict[str, Value]:
     return {
-        "n": found.n,
+        "n": found.estimate.n,
         "k": found.k,
         "undecided": found.undecided or None,
-        "estimate": found.value,
-        "ci": found.ci,
+        "estimate": found.estimate.value,
+        "ci": found.estimate.bounds(),
     }

@@ -74,7 +74,7 @@ def partial_import(db: Path) -> None:
         name = f"experiment_{experiment}/experiment_{experiment}_iter_{number + 1}.csv"
         files[name] = drive(played, yields=yields).csv()
     with open_files(write_folder(db.parent / "recordings", files)) as found:
-        import_trials(sort_files(found).trials, Store(db))
+        import_trials(sort_files(found), Store(db))
 
 
 def other_vehicle_length(db: Path) -> None:

@@ -31,7 +31,7 @@ SAID = {
     "temperature": (["temperature = 0.2"], ["no temperature", "default sampling temperature"]),
     "programs": (
         [
-            "11 of 22 trials of projected-order/baseline repeat an earlier one",
+            "projected-order/baseline: 11 of 22 trials repeat an earlier one",
             "* emulator+constant: scripted stand-in, no language model",
             "No language model is judged here.",
         ],
@@ -44,7 +44,7 @@ SAID = {
     "killed": (["o3/baseline: Collisions: no difference shown."], ["o3 does not drive"]),
     "word_for_word": (
         ["o3/baseline: 22 of 33 trials are as an earlier one to the last state; each counts"],
-        ["repeat an earlier one", "no chance"],
+        ["declare no chance"],
     ),
     "two_studies": (
         [
@@ -56,7 +56,7 @@ SAID = {
     ),
     "mirrored_chance": (
         ["95 of 220 trials are undecided, since another collision rule ended them"],
-        ["repeat an earlier one"],
+        ["declare no chance"],
     ),
     "no_valid_reply": (
         [

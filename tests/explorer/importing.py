@@ -18,4 +18,4 @@ def import_some(db, folder):
             name = f"experiment_{experiment}/experiment_{experiment}_iter_{number + 1}.csv"
             files[name] = drive(condition, yields=yields).csv()
     with open_files(write_folder(folder, files)) as found:
-        import_trials(sort_files(found).trials, Store(db))
+        import_trials(sort_files(found), Store(db))

@@ -57,7 +57,7 @@ def humans(tmp_path_factory):
     }
     db = folder / "t.duckdb"
     with open_files(write_folder(folder / "recordings", files)) as found:
-        import_trials(sort_files(found).trials, Store(db))
+        import_trials(sort_files(found), Store(db))
     return db
 
 

@@ -11,6 +11,7 @@ import pandas as pd
 
 from tests.independent import recompute_statistics as statistics
 from tests.independent import recompute_trials as measured
+from tests.independent import recompute_verdicts
 
 WHO_FIRST = ("intercept", "projected_headway", "relative_velocity")
 GAP = ("intercept", "abs_projected_headway", "abs_relative_velocity", "headway_x_velocity")
@@ -53,6 +54,7 @@ def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
         "indicators": _indicators(who | baselines),
         "contrasts": _prompts(judged, trials.attrs["orders"]),
         "factors": _factors(judged, trials.attrs["orders"]),
+        "verdicts": _beside_humans(judged, who, recorded),
     }
     for rows in found.values():
         rows |= {_id(key): {} for key in groups.keys() - judged.keys()}
@@ -70,6 +72,18 @@ def _is_judged(rows: pd.DataFrame) -> bool:
         for model, pair in asked.items():
             counts[model] = counts.get(model, 0) + np.array(pair)
     return all(invalid <= MOST_INVALID * n for n, invalid in counts.values())
+
+
+def _beside_humans(judged, who, recorded: pd.DataFrame) -> dict[str, dict]:
+    """The humans and every driver and prompt that is judged, by measure."""
+    (human,) = who.values()
+    humans = {"who": human, "recorded": None if recorded.empty else recorded}
+    rows = {f"human/{name}": row for name, row in recompute_verdicts.of_humans(humans).items()}
+    for key, trials in judged.items():
+        robust = {name: holds for name, (*_, holds) in _verdicts(trials).items()}
+        for name, row in recompute_verdicts.rows(trials, humans, robust).items():
+            rows[f"{_id(key)}/{name}"] = row
+    return rows
 
 
 def _by_term(groups, terms, rows_of) -> dict[str, dict]:

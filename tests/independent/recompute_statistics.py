@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import statsmodels.api as sm
-from scipy import optimize, stats
+from scipy import optimize, special, stats
 
 Z = stats.norm.ppf(0.975)
 
@@ -37,48 +37,87 @@ def unidentified(x: np.ndarray, y: np.ndarray) -> bool:
     return few or len(np.unique(y)) < 2
 
 
-def firth(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
-    """Firth's penalised fit (1993): a row (b, se, p) a term, p of penalised likelihood ratios.
+class Firth:
+    """Firth's penalised likelihood (1993), by Newton's steps, halved where they go too far."""
 
-    The restricted fits keep the penalty of the whole design (Heinze and Schemper 2002).
-    """
-    if unidentified(x, y):
-        return None
+    def __init__(self, x: np.ndarray, y: np.ndarray):
+        # Equal rows together: ``n`` trials, of which ``y`` are successes.
+        self.x, row = np.unique(x, axis=0, return_inverse=True)
+        self.n, self.y = np.bincount(row), np.bincount(row, y)
+        self.b, self.se = np.zeros(x.shape[1]), np.zeros(x.shape[1])
+        self.b = self.fitted()
+        self.se = np.sqrt(np.diag(np.linalg.inv(self.parts(self.b)[1])))
 
-    def parts(b):
-        p = 1 / (1 + np.exp(-x @ b))
-        information = x.T @ (x * (p * (1 - p))[:, None])
-        return p, information
+    def parts(self, b):
+        p = special.expit(self.x @ b)
+        return p, self.x.T @ (self.x * (self.n * p * (1 - p))[:, None])
 
-    def penalised(b):
-        eta = x @ b
-        _, information = parts(b)
-        return y @ eta - np.logaddexp(0, eta).sum() + np.linalg.slogdet(information)[1] / 2
+    def likelihood(self, b) -> float:
+        eta = self.x @ b
+        _, information = self.parts(b)
+        fit = self.y @ eta - self.n @ np.logaddexp(0, eta)
+        return fit + np.linalg.slogdet(information)[1] / 2
 
-    def fitted(free):
-        b = np.zeros(x.shape[1])
-        for _ in range(5000):
-            p, information = parts(b)
-            w = p * (1 - p)
-            leverage = w * np.einsum("ij,jk,ik->i", x, np.linalg.inv(information), x)
-            score = (x.T @ (y - p + leverage * (0.5 - p)))[free]
-            if np.abs(score).max() < 1e-10:
-                break
+    def fitted(self, column: int | None = None, value: float = 0.0) -> np.ndarray:
+        """Coefficients of the largest likelihood, one of them held at a value.
+
+        A restricted fit keeps the penalty of the whole design (Heinze and Schemper 2002). Far out
+        it may have several maxima, and a saddle where data are symmetric: it is begun anew at both
+        sides of the whole fit.
+        """
+        found = []
+        for side in (-1, 0, 1) if self.se.any() else (0,):
+            start = self.b + side * self.se
+            if column is not None:
+                start[column] = value
+            found.append(self._climbed(start, column))
+        return max(found, key=self.likelihood)
+
+    def _climbed(self, b: np.ndarray, column: int | None) -> np.ndarray:
+        x, y, n = self.x, self.y, self.n
+        free = np.setdiff1d(np.arange(x.shape[1]), [column])
+        for _ in range(1000):
+            p, information = self.parts(b)
+            w = n * p * (1 - p)
+            leverage = w * np.einsum("ij,ij->i", x @ np.linalg.inv(information), x)
+            score = (x.T @ (y - n * p + leverage * (0.5 - p)))[free]
             step = np.zeros_like(b)
             step[free] = np.linalg.solve(information[np.ix_(free, free)], score)
-            while penalised(b + step) < penalised(b) - 1e-12:
+            while self.likelihood(b + step) < self.likelihood(b) - 1e-12:
                 step /= 2
             b = b + step
+            if np.abs(step).max() < 1e-9:
+                break
         return b
 
-    every = np.arange(x.shape[1])
-    b = fitted(every)
-    se = np.sqrt(np.diag(np.linalg.inv(parts(b)[1])))
-    p = [
-        stats.chi2.sf(max(0.0, 2 * (penalised(b) - penalised(fitted(np.delete(every, k))))), 1)
-        for k in every
-    ]
-    return np.column_stack([b, se, p])
+    def lost(self, column: int, value: float) -> float:
+        """Twice the log-likelihood that is lost where a coefficient has this value."""
+        best, held = (self.likelihood(b) for b in (self.b, self.fitted(column, value)))
+        return max(0.0, 2 * (best - held))
+
+    def p(self, column: int) -> float:
+        """By the likelihood ratio."""
+        return stats.chi2.sf(self.lost(column, 0.0), 1)
+
+    def interval(self, column: int) -> list[float]:
+        """The values that a likelihood-ratio test does not reject at 5 %."""
+        level = stats.chi2.ppf(0.95, 1)
+        b, ends = self.b[column], []
+        for sign in (-1, 1):
+            far = sign * 2 * self.se[column]
+            while self.lost(column, b + far) < level:
+                far *= 1.5
+            found = optimize.brentq(lambda at: self.lost(column, at) - level, b, b + far)
+            ends.append(found)
+        return ends
+
+
+def firth(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
+    """Firth's fit: a row (b, se, p) a term, p of penalised likelihood ratios."""
+    if unidentified(x, y):
+        return None
+    fit = Firth(x, y)
+    return np.column_stack([fit.b, fit.se, [fit.p(k) for k in range(x.shape[1])]])
 
 
 def least_squares(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray | None, ...]:
@@ -202,11 +241,11 @@ def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
         "ci_low": 100 * (p - q - np.hypot(p - low1, high2 - q)),
         "ci_high": 100 * (p - q + np.hypot(high1 - p, q - low2)),
         "p": min(1.0, chances[chances <= chances[a.sum() - least] * (1 + 1e-7)].sum()),
-        "detectable": _detectable(int(n.sum()), int(m.sum()), q),
+        "detectable": detectable_rate(int(n.sum()), int(m.sum()), q),
     }
 
 
-def _detectable(n: int, m: int, rate: float) -> float | None:
+def detectable_rate(n: int, m: int, rate: float) -> float | None:
     """The smallest difference from ``rate`` that Fisher's test finds with a power of 0.8."""
     found = np.zeros((n + 1, m + 1))
     for total in range(n + m + 1):

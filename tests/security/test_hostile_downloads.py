@@ -67,13 +67,13 @@ def test_a_member_that_leads_out_refuses_the_zip(imported, tmp_path):
     assert set(tmp_path.parent.rglob("*")) == before
 
 
-def test_a_link_in_a_zip_is_no_file(imported, tmp_path):
+def test_a_link_in_a_zip_is_not_followed(imported, tmp_path):
     secret = tmp_path / "secret"
     secret.write_text("private")
     path = with_link(write_zip(tmp_path / "d.zip", GOOD), f"{TRIAL}.csv", str(secret))
     run = imported(path)
     assert run.code == 1
-    assert f"error: {TRIAL}.csv: it is a link, not a file" in run.err
+    assert f"error: {TRIAL}.csv: it lacks " in run.err
     assert "private" not in run.err + run.out
     assert trials(tmp_path) == 1
 
@@ -97,15 +97,10 @@ def test_a_zip_within_the_zip_is_not_opened(imported, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [(bytes(10**6), "unpacks from"), (os.urandom(65 * 2**20), "bytes unpacked")],
-    ids=["ratio", "size"],
-)
-def test_a_bomb_refuses_the_zip_before_anything_is_unpacked(imported, tmp_path, content, says):
-    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.csv": content}))
+def test_a_bomb_refuses_the_zip_before_anything_is_unpacked(imported, tmp_path):
+    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.csv": bytes(65 * 2**20)}))
     assert (run.code, len(run.err.splitlines())) == (2, 1)
-    assert says in run.err
+    assert "bytes unpacked" in run.err
     assert not (tmp_path / "results").exists()
 
 

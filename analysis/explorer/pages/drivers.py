@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.explorer.conditions import ordered
 from merge_runner_analysis.explorer.display_text import with_minus
 from merge_runner_analysis.explorer.pages.computed import computed_table

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from merge_runner_analysis.data.human_counts import human_counts
+from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.data.studies import DESCRIPTIONS
 from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.conditions import ordered
@@ -113,9 +113,11 @@ def verdicts_of(
 
 
 def humans_of(table: Table | None) -> dict[str, Any]:
-    """The humans' cells by measure, and where their bands lie."""
+    """The humans' cells by measure, where their bands lie, and which humans they are."""
     found = by_group(table.rows).get(HUMAN, {}) if table else {}
+    label = str(next(iter(found.values()))["driver"]) if found else HUMAN
     return {
+        "about": label.partition("(")[2].rstrip(")") or "990 trials of nine pairs, as published",
         "cells": cells(found),
         "bands": {name: band(measure, found.get(name, {})) for name, measure in MEASURES.items()},
     }

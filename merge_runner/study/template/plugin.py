@@ -24,7 +24,6 @@ register(
         label="lowest speed",
         unit="m/s",
         meaning="the lowest speed of either vehicle",
-        phrase="the lowest speed",
         value="""(SELECT min(velocity_mps) FROM states WHERE states.trial_id = trials.trial_id
             AND states.spec_hash = trials.spec_hash AND time_s >= 0)""",
     )

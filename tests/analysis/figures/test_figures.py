@@ -17,22 +17,16 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.figures.drawing import PAGE_IN
-from merge_runner_analysis.figures.gallery import (
-    MAKERS,
-    SETTINGS,
-    figure_2,
-    rendered,
-    write_figures,
-)
-from merge_runner_analysis.figures.panels import (
+from merge_runner_analysis.figures.figure_2 import (
     HUMAN_VELOCITIES_MPS,
-    deviations,
-    gaps,
+    deviation,
+    gap,
     left_first,
     left_traces,
+    points,
     published_gap_line,
 )
-from merge_runner_analysis.figures.variant_figure import figure_2_variants
+from merge_runner_analysis.figures.gallery import MAKERS, SETTINGS, rendered, write_figures
 from merge_runner_analysis.stats.intervals import mean, proportion
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
@@ -73,27 +67,27 @@ def test_a_folder_that_cannot_be_made_is_said(small, tmp_path):
 
 def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(study):
     group = study.models[0]
-    points = {
+    firsts = {
         (velocity, point.x): point.estimate
         for velocity in HUMAN_VELOCITIES_MPS
-        for point in left_first(group, velocity)
+        for point in points(group, velocity, left_first)
     }
-    assert set(points) == {
+    assert set(firsts) == {
         (c.relative_velocity_mps, c.projected_headway_m) for c in CONDITIONS.values()
     }
     for name, condition in CONDITIONS.items():
         trials = group.finished[group.finished["condition"] == name]
-        found = points[condition.relative_velocity_mps, condition.projected_headway_m]
+        found = firsts[condition.relative_velocity_mps, condition.projected_headway_m]
         assert found == proportion(int((trials["merged_first"] == "left").sum()), len(trials))
-        (gap,) = [
+        (mean_gap,) = [
             point.estimate
-            for point in gaps(group, condition.relative_velocity_mps)
+            for point in points(group, condition.relative_velocity_mps, gap)
             if point.x == condition.projected_headway_m
         ]
-        assert gap == mean(trials["gap_m"])
+        assert mean_gap == mean(trials["gap_m"])
         (both,) = [
             point.estimate
-            for point in deviations(group, condition.relative_velocity_mps)
+            for point in points(group, condition.relative_velocity_mps, deviation)
             if point.x == condition.projected_headway_m
         ]
         assert both.n == 2 * len(trials), "each trial gives two values"
@@ -109,25 +103,9 @@ def test_traces_are_those_of_the_left_vehicle_that_merges_first_or_second(study)
             f"spec_hash = 'o3-baseline' AND merged_first = '{first}' GROUP BY trial_id",
             study.db,
         )
-        found = left_traces(study, group, first)
+        found = [t for traces in left_traces(study, group, first).values() for t in traces]
         assert sorted(tuple(trace[:, 1]) for trace in found) == sorted(tuple(v) for v in rows["v"])
         assert all(trace[0, 0] == 0 for trace in found)
-
-
-def test_before_an_import_the_figure_says_what_is_missing_and_draws_the_published_line(study):
-    figure = figure_2(study)
-    texts = [t.get_text() for sub in figure.subfigs for axis in sub.axes for t in axis.texts]
-    assert sum("recordings" in text for text in texts) == 2 + 3  # A and B; E for each velocity
-    lines = [
-        line
-        for axis in figure.subfigs[1].axes[3:6]
-        for line in axis.lines
-        if line.get_linestyle() == "--"
-    ]
-    assert len(lines) == 3
-    heights = dict(zip(*lines[1].get_data(), strict=True))
-    assert heights[0] == pytest.approx(3.54)
-    assert heights[4] == pytest.approx(3.54 + 4 * 0.17)
 
 
 OWN = (
@@ -136,22 +114,27 @@ OWN = (
 )
 
 
-def test_where_no_human_drove_no_human_line_is_drawn_and_none_is_missed(tmp_path):
-    figure = figure_2(changed(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)), OWN))
-    curves = figure.subfigs[1].axes
-    dashed = [[x for x in axis.lines if x.get_linestyle() == "--"] for axis in curves[4:8]]
-    assert [len(lines) for lines in dashed] == [1, 1, 1, 0]
-    texts = [" ".join(text.get_text() for text in axis.texts) for axis in curves[8:]]
-    assert ["not imported" in text for text in texts] == [True, True, True, False]
+def drawn(study, name="figure2"):
+    """The panels of Figure 2, by row, and its legend."""
+    figure = MAKERS[name](study)
+    rows = [figure.axes[i : i + 5] for i in range(0, len(figure.axes), 5)]
+    return rows, figure.legends[0].legend_handles
+
+
+def test_where_no_human_drove_no_human_line_is_drawn(tmp_path):
+    study = changed(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)), OWN)
+    (human, _), keys = drawn(study)
+    assert len(keys) == 4 + 1, "a velocity that no human drove, and the published regression"
+    assert sum(line.get_linestyle() == "--" for line in human[3].lines) == 3
 
 
 def test_conditions_that_were_not_played_are_not_drawn(tmp_path):
     drives = [d for d in yielding("o3", reps=1) if d.condition in {"N_0_0", "L_4_0"}]
     study = Study(write_study(tmp_path / "t.duckdb", drives))
     assert {*study.conditions} == {"N_0_0", "L_4_0"}
-    (axis, *others) = figure_2(study).subfigs[1].axes
-    assert len(others) == 2, "one relative velocity"
-    assert sorted({round(x) for line in axis.lines for x in line.get_xdata()}) == [0, 4]
+    (human, _), keys = drawn(study)
+    assert len(keys) == 1 + 1, "one relative velocity, and the published regression"
+    assert sorted({round(x) for line in human[2].lines for x in line.get_xdata()}) == [0, 4]
     humans = Study(write_study(tmp_path / "h.duckdb", []))
     assert {*humans.conditions} == {*HUMAN_CONDITIONS}
 
@@ -160,16 +143,17 @@ def test_conditions_that_were_not_played_are_not_drawn(tmp_path):
 def test_panels_reach_as_far_as_the_conditions_and_the_published_line_as_the_humans(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1))
     for study, farthest in ((Study(db), 4), (changed(db, OWN), 8)):
-        axes = figure_2(study).subfigs[1].axes
-        ticks = [-farthest, -farthest / 2, 0, farthest / 2, farthest]
-        assert [list(axis.get_xticks()) for axis in axes] == [ticks] * len(axes)
-    assert published_gap_line(0)[0][[0, -1]] == pytest.approx([-4, 4])
+        for row in drawn(study)[0]:
+            assert [list(axis.get_xticks()) for axis in row[2:]] == [[-farthest, 0, farthest]] * 3
+    headways, gaps = published_gap_line(0)
+    assert headways[[0, -1]] == pytest.approx([-4, 4])
+    assert gaps[[40, -1]] == pytest.approx([3.54, 3.54 + 4 * 0.17])
 
 
 @pytest.mark.slow
 def test_no_two_relative_velocities_look_alike(tmp_path):
     study = changed(write_study(tmp_path / "t.duckdb", yielding("o3", reps=7)), OWN)
-    keys = figure_2_variants(study).legends[0].legend_handles[:-1]
+    keys = drawn(study)[1][:-1]
     assert len(keys) == len({(key.get_color(), key.get_marker()) for key in keys}) == 3 + 7
 
 
@@ -236,23 +220,17 @@ def test_every_figure_says_who_is_a_stand_in_and_names_its_variant(name, long_na
         assert any("A7" in text and "o3" in text for text in shown)
 
 
-def rows_of(figure):
-    """The panels of the figure of variants, by row."""
-    return [figure.axes[i : i + 5] for i in range(0, len(figure.axes), 5)]
-
-
 @pytest.mark.slow
 def test_each_group_has_a_row_of_its_own_with_its_trials(study):
-    figure = figure_2_variants(study)
-    rows = rows_of(figure)
+    rows, _ = drawn(study, "figure2-variants")
     assert len(rows) == len(study.groups) == 5
     for group, row in zip(study.groups[1:], rows[1:], strict=True):
         firsts = group.finished["merged_first"].value_counts()
         for axis, side in zip(row[:2], ("left", "right"), strict=True):
             assert sum(len(c.get_segments()) for c in axis.collections[:3]) == firsts[side]
-        for axis, points in zip(row[2:], (left_first, gaps, deviations), strict=True):
+        for axis, summary in zip(row[2:], (left_first, gap, deviation), strict=True):
             for index, velocity in enumerate(HUMAN_VELOCITIES_MPS):
-                found = points(group, velocity)
+                found = points(group, velocity, summary)
                 line = axis.containers[index].lines[0]
                 assert list(line.get_ydata()) == [p.estimate.value for p in found]
                 assert line.get_xdata() == pytest.approx([p.x + 0.3 * (index - 1) for p in found])
@@ -260,7 +238,7 @@ def test_each_group_has_a_row_of_its_own_with_its_trials(study):
 
 @pytest.mark.slow
 def test_variants_are_shown_by_the_same_scales_and_before_an_import_humans_as_published(study):
-    rows = rows_of(figure_2_variants(study))
+    rows, _ = drawn(study, "figure2-variants")
     for row in rows:
         assert row[0].get_ylim() == row[1].get_ylim()
         assert [axis.get_ylim() for axis in row] == [axis.get_ylim() for axis in rows[0]]
@@ -281,8 +259,13 @@ def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
         for rep, strength in enumerate((0.3, 0.7), 1)
     ]
     study = Study(write_study(tmp_path / "t.duckdb", drives))
-    low, high = rows_of(figure_2_variants(study))[0][3].get_ylim()
-    found = [p.estimate for g in study.groups for v in HUMAN_VELOCITIES_MPS for p in gaps(g, v)]
+    low, high = drawn(study, "figure2-variants")[0][0][3].get_ylim()
+    found = [
+        point.estimate
+        for group in study.groups
+        for velocity in HUMAN_VELOCITIES_MPS
+        for point in points(group, velocity, gap)
+    ]
     assert max(one.high - one.low for one in found) > 2 * (high - low)
     assert all(low < one.value < high for one in found)
     assert sum(low < one.low and one.high < high for one in found) >= 0.8 * len(found)

@@ -88,7 +88,7 @@ def test_a_damaged_member_is_unreadable_and_the_others_are_not(tmp_path, compres
     name = next(iter(FILES)).encode()
     patched(path, name, len(name) + 2, "B", 0x55)
     with open_files(path) as files:
-        with pytest.raises(Unreadable, match="damaged in the zip"):
+        with pytest.raises(Unreadable, match="it is damaged"):
             files[0].read()
         assert files[1].read() == b"second"
 
@@ -97,7 +97,7 @@ def test_a_member_that_is_shorter_or_longer_than_declared_is_unreadable(tmp_path
     for size in (249, 251):
         path = write_zip(tmp_path / "d.zip", FILES)
         patched(path, b"PK\1\2", 24, "<I", size)
-        with open_files(path) as files, pytest.raises(Unreadable, match="damaged in the zip"):
+        with open_files(path) as files, pytest.raises(Unreadable, match="it is damaged"):
             files[0].read()
 
 
@@ -109,7 +109,7 @@ def test_no_more_is_unpacked_than_declared(tmp_path, monkeypatch):
     monkeypatch.setattr(
         zipfile.ZipExtFile, "read", lambda self, n=-1: asked.append(n) or read(self, n)
     )
-    with open_files(path) as files, pytest.raises(Unreadable, match="damaged in the zip"):
+    with open_files(path) as files, pytest.raises(Unreadable, match="it is damaged"):
         files[0].read()
     assert asked == [10_000]
 
@@ -117,7 +117,7 @@ def test_no_more_is_unpacked_than_declared(tmp_path, monkeypatch):
 def test_an_encrypted_member_says_so(tmp_path):
     path = write_zip(tmp_path / "d.zip", FILES)
     patched(path, b"PK\1\2", 8, "<H", 1)
-    with open_files(path) as files, pytest.raises(Unreadable, match="it is encrypted: unpack"):
+    with open_files(path) as files, pytest.raises(Unreadable, match="is encrypted"):
         files[0].read()
 
 
@@ -128,20 +128,14 @@ def test_a_compression_that_cannot_be_bounded_is_not_unpacked(tmp_path, compress
         files[0].read()
 
 
-def test_a_bomb_is_refused_by_its_declared_sizes(tmp_path):
+def test_a_bomb_is_refused_by_its_declared_sizes():
     refuse_bombs([file("small", bytes(1000)), file("empty", b"")])
-    million = write_zip(tmp_path / "d.zip", {"experiment_4_iter_1.csv": bytes(10**6)})
-    with (
-        open_files(million) as files,
-        pytest.raises(UsageError, match=r"iter_1\.csv unpacks from \d+ to 1000000 bytes"),
-    ):
-        refuse_bombs(files)
-    huge = archive.File("x.csv", archive.MAX_FILE_BYTES + 1, 10**9, bytes)
+    huge = archive.File("x.csv", archive.MAX_FILE_BYTES + 1, bytes)
     with pytest.raises(UsageError, match=r"x\.csv has 67108865 bytes unpacked"):
         refuse_bombs([huge])
-    big = archive.File("x.csv", archive.MAX_FILE_BYTES, 10**9, bytes)
+    big = archive.File("x.csv", archive.MAX_FILE_BYTES, bytes)
     refuse_bombs([big] * 64)
-    with pytest.raises(UsageError, match="more than 4294967296 bytes"):
+    with pytest.raises(UsageError, match="files up to it have 4362076160"):
         refuse_bombs([big] * 65)
 
 

@@ -11,8 +11,7 @@ from merge_runner.results.rows import rows_of
 from merge_runner.results.store import Store, query, results_digest
 from merge_runner_analysis.human import load
 from merge_runner_analysis.human.load import import_trials, sort_files
-from merge_runner_analysis.human.record import SPEC, SPEC_HASH, trial_record
-from merge_runner_analysis.human.trace import parse_csv
+from merge_runner_analysis.human.record import SPEC, SPEC_HASH, parse_csv, trial_record
 from tests.analysis.recordings import Recording, drive, file
 
 LEFT, RIGHT = drive("L_4_0"), drive("R_-4_0", yields="left")
@@ -25,7 +24,7 @@ def path(tmp_path):
 
 def imported(path, files: dict[str, bytes]):
     download = sort_files(file(name, content) for name, content in files.items())
-    return import_trials(download.trials, Store(path))
+    return import_trials(download, Store(path))
 
 
 def rows(path, sql):
@@ -120,10 +119,10 @@ def test_only_a_csv_is_ever_read(path, suffix):
     def read():
         raise AssertionError
 
-    other = replace(file(f"experiment_4_iter_1.{suffix}", b""), read=read)
+    other = replace(file(f"experiment_4_iter_1.{suffix}", b""), content=read)
     beside = [file("experiment_4_iter_2.csv", LEFT.csv())]
     beside.append(replace(other, name=f"{suffix}/experiment_4_iter_2.{suffix}"))
-    report = import_trials(sort_files([other, *beside]).trials, Store(path))
+    report = import_trials(sort_files([other, *beside]), Store(path))
     assert (report.added, report.unreadable) == (1, [])
 
 
@@ -138,9 +137,8 @@ def test_only_trials_are_trials():
         *("participant_info.txt", "._experiment_4_iter_1.csv", "experiment_4_iter_1.csv.bak"),
         *("experiment_4_iter_.csv", "experiment_10_iter_1.CSV", "experiment_9_iter_2.csv"),
     ]
-    download = sort_files(file(name, b"x") for name in names)
-    assert download.skipped == 4
-    assert [trial[:2] for trial in download.trials] == [(9, 2), (10, 1)]
+    sources = sort_files(file(name, b"x") for name in names)
+    assert [source[1:3] for source in sources] == [(9, 2), (10, 1)]
 
 
 def test_only_what_would_be_read_can_be_a_bomb():
@@ -159,10 +157,10 @@ def test_what_is_stored_before_an_interruption_stays(path, monkeypatch):
         raise KeyboardInterrupt
 
     files = [file(f"experiment_4_iter_{m}.csv", content) for m in range(5)]
-    files[3] = replace(files[3], read=interrupt)
+    files[3] = replace(files[3], content=interrupt)
     with pytest.raises(KeyboardInterrupt):
-        import_trials(sort_files(files).trials, Store(path))
+        import_trials(sort_files(files), Store(path))
     assert rows(path, "select rep from trials order by rep") == [(0,), (1,)]
-    files[3] = replace(files[3], read=lambda: content)
-    report = import_trials(sort_files(files).trials, Store(path))
+    files[3] = replace(files[3], content=lambda: content)
+    report = import_trials(sort_files(files), Store(path))
     assert (report.added, report.there) == (3, 2)

@@ -8,8 +8,7 @@ import pytest
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.human.archive import Unreadable
-from merge_runner_analysis.human.record import SPEC_HASH, trial_record
-from merge_runner_analysis.human.trace import parse_csv
+from merge_runner_analysis.human.record import SPEC_HASH, parse_csv, trial_record
 from tests.analysis.recordings import drive
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from merge_runner_analysis.human.archive import Unreadable
-from merge_runner_analysis.human.trace import NEEDED, parse_csv
+from merge_runner_analysis.human.record import NEEDED, parse_csv
 from tests.analysis.recordings import drive
 
 

@@ -9,7 +9,7 @@ from merge_runner.results.store import Store, query
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.human.archive import Unreadable
-from merge_runner_analysis.human.load import Report, import_pages, import_trials, sort_files
+from merge_runner_analysis.human.load import import_trials, sort_files
 from merge_runner_analysis.human.velocity_pages import condition_of, trace_of, trials_of
 from tests.analysis.pages import packed, velocity_page
 from tests.analysis.recordings import drive, file, write_folder
@@ -46,11 +46,7 @@ def recordings():
 
 def imported(db, files):
     download = sort_files(file(name, content) for name, content in files.items())
-    store, report = Store(db), Report()
-    if download.trials:
-        report = import_trials(download.trials, store)
-    import_pages(download.pages, store, report)
-    return report
+    return import_trials(download, Store(db))
 
 
 def states(db, condition):

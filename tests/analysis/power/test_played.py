@@ -9,7 +9,7 @@ import pytest
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.power.study import played, simulate
+from merge_runner_analysis.power import played, simulate
 from merge_runner_analysis.stats.regressions import gap_ols
 
 REPS = 10

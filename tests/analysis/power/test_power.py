@@ -23,9 +23,9 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.file import Effect
-from merge_runner_analysis.power.study import HUMANS, Case, chances, human, simulate
-from merge_runner_analysis.stats.ceiling import ceiling
-from merge_runner_analysis.stats.indicators import ROBUST, judged
+from merge_runner_analysis.power import HUMANS, Case, chances, human, simulate
+from merge_runner_analysis.stats.group_scores import ceiling
+from merge_runner_analysis.stats.indicators import TESTED
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth, who_first_logit
 
 STUDIES = 20
@@ -79,8 +79,9 @@ def test_twenty_planted_studies_find_the_effect_at_the_stated_rate(of_speed):
     of_humans = human().relative_velocity
     stated = chance(Case(human().plus(Effect(relative_velocity=of_speed - of_humans)), 10), "I2")
     found = sum(
-        bool(judged(ROBUST["I2"], who_first_firth(emulated(effect, 10, study))).passed)
+        slope.b < 0 and slope.p < 0.05
         for study in range(STUDIES)
+        if (slope := who_first_firth(emulated(effect, 10, study)).terms["relative_velocity"])
     )
     low, high = stats.binom.interval(0.99, STUDIES, stated)
     assert low <= found <= high
@@ -101,9 +102,9 @@ def test_simulated_trials_scatter_about_their_truth():
 
 @pytest.mark.slow
 def test_the_chances_of_humans_are_their_ceiling():
-    shares = ceiling((10,) * len(HUMAN_CONDITIONS)).robust
+    shares = ceiling((10,) * len(HUMAN_CONDITIONS))["robust"]
     found = Case(human(), 10).chances(list(HUMAN_CONDITIONS), 1, 150)
-    for name in ROBUST:
+    for name in TESTED:
         assert found[name] == pytest.approx(shares[name], abs=0.12)
 
 

@@ -6,8 +6,8 @@ import duckdb
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner_analysis.data.human_counts import human_counts
 from merge_runner_analysis.data.load import load_trials
+from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.metrics import BOXES, COLLISIONS

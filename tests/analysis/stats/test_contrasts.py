@@ -17,11 +17,9 @@ from merge_runner_analysis.stats.contrasts import (
     contrast_means,
     corrected,
     detectable_rate,
-    interaction_of_means,
-    interaction_of_rates,
+    difference_of_rates,
     rejected,
     shared_cells,
-    slope_within,
 )
 
 
@@ -144,7 +142,7 @@ def test_rates_that_differ_by_their_conditions_alone_do_not_differ():
 
 def test_an_interaction_of_rates_is_excluded_at_the_level_of_its_p():
     one, other = (shared_cells(*trials(strata), "hit") for strata in STRATA[:2])
-    found = interaction_of_rates(one, other)
+    found = difference_of_rates([*one.rates, *reversed(other.rates)])
     rates = (*standardised(STRATA[0]), *reversed(standardised(STRATA[1])))
     (p, n), (q, m), (r, k), (s, j) = rates
     assert found.value == pytest.approx(p - q - (s - r))
@@ -156,12 +154,12 @@ def test_an_interaction_of_rates_is_excluded_at_the_level_of_its_p():
     z = stats.norm.isf(found.p / 2)
     low, high = intervals.newcombe(rates, z)
     assert min(abs(low), abs(high)) == pytest.approx(0, abs=1e-9)
-    assert interaction_of_rates(one, one).p == 1
+    assert difference_of_rates([*one.rates, *reversed(one.rates)]).p == 1
 
 
 def test_an_interaction_of_means_is_the_difference_of_both_differences_with_welchs_test():
-    found = interaction_of_means(
-        slope_within(FIRST, SECOND, "gap_m"), slope_within(SECOND, FIRST, "gap_m")
+    found = intervals.difference(
+        contrast_means(FIRST, SECOND, "gap_m"), contrast_means(SECOND, FIRST, "gap_m")
     )
     one = contrast_means(FIRST, SECOND, "gap_m")
     assert found.value == pytest.approx(2 * one.value)

@@ -200,9 +200,8 @@ def test_i5_is_one_sided_the_mean_gain_is_above_0(monkeypatch, gain, passed):
 def test_beside_the_gain_stand_the_share_of_trials_and_what_a_clock_of_1_hz_makes(tmp_path):
     """This driver holds for whole seconds: its clock makes all of its gain."""
     study = driving(tmp_path)
-    (table,) = make_tables(study, ["indicators"])
-    rows = {row.id: row.values for row in table.rows}
-    gain = rows["o3/baseline/I5"]["value"]
-    assert rows["o3/baseline/I5-held"]["value"] == 100
-    assert rows["o3/baseline/I5-clock"]["value"] == pytest.approx(gain)
-    assert "o3/baseline/I5-humans" not in rows  # none are imported
+    (table,) = make_tables(study, ["velocity-profiles"])
+    values = {row.id: row.values for row in table.rows}["o3/baseline"]
+    assert values["held_percent"] == 100
+    assert values["clocked_gain"] == pytest.approx(values["gain"])
+    assert "difference_sd" not in values, "no humans are imported"

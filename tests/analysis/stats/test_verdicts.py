@@ -9,17 +9,18 @@ from scipy.special import expit
 
 from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.stats.intervals import newcombe, two_sided_p
+from merge_runner_analysis.stats.intervals import Estimate, newcombe, wilson
 from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, who_first_data
-from merge_runner_analysis.stats.verdicts import _of_rates, _rate, compared, of_humans
+from merge_runner_analysis.stats.verdicts import Known, _of_rates, compared, of_humans
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.verdict_words import (
     MEASURES,
     by_group,
+    differs,
     headline,
     sentence,
     sentences,
-    strongest,
+    told,
 )
 from tests.analysis.studies import Drive, write_study, yielding
 
@@ -79,19 +80,23 @@ def test_a_slope_of_who_goes_first_has_the_interval_of_its_profile(tmp_path, nam
         {"headway": "projected_headway", "velocity": "relative_velocity"}[name]
     )
     design, left = who_first_data(study.models[0].outcomes)
-    best = penalised(design, left, column, found.own.value)
-    for end in found.own.ci:
+    best = penalised(design, left, column, found.own.estimate.value)
+    for end in found.own.estimate.bounds():
         lost = 2 * (best - penalised(design, left, column, end))
         assert lost == pytest.approx(stats.chi2.ppf(0.95, 1), rel=1e-3)
 
 
 def test_a_difference_of_rates_is_newcombes_and_its_p_the_level_that_leaves_0_out():
-    found = _of_rates(_rate(0.5, 20, 20), _rate(0.1, 50, 50))
+    def known(k, n):
+        low, high = wilson(k / n, n)
+        return Known(Estimate(100 * k / n, 100 * low, 100 * high, n, weight=n), k=k)
+
+    found = _of_rates(known(10, 20), known(5, 50))
     low, high = newcombe([(0.5, 20), (0.1, 50)])
     assert found.bounds() == pytest.approx((100 * low, 100 * high))
     z = stats.norm.isf(found.p / 2)
     assert newcombe([(0.5, 20), (0.1, 50)], z)[0] == pytest.approx(0, abs=1e-9)
-    assert _of_rates(_rate(0.2, 20, 20), _rate(0.2, 50, 50)).p == two_sided_p(0.0) == 1
+    assert _of_rates(known(4, 20), known(10, 50)).p == 1
 
 
 def test_interval_and_p_of_a_difference_agree(rows):
@@ -104,12 +109,12 @@ def test_interval_and_p_of_a_difference_agree(rows):
 
 
 def test_the_humans_are_the_published_ones(study, rows):
-    humans = of_humans(study)
+    humans = {name: known.estimate for name, known in of_humans(study).items()}
     assert humans["collisions"].value == pytest.approx(100 * 28 / 990)
-    assert humans["gap"].ci == pytest.approx((2.85, 4.85), abs=0.005)
+    assert humans["gap"].bounds() == pytest.approx((2.88, 4.82), abs=0.005)
     assert humans["gap-velocity"].value == pytest.approx(-0.2 * 0.8)
     assert rows["human/headway"]["n"] == 962
-    assert humans["velocity"].ci[0] < humans["velocity"].value
+    assert humans["velocity"].low < humans["velocity"].value
 
 
 def test_a_driver_that_yields_shows_what_humans_do_and_one_that_crashes_is_unlike_them(rows):
@@ -126,14 +131,11 @@ def test_sentences_tell_the_states_of_the_rows_and_the_headline_the_surest_diffe
     groups = by_group(table.rows)
     wild = groups["wild/baseline"]
     assert f"ollides in {wild['collisions']['estimate']:.0f} % of trials" in sentence(wild)
-    surest = strongest(wild)
-    assert all(
-        surest["p_holm"] <= one["p_holm"] for one in wild.values() if one.get("state") == "unlike"
-    )
+    surest = min((one for one in wild.values() if differs(one)), key=lambda one: one["p_holm"])
     assert headline({}) == ("No language model is judged here.", "")
-    claim, told = headline({"wild": wild})
+    claim, because = headline({"wild": wild})
     assert claim == "wild does not drive like humans:"
-    assert "humans" in told
+    assert because == f"it {told(surest)}."
 
 
 def test_undecided_trials_leave_both_worst_cases_and_a_verdict_that_holds_in_both(tmp_path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import duckdb
 import pytest
 
-from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.reference_data import published
@@ -13,7 +12,7 @@ from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.human.archive import open_files
 from merge_runner_analysis.human.load import import_trials, sort_files
 from merge_runner_analysis.tables import finished_tables, make_tables
-from merge_runner_analysis.tables.against import DRIVERS, against, in_paper
+from merge_runner_analysis.tables.against import FILES, against
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding
 
@@ -75,17 +74,13 @@ def partly(tmp_path_factory):
     }
     db = write_study(folder / "t.duckdb", yielding("o3", reps=1))
     with open_files(write_folder(folder / "recordings", files)) as found:
-        import_trials(sort_files(found).trials, Store(db))
+        import_trials(sort_files(found), Store(db))
     return Study(db)
 
 
-def beside(study, name=TABLE_VII, driver=None):
+def beside(study, name=TABLE_VII):
     (table,) = make_tables(study, [name])
-    return against(table, "paper", driver)
-
-
-def test_the_paper_has_these_drivers():
-    assert tuple(published("paper_gap")["driver"].unique()) == DRIVERS
+    return against(table, study)
 
 
 def differences(table, row_id):
@@ -95,7 +90,7 @@ def differences(table, row_id):
 
 @pytest.mark.slow
 def test_published_human_values_stand_there_and_are_not_compared_with_themselves(met):
-    tables = [against(table, "paper") for table in make_tables(met) if in_paper(table)]
+    tables = [against(table, met) for table in make_tables(met, [*FILES])]
     assert len(tables) == 5
     for table in tables:
         rows = [row for row in table.rows if row.groups[0] == "human"]
@@ -113,38 +108,13 @@ def test_humans_of_a_partial_import_stand_beside_the_paper_without_differences(p
 
 
 def test_a_stand_in_never_stands_beside_the_model_in_whose_name_it_answered(met):
-    for driver in (None, "gemini-2.5-pro"):
-        table = beside(met, driver=driver)
-        assert cell(table, "gemini-2.5-pro/baseline", "gap_m_in_paper") is None
+    assert cell(beside(met), "gemini-2.5-pro/baseline", "gap_m_in_paper") is None
     assert cell(beside(met), "o3/baseline", "gap_m_in_paper") == paper("o3")
 
 
-def test_any_driver_stands_beside_a_named_one_setting_for_setting(met):
-    table = beside(met, driver="gemini-2.5-pro")
-    expected = paper("gemini-2.5-pro")
-    for name in ("o3", "emulator", "constant"):
-        assert cell(table, f"{name}/baseline", "gap_m_in_paper") == expected
-        assert cell(table, f"{name}/baseline", "gap_m_difference") == pytest.approx(
-            cell(table, f"{name}/baseline", "gap_m") - expected
-        )
-    assert cell(table, "o3/A2", "gap_m_in_paper") == paper("gemini-2.5-pro", "A2")
-    assert "every driver stands beside the paper's gemini-2.5-pro" in table.notes
-    gap = beside(met, "gap", "o3")
-    assert cell(gap, "emulator/baseline/intercept", "b_in_paper") == 8.14
-    assert cell(beside(met, "indicators", "o3"), "emulator/baseline/I2", "paper_in_paper") is False
-
-
-def test_beside_the_humans_stands_every_setting(met):
-    table = beside(met, driver="human")
-    values = {row.id: row.values.get("gap_m_in_paper") for row in table.rows}
-    assert values.pop("gemini-2.5-pro/baseline") is None, "a stand-in in a model's name"
-    assert {*values.values()} == {3.85}
-
-
-def test_a_model_at_another_endpoint_stands_beside_the_papers_only_when_told_to(tmp_path):
+def test_a_model_at_another_endpoint_does_not_stand_beside_the_papers(tmp_path):
     elsewhere, name = changed(tmp_path, ELSEWHERE), "o3 at localhost:8080/baseline"
     assert cell(beside(elsewhere), name, "gap_m_in_paper") is None
-    assert cell(beside(elsewhere, driver="o3"), name, "gap_m_in_paper") == paper("o3")
 
 
 def test_another_sample_set_of_a_driver_stands_beside_the_papers(tmp_path):
@@ -152,21 +122,15 @@ def test_another_sample_set_of_a_driver_stands_beside_the_papers(tmp_path):
     assert cell(beside(study), "o3/set1/baseline", "gap_m_in_paper") == paper("o3")
 
 
-def test_a_kept_table_is_placed_as_one_just_made(met):
-    made = [against(table, "paper", "o3") for table in make_tables(met, [TABLE_VII])]
+def test_a_kept_table_stands_beside_the_paper_as_one_just_made(met):
+    made = beside(met)
     for _ in range(2):
-        tables = finished_tables(met.db, None, [TABLE_VII])
-        kept = [against(table, "paper", "o3") for table in tables]
-        assert [[row.values for row in t.rows] for t in kept] == [
-            [row.values for row in t.rows] for t in made
-        ]
+        (kept,) = (against(t, met) for t in finished_tables(met.db, None, [TABLE_VII]))
+        assert [row.values for row in kept.rows] == [row.values for row in made.rows]
 
 
-def test_as_needs_the_paper_and_one_of_its_drivers(met, in_process, capsys):
-    with pytest.raises(UsageError, match=r"--as gpt: the paper has human, o3, gemini-2\.5-pro"):
-        beside(met, driver="gpt")
-    assert in_process("tables", TABLE_VII, "--db", met.db, "--as", "o3") == 2
-    assert "--against paper" in capsys.readouterr().err
-    told = ("tables", TABLE_VII, "--db", met.db, "--against", "paper", "--as", "o3")
-    assert in_process(*told) == 0
-    assert "every driver stands beside the paper's o3" in capsys.readouterr().out
+def test_values_stand_against_the_paper_alone(met, in_process, capsys):
+    assert in_process("tables", TABLE_VII, "--db", met.db, "--against", "humans") == 2
+    assert "valid is paper" in capsys.readouterr().err
+    assert in_process("tables", TABLE_VII, "--db", met.db, "--against", "paper") == 0
+    assert "paper: " in capsys.readouterr().out

@@ -24,7 +24,7 @@ from merge_runner_analysis.stats.group_scores import score
 from merge_runner_analysis.stats.intervals import proportion
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, make_tables
-from merge_runner_analysis.tables.against import against, in_paper
+from merge_runner_analysis.tables.against import against
 from merge_runner_analysis.tables.formats import as_text, render, with_columns
 from merge_runner_analysis.tables.model import Column, Row, Table
 from tests.analysis.studies import Drive, changed, write_study, yielding
@@ -122,11 +122,6 @@ def test_the_score_counts_the_marks_beside_it(tables):
             marks = [row.values.get(f"i{i}_{rule}") for i in range(1, 6)]
             known = [mark for mark in marks if mark is not None]
             assert row.values[f"score_{rule}"] == f"{sum(known)} of {len(known)}", (row.id, rule)
-            name = {"paper": "the paper's test", "robust": "the robust tests"}[rule]
-            said = [part for part in row.note.split("; ") if part.startswith("the score")]
-            # The paper judged I5 by eye: its rule leaves it out of every score of a driver.
-            left_out = marks if rule == "robust" else marks[:4]
-            assert any(f"by {name}" in part for part in said) == (None in left_out), (row.id, rule)
 
 
 def test_disagreeing_rules_are_marked(study, tables):
@@ -175,15 +170,15 @@ def test_a_table_refuses_nan_and_a_gap_without_a_word():
     Table("t", (column,), [Row("r", (), {}, "why")])
 
 
-def test_against_the_paper_stand_its_values_and_the_difference(tables):
-    table = against(tables["who-first"], "paper")
+def test_against_the_paper_stand_its_values_and_the_difference(study, tables):
+    table = against(tables["who-first"], study)
     assert cell(table, "o3/baseline/projected_headway", "b_in_paper") == 1.11
     ours = cell(table, "o3/baseline/projected_headway", "b")
     assert ours is None or cell(
         table, "o3/baseline/projected_headway", "b_difference"
     ) == pytest.approx(ours - 1.11)
     assert cell(table, "other/baseline/intercept", "b_in_paper") is None
-    quantitative = against(tables["ablation-quantitative"], "paper")
+    quantitative = against(tables["ablation-quantitative"], study)
     assert cell(quantitative, "o3/A2", "gap_m_in_paper") == 10.63
     assert cell(quantitative, "o3/A2", "gap_m_difference") == pytest.approx(
         cell(quantitative, "o3/A2", "gap_m") - 10.63
@@ -192,10 +187,10 @@ def test_against_the_paper_stand_its_values_and_the_difference(tables):
     assert cell(quantitative, "o3/A2", "collided_boxes_percent_in_paper") is None
     assert cell(quantitative, "human", "collided_percent_in_paper") is None
     assert cell(quantitative, "human", "collided_boxes_percent_in_paper") == 2.83
-    qualitative = against(tables["ablation-qualitative"], "paper")
+    qualitative = against(tables["ablation-qualitative"], study)
     assert cell(qualitative, "o3/A1", "i2_paper_in_paper") is False
     assert cell(qualitative, "o3/A2", "score_paper_in_paper") == "5 of 5"
-    indicators = against(tables["indicators"], "paper")
+    indicators = against(tables["indicators"], study)
     assert cell(indicators, "o3/baseline/I2", "paper_in_paper") is False
     assert cell(indicators, "o3/baseline/rmse_mps", "value_in_paper") == 1.34
     assert cell(indicators, "human/score", "paper_in_paper") == "5 of 5"
@@ -203,13 +198,10 @@ def test_against_the_paper_stand_its_values_and_the_difference(tables):
     assert cell(indicators, "o3/baseline/collided_boxes_percent", "value_in_paper") is None
     assert cell(indicators, "o3/baseline/collided_percent", "value_in_paper") == 0
     assert any("arXiv 2604.09609, Table III" in note for note in table.notes)
-    with pytest.raises(UsageError, match="valid is paper"):
-        against(table, "humans")
 
 
-def test_a_table_that_the_paper_has_not_says_so(tables):
-    assert not in_paper(tables["words"])
-    assert "no such table" in against(tables["words"], "paper").notes[-1]
+def test_a_table_that_the_paper_has_not_says_so(study, tables):
+    assert "no such table" in against(tables["words"], study).notes[-1]
 
 
 def test_prompts_are_contrasted_without_one_that_is_called_baseline(tmp_path):
@@ -306,7 +298,7 @@ def test_another_task_leaves_a_baseline_and_its_variants_together(tmp_path):
     assert study.models[2].driver.startswith("o3 [")
     (table,) = make_tables(study, ["contrasts"])
     assert any(row.id == "o3/A1/baseline/gap_m" for row in table.rows)
-    (beside,) = [against(t, "paper") for t in make_tables(study, ["ablation-quantitative"])]
+    (beside,) = [against(t, study) for t in make_tables(study, ["ablation-quantitative"])]
     assert cell(beside, f"{study.models[2].id}", "gap_m_in_paper") == 9.28
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 from merge_runner.records import SIDES
 from merge_runner.results.store import Store
 from merge_runner_analysis.data.reference_data import PAIRS
-from merge_runner_analysis.human.record import SPEC, SPEC_HASH, trial_record
-from merge_runner_analysis.human.trace import Trace
+from merge_runner_analysis.human.record import SPEC, SPEC_HASH, Trace, trial_record
 from merge_runner_cei.batch import simulate
 from merge_runner_cei.calibration.design import design, experiment, model_of
 from merge_runner_cei.parameters import OFFSETS, TICK_S, ThresholdSet

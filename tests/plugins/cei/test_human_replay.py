@@ -37,7 +37,7 @@ def db(tmp_path):
     """A database with four human trials, one of which collided."""
     path = tmp_path / "results/merge.duckdb"
     download = sort_files(file(name, trial.csv()) for name, trial in FILES.items())
-    assert import_trials(download.trials, Store(path)).added == 4
+    assert import_trials(download, Store(path)).added == 4
     yield path
     HUMANS.keep(())
     make_plan("baseline", "constant")
@@ -139,7 +139,7 @@ async def test_a_human_keeps_its_speed_once_its_trace_has_ended(plan_of):
 def test_the_trials_that_are_replayed_determine_the_spec(db, plan_of):
     before = plan_of(HUMAN_REPLAY).trial_specs()[0].spec_hash
     more = sort_files([file("experiment_6_iter_1.csv", drive("L_4_0").csv())])
-    import_trials(more.trials, Store(db))
+    import_trials(more, Store(db))
     assert plan_of(HUMAN_REPLAY).trial_specs()[0].spec_hash != before
 
 

@@ -24,7 +24,7 @@ from merge_runner_analysis.names import BASELINE
 from merge_runner_analysis.stats import regressions
 from merge_runner_analysis.stats.contrasts import contrast_means, shared_cells
 from merge_runner_analysis.stats.group_scores import fits
-from merge_runner_analysis.stats.indicators import ALPHA, ROBUST, verdicts
+from merge_runner_analysis.stats.indicators import ALPHA, TESTED, verdicts
 from merge_runner_analysis.stats.intervals import POWER
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
@@ -128,11 +128,11 @@ def findings(own: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
     """Return by question what trials show at p < .05: the indicators, or how two groups differ."""
     if other is None:
         gap = regressions.gap_ols(own, robust=True)
-        judged = verdicts(ROBUST, regressions.who_first_firth(own), gap)
+        judged = verdicts(regressions.who_first_firth(own), gap, robust=True)
         return {name: verdict.passed is True for name, verdict in judged.items()}
-    fit, gaps = regressions.penalised(own, other), contrast_means(own, other, "gap_m")
+    slopes = regressions.who_first_firth(own, less=other).terms
+    gaps = contrast_means(own, other, "gap_m")
     cells = shared_cells(own, other, "collided")
-    slopes = {} if isinstance(fit, str) else fit.terms
     p = {name.replace("_", " "): slope.p for name, slope in slopes.items()}
     p |= {"gap": gaps.p if gaps else 1.0, "collisions": cells.p if cells else 1.0}
     return {question: value < ALPHA for question, value in p.items()}
@@ -155,7 +155,7 @@ class Case:
         for question, (_, number, _) in QUESTIONS.items():
             size = getattr(self.own, number) - (getattr(self.other, number) if self.other else 0.0)
             known = question != "gap" or self.against != HUMANS
-            if (question in ROBUST) is (self.other is None) and size and known:
+            if (question in TESTED) is (self.other is None) and size and known:
                 effects[question] = size
         return effects
 

@@ -1,1 +1,0 @@
-"""What a study can find, simulated before it is played."""
