@@ -112,7 +112,7 @@ def test_a_run_says_how_long_it_lasted(study):
 def share(name, count, of, things):
     """A row of the page, as text."""
     part = f" ({100 * count / of:.1f} %)" if count else ""
-    return f"{name} {count} of {of}{part} {things}"
+    return f"{name} {count:,} of {of:,}{part} {things}"
 
 
 def test_the_page_has_the_numbers_of_the_database(written):
