@@ -20,12 +20,11 @@ from merge_runner_analysis.data.derived_cache import finished, keep_finished
 from merge_runner_analysis.data.load import load_each
 from merge_runner_analysis.data.provenance import provenance
 from merge_runner_analysis.data.reference_data import published
-from merge_runner_analysis.data.studies import DESCRIPTIONS
 from merge_runner_analysis.data.study import Study, levels_of
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
-from merge_runner_analysis.names import BASELINE
+from merge_runner_analysis.names import BASELINE, DESCRIPTIONS
 from merge_runner_analysis.report.alarms import alarms, posing
 from merge_runner_analysis.stats.factors import levels_by_factor
 from merge_runner_analysis.table_format import TableFormat
