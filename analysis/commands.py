@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -113,6 +113,13 @@ def tables(
     from merge_runner_analysis.tables.formats import render, with_columns
 
     study = None
+    chosen: dict[str, Any] = {
+        "models": drivers(models),
+        "where": _at(where),
+        "file": study_file,
+        "by": by,
+        "without_fallbacks": without_fallbacks,
+    }
     if against is not None:
         from merge_runner_analysis.data.study import Study
         from merge_runner_analysis.tables.against import PAPER
@@ -120,17 +127,8 @@ def tables(
 
         if against != PAPER:
             raise UsageError(f"--against {against}: valid is {PAPER}")
-        study = Study(db, drivers(models), _at(where), study_file, by, without_fallbacks)
-    made = finished_tables(
-        db,
-        drivers(models),
-        names or (),
-        study,
-        where=_at(where),
-        file=study_file,
-        by=by,
-        without_fallbacks=without_fallbacks,
-    )
+        study = Study(db, **chosen)
+    made = finished_tables(db, names or (), study, chosen)
     if study is not None:
         made = [beside(table, study) for table in made]
     if columns is not None:
@@ -157,7 +155,7 @@ def explain(
     from merge_runner_analysis.explain import explain as explain_cell
     from merge_runner_analysis.tables import finished_tables
 
-    (made,) = finished_tables(db, None, [table], study)
+    (made,) = finished_tables(db, [table], study)
     found = explain_cell(study, made, cell)
     if as_json:
         print_out(json.dumps(asdict(found), indent=2, ensure_ascii=False))
@@ -256,7 +254,7 @@ def report(
 ) -> None:
     """Write conclusions, tables and figures as one HTML file."""
     use_study(study_file, trust=trust)
-    from merge_runner_analysis.report.writer import write_report
+    from merge_runner_analysis.report.page import write_report
 
     refuse_another_kind(out, HTML, "page of HTML")
     deque(write_report(db, drivers(models), out, files, _at(where), study_file), maxlen=0)

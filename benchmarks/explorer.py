@@ -24,7 +24,7 @@ from benchmarks.cases import Bench, Figures, figures_of, study_of
 from benchmarks.processes import PROGRAM, PYTHON, run, serving
 from merge_runner.results.store import query
 
-ASKED, TIMEOUT_S, POLL_S = 20, 60.0, 0.05
+ASKED, TIMEOUT_S, POLL_S = 20, 60.0, 0.2
 LIST, FILTERED = "trials", "trials?condition=N_0_0&sort=gap&page=3"
 # What a page has in the place of numbers that are not there yet.
 PENDING = 'class="computing"'

@@ -50,7 +50,7 @@ def db(tmp_path):
 def test_all_that_tell_of_other_models_tell_the_same(db):
     assert sorted(served for _, served, _ in sweep_facts(db, "sweep-1")["others"]) == OTHERS
     assert sorted(served for _, served in load_calls(db).others) == OTHERS
-    assert sorted(one.served for one in provenance(db).mismatches) == OTHERS
+    assert sorted(provenance(db).mismatches.served) == OTHERS
     found = [
         f.text for f in audit_sweep(db, "sweep-1", [], finished=True).findings if f.kind == "served"
     ]

@@ -33,7 +33,7 @@ from tests.harness import PROGRAM, PROJECT, environment
 # What commands import where they need it; nothing of it may start a thread.
 WARM = (
     "merge_runner_analysis.commands",
-    "merge_runner_analysis.report.writer",
+    "merge_runner_analysis.report.page",
     "merge_runner.llm.http",
     "merge_runner.emulator.server",
     "merge_runner.run.sweep",

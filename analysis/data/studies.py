@@ -18,10 +18,6 @@ SWEEPS = """
 SELECT sweep_id, name, nullif(config->>'$.seat', '') AS seat, config->'$.levels' AS levels
 FROM sweeps ORDER BY started_at DESC, sweep_id
 """
-DESCRIPTIONS = """
-SELECT config->>'$.description' AS description FROM sweeps
-WHERE description <> '' GROUP BY ALL ORDER BY min(started_at)
-"""
 LINKS = "SELECT DISTINCT trial_id, spec_hash, sweep_id FROM sweep_trials"
 Order = Mapping[str, list[str]]
 

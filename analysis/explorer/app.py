@@ -18,7 +18,6 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
-from starlette.middleware.base import BaseHTTPMiddleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
@@ -33,8 +32,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from merge_runner.errors import MergeRunnerError, UsageError
-from merge_runner_analysis.explorer.assets import STATIC
-from merge_runner_analysis.explorer.guard import LOOPBACK, from_elsewhere, guarded
+from merge_runner_analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
 from merge_runner_analysis.explorer.offline import page_of_trials
 from merge_runner_analysis.explorer.pages import (
     comparing,
@@ -50,7 +48,7 @@ from merge_runner_analysis.explorer.pages import (
     words,
 )
 from merge_runner_analysis.explorer.reading import reading
-from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site
+from merge_runner_analysis.explorer.site import STATIC, NothingNew, NotThere, Site
 from merge_runner_analysis.explorer.urls import whole
 
 LOG = logging.getLogger(__name__)
@@ -116,7 +114,7 @@ def explorer(site: Site) -> Starlette:
             Mount("/static", StaticFiles(directory=STATIC)),
         ],
         middleware=[
-            Middleware(BaseHTTPMiddleware, dispatch=guarded),
+            Middleware(Guard),
             Middleware(TrustedHostMiddleware, allowed_hosts=[LOOPBACK, "localhost"]),
             Middleware(GZipMiddleware, minimum_size=2_000),
         ],
@@ -225,7 +223,7 @@ PAGES: dict[str, Callable[[Site, Request], str | Response]] = {
 
 
 async def _noted(site: Site, request: Request) -> Response:
-    """Keep what a reader notes; see ``guarded`` for who may write."""
+    """Keep what a reader notes; see ``Guard`` for who may write."""
     size = whole(request.headers.get("content-length", ""))
     if size is None or size > MOST_NOTED:
         return PlainTextResponse("nothing was noted: the form is too large", 413)

@@ -399,25 +399,20 @@ class Catalogue:
             *values,
         )
 
-    def page(self, wanted: Filter, sort: str, number: int) -> list[Row]:
-        """The trials of one page, counted from 1; ``-gap`` sorts the largest gap first."""
+    def every(self, wanted: Filter, sort: str = "trial", limit: str = "") -> list[Row]:
+        """All trials of a filter; ``-gap`` sorts the largest gap first."""
         where, values = wanted.where()
         order = order_by(sort)
-        # Only the trials of the page are read with their speeds, which take the longest.
+        # Only the trials of a page are read with their speeds, which take the longest.
         return self.ask(
             f"SELECT {SHOWN} FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
-            f"ORDER BY {order} LIMIT {PAGE} OFFSET ?) USING (number) ORDER BY {order}",
+            f"ORDER BY {order} {limit}) USING (number) ORDER BY {order}",
             *values,
-            PAGE * (number - 1),
         )
 
-    def every(self, wanted: Filter) -> list[Row]:
-        """All trials of a filter, by name."""
-        where, values = wanted.where()
-        return self.ask(
-            f"SELECT {SHOWN} FROM listed WHERE {where} ORDER BY trial_id, spec_hash",  # noqa: S608 # constants
-            *values,
-        )
+    def page(self, wanted: Filter, sort: str, number: int) -> list[Row]:
+        """The trials of one page, counted from 1."""
+        return self.every(wanted, sort, f"LIMIT {PAGE} OFFSET {PAGE * (number - 1)}")
 
     def find(self, trial_id: str, spec_hash: str | None = None) -> Row | None:
         """One trial; where its name stands for several, the one of that spec, or any."""

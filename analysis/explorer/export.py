@@ -22,13 +22,12 @@ import httpx
 from merge_runner.errors import UsageError
 from merge_runner.paths import refuse_another_kind
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.assets import STATIC
 from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, Filter
 from merge_runner_analysis.explorer.guard import LOOPBACK
 from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.offline import offline, page_of_trials
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.site import SCOPE, Site
+from merge_runner_analysis.explorer.site import SCOPE, STATIC, Site
 from merge_runner_analysis.explorer.urls import query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990

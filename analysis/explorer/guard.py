@@ -1,13 +1,12 @@
-"""Refuses other sites' requests, and says what a page may do."""
+"""Middleware that refuses other sites' requests and says what a page may do."""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers
-from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOOPBACK = "127.0.0.1"
 # Scripts and styles are files of ours. What a model wrote could not run even if it were let in.
@@ -25,15 +24,6 @@ HEADERS = {
 }
 
 
-async def guarded(request: Request, answer: Callable[[Request], Awaitable[Response]]) -> Response:
-    """Refuse requests of other sites' pages but links, and add HEADERS to every reply."""
-    refusal = _refusal(request.method, request.headers)
-    reply = PlainTextResponse(f"{refusal}\n", 403) if refusal else await answer(request)
-    for name, value in HEADERS.items():
-        reply.headers.setdefault(name, value)
-    return reply
-
-
 def from_elsewhere(headers: Headers) -> bool:
     """Return whether another site's page led here.
 
@@ -46,6 +36,30 @@ def from_elsewhere(headers: Headers) -> bool:
     host = headers.get("host", "")
     led = [headers[name] for name in ("origin", "referer") if name in headers]
     return any(urlsplit(address).netloc != host for address in led)
+
+
+class Guard:
+    """Refuses requests of other sites' pages but links, and adds HEADERS to every reply."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer, or say why not."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        refusal = _refusal(scope["method"], Headers(scope=scope))
+        app = PlainTextResponse(f"{refusal}\n", 403) if refusal else self._app
+        await app(scope, receive, guarded)
 
 
 def _refusal(method: str, headers: Headers) -> str:

@@ -8,10 +8,10 @@ from __future__ import annotations
 import fcntl
 import getpass
 import os
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
@@ -51,12 +51,8 @@ class Kept:
 
     notes: tuple[Note, ...] = ()
     damage: tuple[str, ...] = ()
-
-    @property
-    def tags(self) -> tuple[tuple[str, str, str], ...]:
-        """Of each trial and its decisions: (trial, spec, tag), each once."""
-        tagged = {(note.trial_id, note.spec_hash, tag) for note in self.notes for tag in note.tags}
-        return tuple(sorted(tagged))
+    tags: tuple[tuple[str, str, str], ...] = ()
+    """Of each trial and its decisions: (trial, spec, tag), each once."""
 
 
 class Notes:
@@ -65,18 +61,12 @@ class Notes:
     def __init__(self, db: Path, reader: str = "") -> None:
         self.path = db.with_name(f"{db.stem}.notes.jsonl")
         self.reader = reader
-        self._lock = threading.Lock()
-        self._read: tuple[tuple[int, ...], Kept] = (), Kept()
 
     def kept(self) -> Kept:
         """What the file holds now: the same object while the file is the same."""
         try:
             stat = self.path.stat()
-            stamp = (stat.st_ino, stat.st_mtime_ns, stat.st_size)
-            with self._lock:
-                if stamp != self._read[0]:
-                    self._read = stamp, self._parsed()
-                return self._read[1]
+            return _parsed(self.path, (stat.st_ino, stat.st_mtime_ns, stat.st_size))
         except FileNotFoundError:
             return Kept()
         except OSError as exc:
@@ -114,15 +104,19 @@ class Notes:
         except OSError as exc:
             raise UsageError(f"nothing was noted: {self.path}: {exc.strerror}") from exc
 
-    def _parsed(self) -> Kept:
-        notes, damage = [], []
-        for number, line in enumerate(self.path.read_bytes().splitlines(), 1):
-            try:
-                if line.strip():
-                    notes.append(LINE.validate_json(line))
-            except ValidationError:
-                damage.append(f"line {number} of {self.path.name} is damaged, and is left out")
-        return Kept(tuple(notes), tuple(damage))
+
+@lru_cache(1)
+def _parsed(path: Path, _: tuple[int, ...]) -> Kept:
+    """What a file with this stamp holds; raises OSError."""
+    notes, damage = [], []
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        try:
+            if line.strip():
+                notes.append(LINE.validate_json(line))
+        except ValidationError:
+            damage.append(f"line {number} of {path.name} is damaged, and is left out")
+    tagged = {(note.trial_id, note.spec_hash, tag) for note in notes for tag in note.tags}
+    return Kept(tuple(notes), tuple(damage), tuple(sorted(tagged)))
 
 
 def reader_of(given: str | None) -> str:

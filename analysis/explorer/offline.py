@@ -11,12 +11,11 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 
 from markupsafe import Markup
 
-from merge_runner_analysis.explorer.assets import STATIC
 from merge_runner_analysis.explorer.display_text import visible
 from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.pages.trial import trial_page
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.site import STATIC, Site
 from merge_runner_analysis.explorer.urls import query_of
 
 # What a template marks, and forms but these.

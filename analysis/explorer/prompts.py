@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from functools import cache, lru_cache
@@ -47,27 +46,31 @@ def parts_of(prompt: str, before: str | None) -> list[Part]:
 
 @lru_cache(KEPT)
 def _blocks(prompt: str) -> list[tuple[str, str]]:
-    """Name and text of each block; what belongs to none that is known here has no name."""
+    """Name and text of each block; what belongs to none that is known here has no name.
+
+    Of the blocks whose paragraphs begin like the next ones the one with the longest beginnings is
+    meant.
+    """
+    known = [
+        (name, _begun(template))
+        for name, block in BLOCKS.items()
+        for template in filter(None, (block.merge, block.straight))
+    ]
     found: list[tuple[str, str]] = []
     paragraphs = prompt.rstrip("\n").split("\n\n")
     while paragraphs:
-        _, name, length = max(_beginning(paragraphs), default=(0, "", 1))
+        alike = (
+            (sum(map(len, begun)), name, len(begun))
+            for name, begun in known
+            if begun[0] and all(map(str.startswith, paragraphs, begun))
+        )
+        _, name, length = max(alike, default=(0, "", 1))
         text = "\n\n".join(paragraphs[:length])
         if found and name == found[-1][0] == "":
             text = f"{found.pop()[1]}\n\n{text}"
         found.append((name, text))
         del paragraphs[:length]
     return found
-
-
-def _beginning(paragraphs: Sequence[str]) -> Iterator[tuple[int, str, int]]:
-    """The blocks whose paragraphs begin like these: characters that agree, name, paragraphs."""
-    for name, block in BLOCKS.items():
-        for template in filter(None, (block.merge, block.straight)):
-            begun = _begun(template)
-            pairs = zip(paragraphs, begun, strict=False)
-            if begun[0] and all(text.startswith(beginning) for text, beginning in pairs):
-                yield sum(map(len, begun)), name, len(begun)
 
 
 @cache

@@ -13,7 +13,6 @@ import jinja2
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
-from merge_runner_analysis.explorer.assets import STYLES
 from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.conditions import condition_texts
@@ -29,7 +28,14 @@ from merge_runner_analysis.explorer.views import clock, condition_text
 from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.verdict_words import TABLE
 
-TEMPLATES = Path(__file__).with_name("templates")
+TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
+STYLES = (
+    "vendor/uplot-1.6.32.min.css",
+    *(f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")),
+)
+# What draws and moves a trial, in the order in which it is loaded.
+_PARTS = "moment track marks charts ribbons panel clock comparison start"
+REPLAY = ("vendor/uplot-1.6.32.min.js", *(f"replay/{part}.js" for part in _PARTS.split()))
 PAGES = {
     "Study": HOME,
     "Drivers": "drivers",

@@ -338,7 +338,7 @@ def _finished(run: Run) -> Assessment:
             f"It had finished, but the database holds only {run.ended} of its {run.planned} "
             "trials.",
         )
-    text = f"Finished: all {run.ended} trials ended, and the audit found nothing"
+    text = f"Finished: all {run.ended} trials ended, and no problems were found"
     if others := run.row["others"]:
         return Assessment("doubtful", f"{text}; but another model gave {others} answers.")
     return Assessment("finished", f"{text}.")

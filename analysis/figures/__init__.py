@@ -23,7 +23,8 @@ OF_FIGURE_2 = (
     "with Wilson intervals. (D) Mean gap at the merge point and (E) mean RMSE of the speed from "
     "the initial speed, two values a trial, with intervals of Student's t. Of two different "
     "drivers, the left vehicle is that of the one named first. Colours and markers tell the "
-    "relative velocities apart; few very wide intervals of D and E are cut at the frame."
+    "relative velocities apart, dotted lines are the humans; few very wide intervals of D and E "
+    "are cut at the frame."
 )
 FIGURES = {
     "figure2": About(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +23,7 @@ BREAK = "\u200b"  # a zero-width space
 BLUE, VERMILION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
 SKY_BLUE, ORANGE = "#56b4e9", "#e69f00"
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, SKY_BLUE, ORANGE)
-MARKERS = "s^DvPX"
+MARKERS = "v^sDPX"
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +37,10 @@ class Style:
 HUMAN_STYLE = Style("#000000", "o")
 
 
-def style(number: int, colours: Sequence[str] = COLOURS, markers: str = MARKERS) -> Style:
+def style(number: int) -> Style:
     """A style, counted from 0; once the colours are used up, each comes with another marker."""
-    turn = number + number // len(colours)
-    return Style(colours[number % len(colours)], markers[turn % len(markers)])
+    turn = number + number // len(COLOURS)
+    return Style(COLOURS[number % len(COLOURS)], MARKERS[turn % len(MARKERS)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,13 +17,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.reference_data import HUMAN_TRIALS, published
 from merge_runner_analysis.data.study import Group, Study, of_trials
 from merge_runner_analysis.figures.drawing import (
-    BLUE,
-    GREEN,
-    ORANGE,
     PAGE_IN,
-    PURPLE,
-    SKY_BLUE,
-    VERMILION,
     Point,
     Style,
     draw_points,
@@ -34,6 +28,7 @@ from merge_runner_analysis.figures.drawing import (
     wrapped,
 )
 from merge_runner_analysis.metrics import Bounded
+from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.stats.intervals import Estimate, mean, proportion
 from merge_runner_analysis.stats.regressions import gap_design
 
@@ -53,10 +48,7 @@ SEMI JOIN (FROM trials WHERE status = 'finished') USING (trial_id, spec_hash)
 WHERE time_s >= 0 AND side = ego GROUP BY ALL ORDER BY ALL
 """
 HUMAN_VELOCITIES_MPS = sorted({c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()})
-# Styles for the humans' relative velocities, in their order, and those left for others.
-STYLES = (Style(BLUE, "v"), Style(GREEN, "o"), Style(VERMILION, "^"))
-OTHER_COLOURS, OTHER_MARKERS = (PURPLE, SKY_BLUE, ORANGE), "sDP"
-Styles = dict[float, Style]
+Styles = dict[float, Style]  # of relative velocities in m/s
 HEADINGS = (
     "left first:\nv left (m/s)",
     "left second:\nv left (m/s)",
@@ -77,7 +69,7 @@ def figure_2(study: Study, chosen: list[Group]) -> Figure:
         group.part(lambda trials: trials["condition"].isin(study.conditions)) for group in chosen
     ]
     velocities = sorted({velocity for _, velocity in study.conditions.values()})
-    styles = _styles(velocities)
+    styles = {velocity: style(number) for number, velocity in enumerate(velocities)}
     names = [_name(group) for group in groups]
     figure, axes = _panels(names)
     for row, group, name in zip(axes, groups, names, strict=False):
@@ -89,6 +81,8 @@ def figure_2(study: Study, chosen: list[Group]) -> Figure:
             _draw_traces(axis, study, group, first, styles)
         for axis, summary in zip(row[2:], SUMMARIES, strict=True):
             _draw_estimates(axis, group, summary, styles)
+            if group.setting and groups[0].driver == HUMAN:
+                _draw_humans(axis, groups[0], summary, styles)
     _scale(axes, groups, study, velocities)
     for axis, heading, panel in zip(axes[0], HEADINGS, "ABCDE", strict=True):
         axis.set_title(heading)
@@ -164,14 +158,6 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
     return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
 
 
-def _styles(velocities: list[float]) -> Styles:
-    """Colour and marker of each relative velocity in m/s."""
-    known = dict(zip(HUMAN_VELOCITIES_MPS, STYLES, strict=True))
-    for number, velocity in enumerate(v for v in velocities if v not in HUMAN_VELOCITIES_MPS):
-        known[velocity] = style(number, OTHER_COLOURS, OTHER_MARKERS)
-    return {velocity: known[velocity] for velocity in velocities}
-
-
 def _name(group: Group) -> str:
     driver = wrapped(group.label, LABEL_IN)
     if not group.setting:
@@ -241,9 +227,21 @@ def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) 
     elif summary is deviation:
         say(axis, MISSING)
     elif summary is gap:
-        for velocity in {*styles} & {*HUMAN_VELOCITIES_MPS}:
-            line = published_gap_line(velocity)
-            axis.plot(*line, color=styles[velocity].colour, ls="--", lw=0.8)
+        _draw_humans(axis, group, summary, styles, "--")
+
+
+def _draw_humans(
+    axis: Axes, human: Group, summary: Summary, styles: Styles, dashes: str = ":"
+) -> None:
+    """The humans as lines, of gaps before an import as the paper's regression has them."""
+    for velocity in {*styles} & {*HUMAN_VELOCITIES_MPS}:
+        if summary is gap and not human.measured:
+            x, y = published_gap_line(velocity)
+        else:
+            found = points(human, velocity, summary)
+            x = np.array([point.x for point in found], dtype=float)
+            y = np.array([point.estimate.value for point in found], dtype=float)
+        axis.plot(x, y, color=styles[velocity].colour, ls=dashes, lw=0.8)
 
 
 def _scale(
@@ -279,11 +277,13 @@ def _limits(found: list[Bounded], lines: list[float]) -> tuple[float, float]:
 
 
 def _human_keys(study: Study) -> list[Line2D]:
-    """Remarks where humans are shown by something other than their own trials."""
+    """How humans are shown beside drivers, and by what other than their own trials."""
     if study.human not in study.groups:
         return []
+    keys = [Line2D([], [], color="#555555", ls=":", lw=0.8, label="humans")]
     if not study.human.measured:
-        return [Line2D([], [], color="#555555", ls="--", lw=0.8, label="published regression")]
+        dashed = Line2D([], [], color="#555555", ls="--", lw=0.8, label="published regression")
+        return [*keys, dashed]
     if study.human.published_outcomes is None:
-        return []
-    return [Line2D([], [], ls="", label=f"humans in C: the {HUMAN_TRIALS} published")]
+        return keys
+    return [*keys, Line2D([], [], ls="", label=f"humans in C: the {HUMAN_TRIALS} published")]

@@ -38,11 +38,6 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
             "intervals and tests claim too much.",
         ),
         (
-            "The human trials are another data set",
-            study.imported.contradicting if study.imported else (),
-            "They are no part of the published trials, and their rows say so.",
-        ),
-        (
             "Trials failed",
             [_failures(group) for group in study.played if len(group.trials) > len(group.ended)],
             "They are in no measure; the same sweep again plays them anew.",

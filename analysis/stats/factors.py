@@ -94,25 +94,19 @@ def difference_of_medians(study: Study, metric: Metric, level: Level, first: Lev
 
 
 def balance(levels: list[Level]) -> str:
-    """Whether all levels of a factor have the same cells, equally often; else which they lack."""
+    """Whether all levels of a factor have the same cells, equally often."""
     found = {level.name: level.cells for level in levels}
-    every = sorted({cell for cells in found.values() for cell in cells})
-    lacking = {name: [cell for cell in every if cell not in cells] for name, cells in found.items()}
-    if any(lacking.values()):
-        said = (
-            f"{name} lacks {len(cells)} of {len(every)} cells ({_shown(cells)})"
-            for name, cells in lacking.items()
-            if cells
-        )
-        return f"not balanced, so that values over all trials are confounded: {'; '.join(said)}"
-    if any(len({cells[cell] for cells in found.values()}) > 1 for cell in every):
-        return (
-            f"every level has all {len(every)} cells, but not equally many trials in each, so that "
-            "values over all trials weigh these differently"
-        )
-    return f"balanced: every level has the same {len(every)} cells equally often"
-
-
-def _shown(cells: list[Cell], most: int = 3) -> str:
-    more = f" and {len(cells) - most} more" if len(cells) > most else ""
-    return "; ".join(" ".join(cell) for cell in cells[:most]) + more
+    every = set().union(*found.values())
+    lacking = [
+        f"{name} lacks {len(every) - len(cells)} of {len(every)} cells"
+        for name, cells in found.items()
+        if len(cells) < len(every)
+    ]
+    if lacking:
+        return f"not balanced, so that values over all trials are confounded: {'; '.join(lacking)}"
+    often = (
+        "equally often"
+        if len({tuple(sorted(c.items())) for c in found.values()}) == 1
+        else ("but not equally often, so that values over all trials weigh these differently")
+    )
+    return f"every level has the same {len(every)} cells, {often}"

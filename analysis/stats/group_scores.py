@@ -87,17 +87,6 @@ def total(judged: dict[str, Verdict]) -> str | None:
     return f"{sum(known)} of {len(known)}" if known else None
 
 
-def unjudged(found: Score, *names: str) -> dict[str, tuple[list[str], list[str]]]:
-    """Why some of these indicators have no verdict: which, and by which rules."""
-    reasons: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
-    for name in names:
-        for rule, judged in found.rules.items():
-            if judged[name].passed is None and (why := judged[name].why):
-                indicators, rules = reasons.setdefault(why, ({}, {}))
-                indicators[name] = rules[rule] = None
-    return {why: (list(which), list(rules)) for why, (which, rules) in reasons.items()}
-
-
 @cache
 def score(study: Study, group: Group) -> Score:
     """Judge a group's indicators."""

@@ -95,11 +95,8 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
         _compared(study, alike, measure, robust.get(SLOPES.get(measure.name, "")))
         for measure in MEASURES.values()
     ]
-    tested = [one.difference.p for one in found if one.difference]
-    holm = iter(corrected(tested)[0] if tested else ())
-    return tuple(
-        replace(one, p_holm=float(next(holm)) if one.difference else None) for one in found
-    )
+    holm = iter(corrected([one.difference.p for one in found if one.difference]))
+    return tuple(replace(one, p_holm=next(holm) if one.difference else None) for one in found)
 
 
 @cache

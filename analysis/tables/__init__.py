@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from merge_runner.errors import unknown_name
 from merge_runner_analysis.data.derived_cache import (
@@ -15,7 +15,7 @@ from merge_runner_analysis.data.derived_cache import (
     options_text,
     present_state,
 )
-from merge_runner_analysis.tables.formats import value_names, value_rows
+from merge_runner_analysis.tables.formats import value_rows
 from merge_runner_analysis.tables.model import Row, Table, Value, from_text, to_text
 
 if TYPE_CHECKING:
@@ -62,11 +62,11 @@ TABLES = {
     "ablation-quantitative": Listed(
         "measures", "Quantitative measures across prompt ablations", "Table VII"
     ),
-    "contrasts": Listed("contrasts", "Differences between prompts"),
+    "contrasts": Listed("differences", "Differences between prompts"),
     "factors": Listed(
-        "factors", "Each factor's levels: every metric, and the difference from the reference"
+        "differences", "Each factor's levels: every metric, and the difference from the reference"
     ),
-    "velocity-profiles": Listed("profiles", "Piecewise-linear velocity profiles (I5)"),
+    "velocity-profiles": Listed("indicators", "Piecewise-linear velocity profiles (I5)"),
     "criticality": Listed(
         "measures", "When conflicts are resolved, and how close the vehicles come"
     ),
@@ -74,7 +74,6 @@ TABLES = {
     "first-action": Listed(
         "first_action", "Net acceleration (m/s²) at the first decision, by own relative velocity"
     ),
-    "words": Listed("words", "Words and deeds: what follows M (merge first) and Y (yield)"),
 }
 # The table that also has drivers that were only asked.
 OF_ASKED = "first-action"
@@ -104,35 +103,29 @@ def _named(table: Table, group: Group) -> dict[str, Value]:
 
 def finished_tables(
     db: Path,
-    models: Sequence[str] | None,
     names: Sequence[str] = (),
     study: Study | None = None,
-    where: Mapping[str, Sequence[str]] | None = None,
-    file: str | None = None,
-    by: str | None = None,
-    *,
-    without_fallbacks: bool = False,
+    options: Mapping[str, Any] | None = None,
 ) -> list[Table]:
-    """The named tables of a database, or all: read from it where stored, else computed.
+    """The named tables of a database, or all: read where they are kept, else computed.
 
-    ``study`` stands in the place of the options of one, if the caller already has it. Raises
-    UsageError for an unknown name.
+    ``options`` are those of a Study; ``study`` stands in their place, if the caller already has it.
+    Raises UsageError for an unknown name.
     """
-    wanted = _valid(names)
-    chosen = (db, models, where, file, by, without_fallbacks)
-    options = study.options if study else options_text(*chosen)
+    wanted, options = _valid(names), options or {}
+    chosen = study.options if study else options_text(db, **options)
     state = study.state if study else present_state(db)
-    kept = finished(db, state, options, wanted)
+    kept = finished(db, state, chosen, wanted)
     found = {name: from_text(text) for name, text in kept.items()}
     # A name may be given twice; the table is computed once.
     missing = [name for name in dict.fromkeys(wanted) if name not in found]
     if missing:
         from merge_runner_analysis.data.study import Study
 
-        study = study or Study(*chosen)
+        study = study or Study(db, **options)
         made = dict(zip(missing, make_tables(study, missing), strict=True))
         # The state is the one before the study was read: trials stored since then outdate it.
-        keep_finished(db, study.state, options, {name: to_text(made[name]) for name in missing})
+        keep_finished(db, study.state, chosen, {name: to_text(made[name]) for name in missing})
         found |= made
     return [found[name] for name in wanted]
 
@@ -149,14 +142,8 @@ def table(study: Study | Path | str, name: str) -> pd.DataFrame:
     read = study if isinstance(study, Study) else Study(study)
     (made,) = make_tables(read, [name])
     frame = pd.DataFrame(value_rows(made)).set_index("row")
-    numbers = (
-        name
-        for column in made.columns
-        if column.kind in {"count", "number", "percent", "p", "interval"}
-        for name in value_names(column)
-    )
-    # Where all are missing pandas cannot tell; a published p may be the text <0.001.
-    missing = [name for name in numbers if frame[name].isna().all()]
+    # Of a column without a value pandas cannot tell the type.
+    missing = [name for name in frame if frame[name].isna().all()]
     return frame.astype(dict.fromkeys(missing, "float64"))
 
 

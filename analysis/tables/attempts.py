@@ -48,12 +48,9 @@ def attempts(study: Study) -> Table:
             for group, counts in found.items()
         ],
         (
-            "a call is asked at one decision, in one or more attempts; retried: another attempt "
-            "followed, of all attempts; lost: the call ended without an answer, and its trial "
-            "failed, of all calls; refused, truncated, empty and invalid: of the answers; "
-            "fallback: an older plan was driven, or none, of all decisions",
-            "unknown: attempts that were under way when a run was killed, whose reply nobody saw; "
-            "other model: answers of another model than the one asked for, by no declared alias",
+            "a call is asked at one decision, in one or more attempts; retried is of all attempts, "
+            "lost of the calls, fallback of all decisions, any other share of the answers; "
+            "unknown: attempts that were under way when a run was killed",
         ),
     )
 

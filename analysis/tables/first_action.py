@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -23,10 +22,11 @@ from merge_runner_analysis.stats.intervals import Estimate
 from merge_runner_analysis.tables.model import (
     ENDED,
     GROUP_COLUMNS,
-    Column,
+    Optional,
     Row,
     Table,
     Value,
+    interval,
     row_of,
 )
 
@@ -46,23 +46,19 @@ ONLY_ASKED = (
 # By the sign of the own relative velocity.
 VELOCITIES = {-1: "slower", 0: "equal", 1: "faster"}
 COLUMNS = (
-    Column("n", "n", "count", 0, "first actions: two a trial, one of a mixed pair"),
+    Optional("n", "n", "count", 0, "first actions: two a trial, one of a mixed pair"),
     *(
-        Column(f"mean_{name}", name, "number", 3, f"mean first action (m/s²), {meaning}")
-        for name, meaning in (
-            ("slower", "where the own vehicle is slower"),
-            ("equal", "at equal velocities"),
-            ("faster", "where the own vehicle is faster"),
-        )
+        Optional(f"mean_{name}", name, "number", 3, f"mean (m/s²) where the own velocity is {name}")
+        for name in VELOCITIES.values()
     ),
-    Column("brake_percent", "brake (%)", "percent", 1, f"below -{HOLD_MPS2} m/s²"),
-    Column("hold_percent", "hold (%)", "percent", 1, f"within {HOLD_MPS2} m/s² of 0"),
-    Column("go_percent", "go (%)", "percent", 1, f"above {HOLD_MPS2} m/s²"),
-    Column("slope", "slope", "number", 3, "on own relative velocity, m/s² per m/s"),
-    Column("slope_se", "SE", "number", 3, "of the slope, clustered by trial"),
-    Column("slope_ci", "95 % CI", "interval", 3, "of the slope"),
-    Column("exchange_rate", "exchange rate", "number", 2, "m of headway that are worth 1 m/s"),
-    Column("exchange_rate_ci", "95 % CI", "interval", 2, "of the rate, by the delta method"),
+    Optional("brake_percent", "brake (%)", "percent", 1, f"below -{HOLD_MPS2} m/s²"),
+    Optional("hold_percent", "hold (%)", "percent", 1, f"within {HOLD_MPS2} m/s² of 0"),
+    Optional("go_percent", "go (%)", "percent", 1, f"above {HOLD_MPS2} m/s²"),
+    Optional("slope", "slope", "number", 3, "on own relative velocity, m/s² per m/s"),
+    Optional("slope_se", "SE", "number", 3, "of the slope, clustered by trial"),
+    interval("slope_ci", "of the slope", 3),
+    Optional("exchange_rate", "exchange rate", "number", 2, "m of headway that are worth 1 m/s"),
+    interval("exchange_rate_ci", "of the rate, by the delta method"),
 )
 
 
@@ -71,7 +67,7 @@ def first_action(study: Study) -> Table:
     groups = (*study.groups, *study.asked)
     return Table(
         "first-action",
-        (*GROUP_COLUMNS, *(replace(one, optional=True) for one in COLUMNS)),
+        (*GROUP_COLUMNS, *COLUMNS),
         [row for group in groups for row in _rows(study, group)],
         (
             "the first action is the net acceleration of the first step under control, drag "
@@ -150,9 +146,5 @@ def _published_slope() -> pd.Series:
 def _human_notes(study: Study) -> Iterator[str]:
     if study.human not in study.groups:
         return
-    known = _published_slope()
-    yield (
-        f"human: slope {known['value']} [{known['low']}, {known['high']}] as published: "
-        f"{known['caution']}"
-    )
+    yield f"human: slope as published: {_published_slope()['caution']}"
     yield f"human: exchange rate: {citation('human_outcomes')}"

@@ -20,6 +20,26 @@ from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
 MISSING = "–"
 BETWEEN = "   "
+LATEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "–": "--",
+        "≠": r"$\neq$",
+        "≥": r"$\geq$",
+        "≤": r"$\leq$",
+        "±": r"$\pm$",
+        "Δ": r"$\Delta$",
+        "²": r"$^2$",
+        "✓": r"\checkmark{}",
+        "✗": r"\textbf{X}",
+        "<": "$<$",
+        ">": "$>$",
+        "|": "$|$",
+        "^": r"\textasciicircum{}",
+        "~": r"\textasciitilde{}",
+        **{character: f"\\{character}" for character in "&%$#_{}"},
+    }
+)
 
 
 def render(tables: Sequence[Table], form: TableFormat, width: int | None = None) -> str:
@@ -45,21 +65,16 @@ def with_columns(tables: Sequence[Table], names: Sequence[str]) -> list[Table]:
         if name not in known:
             raise unknown_name("column", name, known)
     return [
-        replace(
-            table,
-            columns=[
-                column
-                for place, column in enumerate(table.columns)
-                if column.name in names or place < leading(table.columns)
-            ],
-        )
+        replace(table, columns=[*first, *(c for c in rest if c.name in names)])
         for table in tables
+        for first, rest in [_parted(table.columns)]
     ]
 
 
-def leading(columns: Sequence[Column]) -> int:
-    """How many columns at the left name a row."""
-    return sum(1 for _ in takewhile(lambda column: column.kind == "text", columns))
+def _parted(columns: Sequence[Column]) -> tuple[Sequence[Column], Sequence[Column]]:
+    """The columns at the left, which name a row, and the others."""
+    names = sum(1 for _ in takewhile(lambda column: column.kind == "text", columns))
+    return columns[:names], columns[names:]
 
 
 def as_text(table: Table, width: int | None = None) -> str:
@@ -70,30 +85,29 @@ def as_text(table: Table, width: int | None = None) -> str:
     # Characters differ in width on a terminal, so len() would misalign the columns.
     from rich.cells import cell_len
 
-    shown = shown_columns(table)
-    columns = []
-    for column, *cells in zip(shown, *_grid(table), strict=True):
-        widest = max(map(cell_len, cells))
-        blanks = [" " * (widest - cell_len(cell)) for cell in cells]
-        left = column.kind == "text"
-        columns.append(
-            [c + b if left else b + c for c, b in zip(cells, blanks, strict=True)],
-        )
-    notes = notes_of(table)
+    columns, grid, notes = shown_columns(table), _grid(table), notes_of(table)
+    widths = [max(map(cell_len, cells)) for cells in zip(*grid, strict=True)]
     if width is not None:
-        ends = accumulate(cell_len(cells[0]) + len(BETWEEN) for cells in columns)
+        ends = accumulate(one + len(BETWEEN) for one in widths)
         fitting = max(sum(end - len(BETWEEN) <= width for end in ends), 1)
-        if left_out := [column.name for column in shown[fitting:]]:
+        if left_out := [column.name for column in columns[fitting:]]:
             notes.insert(
                 0,
                 f"wider than the terminal, so without {', '.join(left_out)}: --columns NAME,NAME "
                 "chooses, --format csv has all",
             )
-        columns = columns[:fitting]
-    lines = [BETWEEN.join(cells) for cells in zip(*columns, strict=True)]
+        columns, widths = columns[:fitting], widths[:fitting]
+    lines = []
+    for cells in grid if columns else ():
+        blanks = (" " * (one - cell_len(cell)) for one, cell in zip(widths, cells, strict=False))
+        texts = (
+            cell + blank if column.kind == "text" else blank + cell
+            for column, cell, blank in zip(columns, cells, blanks, strict=False)
+        )
+        lines.append(BETWEEN.join(texts))
     lines[1:1] = ["─" * max(map(cell_len, lines))] if lines else []
-    texts = (_wrapped(f"  {note}", width) for note in notes)
-    return "\n".join([_wrapped(table.heading, width), *(line.rstrip() for line in lines), *texts])
+    wrapped = (_wrapped(f"  {note}", width) for note in notes)
+    return "\n".join([_wrapped(table.heading, width), *(line.rstrip() for line in lines), *wrapped])
 
 
 def _grid(table: Table) -> list[list[str]]:
@@ -116,7 +130,11 @@ def as_csv(table: Table) -> str:
     names = [name for column in table.columns for name in value_names(column)]
     writer.writerow(["row", *names, "note"])
     for row in value_rows(table):
-        writer.writerow(_exact(value) for value in row.values())
+        # repr is the shortest text that reads back as the same float; float() strips NumPy's type.
+        writer.writerow(
+            repr(float(cell)) if isinstance(cell, float) else in_spreadsheet(cell)
+            for cell in row.values()
+        )
     return out.getvalue().rstrip("\n")
 
 
@@ -135,20 +153,24 @@ def as_json(table: Table) -> dict[str, object]:
     }
 
 
+def value_names(column: Column) -> tuple[str, ...]:
+    """The names of the values of a column: those of an interval are two."""
+    if column.kind == "interval":
+        return f"{column.name}_low", f"{column.name}_high"
+    return (column.name,)
+
+
 def value_rows(table: Table) -> list[dict[str, Value]]:
     """Each row's id, values and note; an interval becomes two values."""
-    return [
-        {
-            "row": row.id,
-            **{
-                name: cell
-                for column in table.columns
-                for name, cell in zip(value_names(column), _plain(column, row), strict=True)
-            },
-            "note": row.note,
-        }
-        for row in table.rows
-    ]
+    rows = []
+    for row in table.rows:
+        cells: dict[str, Value] = {"row": row.id}
+        for column in table.columns:
+            names, value = value_names(column), row.values.get(column.name)
+            every = value if isinstance(value, tuple) else (value,) * len(names)
+            cells |= dict(zip(names, every, strict=True))
+        rows.append(cells | {"note": row.note})
+    return rows
 
 
 def as_markdown(table: Table) -> str:
@@ -162,22 +184,31 @@ def as_markdown(table: Table) -> str:
 
 def as_latex(table: Table) -> str:
     r"""A table for the paper: needs the packages booktabs, amssymb and graphicx."""
-    shown = shown_columns(table)
-    body = [[_latex(column, row.values.get(column.name)) for column in shown] for row in table.rows]
-    form = "".join("l" if column.kind == "text" else "r" for column in shown)
-    head = " & ".join(_escaped(column.heading) for column in shown)
-    rows = "\n".join(" & ".join(cells) + r" \\" for cells in body)
-    notes = r"\\ ".join(_escaped(note) for note in notes_of(table))
+    columns = shown_columns(table)
+    form = "".join("l" if column.kind == "text" else "r" for column in columns)
+    head, *body = _grid(table)
+    numeric = [column.kind in {"p", "number", "percent", "interval"} for column in columns]
+    rows = [
+        " & ".join(
+            f"${cell}$" if number and cell != MISSING else cell.translate(LATEX)
+            for number, cell in zip(numeric, cells, strict=True)
+        )
+        + r" \\"
+        for cells in body
+    ]
+    headings = " & ".join(cell.translate(LATEX) for cell in head)
+    notes = r"\\ ".join(note.translate(LATEX) for note in notes_of(table))
+    lines = "\n".join(rows)
     return rf"""\begin{{table*}}
 \centering
-\caption{{{_escaped(table.title)}}}
+\caption{{{table.title.translate(LATEX)}}}
 \label{{tab:{table.name}}}
 \resizebox{{\ifdim\width>\linewidth\linewidth\else\width\fi}}{{!}}{{%
 \begin{{tabular}}{{{form}}}
 \toprule
-{head} \\
+{headings} \\
 \midrule
-{rows}
+{lines}
 \bottomrule
 \end{{tabular}}}}
 \\[2pt]\parbox{{\linewidth}}{{\footnotesize {notes}}}
@@ -208,72 +239,20 @@ def shown_value(column: Column, value: Value) -> str:
     if value is None:
         return "" if column.kind == "text" else MISSING
     if isinstance(value, tuple):
-        return f"[{_rounded(value[0], column.digits)}, {_rounded(value[1], column.digits)}]"
+        return f"[{', '.join(_rounded(end, column.digits) for end in value)}]"
     if isinstance(value, bool):
         return "✓" if value else "✗"
-    if column.name == "setting" and isinstance(value, str):
-        return title_of(value)
-    if column.kind == "p" and isinstance(value, float):
-        return "<0.001" if value < 0.001 else f"{value:.3f}"
-    if isinstance(value, float):
-        return _rounded(value, column.digits)
-    return str(value)
+    if column.name == "setting":
+        return title_of(str(value))
+    if column.kind == "p" and isinstance(value, float) and value < 0.001:
+        return "<0.001"
+    return _rounded(value, column.digits) if isinstance(value, float) else str(value)
 
 
 def _rounded(value: float, digits: int) -> str:
     text = f"{value:.{digits}f}"
     # A small negative value that rounds to zero would otherwise be shown as -0.00.
     return text.lstrip("-") if float(text) == 0 else text
-
-
-def _exact(cell: Value) -> object:
-    # repr is the shortest text that reads back as the same float; float() strips NumPy's type name.
-    return repr(float(cell)) if isinstance(cell, float) else in_spreadsheet(cell)
-
-
-def value_names(column: Column) -> tuple[str, ...]:
-    """The names of the values of a column: those of an interval are two."""
-    if column.kind == "interval":
-        return f"{column.name}_low", f"{column.name}_high"
-    return (column.name,)
-
-
-def _plain(column: Column, row: Row) -> tuple[Value, ...]:
-    value = row.values.get(column.name)
-    if column.kind != "interval":
-        return (value,)
-    return value if isinstance(value, tuple) else (None, None)
-
-
-def _latex(column: Column, value: Value) -> str:
-    text = shown_value(column, value)
-    if isinstance(value, bool):
-        return r"\checkmark" if value else r"\textbf{X}"
-    if column.kind in {"p", "number", "percent", "interval"} and value is not None:
-        return f"${text}$"
-    return _escaped(text)
-
-
-def _escaped(text: str) -> str:
-    special = {
-        "\\": r"\textbackslash{}",
-        "–": "--",
-        "≠": r"$\neq$",
-        "≥": r"$\geq$",
-        "≤": r"$\leq$",
-        "±": r"$\pm$",
-        "Δ": r"$\Delta$",
-        "²": r"$^2$",
-        "✓": r"\checkmark{}",
-        "✗": r"\textbf{X}",
-        "<": "$<$",
-        ">": "$>$",
-        "|": "$|$",
-        "^": r"\textasciicircum{}",
-        "~": r"\textasciitilde{}",
-        **{character: f"\\{character}" for character in "&%$#_{}"},
-    }
-    return "".join(special.get(character, character) for character in text)
 
 
 def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> dict[str, object]:
@@ -283,7 +262,7 @@ def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> di
     with each of its cells.
     """
     columns = shown_columns(table)
-    headers = leading(columns)
+    headers, _ = _parted(columns)
     return {
         "name": table.name,
         "heading": table.heading,
@@ -297,11 +276,11 @@ def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> di
                     {
                         "text": shown_value(column, row.values.get(column.name)),
                         "left": column.kind == "text",
-                        "header": place < headers,
+                        "header": column in headers,
                         "link": link(table, row, column) if _linked(row, column) else None,
                         "label": f"{column.heading} of {row.id}",
                     }
-                    for place, column in enumerate(columns)
+                    for column in columns
                 ],
             }
             for row in table.rows

@@ -1,17 +1,19 @@
-"""Tables V and VI: the indicators of human behaviour beside the human ceiling."""
+"""Tables V and VI: indicators of human behaviour beside the human ceiling; the numbers of I5."""
 
 from __future__ import annotations
 
+from merge_runner_analysis.data.intermittency import RANDOM_SECONDS, STEADY_MPS, random_gain
+from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
-from merge_runner_analysis.stats.group_scores import Score, score, total, unjudged
+from merge_runner_analysis.stats.group_scores import Score, score, total
 from merge_runner_analysis.stats.indicators import (
     INDICATORS,
     TESTED,
     disagree,
 )
 from merge_runner_analysis.stats.intervals import Estimate
-from merge_runner_analysis.stats.likeness import gains, mean_gain
+from merge_runner_analysis.stats.likeness import NO_ACTION, gains, held, less_humans, mean_gain
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
 from merge_runner_analysis.tables.measures import measured
@@ -27,10 +29,21 @@ from merge_runner_analysis.tables.model import (
     interval,
     row_of,
 )
-from merge_runner_analysis.tables.notes import CEILING, GAIN
 
 # The indicators that rest on who merged first.
 OF_OUTCOMES = ("I1", "I2")
+CEILING = (
+    "humans pass: share of 1000 human data sets with as many trials in each condition as the row "
+    "has on average; outcomes from the published counts, gaps from the published regression with "
+    f"residuals of SD {HUMAN_GAP_SD_M} m; at the score: I1 to I4 together. So often a perfect copy "
+    "of the humans passes"
+)
+GAIN = (
+    "I5: piecewise-constant acceleration, by the gain of straight lines over cubics in the speeds "
+    "under control, BIC per sample at 5 Hz; above 0 accelerations are held and jump, below 0 they "
+    "move. Robust: the 95 % interval of the mean gain lies above 0. Vehicles that took no action "
+    "do not count"
+)
 RESAMPLED = "share of resampled human data sets of this size that pass"
 NOTES = (
     "✓ by the paper's rule: signs and p < .05 of Wald tests; robust: likelihood-ratio tests of "
@@ -181,20 +194,12 @@ def _ceilings(found: Score, name: str) -> dict[str, Value]:
 
 def _verdict_note(found: Score, *names: str) -> str:
     """Why a verdict is missing, or what it rests on if not on a test."""
-    known: dict[str, dict[str, None]] = {}
-    for name in names:
-        for judged in found.rules.values():
-            if judged[name].why and judged[name].passed is not None:
-                known.setdefault(judged[name].why, {})[name] = None
-    return "; ".join(
-        [
-            *(f"{', '.join(which)} {why}" for why, which in known.items()),
-            *(
-                f"{', '.join(which)} cannot be judged {' or '.join(rules)}: {why}"
-                for why, (which, rules) in unjudged(found, *names).items()
-            ),
-        ]
-    )
+    reasons: dict[str, list[str]] = {}
+    for rule, judged in found.rules.items():
+        for name in names:
+            if why := judged[name].why:
+                reasons.setdefault(f"{rule}: {why}", []).append(name)
+    return "; ".join(f"{', '.join(which)} {why}" for why, which in reasons.items())
 
 
 def no_ceiling(group: Group) -> str:
@@ -205,3 +210,49 @@ def no_ceiling(group: Group) -> str:
         return "not all conditions of the humans were played: no ceiling"
     played = len(group.ended_outcomes)
     return f"{'no human drove its conditions' if played else 'no trial ended'}: no ceiling"
+
+
+def velocity_profiles(study: Study) -> Table:
+    """A row per group: how far accelerations are held, compared with humans."""
+    return Table(
+        "velocity-profiles",
+        (
+            *GROUP_COLUMNS,
+            Column("n", "n", "count", 0, "finished trials"),
+            Column("no_action", "no action", "count", 0, "trials in which no vehicle acted"),
+            Column("gain", "gain", "number", 2, "mean gain of lines over cubics (I5)"),
+            interval("gain_ci", "t, of humans over pairs"),
+            Column("held_percent", "held (%)", "percent", 1, "trials with a gain above 0"),
+            Optional("clocked_gain", "gain at 1 Hz", "number", 2, "one acceleration a second"),
+            Optional("difference_sd", "- humans (SD)", "number", 2, "within conditions"),
+            interval("difference_sd_ci", "Welch, by pair"),
+        ),
+        [_profile_row(study, group) for group in study.groups],
+        (
+            f"{GAIN}: those that stay within {STEADY_MPS} m/s, with or without the simulator's "
+            "resistance",
+            "gain at 1 Hz: of the same speeds with one acceleration from each full second to the "
+            "next, as any driver has that decides once a second and holds. Accelerations that are "
+            f"drawn by chance each second have {random_gain():.2f}, on average over "
+            f"{RANDOM_SECONDS} s: so much the clock alone can make",
+            "the difference from the humans, in human SD, is no part of I5, and needs human traces "
+            "of every condition",
+        ),
+    )
+
+
+def _profile_row(study: Study, group: Group) -> Row:
+    values: dict[str, Value] = {"n": len(group.finished)}
+    if not group.measured:
+        return row_of(group, values, "no human traces are imported")
+    gain, share = mean_gain(study, group), held(study, group)
+    values |= {
+        "no_action": int(gains(study, group)["steady"].sum()),
+        "gain": gain.value,
+        "gain_ci": gain.bounds(),
+        "clocked_gain": mean_gain(study, group, "clocked_gain").value,
+        "held_percent": None if share.value is None else 100 * share.value,
+    }
+    if found := less_humans(study, group):
+        values |= {"difference_sd": found.value, "difference_sd_ci": found.bounds()}
+    return row_of(group, values, "" if share.n else NO_ACTION)

@@ -5,12 +5,13 @@ The output formats and ``explain`` read nothing else.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from math import isnan
 from typing import TYPE_CHECKING, Literal
+
+from pydantic import TypeAdapter
 
 if TYPE_CHECKING:
     from merge_runner_analysis.data.study import Group
@@ -112,27 +113,14 @@ class Table:
         return f"{self.number}. {self.title}" if self.number else self.title
 
 
+AS_JSON = TypeAdapter(Table)
+
+
 def to_text(table: Table) -> str:
     """A table as JSON text, which ``from_text`` turns back into an equal table."""
-    return json.dumps(asdict(table), ensure_ascii=False)
+    return AS_JSON.dump_json(table).decode()
 
 
 def from_text(text: str) -> Table:
     """The table that ``to_text`` wrote."""
-    content = json.loads(text)
-    # JSON has no tuples: without these conversions the table would not equal the original.
-    rows = [
-        Row(
-            **row
-            | {
-                "groups": tuple(row["groups"]),
-                "values": {
-                    name: tuple(value) if isinstance(value, list) else value
-                    for name, value in row["values"].items()
-                },
-            }
-        )
-        for row in content["rows"]
-    ]
-    columns = tuple(Column(**column) for column in content["columns"])
-    return Table(**content | {"columns": columns, "rows": rows, "notes": tuple(content["notes"])})
+    return AS_JSON.validate_json(text)

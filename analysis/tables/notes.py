@@ -8,22 +8,10 @@ from dataclasses import replace
 import pandas as pd
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import HUMAN_DOI, HUMAN_GAP_SD_M, HUMAN_TRIALS
+from merge_runner_analysis.data.reference_data import HUMAN_DOI, HUMAN_TRIALS
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.tables.model import Table
 
-CEILING = (
-    "humans pass: share of 1000 human data sets with as many trials in each condition as the row "
-    "has on average; outcomes from the published counts, gaps from the published regression with "
-    f"residuals of SD {HUMAN_GAP_SD_M} m; at the score: I1 to I4 together. So often a perfect copy "
-    "of the humans passes"
-)
-GAIN = (
-    "I5: piecewise-constant acceleration, by the gain of straight lines over cubics in the speeds "
-    "under control, BIC per sample at 5 Hz; above 0 accelerations are held and jump, below 0 they "
-    "move. Robust: the 95 % interval of the mean gain lies above 0. Vehicles that took no action "
-    "do not count"
-)
 # Tables whose intervals and tests take imported human trials as independent.
 POOLING = {
     "who-first", "gap", "indicators", "ablation-qualitative", "ablation-quantitative",

@@ -23,7 +23,7 @@ from merge_runner_analysis.data.reference_data import PAIRS, published
 from merge_runner_analysis.explorer.export import export_folder
 from merge_runner_analysis.human.archive import open_files
 from merge_runner_analysis.human.load import import_trials, sort_files
-from merge_runner_analysis.report.writer import write_report
+from merge_runner_analysis.report.page import write_report
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import Drive, Said, as_humans, write_study, yielding
 

@@ -212,13 +212,12 @@ def test_the_notes_say_which_cells_a_level_lacks(study):
     assert note.startswith(
         "model: not balanced, so that values over all trials are confounded: dear lacks 6 "
     )
-    assert "(L_4_0 prompt=baseline opponent=sleepy temperature=0.2; " in note
     tested = {
         row.values["factor"]: row.values.get("p") for row in table.rows if row.values.get("p")
     }
     assert {*tested} == {"temperature"}
     assert value(table, "model=dear/gap_m", "difference_ci")
-    assert any(note.startswith("temperature: balanced: every level") for note in table.notes)
+    assert any(note.startswith("temperature: every level has the same") for note in table.notes)
 
 
 def test_means_are_compared_within_the_cells_that_both_levels_have(study):

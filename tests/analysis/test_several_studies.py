@@ -14,7 +14,7 @@ from merge_runner.errors import UsageError
 from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.report.design import design
+from merge_runner_analysis.report.page import design
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import changed
 

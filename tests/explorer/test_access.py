@@ -61,7 +61,7 @@ def test_a_page_fits_its_window_and_axe_finds_nothing_serious(page, address):
 
 @pytest.mark.long
 def test_exported_pages_fit_and_axe_finds_nothing_serious(page, exported):
-    one = ("index", "trials", "trials-emulator-baseline-N_0_0-rep01", "conditions-N_0_0", "notes",
+    one = ("index", "trials", "trials-emulator-baseline-N_0_0-rep01", "notes",
            "sweeps", "tables", "tables-attempts", "prompts", "glossary")  # fmt: skip
     for path in sorted(exported.rglob("*.html")):
         if path.stem not in one:
@@ -83,3 +83,18 @@ def test_the_dialog_of_a_page_has_its_words_and_leads_to_all(page):
         assert serious(page) == []
     page.get_by_role("link", name="All words").click()
     expect(page.locator("#main dt", has_text="tunnel")).to_be_visible()
+
+
+@pytest.mark.long
+def test_a_theme_is_chosen_and_kept(page):
+    page.emulate_media(color_scheme="light")
+    page.goto("/glossary")
+    paper = "getComputedStyle(document.body).backgroundColor"
+    light = page.evaluate(paper)
+    page.locator("#theme").select_option("dark")
+    dark = page.evaluate(paper)
+    assert dark != light
+    page.goto("/notes")
+    assert page.evaluate(paper) == dark
+    page.locator("#theme").select_option("")
+    assert page.evaluate(paper) == light

@@ -96,8 +96,8 @@ def test_what_is_offered_to_all_of_a_condition_is_what_is_offered_to_each(db, cl
 
 def test_all_words_of_a_search_count_and_the_own_trial_is_not_found(client):
     found = ask(client, "o3/baseline/N_0_0/rep01", q="O3 rep01")
-    assert [one["name"] for one in found["found"]] == ["o3/A1/N_0_0/rep01"]
-    assert ask(client, "o3/baseline/N_0_0/rep01", q="nobody has this") == {"found": [], "more": 0}
+    assert [one["key"] for one in found["found"]] == ["o3/A1/N_0_0/rep01"]
+    assert ask(client, "o3/baseline/N_0_0/rep01", q="nobody has this") == {"found": []}
 
 
 def test_an_offer_that_is_unknown_names_the_others(client):

@@ -200,7 +200,7 @@ def test_a_page_of_few_trials_lists_them_and_lays_them_beside_each_other(page, s
     page.locator("a.decision").nth(1).click()
     expect(page.locator(".decision-panel .block").first).to_contain_text("You drive a car")
     page.locator("#compare").fill("rep03")
-    page.locator("#others button").click()
+    page.keyboard.press("Enter")
     expect(page.locator("#ghost-key")).to_contain_text("dashed: emulator, baseline, N_0_0, rep 3")
     page.keyboard.press("Escape")
     expect(page.locator("#decision .decision-panel h2")).to_have_count(4)

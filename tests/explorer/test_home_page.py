@@ -16,10 +16,9 @@ from merge_runner.errors import UsageError
 from merge_runner.results.store import results_digest
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.assets import STATIC, STYLES
 from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.pages.home import home_page
-from merge_runner_analysis.explorer.site import NothingNew, Site
+from merge_runner_analysis.explorer.site import STATIC, STYLES, NothingNew, Site
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import MAKERS
 from merge_runner_analysis.table_format import TableFormat

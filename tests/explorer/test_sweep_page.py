@@ -112,7 +112,7 @@ def test_a_run_says_how_long_it_lasted(study):
 def share(name, count, of, things):
     """A row of the page, as text."""
     part = f" ({100 * count / of:.1f} %)" if count else ""
-    return f"{name} {count} of {of}{part} {things}"
+    return f"{name} {count:,} of {of:,}{part} {things}"
 
 
 def test_the_page_has_the_numbers_of_the_database(written):
@@ -232,7 +232,7 @@ def test_while_it_runs_its_totals_are_its_progress_file_s_and_the_cells_those_st
 @pytest.mark.parametrize(
     ("code", "ended", "failed", "kind", "words", "goes_on"),
     [
-        (0, 33, 0, "finished", "Finished: all 33 trials ended, and the audit found nothing.", 0),
+        (0, 33, 0, "finished", "Finished: all 33 trials ended, and no problems were found.", 0),
         (0, 30, 0, "stopped", "holds only 30 of its 33 trials", 0),
         (None, 30, 0, "stopped", "Stopped without a word", 1),
         (130, 30, 0, "stopped", "Stopped: it was interrupted (Ctrl-C). 30 of 33 trials", 1),

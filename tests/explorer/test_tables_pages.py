@@ -22,6 +22,7 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.explorer import computing as worker
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.computing import Computing, Numbers, Worker
+from merge_runner_analysis.explorer.display_text import with_minus
 from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import printed
@@ -254,8 +255,8 @@ def test_the_page_of_prompts_has_the_differences_of_the_table(ask, db):
     shown = [row for row in contrasts.rows if row.values["difference"] is not None]
     assert shown
     for row in shown:
-        told = printed(contrasts, row)
-        assert f"{told['difference']}</a> <small>{told['ci']}, Holm {told['p_holm']}" in text
+        told = {name: with_minus(value) for name, value in printed(contrasts, row).items()}
+        assert f"{told['difference']}</a>\n<small>{told['ci']}, Holm {told['p_holm']}" in text
     assert "/discordant?model=o3&amp;variant=A1" in text
 
 

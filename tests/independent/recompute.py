@@ -374,6 +374,5 @@ def correct(rows: dict[str, dict]) -> None:
         if "family" in row:
             families.setdefault(row["family"], []).append(row)
     for family in families.values():
-        found = statistics.corrections([row["p"] for row in family])
-        for row, holm, bh in zip(family, *found, strict=True):
-            row |= {"p_holm": holm, "p_bh": bh}
+        for row, p in zip(family, statistics.holm([row["p"] for row in family]), strict=True):
+            row["p_holm"] = p

@@ -290,13 +290,9 @@ def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
     }
 
 
-def corrections(p: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """A family's p by Holm (1979) and by Benjamini and Hochberg (1995)."""
+def holm(p: list[float]) -> np.ndarray:
+    """A family's p by Holm (1979)."""
     p, m = np.array(p), len(p)
-    order = np.argsort(p, kind="stable")
-    holm, bh = np.empty(m), np.empty(m)
-    holm[order] = np.minimum(np.maximum.accumulate(p[order] * (m - np.arange(m))), 1)
-    bh[order] = np.minimum(
-        np.minimum.accumulate((p[order] * m / np.arange(1, m + 1))[::-1])[::-1], 1
-    )
-    return holm, bh
+    order, found = np.argsort(p, kind="stable"), np.empty(len(p))
+    found[order] = np.minimum(np.maximum.accumulate(p[order] * (m - np.arange(m))), 1)
+    return found

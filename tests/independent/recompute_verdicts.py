@@ -48,7 +48,7 @@ def rows(trials: pd.DataFrame, humans: dict, indicators) -> dict[str, dict]:
             apart = statistics.difference(*parts)
         found[name] = _beside(own, other, apart)
     tested = [row for row in found.values() if row["p"] is not None]
-    corrected = statistics.corrections([row["p"] for row in tested])[0] if tested else ()
+    corrected = statistics.holm([row["p"] for row in tested]) if tested else ()
     for row, p in zip(tested, corrected, strict=True):
         row["p_holm"] = p
     for name, row in found.items():

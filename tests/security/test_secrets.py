@@ -10,7 +10,7 @@ import duckdb
 import pytest
 from aiohttp import web
 
-from merge_runner_analysis.report.writer import write_report
+from merge_runner_analysis.report.page import write_report
 from tests.harness import FAST, watched
 
 KEYS = {

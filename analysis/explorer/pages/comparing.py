@@ -119,26 +119,20 @@ def key_of(site: Site, at: At) -> str:
 
 
 def searched(site: Site, row: Row, text: str) -> dict[str, Any]:
-    """The first trials that have all words of a text, and how many more; those alike come first."""
+    """The first trials that have all words of a text; those of the same condition come first."""
     words = text.lower().split()
     fits = "".join(f" AND contains({WORDS}, ?)" for _ in words)
     found = site.catalogue.ask(
-        "SELECT key, trial_id, outcome, stand_in, count(*) OVER () AS every "  # noqa: S608 # constants
-        f"FROM {NAMED} WHERE (trial_id, spec_hash) <> (?, ?){fits} "
+        f"SELECT key, outcome, stand_in FROM {NAMED} "  # noqa: S608 # constants
+        f"WHERE (trial_id, spec_hash) <> (?, ?){fits} "
         f"ORDER BY condition <> ?, trial_id, spec_hash LIMIT {FOUND}",
         *(row["trial_id"], row["spec_hash"], *words, row["condition"]),
     )
     return {
         "found": [
-            {
-                "key": one["key"],
-                "name": visible(one["trial_id"]),
-                "outcome": one["outcome"],
-                "note": visible(one["stand_in"] or ""),
-            }
+            {"key": one["key"], "outcome": one["outcome"], "note": visible(one["stand_in"] or "")}
             for one in found
-        ],
-        "more": found[0]["every"] - len(found) if found else 0,
+        ]
     }
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner_analysis.data.reference_data import human_counts
-from merge_runner_analysis.data.studies import DESCRIPTIONS
 from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.conditions import ordered
 from merge_runner_analysis.explorer.marks import Cell, band, cells
@@ -16,7 +15,7 @@ from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.scope import Bar, Scope, carried, scope_of, unmarked
 from merge_runner_analysis.explorer.site import Site, news_of
 from merge_runner_analysis.explorer.sweeps import standing_of
-from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.names import DESCRIPTIONS, HUMAN
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.verdict_words import (
     HUMANS,
@@ -106,8 +105,8 @@ def verdicts_of(
     """The table of verdicts of a scope, once it is computed."""
     part = scope.sweep, scope.condition
     found, table = computed_table(site, TABLE, asked, *part)
-    running = any(entry.followed for entry, _ in standing_of(site.catalogue))
-    if table and found.older and not running:  # else a new one would soon be old again
+    # While a run goes on, a new one would soon be old again.
+    if table and found.older and not any(run.followed for run, _ in standing_of(site.catalogue)):
         found, table = computed_table(site, TABLE, {**asked, "anew": "1"}, *part)
     return found, table
 

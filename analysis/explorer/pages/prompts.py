@@ -86,7 +86,8 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         verdicts=verdicts,
         measures=MEASURES,
         human=humans_of(verdicts),
-        slopes=_with_several_prompts(driven),
+        kinds=_with_several_prompts(driven),
+        headings={},
     )
 
 

@@ -12,13 +12,12 @@ from merge_runner.records import SIDES
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.accounts.account import Account
 from merge_runner_analysis.explorer import views
-from merge_runner_analysis.explorer.assets import REPLAY
 from merge_runner_analysis.explorer.details import Trial, read_trial
 from merge_runner_analysis.explorer.display_text import clamped, shortened
 from merge_runner_analysis.explorer.pictures import step_points
 from merge_runner_analysis.explorer.prompts import parts_of
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.explorer.site import REPLAY, NotThere, Site
 from merge_runner_analysis.explorer.urls import whole
 
 # What is offered to lay beside a trial, and by what rule.
@@ -115,6 +114,7 @@ def decision_panel(site: Site, row: Row, trial: Trial, decision: Row) -> Markup:
     panel = site.render(
         "_decision.html",
         d=decision,
+        driver=row[f"model_{decision['side']}"],
         clamped=clamped,
         went_on=views.older_plan(trial, decision) if decision["fallback"] else "",
         before=before,

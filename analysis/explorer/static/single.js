@@ -1,14 +1,12 @@
 "use strict";
 // A page without a server that holds several trials, each in a template: the address names the one shown.
 (() => {
-  const FOUND = 12;
   const held = [...document.querySelectorAll("template.held")];
   const find = (trial, spec) => held.find(({ dataset }) => dataset.trial === trial && (!spec || dataset.spec === spec));
   // An address names a trial by its name alone, or as NAME@SPEC.
   const named = (key) => find(key) ?? find(...key.split(/@(?=[^@]*$)/));
-  const asked = new URL(location.href).searchParams,
-    name = asked.get("trial");
-  const chosen = find(name, asked.get("spec")) ?? find(name) ?? held[0];
+  const shown = (href, asked = new URL(href).searchParams) => find(asked.get("trial"), asked.get("spec"));
+  const chosen = shown(location.href) ?? held[0];
   window.explorer = {
     panel: async (link, other) => replay.held(link, (other?.held ?? chosen).content),
     data: async (key) => {
@@ -26,17 +24,15 @@
     search: async (text) => {
       const words = text.toLowerCase().split(/\s+/);
       const fit = held.filter((one) => one !== chosen && words.every((word) => one.dataset.words.includes(word)));
-      const found = fit
-        .slice(0, FOUND)
-        .map(({ dataset: { trial, spec, name, outcome } }) => ({ key: `${trial}@${spec}`, name, outcome }));
-      return { found, more: fit.length - found.length };
+      return {
+        found: fit.map(({ dataset }) => ({ key: `${dataset.trial}@${dataset.spec}`, outcome: dataset.outcome })),
+      };
     },
   };
   document.getElementById("shown").replaceChildren(chosen.content.cloneNode(true));
-  document.title = `${chosen.dataset.name} · merge-runner`;
+  document.title = `${document.querySelector("h1").textContent} · merge-runner`;
   for (const link of document.querySelectorAll(".few a")) {
-    const { searchParams } = new URL(link.href);
-    if (find(searchParams.get("trial"), searchParams.get("spec")) === chosen) link.ariaCurrent = "page";
+    if (shown(link.href) === chosen) link.ariaCurrent = "page";
   }
   startReplay();
 })();

@@ -19,7 +19,7 @@ from merge_runner_analysis.data.derived_cache import (
     present_state,
 )
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.report.writer import finished_figures
+from merge_runner_analysis.report.page import finished_figures
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, finished_tables, make_tables
 from merge_runner_analysis.tables.formats import render
@@ -80,25 +80,25 @@ def test_a_table_reads_the_same_after_it_was_a_text(tables, name, form):
 
 @pytest.mark.slow
 def test_tables_are_made_once_and_then_read(db, made):
-    first = finished_tables(db, None, ["gap", "attempts"])
+    first = finished_tables(db, ["gap", "attempts"])
     assert made == ["gap", "attempts"]
-    again = finished_tables(db, None, ["attempts", "words", "gap"])
-    assert made == ["gap", "attempts", "words"]
+    again = finished_tables(db, ["attempts", "factors", "gap"])
+    assert made == ["gap", "attempts", "factors"]
     assert [to_text(t) for t in (again[2], again[0])] == [to_text(t) for t in first]
-    assert finished_tables(db, ["o3"], ["gap"])
+    assert finished_tables(db, ["gap"], options={"models": ["o3"]})
     assert made[3:] == ["gap"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", CHANGES)
 def test_after_any_change_of_the_results_tables_are_made_anew(db, made, what):
-    finished_tables(db, None, ["attempts"])
+    finished_tables(db, ["attempts"])
     state = present_state(db)
     change(db, UNSEEN)
     assert present_state(db) == state
     change(db, CHANGES[what])
     assert present_state(db) != state
-    finished_tables(db, None, ["attempts"])
+    finished_tables(db, ["attempts"])
     assert made == ["attempts", "attempts"]
 
 
@@ -108,7 +108,7 @@ def test_another_program_makes_tables_anew(db, made, monkeypatch):
         monkeypatch.setattr(
             "merge_runner_analysis.data.derived_cache.program", lambda name=name: name
         )
-        finished_tables(db, None, ["velocity-profiles"])
+        finished_tables(db, ["velocity-profiles"])
     assert made == ["velocity-profiles"] * 2
 
 
@@ -128,7 +128,7 @@ def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, 
 @pytest.mark.slow
 def test_what_is_kept_is_not_in_the_database(db):
     before = db.read_bytes()
-    finished_tables(db, None, ["velocity-profiles"])
+    finished_tables(db, ["velocity-profiles"])
     assert db.read_bytes() == before
 
 
@@ -145,7 +145,7 @@ def test_tables_of_results_that_changed_meanwhile_are_not_kept(db):
 def test_tables_of_a_study_that_was_read_before_a_change_are_not_kept(db):
     study = Study(db)
     change(db, CHANGES["an outcome"])
-    finished_tables(db, None, ["attempts"], study)
+    finished_tables(db, ["attempts"], study)
     assert finished(db, present_state(db), options_text(db), ["attempts"]) == {}
 
 
@@ -153,8 +153,8 @@ def test_tables_of_a_study_that_was_read_before_a_change_are_not_kept(db):
 def test_a_study_that_was_read_before_a_change_takes_no_table_of_the_later_state(db, made):
     study = Study(db)
     change(db, CHANGES["an outcome"])
-    finished_tables(db, None, ["attempts"])
-    finished_tables(db, None, ["attempts"], study)
+    finished_tables(db, ["attempts"])
+    finished_tables(db, ["attempts"], study)
     assert made == ["attempts", "attempts"]
 
 
@@ -162,18 +162,18 @@ def test_what_cannot_be_kept_is_made_and_said_once(db, made, caplog):
     before = db.read_bytes()
     db.with_name(f"{db.name}.derived").mkdir()
     for _ in range(2):
-        assert finished_tables(db, None, ["velocity-profiles"])
+        assert finished_tables(db, ["velocity-profiles"])
     assert made == ["velocity-profiles"] * 2
     assert caplog.text.count("is not kept for the next time") == 1
     assert db.read_bytes() == before
 
 
 def test_a_figure_is_not_taken_for_the_table_of_its_name(db, monkeypatch):
-    monkeypatch.setattr("merge_runner_analysis.report.writer.FIGURES", {"attempts": None})
-    monkeypatch.setattr("merge_runner_analysis.report.writer.rendered", lambda *_: b"<svg/>")
-    (table,) = finished_tables(db, None, ["attempts"])
+    monkeypatch.setattr("merge_runner_analysis.report.page.FIGURES", {"attempts": None})
+    monkeypatch.setattr("merge_runner_analysis.report.page.rendered", lambda *_: b"<svg/>")
+    (table,) = finished_tables(db, ["attempts"])
     assert finished_figures(Study(db)) == {"attempts": "PHN2Zy8+"}
-    (again,) = finished_tables(db, None, ["attempts"])
+    (again,) = finished_tables(db, ["attempts"])
     assert to_text(again) == to_text(table)
 
 
@@ -181,10 +181,10 @@ def test_a_figure_is_not_taken_for_the_table_of_its_name(db, monkeypatch):
 def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        "merge_runner_analysis.report.writer.FIGURES", {"figure2": None, "distributions": None}
+        "merge_runner_analysis.report.page.FIGURES", {"figure2": None, "distributions": None}
     )
     monkeypatch.setattr(
-        "merge_runner_analysis.report.writer.rendered",
+        "merge_runner_analysis.report.page.rendered",
         lambda *wanted: drawn.append(wanted[1:]) or b"<svg/>",
     )
     first = finished_figures(Study(db))
@@ -213,8 +213,8 @@ def test_a_warm_table_waits_for_no_heavy_library(db, tmp_path):
 
 @pytest.mark.slow
 def test_unknown_names_are_refused_also_beside_kept_tables(db):
-    finished_tables(db, None, ["attempts"])
+    finished_tables(db, ["attempts"])
     with pytest.raises(UsageError, match="unknown table 'gaps'"):
-        finished_tables(db, None, ["gaps"])
+        finished_tables(db, ["gaps"])
     with pytest.raises(UsageError, match="unknown driver 'o4'"):
-        finished_tables(db, ["o4"], ["attempts"])
+        finished_tables(db, ["attempts"], options={"models": ["o4"]})

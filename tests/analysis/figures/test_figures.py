@@ -124,7 +124,7 @@ def drawn(study, name="figure2"):
 def test_where_no_human_drove_no_human_line_is_drawn(tmp_path):
     study = changed(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)), OWN)
     (human, _), keys = drawn(study)
-    assert len(keys) == 4 + 1, "a velocity that no human drove, and the published regression"
+    assert len(keys) == 4 + 2, "a velocity that no human drove, and how humans are shown"
     assert sum(line.get_linestyle() == "--" for line in human[3].lines) == 3
 
 
@@ -133,7 +133,7 @@ def test_conditions_that_were_not_played_are_not_drawn(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", drives))
     assert {*study.conditions} == {"N_0_0", "L_4_0"}
     (human, _), keys = drawn(study)
-    assert len(keys) == 1 + 1, "one relative velocity, and the published regression"
+    assert len(keys) == 1 + 2, "one relative velocity, and how humans are shown"
     assert sorted({round(x) for line in human[2].lines for x in line.get_xdata()}) == [0, 4]
     humans = Study(write_study(tmp_path / "h.duckdb", []))
     assert {*humans.conditions} == {*HUMAN_CONDITIONS}
@@ -153,7 +153,7 @@ def test_panels_reach_as_far_as_the_conditions_and_the_published_line_as_the_hum
 @pytest.mark.slow
 def test_no_two_relative_velocities_look_alike(tmp_path):
     study = changed(write_study(tmp_path / "t.duckdb", yielding("o3", reps=7)), OWN)
-    keys = drawn(study)[1][:-1]
+    keys = drawn(study)[1][:-2]
     assert len(keys) == len({(key.get_color(), key.get_marker()) for key in keys}) == 3 + 7
 
 

@@ -300,20 +300,13 @@ def test_two_trials_alone_have_no_test():
     assert contrast_means(group(N_0_0=[3.0]), group(N_0_0=[4.0]), "gap_m") is None
 
 
-def test_a_family_is_corrected_by_holm_and_by_benjamini_and_hochberg():
-    holm, false_discovery = corrected([0.01, 0.04, 0.03, 0.005])
-    assert list(holm) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert list(false_discovery) == pytest.approx([0.02, 0.04, 0.04, 0.02])
+def test_a_family_is_corrected_by_holm():
+    assert corrected([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert corrected([0.6, 0.9, 0.2]) == pytest.approx([1.0, 1.0, 0.6])
+    assert corrected([]) == []
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 40])
-def test_the_corrections_are_those_of_statsmodels(n):
+def test_the_correction_is_that_of_statsmodels(n):
     family = list(np.random.default_rng(n).random(n).round(1) ** 3)  # with ties
-    for found, method in zip(corrected(family), ("holm", "fdr_bh"), strict=True):
-        assert list(found) == pytest.approx(list(multipletests(family, method=method)[1]))
-
-
-def test_corrected_p_values_stay_at_most_1():
-    holm, false_discovery = corrected([0.6, 0.9, 0.2])
-    assert list(holm) == pytest.approx([1.0, 1.0, 0.6])
-    assert list(false_discovery) == pytest.approx([0.9, 0.9, 0.6])
+    assert corrected(family) == pytest.approx(list(multipletests(family, method="holm")[1]))

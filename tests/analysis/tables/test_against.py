@@ -125,7 +125,7 @@ def test_another_sample_set_of_a_driver_stands_beside_the_papers(tmp_path):
 def test_a_kept_table_stands_beside_the_paper_as_one_just_made(met):
     made = beside(met)
     for _ in range(2):
-        (kept,) = (against(t, met) for t in finished_tables(met.db, None, [TABLE_VII]))
+        (kept,) = (against(t, met) for t in finished_tables(met.db, [TABLE_VII]))
         assert [row.values for row in kept.rows] == [row.values for row in made.rows]
 
 

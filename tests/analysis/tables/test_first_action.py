@@ -1,4 +1,4 @@
-"""The tables of first actions and of words: their numbers are those of the stored trials."""
+"""The table of first actions: its numbers are those of the stored trials."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.figures.gallery import figure_of_first_actions
 from merge_runner_analysis.tables import make_tables
-from tests.analysis.studies import Drive, write_study, yielding
+from tests.analysis.studies import Drive, write_study
 
 MIRRORED = {
     name: next(
@@ -278,57 +278,7 @@ def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(
     run = prepare(tmp_path, "sweep", "mine.toml")
     assert run.code == 0, run.err
     study = Study(tmp_path / "results/merge.duckdb")
-    first, words = make_tables(study, ["first-action", "words"])
-    (row,) = [row for row in first.rows if row.id.startswith("emulator")]
+    (table,) = make_tables(study, ["first-action"])
+    (row,) = [row for row in table.rows if row.id.startswith("emulator")]
     assert row.values["n"] == 0
     assert '"own_exit" one driver acts while' in row.note
-    values = words.rows[0].values
-    assert values["merge_second_n"] + values["yield_first_n"] <= 8, "one first word of each driver"
-
-
-def spoken(drives, tmp_path, words):
-    """A study in which the word of a decision is what ``words`` says of trial, side and number."""
-    db = write_study(tmp_path / "w.duckdb", drives)
-    with duckdb.connect(str(db)) as connection:
-        connection.execute(f"UPDATE decisions SET tactical = {words}")
-    return Study(db)
-
-
-@pytest.mark.slow
-def test_words_that_are_kept_and_that_are_broken_are_counted(tmp_path):
-    study = spoken(yielding("o3", reps=2), tmp_path, "if(applied[1] > 0, 'M', 'Y')")
-    (table,) = make_tables(study, ["words"])
-    values = {row.id: row.values for row in table.rows}["o3/baseline"]
-    assert values["merge_yields_percent"] == values["yield_goes_percent"] == 0
-    assert values["merge_second_percent"] == values["yield_first_percent"] == 0
-    assert values["merge_second_n"] + values["yield_first_n"] == 44
-    broken = spoken(yielding("o3", reps=2), tmp_path, "if(applied[1] > 0, 'Y', 'M')")
-    (table,) = make_tables(broken, ["words"])
-    values = table.rows[0].values
-    assert values["yield_goes_percent"] == 100
-    assert values["merge_second_percent"] == values["yield_first_percent"] == 100
-    # After three seconds the drivers keep their speed: that is no yielding.
-    acted = load("SELECT count(*) AS n FROM decisions WHERE applied[1] < 0", broken.db)["n"].iloc[0]
-    counted = values["merge_yields_percent"] / 100 * values["merge_yields_n"]
-    assert 0 < round(counted) <= acted
-
-
-@pytest.mark.slow
-def test_the_words_of_two_models_of_a_pair_are_not_pooled(tmp_path):
-    study = spoken(yielding("o3", reps=1), tmp_path, "if(side = 'left', 'M', 'Y')")
-    with duckdb.connect(str(study.db)) as connection:
-        connection.execute("UPDATE trials SET model_right = 'other'")
-    (table,) = make_tables(Study(study.db), ["words"])
-    found = {row.id: row for row in table.rows}
-    assert set(found) == {"o3+other/baseline/left", "o3+other/baseline/right"}
-    left, right = found.values()
-    assert left.values["driver"] == "o3 of o3+other"
-    assert left.values["yield_goes_n"] == right.values["merge_yields_n"] == 0
-
-
-@pytest.mark.slow
-def test_no_word_is_said(tmp_path):
-    silent = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)))
-    (table,) = make_tables(silent, ["words"])
-    assert table.rows == []
-    assert any("no driver said a tactical word" in note for note in table.notes)

@@ -41,14 +41,16 @@ replay.comparison = (scene, { changed }) => {
     if (key) lay(key, true);
     else if (key === null) say(`${button.textContent}: there is none here. It would be ${button.title}.`);
   });
-  field.addEventListener("input", async () => {
+  const suggest = async () => {
     const text = field.value.trim();
     if ([...list.options].some(({ value }) => value === text)) return form.requestSubmit();
     const answer = await answered(explorer.search(text));
     if (!answer || field.value.trim() !== text) return;
     const option = ({ key, outcome, note }) => new Option(note ? `${outcome}, ${note}` : outcome, key);
     list.replaceChildren(...answer.found.map(option));
-  });
+  };
+  field.addEventListener("input", suggest);
+  field.addEventListener("focus", suggest);
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     const text = field.value.trim(),

@@ -55,16 +55,6 @@ window.startReplay = () => {
       else wanted.searchParams.delete(name);
     }
     if (wanted.href !== location.href) history[push ? "pushState" : "replaceState"](null, "", wanted);
-    share();
-  };
-  // A page of this trial holds the other one, too.
-  const share = () => {
-    const link = at("as-page");
-    if (!link) return;
-    const wanted = new URL(link.href);
-    if (scene.ghost) wanted.searchParams.set("compare", scene.ghost.named);
-    else wanted.searchParams.delete("compare");
-    link.href = wanted;
   };
   const recall = async () => {
     const asked = address().searchParams;
@@ -76,7 +66,6 @@ window.startReplay = () => {
     // Of a decision that is not there the page says so already.
     if (link || !asked.has("decision")) panel.choose(link ?? null);
     else panel.come(null);
-    share();
   };
 
   // ---- the parts
@@ -115,6 +104,12 @@ window.startReplay = () => {
 
   // ---- hands
 
+  // A page of this trial holds the other one, too.
+  at("as-page")?.addEventListener("click", ({ target }) => {
+    const wanted = new URL(target.href);
+    wanted.searchParams.set("compare", scene.ghost?.named ?? "");
+    target.href = wanted;
+  });
   at("previous-decision").addEventListener("click", () => step(-1));
   at("next-decision").addEventListener("click", () => step(1));
   at("follow").addEventListener("click", free);
