@@ -112,9 +112,12 @@ def verdicts_of(
     return found, table
 
 
-def humans_of(table: Table | None) -> dict[str, Any]:
-    """The humans' cells by measure, and where their bands lie."""
+def humans_of(table: Table | None, own: Driver | None = None) -> dict[str, Any]:
+    """The humans' cells by measure, and where their bands lie; beside a driver as it meets them."""
     found = by_group(table.rows).get(HUMAN, {}) if table else {}
+    for name, values in own.verdicts.items() if own and own.cells else ():
+        beside = {"estimate": values.get("human"), "ci": values.get("human_ci")}
+        found[name] = {**found[name], **beside}
     return {
         "cells": cells(found),
         "bands": {name: band(measure, found.get(name, {})) for name, measure in MEASURES.items()},
