@@ -34,7 +34,7 @@ from benchmarks.cases import (
     resume,
     start,
 )
-from benchmarks.explorer import explorer, explorer_floor
+from benchmarks.explorer import explorer, explorer_floor, export, first_page
 from benchmarks.goals import judged
 from benchmarks.peers import installed, peer_cached, peer_cold, peer_resume
 from benchmarks.processes import served
@@ -78,6 +78,9 @@ CASES = (
     ),
     Case("explorer of 11,000", 1, explorer(max(STUDIES))),
     Case("floor, explorer of 11,000", 1, explorer_floor),
+    Case("first page of 2,200", 1, first_page(2_200)),
+    Case("first page of 11,000", 1, first_page(max(STUDIES))),
+    Case("export of 660", 1, export(660)),
     Case("soak of 200", 1, soak(200, lives_s=3), is_long=True),
     Case("soak of 10,000", 1, soak(10_000, lives_s=30), is_long=True),
     *PEERS,

@@ -14,10 +14,27 @@ from merge_runner.records import SLOT_HEADER
 HANGS_S = 300
 
 
-class Gate:
-    """Lets a number of requests through, and holds the next ones until it opens."""
+# The emulator as it ships, but for its patience, which a loaded machine would outlast.
+PATIENT = f"""
+[emulator]
+provider = "emulator"
+format = "openai-chat"
+id = "scripted-driver"
+max_output_tokens = 4000
+price = "free"
+timeout_s = {HANGS_S}
+deadline_s = {HANGS_S}
+"""
 
-    def __init__(self, passing: int) -> None:
+
+class Gate:
+    """Lets a number of requests through, and holds the next ones until it opens.
+
+    A sweep in ``folder`` waits as long for the emulator.
+    """
+
+    def __init__(self, passing: int, folder: Path) -> None:
+        (folder / "models.toml").write_text(PATIENT)
         self.passing = passing
         self.asked: list[str] = []
         self.held: dict[str, int] = {}  # slot to the asking port

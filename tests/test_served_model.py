@@ -56,7 +56,7 @@ def test_all_that_tell_of_other_models_tell_the_same(db):
     ]
     assert sorted(text.split(": ")[0] for text in found) == [f"o3 -> {name}" for name in OTHERS]
     catalogue = Catalogue(db)
-    ((*_, (run, _)), _) = list_runs(catalogue)
+    *_, (run, _) = list_runs(catalogue)
     assert run.row["others"] == len(OTHERS)
     causes = [cause for cause, _ in catalogue.facets(Filter())["cause"]]
     assert [c for c in causes if c.startswith("model: ")] == [f"model: o3 → {n}" for n in OTHERS]

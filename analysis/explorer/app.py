@@ -140,9 +140,9 @@ def _page(
     return HTMLResponse(rendered) if isinstance(rendered, str) else rendered
 
 
-def _named(render: Callable[..., str]) -> Callable[[Site, Request], str]:
-    """The page of what an address names."""
-    return lambda site, asked: render(site, asked.path_params["name"], asked.query_params)
+def _shown(render: Callable[..., str]) -> Callable[[Site, Request], str]:
+    """The page of what an address names and asks for."""
+    return lambda site, asked: render(site, *asked.path_params.values(), asked.query_params)
 
 
 def _trial(site: Site, asked: Request) -> str | Response:
@@ -196,31 +196,28 @@ def _sql_csv(site: Site, asked: Request) -> Response:
         return HTMLResponse(sql.sql_page(site, state, problem=str(exc)), 400)
 
 
-# What is shown at an address. ``seen`` is what a page that looks for news has shown already.
 PAGES: dict[str, Callable[[Site, Request], str | Response]] = {
-    "/": lambda site, asked: home.home_page(site, asked.query_params),
-    "/drivers": lambda site, asked: drivers.drivers_page(site, asked.query_params),
-    "/drivers/{name:path}": _named(drivers.driver_page),
-    "/sweeps": lambda site, asked: sweep.sweeps_page(site, asked.query_params),
-    "/sweeps/{name:path}": _named(
-        lambda site, name, state: sweep.sweep_page(site, name, state.get("seen", ""))
-    ),
-    "/trials": lambda site, asked: trials.trials_page(site, asked.query_params),
+    "/": _shown(home.home_page),
+    "/drivers": _shown(drivers.drivers_page),
+    "/drivers/{name:path}": _shown(drivers.driver_page),
+    "/sweeps": _shown(sweep.sweeps_page),
+    "/sweeps/{name:path}": _shown(sweep.sweep_page),
+    "/trials": _shown(trials.trials_page),
     "/trials/": lambda site, asked: RedirectResponse(site.at.to("trials", **asked.query_params)),
     "/trials.csv": _trials_csv,
     "/trials/{name:path}": _trial,
-    "/decisions/{name:path}": _named(trial.decision_fragment),
+    "/decisions/{name:path}": _shown(trial.decision_fragment),
     "/others/{name:path}": _others,
     "/raw/{name:path}": _raw,
     "/glossary": lambda site, _: site.render("glossary.html", here="glossary"),
     "/tables": lambda site, _: tables.tables_page(site),
     "/tables/{name}.{suffix}": _table_file,
-    "/tables/{name}": _named(tables.table_page),
+    "/tables/{name}": _shown(tables.table_page),
     "/figures/{name}.{form}": _figure_file,
-    "/figures/{name}": _named(tables.figure_page),
-    "/prompts": lambda site, asked: prompts.prompts_page(site, asked.query_params),
-    "/discordant": lambda site, asked: prompts.discordant_page(site, asked.query_params),
-    "/words": lambda site, asked: words.words_page(site, asked.query_params),
+    "/figures/{name}": _shown(tables.figure_page),
+    "/prompts": _shown(prompts.prompts_page),
+    "/discordant": _shown(prompts.discordant_page),
+    "/words": _shown(words.words_page),
     "/notes": lambda site, _: notes.notes_page(site),
     "/sql": _sql,
     "/sql.csv": _sql_csv,

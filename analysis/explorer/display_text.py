@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import unicodedata
 from datetime import datetime
 from decimal import Decimal
@@ -10,6 +11,7 @@ from decimal import Decimal
 from merge_runner.text_safety import in_spreadsheet
 
 MINUS = "−"
+NEGATIVE = re.compile(r"(?<![\w-])-(?=\d)")
 SHOWN = 20_000
 BEGINNING = 800
 # What Python gets for infinite timestamps.
@@ -24,6 +26,11 @@ _BLANK.update(range(0x180B, 0x1810), range(0xFE00, 0xFE10), range(0xE0100, 0xE01
 def shown_number(value: float | None, decimals: int = 2, unit: str = "") -> str:
     """A number with its unit, as all pages print it; an en dash where there is none."""
     return "–" if value is None else f"{value:.{decimals}f}{unit}".replace("-", MINUS)
+
+
+def with_minus(text: str) -> str:
+    """A text whose negative numbers have a true minus sign; hyphens stay, also those of names."""
+    return NEGATIVE.sub(MINUS, text)
 
 
 def visible(text: str) -> str:

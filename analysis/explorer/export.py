@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from functools import cache, partial
 from html import unescape
 from itertools import count
 from pathlib import Path, PurePosixPath
@@ -27,17 +28,19 @@ from merge_runner_analysis.explorer.guard import LOOPBACK
 from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.offline import offline, page_of_trials
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.site import SCOPE, Site
 from merge_runner_analysis.explorer.urls import query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
-# The pages of an export by the first part of their path, and what their addresses may ask for.
-FOLLOWED = {
-    *("", "drivers", "trials", "conditions", "discordant", "sweeps", "tables", "figures"),
-    *("prompts", "notes", "glossary"),
+# The pages of an export by the first part of their path, and what their addresses ask for. They
+# are of all trials, so that a link within a scope leads to the page without it.
+FOLLOWED: dict[str, Collection[str]] = {
+    **dict.fromkeys(("", "sweeps", "tables", "figures", "prompts", "notes", "glossary"), ()),
+    "drivers": ("variant",),
+    "trials": ("spec", "page", *FACETS),
+    "discordant": ("model", "variant"),
 }
-OF_TRIALS = {"trials", "glossary"}
-ASKED = {"prompt", "spec", "page", "by", *FACETS}
+OF_TRIALS = ("trials", "glossary")
 MOMENT = ("side", "decision")  # the script of a trial's page reads these
 POLICY = (
     "default-src 'none'; script-src 'self' file:; style-src 'self' file:; "
@@ -113,8 +116,13 @@ async def _crawled(
                 continue
             text = reply.text if reply.headers["content-type"].startswith("text/html") else ""
             for link in _LINKS.findall(text):
-                page, _ = _page_of(unescape(link), heads)
-                if page and page not in files and not page.endswith(".png"):
+                page, _ = _page_of(unescape(link))
+                if (
+                    page
+                    and page not in files
+                    and _head(page) in heads
+                    and not page.endswith(".png")
+                ):
                     files[page] = _file_of(page, files.values())
                     waiting.append(page)
             if BUSY in text:
@@ -126,16 +134,24 @@ async def _crawled(
     return {address: file for address, file in files.items() if address not in absent}
 
 
-def _page_of(address: str, heads: Collection[str] = FOLLOWED) -> tuple[str, str]:
+@cache  # a link is read when it is followed, and when it is rewritten
+def _page_of(address: str) -> tuple[str, str]:
     """Split an address into a page and the moment it shows; two empty texts for other pages."""
     parts = urlsplit(address)
+    known = FOLLOWED.get(_head(address)) if parts.path.startswith("/") else None
     asked = dict(parse_qsl(parts.query))
     moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
-    is_known = all(name in ASKED or name.startswith(FACTOR) for name in asked)
-    root, _, rest = parts.path.partition("/")
-    if root or not is_known or rest.partition("/")[0] not in heads:
+    if known is None or parts.netloc:
         return "", ""
-    return parts.path + query_of(asked), moment + (f"#{parts.fragment}" if parts.fragment else "")
+    kept = {name: asked[name] for name in asked if name in known or name.startswith(FACTOR)}
+    if asked.keys() - kept.keys() - {*SCOPE}:
+        return "", ""
+    return parts.path + query_of(kept), moment + (f"#{parts.fragment}" if parts.fragment else "")
+
+
+def _head(address: str) -> str:
+    """The first part of a path."""
+    return urlsplit(address).path.removeprefix("/").partition("/")[0]
 
 
 def _file_of(page: str, taken: Collection[str]) -> str:
@@ -155,17 +171,16 @@ def _file_of(page: str, taken: Collection[str]) -> str:
 def _rewrite(db: Path, stage: Path, files: dict[str, str]) -> None:
     """Have the links of all pages lead to files, and put the files beside them that they need."""
     needed = set[str]()
+    ways = {
+        folder: {page: os.path.relpath(file, folder) for page, file in files.items()}
+        for folder in (".", FILES)
+    }
     for file in files.values():
-        folder = PurePosixPath(file).parent
-
-        def leads(address: str, folder: PurePosixPath = folder) -> str:
-            page, moment = _page_of(address)
-            return os.path.relpath(files[page], folder) + moment if page in files else ""
-
+        folder = str(PurePosixPath(file).parent)
         path = stage / file
         text = path.read_text(encoding="utf-8")
         if file.endswith(".html"):
-            text = offline(text, db.name, POLICY, leads)
+            text = offline(text, db.name, POLICY, partial(_leads, ways[folder]))
             needed.update(_STATIC.findall(text))
             text = _STATIC.sub(rf'="{os.path.relpath(f"{FILES}/static", folder)}/\1"', text)
             path.write_text(text, encoding="utf-8")
@@ -174,6 +189,12 @@ def _rewrite(db: Path, stage: Path, files: dict[str, str]) -> None:
         copy = stage / FILES / "static" / name
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(STATIC / name, copy)
+
+
+def _leads(ways: dict[str, str], address: str) -> str:
+    """Return the way to the file of an address; empty where there is none."""
+    page, moment = _page_of(address)
+    return ways[page] + moment if page in ways else ""
 
 
 @contextmanager

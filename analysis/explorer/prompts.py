@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Literal
 
 from merge_runner.prompts.blocks import BLOCKS
@@ -64,11 +64,16 @@ def _beginning(paragraphs: Sequence[str]) -> Iterator[tuple[int, str, int]]:
     """The blocks whose paragraphs begin like these: characters that agree, name, paragraphs."""
     for name, block in BLOCKS.items():
         for template in filter(None, (block.merge, block.straight)):
-            # A paragraph is known by its text up to its first value.
-            begun = [part.partition("{")[0] for part in template.split("\n\n")]
-            agree = [text.startswith(part) for text, part in zip(paragraphs, begun, strict=False)]
-            if begun[0] and all(agree):
+            begun = _begun(template)
+            pairs = zip(paragraphs, begun, strict=False)
+            if begun[0] and all(text.startswith(beginning) for text, beginning in pairs):
                 yield sum(map(len, begun)), name, len(begun)
+
+
+@cache
+def _begun(template: str) -> list[str]:
+    """The text of each paragraph up to its first value, by which it is known."""
+    return [paragraph.partition("{")[0] for paragraph in template.split("\n\n")]
 
 
 def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:

@@ -15,15 +15,12 @@ from typing import Any
 import duckdb
 
 from merge_runner.errors import UsageError
-from merge_runner.results.database import SHARED, Instance, read_database
+from merge_runner.results.database import SHARED, Instance, names_of, read_database
 from merge_runner.text_safety import first_line
 
 ALONE = threading.RLock()
-
-
 # A sweep that stores its trials holds the file for less; a page cannot wait for anybody else.
 PATIENCE_S = 2.0
-
 
 Row = dict[str, Any]
 
@@ -48,7 +45,7 @@ def records(
 ) -> list[Row]:
     """The rows of a query, by the names of their columns."""
     found = connection.execute(sql, values)
-    names = [column[0] for column in found.description]
+    names = names_of(found)
     return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
@@ -17,6 +18,8 @@ from merge_runner_analysis.names import BASELINE
 OFFERED = """
 SELECT DISTINCT model, variant, condition FROM listed WHERE who <> 'humans' ORDER BY ALL
 """
+# What the analysis adds to the names of drivers that have several tasks, prompts or stand-ins.
+MARKS = re.compile(r"( \[([0-9a-f]{8}|scripted)\])+$")
 SWEEPS = "SELECT sweep_id, name, started_at FROM sweeps ORDER BY started_at DESC"
 
 
@@ -107,8 +110,11 @@ def carried(asked: Mapping[str, str]) -> dict[str, list[str]]:
 
 
 def unmarked(driver: str) -> str:
-    """The name by which the list of trials knows a driver, without a mark of its settings."""
-    return driver.partition(" [")[0]
+    """The name by which the list of trials knows a driver, without the marks of a group.
+
+    The levels of a study's factors, which stand in brackets too, are part of both names.
+    """
+    return MARKS.sub("", driver)
 
 
 def every(asked: Mapping[str, str], name: str) -> list[str]:

@@ -13,12 +13,12 @@ import jinja2
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
-from merge_runner_analysis.explorer.analysis_process import Computing
 from merge_runner_analysis.explorer.assets import STYLES
 from merge_runner_analysis.explorer.catalogue import Catalogue
+from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.conditions import condition_texts
 from merge_runner_analysis.explorer.database_copy import Copies
-from merge_runner_analysis.explorer.display_text import MINUS, shown_number, visible
+from merge_runner_analysis.explorer.display_text import MINUS, shown_number, visible, with_minus
 from merge_runner_analysis.explorer.glossary import sections
 from merge_runner_analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
 from merge_runner_analysis.explorer.queries import Queries
@@ -96,7 +96,7 @@ class Site:
             format=lambda text, *values: (str(text) % values).replace("-", MINUS),
             num=shown_number,
             whole="{:,}".format,
-            minus=lambda text: str(text).replace("-", MINUS),
+            minus=lambda text: with_minus(str(text)),
         )
         self._environment.globals.update(
             at=self.at,

@@ -219,38 +219,37 @@ class Assessment:
     later: str = ""
 
 
-def list_runs(
-    catalogue: Catalogue, where: str = "true", values: Sequence[object] = ()
-) -> tuple[list[tuple[Run, Assessment]], Row]:
-    """All runs, the newest first, and what they come to in the listed trials that are wanted.
-
-    Raises what ``Catalogue.refresh`` does.
-    """
+def list_runs(catalogue: Catalogue) -> list[tuple[Run, Assessment]]:
+    """All runs, the newest first. Raises what ``Catalogue.refresh`` does."""
     catalogue.refresh()
-    runs = _runs(catalogue, where, values)
+    runs = _runs(catalogue)
     # A run notes its end in the database before its file goes: one that seems to be lost may have
     # ended since the rows were read, by whoever refreshed the catalogue since.
     if any(run.state == "lost" for run in runs):
         catalogue.refresh()
-        runs = _runs(catalogue, where, values)
-    *runs, together = runs
+        runs = _runs(catalogue)
     later = [_later(run, runs[:place]) for place, run in enumerate(runs)]
-    return [
-        (run, assessment_of(run, other)) for run, other in zip(runs, later, strict=True)
-    ], together.row
+    return [(run, assessment_of(run, other)) for run, other in zip(runs, later, strict=True)]
 
 
-def _runs(catalogue: Catalogue, where: str, values: Sequence[object]) -> list[Run]:
-    found = catalogue.ask(RUNS.format(where=where), *values)
-    rows = [row | {name: row[name] or 0 for name in NUMBERS} for row in found]
+def numbers_of(
+    catalogue: Catalogue, where: str = "true", values: Sequence[object] = ()
+) -> dict[str, Row]:
+    """The columns of RUNS by the run's id, counted in the listed trials that are wanted."""
+    rows = catalogue.ask(RUNS.format(where=where), *values)
+    return {row["sweep_id"]: row | {name: row[name] or 0 for name in NUMBERS} for row in rows}
+
+
+def _runs(catalogue: Catalogue) -> list[Run]:
     return [
         Run(
             row,
             json.loads(row["config"]),
-            None if row["ended_at"] else read_standing(catalogue.db, row["sweep_id"]),
+            None if row["ended_at"] else read_standing(catalogue.db, sweep_id),
             catalogue.db,
         )
-        for row in rows
+        for sweep_id, row in numbers_of(catalogue).items()
+        if sweep_id
     ]
 
 
@@ -259,7 +258,7 @@ def standing_of(catalogue: Catalogue) -> list[tuple[Run, Assessment]]:
 
     The newest come first. Raises what ``Catalogue.refresh`` does.
     """
-    runs, _ = list_runs(catalogue)
+    runs = list_runs(catalogue)
     return [
         (run, said) for run, said in runs if run.state != "finished" and not said.later
     ] or runs[:1]
@@ -272,7 +271,7 @@ def arms_of(catalogue: Catalogue, run: Run) -> list[Row]:
     """
     columns = "model_left", "model_right", "variant", "levels"
     stored = {
-        (*map(row.get, columns[:3]), *row["levels"]): row
+        (*map(row.get, columns[:3]), *(row["levels"] or ())): row
         for row in catalogue.counts(Filter(sweep=run.sweep_id), *columns)
     }
     arms = []
@@ -293,7 +292,7 @@ def arms_of(catalogue: Catalogue, run: Run) -> list[Row]:
             }
         )
     others = [
-        row | {"label": row["variant"], "planned": 0, "state": {"variant": row["variant"]}}
+        row | {"label": row["variant"] or "", "planned": 0, "state": {"variant": row["variant"]}}
         for row in stored.values()
     ]
     return arms + others

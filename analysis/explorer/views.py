@@ -8,13 +8,12 @@ from typing import Any
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
-from merge_runner.records import SIDES, Side
+from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.accounts.account import Account, account
-from merge_runner_analysis.accounts.classes import ACTED_MPS
 from merge_runner_analysis.accounts.course import Course
-from merge_runner_analysis.explorer.details import Decision, Trial
+from merge_runner_analysis.explorer.details import Trial
 from merge_runner_analysis.explorer.display_text import visible
 from merge_runner_analysis.explorer.reading import Row
 
@@ -150,19 +149,17 @@ def summary(row: Row, trial: Trial) -> list[str]:
                 f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s"
                 f"{_hardest(samples)}."
             )
-    for side in SIDES:
-        mine = [d for d in trial.decisions if d["side"] == side]
-        if mine:
-            words = [d["tactical"] for d in mine]
-            letters = " ".join(word or "–" for word in words)
-            said = letters if any(words) else f"{len(words)}, none in words"
-            bad = [str(d["decision"]) for d in mine if not d["valid"] and not d["lost"]]
-            lost = [str(d["decision"]) for d in mine if not d["driven"]]
-            lines.append(
-                f"Decisions of the {side} driver: {said}"
-                + (f"; without a valid plan: {', '.join(bad)}" if bad else "")
-                + (f"; the trial ended before {', '.join(lost)} was driven." if lost else ".")
-            )
+    for side, mine in trial.by_side.items():
+        words = [d["tactical"] for d in mine]
+        letters = " ".join(word or "–" for word in words)
+        said = letters if any(words) else f"{len(words)}, none in words"
+        bad = [str(d["decision"]) for d in mine if not d["valid"] and not d["lost"]]
+        lost = [str(d["decision"]) for d in mine if not d["driven"]]
+        lines.append(
+            f"Decisions of the {side} driver: {said}"
+            + (f"; without a valid plan: {', '.join(bad)}" if bad else "")
+            + (f"; the trial ended before {', '.join(lost)} was driven." if lost else ".")
+        )
     return lines
 
 
@@ -177,24 +174,6 @@ def _hardest(samples: Row) -> str:
 def controlled(samples: Row, name: str) -> list[float]:
     """The samples of a vehicle from the start of control on; in the tunnels nobody controls it."""
     return [x for t, x in zip(samples["time_s"], samples[name], strict=True) if t >= 0]
-
-
-def actions(trial: Trial) -> dict[Side, str]:
-    """How each driver first acted, and when it was at the merge point: all that humans tell."""
-    return {side: _action(samples) for side, samples in trial.states.items()}
-
-
-def _action(samples: Row) -> str:
-    times, speeds = controlled(samples, "time_s"), controlled(samples, "velocity_mps")
-    said = f"it kept its speed to within {ACTED_MPS:g} m/s"
-    for time_s, speed_mps in zip(times, speeds, strict=True):
-        if abs(speed_mps - speeds[0]) >= ACTED_MPS:
-            compared = "faster" if speed_mps > speeds[0] else "slower"
-            said = f"after {time_s:.1f} s it was {ACTED_MPS:g} m/s {compared} than at the start"
-            break
-    merges_s = reaches_s(samples, TRACK.merge_point_m)
-    merged = "it never merged" if merges_s is None else f"it merged after {merges_s:.1f} s"
-    return f"{said}; {merged}"
 
 
 def account_of(row: Row, trial: Trial) -> Account | None:
@@ -307,25 +286,22 @@ def _bound(scenario: ScenarioConfig, mean_m: float) -> float | None:
     return round(high, 3)
 
 
-def plan_chart(decision: Decision, trial: Trial) -> dict[str, Any] | None:
+def plan_chart(row: Row, trial: Trial) -> dict[str, Any] | None:
     """A plan as steps over its horizon, beside what the previous plan intended for that time.
 
     None where there is no plan.
     """
-    row, before, scenario = decision.row, decision.before, trial.scenario
-    pace = trial.paces[row["side"]]
-    if row["lost"]:
-        return None
-    applied = (row["applied"] or []) if row["time_s"] < trial.end_s else []
+    pace, before = trial.paces[row["side"]], row["before"]
+    applied = (row["applied"] or []) if row["driven"] else []
     old = (before["plan"] or [])[len(before["applied"]) :] if before else []
-    if not (row["plan"] or old or applied):
+    if row["lost"] or not (row["plan"] or old or applied):
         return None
     return {
         "plan": row["plan"] or [],
         "before": old,
         "applied": applied,
-        "step_s": pace.action_steps * scenario.step_s,
-        "most_mps2": scenario.max_acceleration_mps2,
+        "step_s": pace.action_steps * trial.scenario.step_s,
+        "most_mps2": trial.scenario.max_acceleration_mps2,
         "steps": pace.plan_actions,
     }
 
@@ -334,10 +310,9 @@ def older_plan(trial: Trial, row: Row) -> str:
     """On which plan a driver went on whose reply held none, and from which of its steps."""
     side, number, scenario = row["side"], row["decision"], trial.scenario
     pace = trial.paces[side]
-    old = next(
-        (d for d in reversed(trial.decisions)
-         if d["side"] == side and d["decision"] < number and d["plan"]), None,
-    )  # fmt: skip
+    old = row["before"]
+    while old and not old["plan"]:
+        old = old["before"]
     if old is None:
         return "it had no earlier plan, and kept its speed"
     since = 0 if scenario.fallback == "restart" else number - old["decision"]
@@ -353,34 +328,12 @@ def older_plan(trial: Trial, row: Row) -> str:
     )
 
 
-def perceived(trial: Trial, decision: Decision) -> list[tuple[str, float, float | None]]:
-    """What was so and what was told, with what it is of; None where it was not seen.
-
-    Empty where the driver was told the truth.
-    """
-    row = decision.row
-    own, other = (
-        trial.states.get(side) for side in sorted(SIDES, key=lambda side: side != row["side"])
-    )
-    imperfect = row.get("other_seen") is not None
-    if not (imperfect and own and other and row["time_s"] in own["time_s"]):
-        return []
-    now = own["time_s"].index(row["time_s"])
-    distance_m = other["position_m"][now] - own["position_m"][now]
-    return [
-        ("how far ahead the other is (m)", distance_m, row["told_distance_m"]),
-        ("the other's speed (m/s)", other["velocity_mps"][now], row["told_other_speed_mps"]),
-        ("its own position (m)", own["position_m"][now], row["told_own_position_m"]),
-        ("its own speed (m/s)", own["velocity_mps"][now], row["told_own_speed_mps"]),
-    ]
-
-
-def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:
+def aftermath(trial: Trial, decision: Row) -> list[dict[str, Any]]:
     """Both vehicles where a decision was made and where the next one was, or at the end."""
-    if decision.row["lost"]:
+    if decision["lost"]:
         return []
-    start = decision.row["time_s"]
-    until = start + trial.interval_s(decision.row["side"])
+    start = decision["time_s"]
+    until = start + trial.interval_s(decision["side"])
     found = []
     for side, samples in trial.states.items():
         times = samples["time_s"]
@@ -390,7 +343,7 @@ def aftermath(trial: Trial, decision: Decision) -> list[dict[str, Any]]:
             found.append(
                 {
                     "side": side,
-                    "own": side == decision.row["side"],
+                    "own": side == decision["side"],
                     "lasted_s": times[last] - times[first],
                     "from_mps": samples["velocity_mps"][first],
                     "to_mps": samples["velocity_mps"][last],

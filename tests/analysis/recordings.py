@@ -44,10 +44,13 @@ class Recording:
         return text.getvalue().encode()
 
 
-def drive(condition="L_4_0", *, yields="right", late=False) -> Recording:
+def drive(
+    condition="L_4_0", *, yields="right", late=False, slowest_mps=6.0, starts_m=0.0
+) -> Recording:
     """A trial in which one side yields, ``both`` do until they stand, or ``nobody`` does.
 
-    ``late`` leaves out the first sample, as the recorder of simulated drivers does.
+    Who yields slows down to ``slowest_mps``, ``starts_m`` after both are in sight. ``late``
+    leaves out the first sample, as the recorder of simulated drivers does.
     """
     start = CONDITIONS[condition]
     positions, speeds = [list(start.starts_m(TRACK))], [list(start.speeds_mps)]
@@ -55,11 +58,11 @@ def drive(condition="L_4_0", *, yields="right", late=False) -> Recording:
     end_state = None
     while end_state is None:
         s, v = positions[-1], speeds[-1]
-        free = min(s) > 50
+        free = min(s) > 50 + starts_m
         net = [0.0, 0.0]
         for i, side in enumerate(SIDES):
             gives_way = free and yields in (side, "both")
-            slowest = 6.0 if yields == side else 0.0
+            slowest = slowest_mps if yields == side else 0.0
             wanted = slowest if gives_way else start.speeds_mps[i] - 0.08
             net[i] = min(max(wanted - v[i], -2.0), 1.0)
         moved = [advance(s[i], v[i], net[i], STEP_S) for i in (0, 1)]

@@ -80,7 +80,7 @@ def test_a_link_to_trials_of_a_driver_finds_them(site, hosts):
 def test_a_sweep_is_named_by_its_driver_and_says_that_a_stand_in_answered(site, hosts):
     client = browser(site)
     names = [f"o3 at {hosts[1]}+constant", f"o3 at {hosts[1]}", f"o3 at {hosts[0]}"]
-    runs = [run for run, _ in list_runs(site.catalogue)[0]]
+    runs = [run for run, _ in list_runs(site.catalogue)]
     assert [run.driver for run in runs] == names
     shown = client.get("/sweeps").text
     for entry, name in zip(runs, names, strict=True):

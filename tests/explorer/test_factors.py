@@ -6,7 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
-from urllib.parse import parse_qs, unquote, urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import duckdb
 import pytest
@@ -14,7 +14,6 @@ from starlette.testclient import TestClient
 
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.site import Site
-from tests.explorer.exporting import export_with_a_table
 
 HOST = "127.0.0.1:8700"
 
@@ -68,7 +67,7 @@ def test_a_sweeps_page_shows_each_arm_and_what_goes_on_with_it(client, played, t
 ASK = """
 import sys
 from pathlib import Path
-from merge_runner_analysis.explorer.analysis_process import Worker
+from merge_runner_analysis.explorer.computing import Worker
 from merge_runner.study.parts import load_study
 
 load_study(sys.argv[2], trust=True)
@@ -91,16 +90,3 @@ def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(pla
         check=True,
     )
     assert "opponent=sleepy/duration_s" in told.stdout
-
-
-@pytest.mark.long
-def test_an_exported_study_has_each_view_of_a_condition(played, tmp_path):
-    files = export_with_a_table(played.db, tmp_path / "o")
-    pages = {path.name: path.read_text() for path in files.glob("*.html")}
-    (sweep,) = (name for name in pages if name.startswith("sweeps-"))
-    assert unquote(sweep) == sweep
-    # Pairs of two different drivers were played: a condition has a page for each view of them.
-    views = {f"conditions-N_0_0{by}.html" for by in ("", "-by-side")}
-    assert views < pages.keys()
-    (ways,) = re.findall(r'<p class="groups">(.*?)</p>', pages["conditions-N_0_0-by-side.html"])
-    assert set(re.findall(r'href="([^"]*)"', ways)) == views - {"conditions-N_0_0-by-side.html"}

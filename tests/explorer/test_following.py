@@ -17,9 +17,9 @@ from tests.harness import PROGRAM, environment, watched
 
 
 @pytest.fixture
-def held_server():
+def held_server(tmp_path):
     """The address of an emulator that holds all but a few answers, and what lets them go."""
-    gate = Gate(10)
+    gate = Gate(10, tmp_path)
     with (
         start_blocking_portal() as elsewhere,
         elsewhere.wrap_async_context_manager(watched(gate.middle)) as server,
@@ -35,6 +35,7 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_se
             *(PROGRAM, "sweep", "baseline", "--reps", "1", "--conditions", "L_4_0,N_0_0"),
             *("--db", db, "--cache", tmp_path / "cache"),
         ],
+        cwd=tmp_path,
         env=environment(EMULATOR_BASE_URL=f"{url}/v1"),
         stderr=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

@@ -8,7 +8,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from merge_runner.errors import UsageError
-from merge_runner_analysis.explorer.app import explorer, listen
+from merge_runner_analysis.explorer.app import PAGES, explorer, listen
 from merge_runner_analysis.explorer.site import Site
 
 HOST = "127.0.0.1:8700"
@@ -87,9 +87,7 @@ def test_while_the_trials_are_read_for_the_first_time_a_page_says_so(study, monk
 
 def test_a_fault_is_one_line_and_the_other_pages_go_on(study, monkeypatch, caplog):
     site = Site(study)
-    monkeypatch.setattr(
-        "merge_runner_analysis.explorer.pages.sweep.sweeps_page", lambda *_, **__: 1 / 0
-    )
+    monkeypatch.setitem(PAGES, "/sweeps", lambda *_: 1 / 0)
     app = explorer(site)
     with TestClient(app, base_url=f"http://{HOST}", raise_server_exceptions=False) as client:
         reply = client.get("/sweeps")

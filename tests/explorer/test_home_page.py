@@ -15,9 +15,9 @@ from starlette.testclient import TestClient
 from merge_runner.errors import UsageError
 from merge_runner.results.store import results_digest
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.explorer.analysis_process import Computing
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.assets import STATIC, STYLES
+from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.pages.home import home_page
 from merge_runner_analysis.explorer.site import NothingNew, Site
 from merge_runner_analysis.figures import FIGURES
@@ -127,6 +127,26 @@ def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
     assert rows["human"]["collisions"]["n"] == 90
     for wrong in ("variant=A9", "condition=nowhere", "sweep=none", "model=nobody"):
         assert client.get(f"/?{wrong}").status_code == 404, wrong
+
+
+def test_links_take_the_scope_to_every_page(client):
+    part = f"variant=baseline&condition={WORST}"
+    for page in ("/", "/drivers", "/trials", "/words", "/prompts", "/sweeps", "/sql"):
+        text = unescape(client.get(f"{page}?{part}").text)
+        assert re.search(f'<option value="{WORST}"[^>]* selected', text), page
+        for other in ("/drivers", "/trials", "/words", "/prompts", "/sweeps", "/sql"):
+            assert f'href="{other}?{part}"' in text, (page, other)
+    assert f"condition in ('{WORST}')" in unescape(client.get(f"/sql?{part}").text)
+    runs = client.get(f"/sweeps?{part}").text
+    assert listed(client.get(f"/trials?{part}&sweep=sweep-1").text) == 3
+    assert re.search(r"all runs together</th><td class=\"n\">3</td>", runs)
+
+
+def test_a_number_has_a_true_minus_sign_on_pages(client):
+    for page in ("/", "/drivers/o3?variant=baseline", "/tables/verdicts", "/tables/gap"):
+        shown = re.sub(r"<(script|svg).*?</\1>|<[^>]*>", " ", client.get(page).text, flags=re.S)
+        assert not re.search(r"(?<![\w-])-\d+\.\d", shown), page
+        assert re.search(r"−\d", shown), page
 
 
 def test_a_sweep_is_a_scope(db):

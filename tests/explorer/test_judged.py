@@ -124,25 +124,9 @@ def test_a_human_trial_is_judged_by_the_boxes(humans):
     assert "outlines of 4.5 m by 1.8 m" in text
 
 
-def test_beside_humans_who_say_nothing_stands_what_they_did(humans):
+def test_beside_humans_who_say_nothing_stands_what_was_measured(humans):
     text = " ".join(Texts(page_of(humans)).said)
-    trial = read_trial(humans, *a_trial(humans))
     assert "A human pair" in text
-    for samples in trial.states.values():
-        driven = [(t, v) for t, v in zip(samples["time_s"], samples["velocity_mps"], strict=True)
-                  if t >= 0]  # fmt: skip
-        changed_s = next((t for t, v in driven if abs(v - driven[0][1]) >= 0.5), None)
-        merged_s = next(
-            t for t, x in zip(samples["time_s"], samples["position_m"], strict=True) if x >= 100
-        )
-        said, *_ = re.findall(
-            "it kept its speed to within 0.5 m/s; it merged after ([0-9.]+) s"
-            if changed_s is None
-            else f"after {changed_s:.1f} s it was 0.5 m/s (?:slower|faster) than at the start; "
-            "it merged after ([0-9.]+) s",
-            text,
-        )
-        assert float(said) == pytest.approx(merged_s, abs=0.1)
     assert "net gap when the first vehicle reaches the merge point" in text
 
 

@@ -10,8 +10,8 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from merge_runner_analysis.explorer.analysis_process import Computing, Worker
 from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.computing import Computing, Worker
 from merge_runner_analysis.explorer.site import Site
 from tests.explorer.serving import held
 from tests.explorer.test_tables_pages import InProcess

@@ -20,7 +20,7 @@ from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.pages import sweep as page
 from merge_runner_analysis.explorer.pages.trials import filter_of
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.explorer.sweeps import Run, assessment_of, list_runs
+from merge_runner_analysis.explorer.sweeps import Run, assessment_of, list_runs, numbers_of
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import held
 from tests.run.standings import progress, runner
@@ -205,7 +205,7 @@ def test_two_other_models_have_a_line_and_a_list_each(study):
 
 def page_of(site):
     site.catalogue.refresh()
-    return page.sweep_page(site, "sweep-1")
+    return page.sweep_page(site, "sweep-1", {})
 
 
 def test_what_a_server_wrote_is_shown_as_text(study):
@@ -278,11 +278,22 @@ def test_what_runs_and_trials_share_counts_once_over_all_runs(study):
             "SELECT count(*), sum(usd), count(*) FILTER (trials > 1) FROM (SELECT count(DISTINCT "
             "trial_id) AS trials, any_value(cost_usd) AS usd FROM calls GROUP BY call_key, attempt)"
         ).fetchone()
-    runs, together = list_runs(Site(study).catalogue)
-    for row in (*(run.row for run, _ in runs), together):
+    catalogue = Site(study).catalogue
+    assert len(list_runs(catalogue)) == 2
+    for row in numbers_of(catalogue).values():
         assert (row["replies"], row["shared"], row["ended"]) == (calls, shared, 29)
         assert row["usd"] == pytest.approx(usd)
     assert shared > 0
+
+
+def test_a_scope_changes_what_is_counted_and_no_sentence(study):
+    client = browser(study)
+    whole, part = (text_of(client, f"/sweeps{scope}") for scope in ("", "?condition=N_0_0"))
+    said = re.search(r"How each ended .*", whole)[0]
+    assert said.split(" To go on")[0] in part
+    assert "30 (3.3 %)" in whole
+    assert "0 of 3 " in part
+    assert "0 of 3 " not in whole
 
 
 def test_a_page_follows_a_sweep_to_its_end_and_has_each_state_read_out_once(study):

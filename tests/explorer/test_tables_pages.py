@@ -19,10 +19,9 @@ from starlette.testclient import TestClient
 from merge_runner.errors import UsageError
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer import analysis_worker
-from merge_runner_analysis.explorer.analysis_process import Computing, Worker
-from merge_runner_analysis.explorer.analysis_worker import Numbers
+from merge_runner_analysis.explorer import computing as worker
 from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.computing import Computing, Numbers, Worker
 from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import printed
@@ -136,6 +135,21 @@ def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, ever
         assert found.value in unescape(page)
 
 
+def test_a_table_is_sorted_and_leaves_out_columns_by_its_address(ask):
+    def column(text, place):
+        rows = re.findall(r"<tr id=.*?</tr>", text, re.DOTALL)
+        cells = [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row, re.DOTALL) for row in rows]
+        return [re.sub(r"<[^>]*>|\s", "", row[place]) for row in cells]
+
+    heads = re.findall(r'value="(\w+)"', ask("/tables/attempts"))
+    text = ask("/tables/attempts?sort=-calls")
+    counts = [int(n) for n in column(text, 1 + heads.index("calls")) if n != "–"]
+    assert counts == sorted(counts, reverse=True)
+    assert 'aria-sort="descending"' in text
+    shorter = ask("/tables/attempts?without=calls")
+    assert shorter.count('<th scope="col"') == text.count('<th scope="col"') - 1
+
+
 def test_facets_sorting_and_exports_keep_the_cell(ask):
     cell = "attempts/o3/A1:lost"
     text = ask(f"/trials?cell={cell}")
@@ -200,15 +214,15 @@ def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_
 
 
 def test_the_database_is_read_anew_where_it_changed(db, monkeypatch):
-    monkeypatch.setattr(analysis_worker, "_db", db, raising=False)
-    monkeypatch.setattr(analysis_worker, "_numbers", None)
-    analysis_worker.answer(("table", "attempts"))
-    first = analysis_worker._numbers
-    analysis_worker.answer(("table", "attempts"))
-    assert analysis_worker._numbers is first
+    monkeypatch.setattr(worker, "_db", db, raising=False)
+    monkeypatch.setattr(worker, "_numbers", None)
+    worker._answer(("table", "attempts"))
+    first = worker._numbers
+    worker._answer(("table", "attempts"))
+    assert worker._numbers is first
     os.utime(db)
-    analysis_worker.answer(("table", "attempts"))
-    assert analysis_worker._numbers is not first
+    worker._answer(("table", "attempts"))
+    assert worker._numbers is not first
 
 
 def test_discordant_trials_are_the_pairs_that_differ(ask, db):

@@ -129,7 +129,7 @@ async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_
     merge_runner, tmp_path, mode
 ):
     part = ("sweep", "baseline", "--conditions", "N_0_0", "--json")
-    gate = Gate(30)  # of three trials of up to 22 calls
+    gate = Gate(30, tmp_path)  # of three trials of up to 22 calls
     async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         assert (await merge_runner(*part, "--reps", 1, **env)).code == 0
@@ -154,17 +154,8 @@ async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_
         assert json.loads(out)["trials"]["planned"] == 3
 
 
-PATIENT = """
-[patient]
-provider = "emulator"
-format = "openai-chat"
-id = "scripted-driver"
-max_output_tokens = 4000
-price = "free"
-timeout_s = 600
-"""
 SHORT = """
-models = ["patient"]
+models = ["emulator"]
 repetitions = 30
 conditions = ["L_4_0", "N_0_0", "R_-4_0", "L_2_-8", "R_-2_8", "L_4_8", "R_-4_8", "L_4_-8", "L_0_-8",
     "R_0_8"]
@@ -178,10 +169,9 @@ timeout_s = 2
 async def test_a_notebook_that_holds_the_database_all_night_costs_no_trial_and_no_call(
     merge_runner, tmp_path, until
 ):
-    (tmp_path / "models.toml").write_text(PATIENT)
     (tmp_path / "short.toml").write_text(SHORT)
     sweep = ("sweep", "short.toml", "--json", *FAST)
-    gate = Gate(30)
+    gate = Gate(30, tmp_path)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         night = await merge_runner.fork(*sweep, **env)

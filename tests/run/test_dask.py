@@ -286,8 +286,10 @@ async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, sche
 
 
 @pytest.mark.slow
-async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(merge_runner, started):
-    gate = Gate(40)
+async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
+    merge_runner, started, tmp_path
+):
+    gate = Gate(40, tmp_path)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)
@@ -327,8 +329,10 @@ def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
 
 
 @pytest.mark.long
-async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(merge_runner, started):
-    gate = Gate(40)
+async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
+    merge_runner, started, tmp_path
+):
+    gate = Gate(40, tmp_path)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*SIX, "--in-flight", 3, "--dask", "local:3", **env)
@@ -379,8 +383,8 @@ def kept_calls(folder) -> int:
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, number):
-    gate = Gate(40)
+async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, number, tmp_path):
+    gate = Gate(40, tmp_path)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)

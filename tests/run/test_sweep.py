@@ -259,7 +259,7 @@ async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(
 async def test_a_terminal_that_closes_loses_no_call_that_is_in_flight(
     merge_runner, tmp_path, quiet
 ):
-    gate = Gate(40)
+    gate = Gate(40, tmp_path)
     ours, theirs = os.openpty()
     async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
@@ -309,8 +309,8 @@ async def test_each_bad_answer_is_followed_by_a_fallback(merge_runner):
     assert bad.summary["fallbacks"] == bad.summary["invalid_decisions"]
 
 
-async def test_another_process_queries_while_a_sweep_runs(merge_runner):
-    gate = Gate(200)  # of two trials at a time, of up to 40 calls each
+async def test_another_process_queries_while_a_sweep_runs(merge_runner, tmp_path):
+    gate = Gate(200, tmp_path)  # of two trials at a time, of up to 40 calls each
     async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
         sweep = ("sweep", "baseline", "--reps", 2, "--in-flight", 2)
         process = await merge_runner.fork(*sweep, EMULATOR_BASE_URL=f"{server.url}/v1")

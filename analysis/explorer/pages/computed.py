@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from merge_runner.errors import MergeRunnerError
-from merge_runner_analysis.explorer.analysis_worker import Request
+from merge_runner.errors import MergeRunnerError, StoreError
+from merge_runner_analysis.explorer.computing import Request
 from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.explorer.urls import query_of
@@ -17,6 +17,7 @@ from merge_runner_analysis.tables.model import Table, from_text
 
 # What is kept comes within this time; what takes longer is asked for again.
 AT_ONCE_S = 0.3
+FILE_WAIT_S = 300.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,3 +75,11 @@ def computed_table(
     """A table, of all trials or of a part of them, once it is computed."""
     found = computed(site, ("table", name, sweep, condition), asked)
     return found, from_text(found.content["table"]) if found.content else None
+
+
+def awaited(site: Site, request: Request, asked: Mapping[str, str]) -> dict[str, Any]:
+    """What a computation answers, however long that takes; raises NotThere and StoreError."""
+    found = computed(site, request, asked, wait_s=FILE_WAIT_S)
+    if found.content is None:
+        raise StoreError(found.failure or "it is still being computed: ask again in a minute")
+    return found.content

@@ -8,7 +8,7 @@ from typing import Any
 
 from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.explorer.conditions import ordered
-from merge_runner_analysis.explorer.display_text import MINUS
+from merge_runner_analysis.explorer.display_text import with_minus
 from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.pages.home import (
     KINDS,
@@ -135,7 +135,7 @@ def _first(site: Site, own: Driver, scope: Scope, asked: Mapping[str, str]) -> s
                 f" %, goes in {of['go_percent']} % of {of['n']}; m/s² per m/s of own relative "
                 f"velocity: {of['slope']} {of['slope_ci']}."
             )
-    return " ".join(told).replace("-", MINUS) if len(told) > 1 else ""
+    return with_minus(" ".join(told)) if len(told) > 1 else ""
 
 
 def _parameters(site: Site, own: Driver) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,6 +13,12 @@ from merge_runner.prompts.blocks import VARIANTS, Variant, blocks_of
 from merge_runner_analysis.explorer import views
 from merge_runner_analysis.explorer.marks import Mark
 from merge_runner_analysis.explorer.pages.computed import computed_table
+from merge_runner_analysis.explorer.pages.home import (
+    Driver,
+    drivers_of,
+    humans_of,
+    verdicts_of,
+)
 from merge_runner_analysis.explorer.prompts import Part, parts_of
 from merge_runner_analysis.explorer.reading import Row, reading, records
 from merge_runner_analysis.explorer.scope import carried, scope_of, unmarked
@@ -21,6 +27,7 @@ from merge_runner_analysis.metrics import COLLISIONS
 from merge_runner_analysis.names import BASELINE
 from merge_runner_analysis.tables import model
 from merge_runner_analysis.tables.formats import printed
+from merge_runner_analysis.verdict_words import MEASURES
 
 # The blocks of each prompt, as its spec names them; a program has none.
 STORED = """
@@ -61,7 +68,8 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
     bar = scope_of(site, asked)
     found, table = computed_table(site, "contrasts", asked, bar.scope.sweep, bar.scope.condition)
     chosen = bar.scope.drivers or bar.drivers
-    drivers = differences(table) if table else {}
+    judged, verdicts = verdicts_of(site, bar.scope, asked)
+    driven = [one for one in drivers_of(site, verdicts, bar.scope) if unmarked(one.name) in chosen]
     return site.render(
         "prompts.html",
         here="prompts",
@@ -70,15 +78,30 @@ def prompts_page(site: Site, asked: Mapping[str, str]) -> str:
         computed=found,
         prompts=_prompts(site),
         left_out=partial(left_out, site),
-        drivers={name: of for name, of in drivers.items() if unmarked(name) in chosen},
+        drivers=differences(table, chosen) if table else {},
         widest=_widest(table.rows) if table else {},
         collisions=COLLISIONS.name,
         table=table,
+        judged=judged,
+        verdicts=verdicts,
+        measures=MEASURES,
+        human=humans_of(verdicts),
+        slopes=_with_several_prompts(driven),
     )
 
 
-def differences(table: model.Table) -> dict[str, dict[str, dict[str, PromptDifference]]]:
-    """What each prompt changes, by driver, by both prompts, and by measure."""
+def _with_several_prompts(driven: Iterable[Driver]) -> dict[str, list[Driver]]:
+    """Drivers that were played with several prompts, each with all of them, the baseline first."""
+    by_name: dict[str, list[Driver]] = {}
+    for one in sorted(driven, key=lambda one: one.prompt != BASELINE):
+        by_name.setdefault(one.name, []).append(one)
+    return {name: of for name, of in sorted(by_name.items()) if len(of) > 1}
+
+
+def differences(
+    table: model.Table, chosen: Collection[str]
+) -> dict[str, dict[str, dict[str, PromptDifference]]]:
+    """What each prompt changes, by driver of these, by both prompts, and by measure."""
     widest = _widest(table.rows)
     drivers: dict[str, dict[str, dict[str, PromptDifference]]] = {}
     for row in filter(_is_compared, table.rows):
@@ -90,6 +113,8 @@ def differences(table: model.Table) -> dict[str, dict[str, dict[str, PromptDiffe
             printed(table, row),
             _mark(row, widest[_measure(row)]),
         )
+        if unmarked(shown.driver) not in chosen:
+            continue
         of_driver = drivers.setdefault(str(row.values["driver"]), {})
         compared = f"{prompt} against {row.values['reference']}"
         of_driver.setdefault(compared, {})[_measure(row)] = shown
@@ -153,8 +178,13 @@ def left_out(site: Site, variant: str) -> str:
     known = VARIANTS.get(variant) or _as_stored(site, variant)
     if known is None:
         return f"of which {views.UNKNOWN}"
-    changes = views.changes_text(known, lambda name: f"{name}: {views.block_meaning(name)}")
-    return changes or "the whole prompt"
+    return views.changes_text(known, _named) or "the whole prompt"
+
+
+def _named(block: str) -> str:
+    """A block with what it means, if that is known here."""
+    meaning = views.block_meaning(block)
+    return block if meaning == views.UNKNOWN else f"{block}: {meaning}"
 
 
 def _as_stored(site: Site, variant: str) -> Variant | None:

@@ -6,33 +6,41 @@ from collections.abc import Mapping
 
 from merge_runner_analysis.explorer.scope import carried, scope_of
 from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site, news_of
-from merge_runner_analysis.explorer.sweeps import CAUSES, TRUST, arms_of, duration, list_runs
+from merge_runner_analysis.explorer.sweeps import (
+    CAUSES,
+    TRUST,
+    arms_of,
+    duration,
+    list_runs,
+    numbers_of,
+)
 from merge_runner_analysis.explorer.views import prompt_text
 
 
 def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
     """The runs of a scope; raises NotThere, and NothingNew where they are as they were ``seen``."""
     bar, part = scope_of(site, asked, any_prompt=True), carried(asked)
-    runs, together = list_runs(site.catalogue, *bar.scope.where())
+    runs = list_runs(site.catalogue)
+    counted = numbers_of(site.catalogue, *bar.scope.where())
     if part:
-        runs = [(run, said) for run, said in runs if run.row["trials"]]
+        runs = [(run, said) for run, said in runs if counted[run.sweep_id]["trials"]]
     return site.render(
         "sweeps.html",
         here="sweeps",
         bar=bar,
         carried=part,
         runs=runs,
-        together=together,
+        counted=counted,
         trust=TRUST,
         duration=duration,
         seen=news_of((runs, site.catalogue.state()), asked.get("seen", "")),
     )
 
 
-def sweep_page(site: Site, sweep_id: str, seen: str = "") -> str:
+def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     """One run; raises NotThere, and NothingNew as ``seen``."""
-    runs, _ = list_runs(site.catalogue)
-    found = [(run, said) for run, said in runs if run.sweep_id == sweep_id]
+    seen = asked.get("seen", "")
+    found = [(run, said) for run, said in list_runs(site.catalogue) if run.sweep_id == sweep_id]
     if not found:
         raise NotThere(f"the database holds no sweep {sweep_id}")
     run, assessment = found[0]

@@ -6,11 +6,8 @@ from base64 import b64encode
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from importlib import metadata
-from typing import Any
 
-from merge_runner.errors import StoreError
-from merge_runner_analysis.explorer.analysis_worker import Request
-from merge_runner_analysis.explorer.pages.computed import computed, computed_table
+from merge_runner_analysis.explorer.pages.computed import awaited, computed, computed_table
 from merge_runner_analysis.explorer.scope import every
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.figures import FIGURES
@@ -26,7 +23,6 @@ FILES = {
 }
 # How a figure can be downloaded, with the file's type.
 FORMS = {"svg": "image/svg+xml", "png": "image/png"}
-FILE_WAIT_S = 300.0
 PAPER = (
     "S. H. A. Mohammad, W. Mooi, A. Zgonnikov: General-purpose LLMs as Models of Human Driver "
     "Behavior: The Case of Simplified Merging. arXiv:2604.09609, 2026."
@@ -49,7 +45,7 @@ def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
     if suffix not in FILES:
         raise NotThere(f"a table comes as {' or '.join(FILES)}")
     form, kind = FILES[suffix]
-    content = awaited(site, ("table", _named(name, TABLES, "table"), "", ""))
+    content = awaited(site, ("table", _named(name, TABLES, "table"), "", ""), {})
     return render([from_text(content["table"])], form) + "\n", kind
 
 
@@ -57,7 +53,7 @@ def figure_file(site: Site, name: str, form: str) -> bytes:
     """A figure as a file; raises NotThere and StoreError."""
     if form not in FORMS:
         raise NotThere(f"a figure comes as {' or '.join(FORMS)}")
-    file: bytes = awaited(site, ("figure", _named(name, FIGURES, "figure"), form))["file"]
+    file: bytes = awaited(site, ("figure", _named(name, FIGURES, "figure"), form), {})["file"]
     return file
 
 
@@ -78,14 +74,6 @@ def figure_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         sources=(PAPER, HUMANS),
         version=metadata.version("merge-runner"),
     )
-
-
-def awaited(site: Site, request: Request) -> dict[str, Any]:
-    """What a computation answers, however long that takes; raises StoreError."""
-    found = computed(site, request, {}, wait_s=FILE_WAIT_S)
-    if found.content is None:
-        raise StoreError(found.failure or "it is still being computed: ask again in a minute")
-    return found.content
 
 
 def _named(name: str, known: Collection[str], what: str) -> str:

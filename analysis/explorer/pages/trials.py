@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from merge_runner.errors import StoreError
 from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
-from merge_runner_analysis.explorer.pages.computed import computed
+from merge_runner_analysis.explorer.pages.computed import awaited, computed
 from merge_runner_analysis.explorer.pictures import sparkline, speed_range
 from merge_runner_analysis.explorer.scope import carried
 from merge_runner_analysis.explorer.site import NotThere, Site, news_of
 from merge_runner_analysis.explorer.urls import whole
 from merge_runner_analysis.tables import TABLES
 
-EXPORT_WAIT_S = 300.0
 # What facets are called that have another name in an address.
 HEADINGS = {"sweep": "run", "model": "driver", "variant": "prompt"}
 
@@ -74,10 +72,8 @@ def export_filter(site: Site, asked: Mapping[str, str]) -> Filter:
     wanted, cell = filter_of(asked), asked.get("cell", "")
     if not cell:
         return wanted
-    named = computed(site, cell_request(cell), asked, wait_s=EXPORT_WAIT_S)
-    if named.content is None:
-        raise StoreError(named.failure or f"the trials behind {cell} are still being looked up")
-    return replace(wanted, trials=tuple(named.content["trials"]))
+    found = awaited(site, cell_request(cell), asked)
+    return replace(wanted, trials=tuple(found["trials"]))
 
 
 def cell_request(cell: str) -> tuple[str, str, str, str]:

@@ -228,7 +228,7 @@ def test_a_driver_of_a_study_is_a_program_also_where_the_study_is_not_at_hand(pr
     site.catalogue.refresh()
     (group,) = Study(db).models
     (trial,) = site.catalogue.every(Filter())
-    (((run, _),), _) = list_runs(site.catalogue)
+    ((run, _),) = list_runs(site.catalogue)
     said = "scripted stand-in, no language model"
     assert (group.posing, trial["stand_in"], run.stand_in) == (said, said, said)
 

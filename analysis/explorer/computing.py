@@ -1,4 +1,4 @@
-"""What the pages show of the analysis, computed in a process of its own.
+"""What the pages show of the analysis, computed in a process of its own and remembered.
 
 pandas and the fits hold a Python process for seconds, and no page may wait for another's numbers.
 """
@@ -9,8 +9,13 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import duckdb
 
 from merge_runner.errors import UsageError
-from merge_runner.registry import use
+from merge_runner.registry import in_use, use
 from merge_runner.results.database import read_database
 from merge_runner.results.store import results_digest
 from merge_runner.study.file import StudyFile
@@ -37,6 +42,7 @@ from merge_runner_analysis.tables.model import from_text, to_text
 if TYPE_CHECKING:
     from merge_runner_analysis.data.study import Study
 
+REMEMBERED = 100
 Request = tuple[str, ...]
 """``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN`` or ``figure NAME FORM``."""
 
@@ -126,7 +132,7 @@ _db: Path
 _numbers: Numbers | None = None
 
 
-def begin(db: Path, text: str, plugins: Mapping[str, str]) -> None:
+def _begin(db: Path, text: str, plugins: Mapping[str, str]) -> None:
     """Use the study of the explorer, whatever stands in its files by now."""
     global _db  # noqa: PLW0603 # of a process that has no other use
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the explorer, which then ends it
@@ -143,7 +149,7 @@ def _end_with_parent() -> None:
     os._exit(0)
 
 
-def answer(request: Request) -> dict[str, Any]:
+def _answer(request: Request) -> dict[str, Any]:
     """The answer of the database as it is now; raises MergeRunnerError."""
     global _numbers  # noqa: PLW0603 # what was read is read once
     try:
@@ -153,3 +159,101 @@ def answer(request: Request) -> dict[str, Any]:
         return _numbers.answer(request)
     except duckdb.Error as exc:  # as where the file is replaced while it is read
         raise UsageError(f"{_db} cannot be read: {first_line(exc)}") from exc
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A computation, of a state of the database (its stamp), begun at a time (s since 1970)."""
+
+    answer: Future[dict[str, Any]]
+    state: tuple[int, ...]
+    at: float
+
+    @property
+    def content(self) -> dict[str, Any] | None:
+        """The answer; None while it is not there, and where there will be none."""
+        is_there = self.answer.done() and self.answer.exception() is None
+        return self.answer.result() if is_there else None
+
+
+class Worker:
+    """A process that computes, with the same study's plug-ins as this one."""
+
+    def __init__(self, db: Path) -> None:
+        self._pool = ProcessPoolExecutor(
+            max_workers=1,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_begin,
+            initargs=(db, in_use().text, dict(in_use().plugins)),
+        )
+        self._pid = self._pool.submit(os.getpid)
+
+    def submit(self, request: Request) -> Future[dict[str, Any]]:
+        """Compute an answer after what was asked before."""
+        return self._pool.submit(_answer, request)
+
+    def close(self) -> None:
+        """End it, whatever is under way."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        with suppress(BrokenProcessPool, ProcessLookupError):
+            os.kill(self._pid.result(), signal.SIGKILL)
+
+
+class Computing:
+    """Answers by request. One computation goes on at a time, the others wait for it."""
+
+    def __init__(self, db: Path, start: Callable[[Path], Worker] = Worker) -> None:
+        self.db = db
+        self._start = start
+        self._lock = threading.Lock()
+        self._jobs: dict[Request, Job] = {}
+        self._worker: Worker | None = None
+
+    def ask(
+        self,
+        request: Request,
+        state: tuple[int, ...],
+        *,
+        anew: bool = False,
+        wait_s: float = 0.0,
+    ) -> Job:
+        """A computation, waiting at most ``wait_s`` for its answer; raises MergeRunnerError.
+
+        ``state`` is the present one. An answer of an earlier one will do, since it says which,
+        unless it is wanted ``anew``; what was absent may be there in another state.
+        """
+        with self._lock:
+            job = self._jobs.get(request)
+            content = job.content if job else None
+            if job is None or (
+                content is not None and job.state != state and (anew or "absent" in content)
+            ):
+                job = Job(self._submit(request), state, time.time())
+                self._jobs.pop(request, None)
+                self._jobs[request] = job
+                if len(self._jobs) > REMEMBERED:
+                    del self._jobs[next(iter(self._jobs))]
+        wait([job.answer], timeout=wait_s)
+        if not job.answer.done() or (failure := job.answer.exception()) is None:
+            return job
+        with self._lock:  # no failure stays
+            if self._jobs.get(request) is job:
+                del self._jobs[request]
+        if isinstance(failure, BrokenProcessPool):
+            raise UsageError(
+                "the computation ended without an answer; what it said stands where "
+                "`merge-runner view` was started"
+            ) from failure
+        raise failure
+
+    def _submit(self, request: Request) -> Future[dict[str, Any]]:
+        if self._worker is not None:
+            with suppress(BrokenProcessPool):  # another process takes its place
+                return self._worker.submit(request)
+        self._worker = self._start(self.db)
+        return self._worker.submit(request)
+
+    def close(self) -> None:
+        """Stop computing."""
+        if self._worker is not None:
+            self._worker.close()
