@@ -156,7 +156,7 @@ def test_a_published_human_value_stands_in_the_tables_with_its_interval_and_sour
     quantitative, indicators = make_tables(Study(db), ["ablation-quantitative", "indicators"])
     (human,) = (row for row in quantitative.rows if row.id == "human")
     assert (human.values["a_mps"], human.values["a_mps_ci"]) == (0.5, (0.4, 0.6))
-    assert "a is a published value, no human traces are imported (X (2026))" in human.note
+    assert "a (m/s): published, no human traces are imported (X (2026))" in human.note
     (human,) = (row for row in indicators.rows if row.id == "human/a_mps")
     assert human.values["interval"] == (0.4, 0.6)
 
