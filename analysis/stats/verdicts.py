@@ -90,7 +90,7 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     alike = group
     if not group.trials["condition"].isin(HUMAN_CONDITIONS).all():
         alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
-    robust = score(study, group).robust
+    robust = score(study, alike).robust
     found = [
         _compared(study, alike, measure, robust.get(SLOPES.get(measure.name, "")))
         for measure in MEASURES.values()

@@ -23,13 +23,18 @@ NUMBER = re.compile(r"[−-]?\d+(?:\.\d+)?(?:e-\d+)?")
 
 @pytest.fixture(scope="module")
 def db(tmp_path_factory):
-    """A driver that yields as humans do, but crashes where nobody is ahead."""
+    """A driver that yields as humans do, but crashes where nobody is ahead.
+
+    It drove one condition less often, so that the humans beside it weigh otherwise than by
+    themselves.
+    """
     crashes = [
         Drive("o3", "baseline", "N_0_0", rep, (0.1 * rep,) * 9, (0.1 * rep,) * 9)
         for rep in range(1, 4)
     ]
     drives = {(one.condition, one.rep): one for one in [*yielding("o3", reps=4), *crashes]}
-    return write_study(tmp_path_factory.mktemp("same") / "study.duckdb", drives.values())
+    kept = [one for (name, rep), one in drives.items() if name != "R_-2_8" or rep == 1]
+    return write_study(tmp_path_factory.mktemp("same") / "study.duckdb", kept)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +53,7 @@ def pages(db):
     site.computing = Awaited(db, InProcess)
     site.catalogue.refresh()
     client = TestClient(explorer(site), base_url="http://127.0.0.1:8700")
-    yield [unescape(client.get(path).text) for path in ("/", "/drivers/o3?prompt=baseline")]
+    yield [unescape(client.get(path).text) for path in ("/", "/drivers/o3")]
     site.computing.close()
 
 
@@ -87,9 +92,7 @@ def test_json_has_the_numbers_of_the_table(db, rows):
 
 
 def test_study_has_the_numbers_of_the_table(rows, pages):
-    told = dict(
-        re.findall(r'href="/drivers/o3\?prompt=baseline#([\w-]+)"\s+title="([^"]+)"', pages[0])
-    )
+    told = dict(re.findall(r'href="/drivers/o3[^"#]*#([\w-]+)"\s+title="([^"]+)"', pages[0]))
     judged = {name: values for name, values in rows.items() if values["estimate"] is not None}
     assert len(judged) >= 5
     assert told.keys() >= judged.keys()
@@ -99,7 +102,7 @@ def test_study_has_the_numbers_of_the_table(rows, pages):
 
 
 def test_a_drivers_page_has_the_numbers_of_the_table(rows, pages):
-    table = pages[1].split('class="verdicts"')[1].split("</table>")[0]
+    table = pages[1].split('class="verdicts')[1].split("</table>")[0]
     for name, values in rows.items():
         row = table.split(f'id="{name}"')[1].split("</tr>")[0]
         cells = dict(re.findall(r'<td[^>]*data-l="([^"]+)"[^>]*>(.*?)</td>', row, re.DOTALL))

@@ -80,8 +80,9 @@ def _beside_humans(judged, who, recorded: pd.DataFrame) -> dict[str, dict]:
     humans = {"who": human, "recorded": None if recorded.empty else recorded}
     rows = {f"human/{name}": row for name, row in recompute_verdicts.of_humans(humans).items()}
     for key, trials in judged.items():
-        robust = {name: holds for name, (*_, holds) in _verdicts(trials).items()}
-        for name, row in recompute_verdicts.rows(trials, humans, robust).items():
+        alike = trials[trials["cell"].isin(measured.OUTCOMES)]  # where humans drove
+        robust = {name: holds for name, (*_, holds) in _verdicts(alike).items()}
+        for name, row in recompute_verdicts.rows(alike, humans, robust).items():
             rows[f"{_id(key)}/{name}"] = row
     return rows
 

@@ -25,23 +25,22 @@ KEPT = ("estimate", "ci_low", "ci_high", "n")
 
 
 def rows(trials: pd.DataFrame, humans: dict, indicators) -> dict[str, dict]:
-    """The rows of a driver and prompt by measure.
+    """The rows of a driver and prompt by measure, of its trials in the humans' conditions.
 
     ``humans`` are two frames of trials: ``who`` and ``recorded``, the latter None without an
     import. ``indicators`` has by name whether I1 to I4 hold by the robust rules.
     """
-    alike = trials[trials["cell"].isin(measured.OUTCOMES)]
     found = {}
     for name in ("headway", "velocity"):
         column = ("headway", "velocity").index(name) + 1
         found[name] = _beside(
-            _first(alike, column),
+            _first(trials, column),
             _first(humans["who"], column),
-            _firsts_apart(alike, humans["who"], column),
+            _firsts_apart(trials, humans["who"], column),
         )
-    found["collisions"] = _collisions(alike, humans["who"])
+    found["collisions"] = _collisions(trials, humans["who"])
     for name in ("gap", "gap-headway", "gap-velocity"):
-        own, other = _gap(alike, name), human_gap(humans["recorded"], alike, name)
+        own, other = _gap(trials, name), human_gap(humans["recorded"], trials, name)
         apart = {}
         if own.get("se") is not None and other.get("se") is not None:
             parts = [(each["estimate"], each["se"], each["freedom"]) for each in (own, other)]

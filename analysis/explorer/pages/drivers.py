@@ -92,7 +92,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         computed=found,
         table=table,
         measures=MEASURES,
-        human=humans_of(table),
+        human=humans_of(table, own),
         first=first,
         parameters=_parameters(site, own) if own else "",
         found=words,

@@ -111,10 +111,16 @@ def verdicts_of(
     return found, table
 
 
-def humans_of(table: Table | None) -> dict[str, Any]:
-    """The humans' cells by measure, where their bands lie, and which humans they are."""
+def humans_of(table: Table | None, own: Driver | None = None) -> dict[str, Any]:
+    """The humans' cells by measure, where their bands lie, and which humans they are.
+
+    Beside a driver they are those that it is compared with, in its conditions.
+    """
     found = by_group(table.rows).get(HUMAN, {}) if table else {}
     label = str(next(iter(found.values()))["driver"]) if found else HUMAN
+    for name, values in own.verdicts.items() if own and own.cells else ():
+        beside = {"estimate": values.get("human"), "ci": values.get("human_ci")}
+        found[name] = {**found[name], **beside}
     return {
         "about": label.partition("(")[2].rstrip(")") or "990 trials of nine pairs, as published",
         "cells": cells(found),

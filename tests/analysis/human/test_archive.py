@@ -38,14 +38,6 @@ def test_a_zip_made_on_windows_has_the_same_names(tmp_path):
         assert [found.name for found in files] == ["a/experiment_4_iter_1.csv"]
 
 
-def test_nothing_is_written_to_disk(tmp_path, monkeypatch):
-    path = write_zip(tmp_path / "d.zip", FILES)
-    monkeypatch.chdir(tmp_path)
-    with open_files(path) as files:
-        assert all(found.read() for found in files)
-    assert list(tmp_path.rglob("*")) == [path]
-
-
 def test_a_path_that_is_not_there_or_no_zip_is_refused(tmp_path):
     with (
         pytest.raises(UsageError, match=r"there is no .*nowhere"),
