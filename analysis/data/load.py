@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-from pydantic import ValidationError
+from pydantic import BaseModel, JsonValue, ValidationError
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
@@ -123,6 +123,20 @@ FROM specs JOIN trials USING (spec_hash) GROUP BY ALL ORDER BY ALL
 """
 
 
+class _Driver(BaseModel):
+    """What a spec says of a driver: a model has the body of its requests, a program has none."""
+
+    body: dict[str, JsonValue] = {}
+
+
+class _Spec(BaseModel):
+    """What is read of a spec; that of humans says none of this."""
+
+    scenario: ScenarioConfig = ScenarioConfig()
+    left: _Driver = _Driver()
+    right: _Driver = _Driver()
+
+
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     """The rows of one read-only query; raises UsageError."""
     return frames.load(Path(db), sql)
@@ -149,7 +163,7 @@ def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:
     for row in load_each({"specs": SPECS}, db)["specs"].itertuples():
         found[row.spec_hash] = json.loads(row.spec)
         try:
-            ScenarioConfig.model_validate(found[row.spec_hash].get("scenario", {}))
+            _Spec.model_validate(found[row.spec_hash])
         except ValidationError as exc:
             first = exc.errors()[0]
             place = ".".join(map(str, first["loc"])) or "all of it"
