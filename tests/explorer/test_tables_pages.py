@@ -280,7 +280,7 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
     site.computing = Computing(db, Slow)
     client = TestClient(explorer(site), base_url=f"http://{HERE}")
     first = client.get("/tables/attempts").text
-    assert "Computing, about 4 s the first time" in first
+    assert "Computing, " in first
     assert asked.wait(60)
     assert listed(client.get("/trials").text) == 66
     assert "Computing, about" in client.get("/prompts").text
