@@ -134,7 +134,7 @@ def test_humans_are_not_compared_with_themselves(imported):
 
 
 def test_the_speeds_of_humans_are_judged_without_the_simulators_resistance(imported):
-    speeds = imported._read(SPEEDS).assign(resisted=True)
+    speeds = imported.read(SPEEDS).assign(resisted=True)
     for group in imported.groups:
         resisted = measure_profiles(of_trials(speeds, group.trials))
         assert len(resisted) == 2 * len(group.trials)
