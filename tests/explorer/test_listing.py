@@ -116,11 +116,6 @@ def test_a_name_that_hides_something_is_neutral(client, address):
     assert not {"\u202e", "\u200b"} & set(said)
 
 
-def test_a_name_that_hides_something_is_neutral_where_it_is_found_to_compare_with(client):
-    found = client.get("/others/o3/baseline/N_0_0/rep01", params={"q": "gpj"}).json()["found"]
-    assert [one["name"] for one in found] == ["o3[U+202E]gpj[U+200B]/baseline/N_0_0/rep01"]
-
-
 @pytest.mark.slow
 def test_a_name_that_hides_something_is_neutral_on_every_page_of_an_export(
     db, tmp_path, monkeypatch

@@ -142,7 +142,9 @@ def test_what_is_said_is_chosen_beside_what_is_planned_and_driven(db, tmp_path):
         assert found(client, planned_from="0.25", planned_to="0.35") == [("o3", "left", 2)]
         assert found(client, planned_from="0.35", model="o3", tactical="Y") == []
         text = client.get("/words", params={"model": "o3", "tactical": "Y"}).text
-        shares = re.findall(r'href="([^"]*planned=(?:go|brake|hold)[^"]*)">(\d+)</a>\s*<small>', text)
+        shares = re.findall(
+            r'href="([^"]*planned=(?:go|brake|hold)[^"]*)">(\d+)</a>\s*<small>', text
+        )
         assert shares
         for link, count in shares:
             assert f"<strong>{count}</strong> decisions" in client.get(unescape(link)).text
