@@ -36,6 +36,7 @@ from merge_runner_analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
 from merge_runner_analysis.explorer.offline import page_of_trials
 from merge_runner_analysis.explorer.pages import (
     comparing,
+    conditions,
     drivers,
     home,
     notes,
@@ -198,6 +199,7 @@ PAGES: dict[str, Callable[[Site, Request], str | Response]] = {
     "/": _shown(home.home_page),
     "/drivers": _shown(drivers.drivers_page),
     "/drivers/{name:path}": _shown(drivers.driver_page),
+    "/conditions/{name:path}": _shown(conditions.condition_page),
     "/sweeps": _shown(sweep.sweeps_page),
     "/sweeps/{name:path}": _shown(sweep.sweep_page),
     "/trials": _shown(trials.trials_page),

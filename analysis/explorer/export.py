@@ -34,7 +34,9 @@ MOST = 1_000  # trials of drivers; of humans there are at most 990
 # The pages of an export by the first part of their path, and what their addresses ask for. They
 # are of all trials, so that a link within a scope leads to the page without it.
 FOLLOWED: dict[str, Collection[str]] = {
-    **dict.fromkeys(("", "sweeps", "tables", "figures", "prompts", "notes", "glossary"), ()),
+    **dict.fromkeys(
+        ("", "sweeps", "conditions", "tables", "figures", "prompts", "notes", "glossary"), ()
+    ),
     "drivers": ("variant",),
     "trials": ("spec", "page", *FACETS),
     "discordant": ("model", "variant"),

@@ -26,6 +26,7 @@ class Links:
     figure = partialmethod(_named, "figures")
     sweep = partialmethod(_named, "sweeps")
     driver = partialmethod(_named, "drivers")
+    condition = partialmethod(_named, "conditions")
     static = partialmethod(_named, "static")
 
     def _of_trial(self, kind: str, row: Mapping[str, Any], /, **state: object) -> str:
@@ -41,10 +42,6 @@ class Links:
     # What a decision's panel shows, and its reply as a plain text.
     decision = partialmethod(_of_decision, "decisions")
     raw = partialmethod(_of_decision, "raw")
-
-    def condition(self, name: str) -> str:
-        """The trials of a condition."""
-        return self.to("trials", condition=name)
 
     def cell(self, table: str, row: str, column: str) -> str:
         """The trials behind a cell.

@@ -13,6 +13,7 @@ __all__ = ["exported"]
 PAGES = (
     "/sweeps",
     "/",
+    "/conditions/N_0_0",
     "/drivers",
     "/drivers/emulator?variant=baseline",
     "/glossary",

@@ -103,7 +103,7 @@ def test_what_an_export_refers_to_lies_in_it_and_asks_no_server(exported):
     names = {path.relative_to(exported).as_posix() for path in exported.rglob("*")}
     assert names > {
         *("index.html", "files/trials.html", "files/trials-emulator-baseline-N_0_0-rep01.html"),
-        *("files/tables-attempts.csv", "files/tables-attempts.tex"),
+        *("files/conditions-N_0_0.html", "files/tables-attempts.csv", "files/tables-attempts.tex"),
         *("files/figures-ablation-matrix.svg", "files/sweeps.html"),
     }
     assert {str(page): found for page in pages if (found := broken(page))} == {}
