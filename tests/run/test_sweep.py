@@ -255,6 +255,12 @@ async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(
     assert results_digest(tmp_path / DB) == quiet
 
 
+def of_a_terminal():
+    """Make a process one of its terminal, whose closing it is told, also where nohup ignores it."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+
 @pytest.mark.slow
 async def test_a_terminal_that_closes_loses_no_call_that_is_in_flight(
     merge_runner, tmp_path, quiet
@@ -272,7 +278,7 @@ async def test_a_terminal_that_closes_loses_no_call_that_is_in_flight(
             stdout=theirs,
             stderr=theirs,
             start_new_session=True,
-            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+            preexec_fn=of_a_terminal,
         )
         os.close(theirs)
         asyncio.get_running_loop().add_reader(ours, os.read, ours, 2**16)
