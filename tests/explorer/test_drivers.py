@@ -92,7 +92,7 @@ def test_a_sweep_is_named_by_its_driver_and_says_that_a_stand_in_answered(site, 
 
 def computed(page, site):
     """A page once its numbers are there."""
-    while "Computing, about" in (text := page(site, {})):
+    while "Computing, " in (text := page(site, {})):
         time.sleep(0.1)
     return text
 
