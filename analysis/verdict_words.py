@@ -47,11 +47,6 @@ class Measure:
     decimals: int = 1
     margin: float | None = None
 
-    @property
-    def is_slope(self) -> bool:
-        """Whether it is a term of a regression, which an indicator tests."""
-        return self.name not in {"collisions", "gap", "held"}
-
 
 MERGED = "status = 'finished' AND merged_first IS NOT NULL"
 # Those that are undecided count, too; what the first part names is a share with a numerator.

@@ -181,7 +181,7 @@ def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> boo
     takes two thirds of that memory; more would only cache the file.
     """
     [(stored, calls)] = connection.execute(SIZES).fetchall()
-    is_little = bool(max(stored, longest) < 8_192 and calls < 250_000)
+    is_little = bool(max(stored, longest) < 8_192 and calls < 210_000)
     limit = "180MB" if is_little else SETTINGS["memory_limit"]
     connection.execute(f"SET memory_limit = '{limit}'")
     return is_little

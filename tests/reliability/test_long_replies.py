@@ -23,6 +23,7 @@ from merge_runner.results.database import (
     SETTINGS,
     append,
     in_memory,
+    limit_memory,
     merge_small_groups,
     open_database,
     schema_sql,
@@ -164,6 +165,23 @@ def test_small_groups_are_merged_unless_texts_are_long(tmp_path):
     short = 10_000 * BYTES_OF_A_CALL + MERGED_BYTES
     assert tasks(short) == (100,)
     assert tasks(short + 1) == (0,)
+
+
+@pytest.mark.parametrize(
+    ("stored", "longest", "calls", "is_little"),
+    [(100, 0, 9, True), (100, 9_000, 9, False), (9_000, 0, 9, False), (1, 1, 300_000, False)],
+)
+def test_memory_is_little_where_texts_are_short_and_calls_not_many(
+    stored, longest, calls, is_little
+):
+    connection = in_memory(SETTINGS)
+    connection.execute(
+        "CREATE TABLE calls AS SELECT 'asked' AS request, repeat('a', ?) AS reply FROM range(?)",
+        [stored, calls],
+    )
+    assert limit_memory(connection, longest) == is_little
+    (limit,) = connection.execute("SELECT current_setting('memory_limit')").fetchone()
+    assert limit == ("171.6 MiB" if is_little else "953.6 MiB")
 
 
 @pytest.mark.long
