@@ -19,14 +19,14 @@ from merge_runner_analysis.explorer.conditions import condition_texts
 from merge_runner_analysis.explorer.database_copy import Copies
 from merge_runner_analysis.explorer.display_text import MINUS, shown_number, visible, with_minus
 from merge_runner_analysis.explorer.glossary import sections
-from merge_runner_analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
+from merge_runner_analysis.explorer.notes import LONGEST_TEXT, Notes
 from merge_runner_analysis.explorer.queries import Queries
 from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.explorer.search import Words
 from merge_runner_analysis.explorer.urls import HOME, Links
 from merge_runner_analysis.explorer.views import clock, condition_text
 from merge_runner_analysis.metrics import METRICS
-from merge_runner_analysis.verdict_words import TABLE
+from merge_runner_analysis.verdict_words import MEASURES, TABLE
 
 TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
 STYLES = (
@@ -108,11 +108,11 @@ class Site:
             at=self.at,
             metrics=METRICS,
             notes=self.notes,
-            note_limits={"text": LONGEST_TEXT, "tags": MOST_TAGS * (LONGEST_TAG + 2)},
+            longest_note=LONGEST_TEXT,
+            measures=MEASURES,
             pages=PAGES,
             lists=LISTS,
             share=self.share,
-            db_option=self.db_option,
             program=self.program,
             styles=STYLES,
             study=str(self.db),
@@ -157,13 +157,8 @@ class Site:
 
     def share(self, *options: str) -> str:
         """The command that writes what is shown here as files."""
-        parts = shlex.join([self.program, "view"]), self.db_option, shlex.join(options)
-        return " ".join(filter(None, parts))
-
-    @property
-    def db_option(self) -> str:
-        """The option that names this database; empty where it is the usual one."""
-        return "" if self.db == DEFAULT_DB else shlex.join(["--db", str(self.db)])
+        db = [] if self.db == DEFAULT_DB else ["--db", str(self.db)]
+        return shlex.join([self.program, "view", *db, *options])
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""
