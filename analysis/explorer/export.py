@@ -49,9 +49,9 @@ POLICY = (
 HTML = b"<!doctype html"
 OURS = f'{HTML.decode()}>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'.encode()
 INDEX, FILES = "index.html", "files"
+SERVED = ("htmx*", "lost.js", "notes.js", "single.js")  # scripts that need a server, or one page
 BUSY, POLL_S = 'class="computing"', 0.1
 _FILE_LINKS = re.compile(r'href="(/(?:tables|figures)/[^"]+\.(?:csv|tex|svg))"')
-_STATIC = re.compile(r'="/static/([^"]+)"')
 _ODD = re.compile(r"[^A-Za-z0-9_.]+")
 LONGEST_NAME = 120
 
@@ -81,6 +81,7 @@ def export_folder(
             site.catalogue.keep([row["number"] for row in rows])
         (stage / FILES).mkdir()
         asyncio.run(_crawl(site, begin, heads, stage, told))
+        shutil.copytree(STATIC, stage / FILES / "static", ignore=shutil.ignore_patterns(*SERVED))
     return index
 
 
@@ -96,7 +97,7 @@ async def _crawl(
     site: Site, begin: str, heads: tuple[str, ...], stage: Path, told: Callable[[int], object]
 ) -> None:
     """Save the pages to which links lead, as they are served, with links from file to file."""
-    files, waiting, needed = {begin: INDEX}, deque([begin]), set[str]()
+    files, waiting = {begin: INDEX}, deque([begin])
 
     def leads(root: str, address: str) -> str:
         """The way to the file of an address; empty where there is none."""
@@ -135,15 +136,10 @@ async def _crawl(
                         (stage / files[page]).write_bytes(file.content)
             root = "" if address == begin else "../"
             text = offline(text, site.db.name, POLICY, partial(leads, root))
-            needed.update(_STATIC.findall(text))
-            text = _STATIC.sub(rf'="{root}{FILES}/static/\1"', text)
+            text = text.replace('="/static/', f'="{root}{FILES}/static/')
             refuse_leaks(site.db, files[address], text)
             (stage / files[address]).write_text(text, encoding="utf-8")
             told(len(files) - len(waiting))
-    for name in needed:
-        copy = stage / FILES / "static" / name
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(STATIC / name, copy)
 
 
 @cache  # pages link to each other

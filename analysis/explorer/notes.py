@@ -122,12 +122,10 @@ def _parsed(path: Path, _: tuple[int, ...]) -> Kept:
 
 def reader_of(given: str | None) -> str:
     """Who writes: the name that is given, or the system's; raises UsageError."""
-    if given is None:
-        try:
-            given = getpass.getuser()
-        except (KeyError, OSError):  # the system knows no name, as in some containers
-            given = "reader"
-    name = " ".join(given.split())
+    try:
+        name = " ".join((getpass.getuser() if given is None else given).split())
+    except (KeyError, OSError):  # the system knows no name, as in some containers
+        name = "reader"
     if not 0 < len(name) <= LONGEST_NAME:
         raise UsageError(f"--reader needs a name of up to {LONGEST_NAME} characters")
     return name

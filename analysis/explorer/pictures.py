@@ -35,7 +35,8 @@ class Scale:
 
 def speed_range(rows: Sequence[Row]) -> tuple[int, int]:
     """The whole m/s at the bottom and the top of all sparklines of these trials."""
-    ends = [end for row in rows for side in SIDES for end in row[f"{side}_range_mps"] or ()]
+    every = [end for row in rows for side in SIDES for end in row[f"{side}_range_mps"] or ()]
+    ends = [end for end in every if end is not None]  # a vehicle may have no samples
     low = floor(min(ends, default=0.0))
     return low, max(ceil(max(ends, default=0.0)), low + 1)
 

@@ -64,7 +64,6 @@ def sql_page(site: Site, asked: Mapping[str, str]) -> str:
         carried=carried(asked),
         query=query if is_asked else scoped_query(carried(asked)),
         asked=is_asked,
-        hides=visible(query) != query,
         longest=LONGEST,
         examples=EXAMPLES,
         tables=tables(),
