@@ -48,7 +48,7 @@ from merge_runner_analysis.explorer.pages import (
     words,
 )
 from merge_runner_analysis.explorer.reading import reading
-from merge_runner_analysis.explorer.site import STATIC, NothingNew, NotThere, Site
+from merge_runner_analysis.explorer.site import STATIC, NothingNew, NotThere, Site, download
 from merge_runner_analysis.explorer.urls import whole
 
 LOG = logging.getLogger(__name__)
@@ -56,15 +56,9 @@ FIRST_TIME = (
     "The trials are read for the first time; ten thousand take about ten seconds. This page comes "
     "back by itself."
 )
-CSV = "text/csv; charset=utf-8"
 MOST_NOTED, MOST_FIELDS = 65_536, 10  # bytes and fields of a form with a note
 # Nothing in a reply runs, whatever a browser takes it for.
 SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
-# Matplotlib writes styles into its SVG, and traces as pictures.
-DRAWN = {
-    "content-security-policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
-    "sandbox"
-}
 
 
 def serve(db: Path, port: int, say: Callable[[str], None], reader: str) -> None:
@@ -136,24 +130,11 @@ def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> 
 
 def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
     wanted = trials.export_filter(site, asked)
-    return _download(site.catalogue.export(wanted, trials.sort_of(asked)), CSV, "trials.csv")
-
-
-def _table_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
-    return _download(*tables.table_file(site, name, suffix), f"{name}.{suffix}")
-
-
-def _figure_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
-    file, kind = tables.figure_file(site, name, suffix)
-    return Response(file, media_type=kind, headers=DRAWN)
+    return download(site.catalogue.export(wanted, trials.sort_of(asked)), "trials.csv")
 
 
 def _raw(site: Site, name: str, asked: Mapping[str, str]) -> Response:
     return PlainTextResponse(trial.raw_reply(site, name, asked), headers=SEALED)
-
-
-def _sql_csv(site: Site, asked: Mapping[str, str]) -> Response:
-    return _download(site.queries.csv(sql.query_in(asked)), CSV, "query.csv")
 
 
 # What renders each page, of what its address names and asks for.
@@ -173,16 +154,16 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/raw/{name:path}": _raw,
     "/glossary": lambda site, _: site.render("glossary.html", here="glossary"),
     "/tables": tables.tables_page,
-    "/tables/{name}.{suffix}": _table_file,
+    "/tables/{name}.{suffix}": tables.table_file,
     "/tables/{name}": tables.table_page,
-    "/figures/{name}.{suffix}": _figure_file,
+    "/figures/{name}.{suffix}": tables.figure_file,
     "/figures/{name}": tables.figure_page,
     "/prompts": prompts.prompts_page,
     "/discordant": prompts.discordant_page,
     "/words": words.words_page,
     "/notes": notes.notes_page,
     "/sql": sql.sql_page,
-    "/sql.csv": _sql_csv,
+    "/sql.csv": sql.sql_csv,
 }
 
 
@@ -204,12 +185,6 @@ async def _noted(site: Site, request: Request) -> Response:
         return RedirectResponse(site.at.trial(row), 303)
 
     return await run_in_threadpool(write)
-
-
-def _download(content: str | bytes, kind: str, name: str) -> Response:
-    """A file that a browser saves under this name."""
-    headers = {"content-disposition": f'attachment; filename="{name}"'}
-    return Response(content, media_type=kind, headers=headers)
 
 
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import jinja2
+from starlette.responses import Response
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
@@ -57,6 +58,13 @@ class NotThere(Exception):
 
 class NothingNew(Exception):
     """What was seen of a page is what it still shows."""
+
+
+def download(text: str, name: str) -> Response:
+    """A file that a browser saves under this name."""
+    kind = {".csv": "text/csv", ".tex": "application/x-tex"}[Path(name).suffix]
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return Response(text, headers=headers, media_type=f"{kind}; charset=utf-8")
 
 
 def news_of(shown: object, seen: str, state: str = "all") -> str:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
+from starlette.responses import Response
+
 from merge_runner.errors import MergeRunnerError
 from merge_runner.results.export import tables, units
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.explorer.display_text import visible
 from merge_runner_analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST
 from merge_runner_analysis.explorer.scope import carried, scope_of
-from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.site import Site, download
 
 # Types of which values stand to the right.
 NUMBER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|BIGNUM|DECIMAL\(.*\)")
@@ -74,6 +76,11 @@ def sql_page(site: Site, asked: Mapping[str, str]) -> str:
         is_number=NUMBER.fullmatch,
         most=DOWNLOADED_ROWS,
     )
+
+
+def sql_csv(site: Site, asked: Mapping[str, str]) -> Response:
+    """All that a query finds, as a file; raises UsageError."""
+    return download(site.queries.csv(query_in(asked)), "query.csv")
 
 
 def scoped_query(chosen: Mapping[str, Sequence[str]]) -> str:

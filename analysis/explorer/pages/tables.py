@@ -6,21 +6,21 @@ from base64 import b64encode
 from collections.abc import Collection, Mapping
 from importlib import metadata
 
+from starlette.responses import Response
+
 from merge_runner_analysis.explorer.pages.computed import awaited, computed, computed_table
 from merge_runner_analysis.explorer.scope import every
-from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.explorer.site import NotThere, Site, download
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.tables.formats import render, shown_columns, table_view
 from merge_runner_analysis.tables.model import from_text
 
-# How tables and figures can be downloaded: the types of the files by their suffix.
-TABLE_FILES = {
-    "csv": (TableFormat.CSV, "text/csv; charset=utf-8"),
-    "tex": (TableFormat.LATEX, "application/x-tex; charset=utf-8"),
-}
+TABLE_FILES = {"csv": TableFormat.CSV, "tex": TableFormat.LATEX}
 FIGURE_FILES = {"svg": "image/svg+xml", "png": "image/png"}
+# Matplotlib writes styles into its SVG, and traces as pictures.
+DRAWN = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
 
 
 def tables_page(site: Site, _: Mapping[str, str]) -> str:
@@ -28,18 +28,18 @@ def tables_page(site: Site, _: Mapping[str, str]) -> str:
     return site.render("tables.html", here="tables", tables=TABLES, figures=FIGURES)
 
 
-def table_file(site: Site, name: str, suffix: str) -> tuple[str, str]:
-    """A table as a file's text with the type of the file; raises NotThere and StoreError."""
-    form, kind = TABLE_FILES[_known(suffix, TABLE_FILES, "file")]
+def table_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
+    """A table as a file; raises NotThere and StoreError."""
+    form = TABLE_FILES[_known(suffix, TABLE_FILES, "file")]
     content = awaited(site, ("table", _known(name, TABLES, "table"), "", ""))
-    return render([from_text(content["table"])], form) + "\n", kind
+    return download(render([from_text(content["table"])], form) + "\n", f"{name}.{suffix}")
 
 
-def figure_file(site: Site, name: str, suffix: str) -> tuple[bytes, str]:
-    """A figure as a file with its type; raises NotThere and StoreError."""
+def figure_file(site: Site, name: str, suffix: str, _: Mapping[str, str]) -> Response:
+    """A figure as a file; raises NotThere and StoreError."""
     kind = FIGURE_FILES[_known(suffix, FIGURE_FILES, "file")]
     content = awaited(site, ("figure", _known(name, FIGURES, "figure"), suffix))
-    return content["file"], kind
+    return Response(content["file"], headers={"content-security-policy": DRAWN}, media_type=kind)
 
 
 def figure_page(site: Site, name: str, _: Mapping[str, str]) -> str:
