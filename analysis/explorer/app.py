@@ -32,6 +32,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner_analysis.explorer.glossary import sections
 from merge_runner_analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
 from merge_runner_analysis.explorer.offline import page_of_trials
 from merge_runner_analysis.explorer.pages import (
@@ -206,10 +207,9 @@ PAGES: dict[str, Callable[[Site, Request], str | Response]] = {
     "/trials/": lambda site, asked: RedirectResponse(site.at.to("trials", **asked.query_params)),
     "/trials.csv": _trials_csv,
     "/trials/{name:path}": _trial,
-    "/decisions/{name:path}": _shown(trial.decision_fragment),
     "/others/{name:path}": _others,
     "/raw/{name:path}": _raw,
-    "/glossary": lambda site, _: site.render("glossary.html", here="glossary"),
+    "/glossary": lambda site, _: site.render("glossary.html", here="glossary", glossary=sections()),
     "/tables": lambda site, _: tables.tables_page(site),
     "/tables/{name}.{suffix}": _table_file,
     "/tables/{name}": _shown(tables.table_page),

@@ -105,8 +105,7 @@ async def _crawled(
     ) as client:
         while waiting:
             address = waiting.popleft()
-            whole = {"as": "whole"} if address.startswith("/trials/") else {}
-            reply = await client.get(httpx.URL(address).copy_merge_params(whole))
+            reply = await client.get(address)
             if reply.is_error:  # no page is there, or a figure cannot be drawn
                 if files[address].endswith(".html") and reply.status_code != httpx.codes.NOT_FOUND:
                     raise UsageError(

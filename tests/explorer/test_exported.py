@@ -29,7 +29,7 @@ class References(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
-        names = {"href", "src", "action", "data-back", "data-panel", "data-others"}
+        names = {"href", "src", "action", "data-back", "data-others"}
         self.found += [v for name, v in attrs if name in names or name.startswith("hx-")]
 
 
@@ -77,7 +77,7 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     expect(page).to_have_url(re.compile("decision=1"))
     page.reload()
     expect(page.locator(".decision-panel h2")).to_contain_text("decision 1 at 1.0 s")
-    expect(page.locator("#charts .uplot")).to_have_count(3)
+    expect(page.locator("#charts .chart")).to_have_count(3)
     expect(page.locator(".plan-values dd").first).to_be_visible()
     page.keyboard.press("Escape")
     expect(page.locator("#decision .decision-panel h2")).to_have_count(2)
@@ -111,8 +111,7 @@ def test_what_an_export_refers_to_lies_in_it_and_asks_no_server(exported):
     scripts = {name.partition("static/")[2] for name in names if name.endswith(".js")}
     assert scripts.isdisjoint({"vendor/htmx-2.0.11.min.js", "notes.js", "filters.js", "sql.js"})
     assert "replay/start.js" in scripts
-    for page in pages:
-        assert page.read_text().count("<form") == 1, "that of the help"
+    assert not [page for page in pages if "<form" in page.read_text()]
 
 
 def test_a_page_of_its_own_refers_to_nothing_but_itself(study, tmp_path):

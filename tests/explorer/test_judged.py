@@ -138,7 +138,7 @@ def test_no_sign_stands_under_a_car_and_every_car_stands_within_the_picture(page
         for width in (1440, 900):
             page.set_viewport_size({"width": width, "height": 900})
             page.goto(f"{address}/trials/{name}")
-            expect(page.locator("#charts .uplot")).to_have_count(3)
+            expect(page.locator("#charts .chart")).to_have_count(3)
             left, top, right, bottom = page.locator("#track").evaluate(box)
             signs = [sign.evaluate(box) for sign in page.locator("#track .sign:visible").all()]
             assert len(signs) == 6

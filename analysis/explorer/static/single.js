@@ -8,17 +8,16 @@
   const shown = (href, asked = new URL(href).searchParams) => find(asked.get("trial"), asked.get("spec"));
   const chosen = shown(location.href) ?? held[0];
   window.explorer = {
-    panel: async (link, other) => replay.held(link, (other?.held ?? chosen).content),
     data: async (key) => {
       const one = named(key),
-        data = one?.content.getElementById("replay-data");
-      if (!data) return null;
+        part = (id) => one?.content.getElementById(id);
+      if (!part("replay-data")) return null;
       const { trial, spec } = one.dataset;
       return {
-        ...JSON.parse(data.textContent),
-        held: one,
+        ...JSON.parse(part("replay-data").textContent),
         page: `?${new URLSearchParams({ trial, spec })}`,
-        ribbons: one.content.getElementById("ribbons")?.innerHTML ?? "",
+        ribbons: part("ribbons").innerHTML,
+        panels: part("panels").textContent,
       };
     },
     search: async (text) => {
