@@ -15,6 +15,7 @@ _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
     (re.compile(r"`(.+?)`"), r"<code>\1</code>"),
+    (re.compile(r" \(\[[^]]+\]\([^)]+\)\)"), ""),
     (re.compile(r"\[(.+?)\]\(.+?\)"), r"\1"),
 )
 
@@ -39,7 +40,7 @@ def sections() -> dict[str, list[Word]]:
 
 
 def _shown(text: str) -> Markup:
-    """A cell of Markdown; its links lead nowhere from a page, and become their texts."""
+    """A cell of Markdown; of its links, which lead nowhere from a page, the texts stay."""
     shown = str(escape(text))
     for pattern, html in _MARKED:
         shown = pattern.sub(html, shown)

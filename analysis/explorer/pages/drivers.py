@@ -9,7 +9,7 @@ from typing import Any
 from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.explorer.conditions import ordered
 from merge_runner_analysis.explorer.display_text import with_minus
-from merge_runner_analysis.explorer.pages.computed import computed_table
+from merge_runner_analysis.explorer.pages.computed import Computed, computed_table
 from merge_runner_analysis.explorer.pages.home import (
     KINDS,
     Driver,
@@ -75,9 +75,9 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
             f"no driver {name!r} was played with this prompt; there are: "
             f"{', '.join(by_name) or 'none'}"
         )
-    first, words = "", None
+    awaited, first, words = None, "", None
     if own and own.facts and own.facts["asked"]:
-        first = _first(site, own, bar.scope, asked)
+        awaited, first = _first(site, own, bar.scope, asked)
         trials = bar.scope.filter(own.name, own.prompt)
         words = site.words.search(Wanted("rationales", (), trials, {}), 1)
     return site.render(
@@ -93,6 +93,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         table=table,
         measures=MEASURES,
         human=humans_of(table, own),
+        awaited=awaited,
         first=first,
         parameters=_parameters(site, own) if own else "",
         found=words,
@@ -122,9 +123,9 @@ def _summary(own: Driver) -> str:
     )
 
 
-def _first(site: Site, own: Driver, scope: Scope, asked: Mapping[str, str]) -> str:
+def _first(site: Site, own: Driver, scope: Scope, asked: Mapping[str, str]) -> tuple[Computed, str]:
     """What the driver does first, by the table of first actions; empty until that is made."""
-    _, table = computed_table(site, "first-action", asked, scope.sweep, scope.condition)
+    found, table = computed_table(site, "first-action", asked, scope.sweep, scope.condition)
     told = []
     for row in table.rows if table else []:
         group = row.groups[0]
@@ -135,7 +136,7 @@ def _first(site: Site, own: Driver, scope: Scope, asked: Mapping[str, str]) -> s
                 f" %, goes in {of['go_percent']} % of {of['n']}; m/s² per m/s of own relative "
                 f"velocity: {of['slope']} {of['slope_ci']}."
             )
-    return with_minus(" ".join(told)) if len(told) > 1 else ""
+    return found, with_minus(" ".join(told)) if len(told) > 1 else ""
 
 
 def _parameters(site: Site, own: Driver) -> str:
