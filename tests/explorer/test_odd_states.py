@@ -80,13 +80,11 @@ def test_a_long_rationale_begins_and_the_rest_is_folded(db):
         db,
         "UPDATE decisions SET rationale = repeat('🚗', 20000) WHERE trial_id LIKE '%N_0_0/rep01'",
     )
-    site = Site(db)
-    for address in (TRIAL, f"{TRIAL.replace('trials', 'decisions')}?side=left&decision=1"):
-        text = ask(site, address).text
-        quote = text[text.index('<blockquote class="said"') :]
-        beginning, rest = quote[: quote.index("</blockquote>")].split("<details>")
-        assert 500 < beginning.count("🚗") < 1000
-        assert beginning.count("🚗") + rest.count("🚗") == 20_000
+    text = ask(Site(db), TRIAL).text
+    quote = text[text.index('<blockquote class="said"') :]
+    beginning, rest = quote[: quote.index("</blockquote>")].split("<details>")
+    assert 500 < beginning.count("🚗") < 1000
+    assert beginning.count("🚗") + rest.count("🚗") == 20_000
 
 
 def test_a_trial_that_failed_again_shows_its_new_error(db):

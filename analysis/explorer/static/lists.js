@@ -6,17 +6,13 @@
     const { pathname, searchParams } = new URL(href);
     return [pathname, searchParams.get("trial"), searchParams.get("spec")].join();
   };
-  // A file cannot read another one.
-  const page = (rel) =>
-    location.protocol === "file:" ? undefined : document.querySelector(`.paging a[rel=${rel}]`)?.href;
   document.addEventListener("click", ({ target }) => {
     const row = target.closest("[data-list] tbody tr");
     if (!row || target.closest("a") !== row.querySelector("a")) return;
     const hrefs = [...document.querySelectorAll("[data-list] tbody tr")].map((one) => one.querySelector("a")?.href);
     // Where several rows are of one trial, as its decisions are, it counts once.
     const rows = [...new Map(hrefs.filter(Boolean).map((href) => [key(href), href])).values()];
-    const list = { address: location.href, rows, next: page("next"), previous: page("prev") };
-    sessionStorage.setItem("list", JSON.stringify(list));
+    sessionStorage.setItem("list", JSON.stringify({ address: location.href, rows }));
   });
 
   const list = JSON.parse(sessionStorage.getItem("list") ?? "null");
@@ -24,9 +20,7 @@
   window.place = {
     lead: () => {
       const at = here();
-      if (at < 0) return;
-      const hrefs = { previous: list.rows[at - 1] ?? list.previous, next: list.rows[at + 1] ?? list.next };
-      for (const [id, href] of Object.entries(hrefs)) {
+      for (const [id, href] of Object.entries({ previous: list?.rows[at - 1], next: at >= 0 && list.rows[at + 1] })) {
         if (href) Object.assign(document.getElementById(`${id}-trial`), { href, hidden: false });
       }
     },

@@ -25,16 +25,13 @@ replay.track = (track, scene) => {
     for (const side of SIDES) draw("polyline", { class: kind, points: `${place(side, 0)} ${mergeX},0 ${endX},0` });
   }
   for (const side of SIDES) {
-    const [x, y] = place(side, road.tunnel),
-      above = side === "left";
-    draw("polyline", { class: "tunnel", points: `${place(side, 0)} ${x},${y}` });
-    draw("text", { class: "sign exit", x: x - 2, y: y + (above ? -5.8 : 8) }, "tunnel exit");
+    draw("polyline", { class: "tunnel", points: `${place(side, 0)} ${place(side, road.tunnel)}` });
     // Towards the middle, where no vehicle drives over it.
-    draw("text", { class: "sign", y: above ? 6.4 : -4, transform: moved(side, road.tunnel / 2) }, `${side} tunnel`);
+    const y = side === "left" ? 6.4 : -4;
+    draw("text", { class: "sign", y, transform: moved(side, road.tunnel / 2) }, `${side} tunnel`);
   }
   draw("polyline", { class: "merge", points: `${mergeX},-4 ${mergeX},4` });
   draw("text", { class: "sign", x: mergeX, y: -5.2 }, "merge point");
-  draw("text", { class: "sign", x: endX - 5, y: -3.4 }, "end");
 
   // A vehicle as large as its trial has it; about this trial's, what its collision rule looks at.
   const judged = {
@@ -59,16 +56,8 @@ replay.track = (track, scene) => {
   build("own", trial);
   const crash = draw("g", { class: "crash" });
   if (trial.status === "collided") {
-    const [left, right] = SIDES.map((side) => trial.sides[side].x.at(-1));
-    const ends = [place("left", left), place("right", right)];
-    const apart = {
-      euclid2d: `${Math.hypot(ends[0][0] - ends[1][0], ends[0][1] - ends[1][1]).toFixed(1)} m between the centres`,
-      rectangle: "the outlines overlap",
-      shared_lane: `${Math.abs(left - right).toFixed(1)} m apart along the road`,
-    }[road.rule];
-    // Beside the signs, and within the picture.
-    const x = Math.min(Math.max((ends[0][0] + ends[1][0]) / 2, mergeX - 3), mergeX + 15);
-    crash.append(svg("polyline", { points: ends.join(" ") }), svg("text", { x, y: 13.5 }, `✸ collision, ${apart}`));
+    const [[x, y], end] = SIDES.map((side) => place(side, trial.sides[side].x.at(-1)));
+    crash.append(svg("polyline", { points: `${x},${y} ${end}` }), svg("text", { x, y: 13.5 }, "✸ collision"));
   }
   return {
     lay: (other) => build("ghost", other),
@@ -85,8 +74,6 @@ replay.track = (track, scene) => {
       const over = trial.status === "collided" && now >= trial.end - 1e-9;
       crash.setAttribute("display", over ? "inline" : "none");
       track.classList.toggle("collided", over);
-      const places = Object.values(trial.sides).map(({ t, x }) => sampled(t, x, now));
-      track.classList.toggle("unjudged", road.rule === "shared_lane" && Math.max(...places) < road.merge);
     },
   };
 };
