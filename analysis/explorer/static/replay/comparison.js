@@ -10,15 +10,18 @@ replay.comparison = (scene, changed) => {
     at("ghost-key").hidden = words.length === 0;
     at("ghost-key").replaceChildren(...words);
   };
-  // What somebody answers; undefined, and said, where nobody does.
-  const answered = async (asked) => {
-    const answer = await asked.catch(() => undefined);
+  // What the server answers; undefined, and said, where it does not.
+  const ask = async (what) => {
+    const address = `${at("trial").dataset.others}&${new URLSearchParams(what)}`;
+    const answer = await fetch(address)
+      .then((reply) => (reply.ok ? reply.json() : undefined))
+      .catch(() => undefined);
     at("lost").hidden = answer !== undefined;
     return answer;
   };
   // An address names a trial by its name alone, or as NAME@SPEC.
   const lay = async (key, push) => {
-    const ghost = (key && (await answered(explorer.data(key)))) || null;
+    const ghost = (key && (await ask({ compare: key }))) || null;
     scene.ghost = ghost && { ...ghost, named: key };
     if (ghost) say("dashed: ", element("a", { href: ghost.page }, ghost.label), `. ${ghost.outcome}`);
     else say(...(key ? [`${key} is not there to compare with, or nothing was driven in it`] : []));
@@ -32,14 +35,14 @@ replay.comparison = (scene, changed) => {
     // What is chosen is done with: the keys are the replay's again.
     button.blur();
     if (button === at("alone")) return lay("", true);
-    const key = await answered(explorer.offer(button.dataset.offer));
+    const key = await ask({ offer: button.dataset.offer });
     if (key) lay(key, true);
     else if (key === null) say(`${button.textContent}: there is none here. It would be ${button.title}.`);
   });
   const known = () => [...list.options].some(({ value }) => value === field.value);
   const suggest = async () => {
     if (known()) return form.requestSubmit();
-    const answer = await answered(explorer.search(field.value));
+    const answer = await ask({ q: field.value });
     if (!answer) return;
     list.replaceChildren(
       ...answer.found.map(({ key, outcome, note }) => new Option([outcome, note].filter(Boolean).join(", "), key)),
@@ -50,7 +53,7 @@ replay.comparison = (scene, changed) => {
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     const text = field.value;
-    const key = known() ? text : (await answered(explorer.search(text)))?.found[0]?.key;
+    const key = known() ? text : (await ask({ q: text }))?.found[0]?.key;
     field.blur();
     if (key) lay(key, true);
     else say("No trial has these words in its name, driver or outcome.");

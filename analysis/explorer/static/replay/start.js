@@ -1,18 +1,5 @@
 "use strict";
 // The replay of a trial: its parts, the keys, and the address, which tells the state.
-// Where other trials come from; a page without a server holds them.
-window.explorer ??= (() => {
-  const asked = async (what) => {
-    const reply = await fetch(`${document.getElementById("trial").dataset.others}&${new URLSearchParams(what)}`);
-    if (!reply.ok) throw new Error(`${reply.status}`);
-    return reply.json();
-  };
-  return {
-    data: (compare) => asked({ compare }),
-    search: (q) => asked({ q }),
-    offer: (offer) => asked({ offer }),
-  };
-})();
 window.startReplay = () => {
   const { at } = replay;
   if (at("trial")) place.lead();
