@@ -32,6 +32,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from merge_runner.errors import MergeRunnerError, UsageError
+from merge_runner_analysis.explorer.glossary import sections
 from merge_runner_analysis.explorer.guard import LOOPBACK, Guard
 from merge_runner_analysis.explorer.pages import (
     comparing,
@@ -149,10 +150,9 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/trials/": lambda site, asked: RedirectResponse(site.at.to("trials", **asked)),
     "/trials.csv": _trials_csv,
     "/trials/{name:path}": trial.trial_page,
-    "/decisions/{name:path}": trial.decision_fragment,
     "/others/{name:path}": lambda *asked: JSONResponse(comparing.others(*asked)),
     "/raw/{name:path}": _raw,
-    "/glossary": lambda site, _: site.render("glossary.html", here="glossary"),
+    "/glossary": lambda site, _: site.render("glossary.html", here="glossary", glossary=sections()),
     "/tables": tables.tables_page,
     "/tables/{name}.{suffix}": tables.table_file,
     "/tables/{name}": tables.table_page,

@@ -5,6 +5,7 @@ pandas and the fits hold a Python process for seconds, and no page may wait for 
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import signal
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import duckdb
 
+from merge_runner.audit.checks import audited_database, check_sweep
 from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, use
 from merge_runner.results.database import read_database
@@ -45,8 +47,15 @@ if TYPE_CHECKING:
 REMEMBERED = 100
 # While a run goes on the database changes all the time: an answer stands for a minute.
 STANDS_S = 60.0
+FOUND = 3  # findings of a run that its page shows
 Request = tuple[str, ...]
-"""``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN`` or ``figure NAME FORM``."""
+"""``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN``, ``figure NAME FORM``,
+``audit``."""
+
+RUNS = """
+SELECT sweep_id, coalesce(exit_code = 0, false) FROM sweeps
+ORDER BY started_at DESC, sweep_id DESC
+"""
 
 
 class Numbers:
@@ -70,6 +79,8 @@ class Numbers:
 
                 digest, _ = results_digest(self.db)
                 found = {"file": rendered(self.study, name, form), "digest": digest}
+            case ["audit"]:
+                found = {"notes": json.loads(self._kept("audit", self._audit))}
             case _:
                 raise UsageError(f"nothing answers {request!r}")
         with read_database(self.db) as connection:
@@ -87,18 +98,35 @@ class Numbers:
     def _state(self) -> str:
         return present_state(self.db)
 
-    def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
-        """A table of all trials, or of those of a sweep and a condition; kept for the next time."""
-        options = options_text(self.db, sweep=sweep, condition=condition)
+    def _kept(self, name: str, make: Callable[[], str], options: str = "") -> str:
+        """What is kept of the present state under a name, or else is made, and kept."""
+        options = options or options_text(self.db)
         kept = finished(self.db, self._state, options, [name])
         if not kept:
+            kept = {name: make()}
+            keep_finished(self.db, self._state, options, kept)
+        return kept[name]
+
+    def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
+        """A table of all trials, or of those of a sweep and a condition; kept for the next time."""
+
+        def make() -> str:
             from merge_runner_analysis.data.study import Study
 
             is_part = sweep or condition
             study = Study(self.db, sweep=sweep, condition=condition) if is_part else self.study
-            kept = {name: to_text(make_tables(study, [name])[0])}
-            keep_finished(self.db, study.state, options, kept)
-        return kept[name]
+            return to_text(make_tables(study, [name])[0])
+
+        return self._kept(name, make, options_text(self.db, sweep=sweep, condition=condition))
+
+    def _audit(self) -> str:
+        """What the audit of each run found and notes, by the run's id; nothing is replayed."""
+        told = {}
+        with audited_database(self.db) as connection:
+            for run, ended in connection.execute(RUNS).fetchall():
+                audit = check_sweep(connection, run, (), finished=ended)
+                told[run] = [f"found: {one}" for one in audit.findings[:FOUND]] + audit.notes
+        return json.dumps(told)
 
     def _cell(self, name: str, row: str, column: str) -> dict[str, Any]:
         from merge_runner_analysis.explain import explain

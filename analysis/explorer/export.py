@@ -114,8 +114,7 @@ async def _crawl(
     ) as client:
         while waiting:
             address = waiting.popleft()
-            whole = {"as": "whole"} if address.startswith("/trials/") else {}
-            reply = await client.get(httpx.URL(address).copy_merge_params(whole))
+            reply = await client.get(address)
             text = reply.text
             if BUSY in text:
                 waiting.append(address)

@@ -14,6 +14,7 @@ _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
     (re.compile(r"`(.+?)`"), r"<code>\1</code>"),
+    (re.compile(r" \(\[[^]]+\]\([^)]+\)\)"), ""),
     (re.compile(r"\[(.+?)\]\(.+?\)"), r"\1"),
 )
 

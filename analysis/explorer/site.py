@@ -19,7 +19,6 @@ from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.conditions import condition_texts
 from merge_runner_analysis.explorer.database_copy import Copies
 from merge_runner_analysis.explorer.display_text import MINUS, shown_number, visible, with_minus
-from merge_runner_analysis.explorer.glossary import sections
 from merge_runner_analysis.explorer.notes import LONGEST_TEXT, Notes
 from merge_runner_analysis.explorer.queries import Queries
 from merge_runner_analysis.explorer.reading import stamp_of
@@ -30,13 +29,10 @@ from merge_runner_analysis.metrics import METRICS
 from merge_runner_analysis.verdict_words import MEASURES, TABLE
 
 TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
-STYLES = (
-    "vendor/uplot-1.6.32.min.css",
-    *(f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")),
-)
+STYLES = [f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")]
 # What draws and moves a trial, in the order in which it is loaded.
-_PARTS = "moment track marks charts ribbons panel clock comparison start"
-REPLAY = ("vendor/uplot-1.6.32.min.js", *(f"replay/{part}.js" for part in _PARTS.split()))
+_PARTS = "moment track charts ribbons panel clock comparison start"
+REPLAY = [f"replay/{part}.js" for part in _PARTS.split()]
 PAGES = {
     "Study": HOME,
     "Drivers": "drivers",
@@ -130,7 +126,6 @@ class Site:
             clock=clock,
             condition_text=condition_text,
             in_words=self.in_words,
-            glossary=sections(),
         )
 
     def begin(self) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from merge_runner_analysis.explorer.display_text import with_minus
-from merge_runner_analysis.explorer.pages.computed import computed_table
+from merge_runner_analysis.explorer.pages.computed import Computed, computed_table
 from merge_runner_analysis.explorer.pages.home import (
     Driver,
     by_condition,
@@ -53,6 +53,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         )
     trials = scope.filter(name, scope.prompt)
     was_asked = own and own.facts and own.facts["asked"]
+    awaited, first = _first(site, name, scope) if was_asked else (None, "")
     return site.render(
         "driver.html",
         here="drivers",
@@ -61,7 +62,8 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         beside=by_name.get(asked.get("with", "")),
         others=[one for one in by_name.values() if one is not own],
         **values | {"human": humans_of(values["table"], own)},
-        first=_first(site, name, scope) if was_asked else "",
+        awaited=awaited,
+        first=first,
         found=site.words.search(Wanted("rationales", (), trials, {}), 1) if was_asked else None,
         kept=scope.trials(name, scope.prompt),
         summary=_summary(own) if own and own.cells else "",
@@ -87,9 +89,9 @@ def _summary(own: Driver) -> str:
     )
 
 
-def _first(site: Site, driver: str, scope: Scope) -> str:
+def _first(site: Site, driver: str, scope: Scope) -> tuple[Computed, str]:
     """What a driver does first, by the table of first actions; empty until that is made."""
-    _, table = computed_table(site, "first-action", scope.sweep, scope.condition)
+    found, table = computed_table(site, "first-action", scope.sweep, scope.condition)
     told = []
     for row in table.rows if table else []:
         is_told = row.groups[0] in {f"{driver}/{scope.prompt}", HUMAN}
@@ -100,4 +102,4 @@ def _first(site: Site, driver: str, scope: Scope) -> str:
                 f" %, goes in {of['go_percent']} % of {of['n']}; m/s² per m/s of own relative "
                 f"velocity: {of['slope']} {of['slope_ci']}."
             )
-    return with_minus(" ".join(told)) if len(told) > 1 else ""
+    return found, with_minus(" ".join(told)) if len(told) > 1 else ""

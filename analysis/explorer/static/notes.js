@@ -4,7 +4,6 @@
   const form = document.getElementById("note");
   if (!form) return;
   const { text, side, decision } = form.elements;
-  const said = document.getElementById("note-said");
   // While something is written, what it is about stays.
   form.addEventListener("focusin", () => {
     if (text.value) return;
@@ -21,9 +20,12 @@
     form.requestSubmit();
   });
   form.addEventListener("htmx:afterRequest", ({ detail: { successful, xhr } }) => {
-    said.textContent = successful ? "saved" : xhr.responseText || "not saved: no answer";
-    if (successful) form.reset();
-    if (successful) document.activeElement.blur();
+    document.getElementById("note-said").textContent = successful
+      ? "saved"
+      : xhr.responseText || "not saved: no answer";
+    if (!successful) return;
+    form.reset();
+    document.activeElement.blur();
   });
   document.addEventListener("keydown", (event) => {
     if (event.key !== "n" || isElsewhere(event)) return;
