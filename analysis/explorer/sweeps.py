@@ -10,6 +10,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from merge_runner.audit.checks import not_judged
 from merge_runner.config import both_sides, pair_name
 from merge_runner.drivers.registry import EMULATOR
 from merge_runner.paths import DEFAULT_DB
@@ -338,8 +339,11 @@ def _finished(run: Run) -> Assessment:
             f"It had finished, but the database holds only {run.ended} of its {run.planned} "
             "trials.",
         )
-    text = f"Finished: all {run.ended} trials ended, and no problems were found"
-    if others := run.row["others"]:
+    row, text = run.row, f"Finished: all {run.ended} trials ended"
+    if why := not_judged(run.driver, row["invalid"], row["asked"]):
+        return Assessment("doubtful", f"{text}; {why}.")
+    text += ", and no problems were found"
+    if others := row["others"]:
         return Assessment("doubtful", f"{text}; but another model gave {others} answers.")
     return Assessment("finished", f"{text}.")
 

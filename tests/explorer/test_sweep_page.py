@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import re
 from collections import Counter
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from urllib.parse import parse_qs, urlsplit
@@ -15,6 +16,7 @@ from starlette.testclient import TestClient
 
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.progress import remove_standing, write_standing
+from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.pages import sweep as page
@@ -23,6 +25,7 @@ from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.explorer.sweeps import Run, assessment_of, list_runs, numbers_of
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import held
+from tests.explorer.test_tables_pages import Awaited, InProcess
 from tests.run.standings import progress, runner
 
 URL = "/sweeps/sweep-1"
@@ -107,6 +110,20 @@ def test_a_run_says_how_long_it_lasted(study):
         connection.execute("UPDATE sweeps SET ended_at = started_at + INTERVAL 2 HOURS")
     assert ">2.0 h<" in browser(study).get("/sweeps").text
     assert "lasted 2.0 h" in text_of(browser(study))
+
+
+def test_runs_show_what_the_audit_finds_and_notes_and_keep_it(study):
+    with duckdb.connect(str(study)) as connection:
+        connection.execute("UPDATE sweeps SET ended_at = started_at, exit_code = 1")
+        connection.execute("UPDATE trials SET end_time_s = 99 WHERE status = 'finished'")
+    for address in (URL, "/sweeps"):
+        site = Site(study)
+        site.computing = Awaited(study, InProcess)
+        with closing(site):
+            text = text_of(TestClient(explorer(site), base_url="http://127.0.0.1:1"), address)
+        assert "found: outcome: sweep-1" in text
+    [run] = audit_database(study, "sweep-1")
+    assert all(" ".join(note.split()) in text for note in run.notes)
 
 
 def share(name, count, of, things):

@@ -12,8 +12,8 @@ from merge_runner_analysis.explorer.pages.trial import (
     OFFERS,
     REPETITION,
     find,
+    panels,
     replayed,
-    ribbons,
 )
 from merge_runner_analysis.explorer.reading import Row, reading, records
 from merge_runner_analysis.explorer.site import NotThere, Site
@@ -93,7 +93,11 @@ def _laid(site: Site, other: Row) -> dict[str, Any] | None:
     if not trial.states:
         return None
     account = account_of(other, trial)
-    return {**replayed(site, other, trial, account), "ribbons": ribbons(site, other, trial)}
+    return {
+        **replayed(site, other, trial, account),
+        "ribbons": site.render("_ribbons.html", row=other, trial_decisions=trial.by_side),
+        "panels": "".join(panels(site, other, trial)),
+    }
 
 
 def _offer(site: Site, at: At, condition: str, kind: str) -> str | None:

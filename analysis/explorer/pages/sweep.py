@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
+from merge_runner_analysis.explorer.pages.computed import Computed, computed
 from merge_runner_analysis.explorer.scope import carried, scope_of
 from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site, news_of
 from merge_runner_analysis.explorer.sweeps import (
     CAUSES,
     TRUST,
+    Run,
     arms_of,
     duration,
     list_runs,
@@ -32,6 +34,7 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
         runs=runs,
         counted=counted,
         trust=TRUST,
+        audit=audit_of(site, [run for run, _ in runs]),
         duration=duration,
         seen=news_of((runs, site.catalogue.state()), asked.get("seen", "")),
     )
@@ -53,6 +56,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         assessment=assessment,
         arms=arms_of(site.catalogue, run),
         trust=TRUST,
+        audit=audit_of(site, [run]),
         causes=site.catalogue.ask(CAUSES, sweep_id),
         prompt_text=prompt_text,
         duration=duration,
@@ -61,3 +65,10 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         quiet=seen.startswith(f"{run.state}-"),
         heard=bool(seen),
     )
+
+
+def audit_of(site: Site, runs: Iterable[Run]) -> Computed | None:
+    """What the audit notes of each run; None while one goes on, which ends with an audit."""
+    if any(run.followed for run in runs):
+        return None
+    return computed(site, ("audit",))

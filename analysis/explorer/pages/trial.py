@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from markupsafe import Markup
@@ -32,26 +32,15 @@ SAMPLES = "from states where trial_id = {} and spec_hash = {} order by step, sid
 
 
 def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
-    """Return a trial, with the decision that the address names.
-
-    With ``as=whole`` it has the panels of all of its decisions, and needs no server for them.
-    """
+    """Return a trial with all of its decisions."""
     row = find(site, trial_id, asked)
     trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
-    panels = whole_panels(site, row, trial) if asked.get("as") == "whole" else {}
-    panel = Markup()
-    if asked.get("side") in SIDES and whole(asked.get("decision", "")) is not None:
-        try:
-            panel = decision_panel(site, row, trial, decision_at(trial, asked))
-        except NotThere as exc:
-            panel = Markup("<p>{}</p>").format(exc)
     account = views.account_of(row, trial)
     return site.render(
         "trial.html",
         here="trials",
         scripts=REPLAY,
-        panel=panel,
-        panels=panels,
+        panels=panels(site, row, trial),
         row=row,
         outcome=views.outcome_text(row, trial.scenario),
         facts=views.facts(row),
@@ -72,28 +61,16 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     )
 
 
-def whole_panels(site: Site, row: Row, trial: Trial) -> dict[str, Markup]:
-    """Return the panels of all decisions of a trial, by side and number."""
-    return {
-        f"{d['side']}/{d['decision']}": decision_panel(site, row, trial, d) for d in trial.decisions
-    }
+def panels(site: Site, row: Row, trial: Trial) -> list[Markup]:
+    """Return the panels of all decisions of a trial, in the order of its ribbons."""
+    others = site.catalogue.others
+    decisions = (d for mine in trial.by_side.values() for d in mine)
+    return [decision_panel(site, row, trial, d, others) for d in decisions]
 
 
 def replayed(site: Site, row: Row, trial: Trial, account: Account | None) -> dict[str, Any]:
     """What a replay draws of a trial, with the address of its page."""
     return {**views.replay_data(row, trial, account), "page": site.at.trial(row)}
-
-
-def ribbons(site: Site, row: Row, trial: Trial) -> str:
-    """The ribbons of a trial's decisions."""
-    return site.render("_ribbons.html", row=row, trial_decisions=trial.by_side)
-
-
-def decision_fragment(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
-    """The panel of one decision; raises NotThere."""
-    row = find(site, trial_id, asked)
-    trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
-    return decision_panel(site, row, trial, decision_at(trial, asked))
 
 
 def decision_at(trial: Trial, asked: Mapping[str, str]) -> Row:
@@ -107,22 +84,26 @@ def decision_at(trial: Trial, asked: Mapping[str, str]) -> Row:
     return found[0]
 
 
-def decision_panel(site: Site, row: Row, trial: Trial, decision: Row) -> Markup:
-    """What a driver was told, said, planned and did."""
+def decision_panel(
+    site: Site, row: Row, trial: Trial, decision: Row, others: Collection[tuple[str, str]]
+) -> Markup:
+    """What a driver was told, said, planned and did; ``others`` are answers of another model."""
     body, before = _reply(decision), decision["before"]
     text, more = shortened(body or "")
+    named = {"side": decision["side"], "decision": decision["decision"]}
     panel = site.render(
         "_decision.html",
         d=decision,
         driver=row[f"model_{decision['side']}"],
+        page=site.at.trial(row, **named),
         clamped=clamped,
         went_on=views.older_plan(trial, decision) if decision["fallback"] else "",
         before=before,
         parts=parts_of(decision["prompt"] or "", before["prompt"] if before else None),
         meaning=views.block_meaning,
-        others=site.catalogue.others,
+        others=others,
         reply=None if body is None else {"text": text, "more": more},
-        raw=site.at.raw(row, decision["side"], decision["decision"]),
+        raw=site.at.raw(row, **named),
         chart=views.plan_chart(decision, trial),
         points=step_points,
         aftermath=views.aftermath(trial, decision),
