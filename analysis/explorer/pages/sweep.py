@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 from merge_runner_analysis.explorer.pages.computed import Computed, computed
 from merge_runner_analysis.explorer.scope import carried, scope_of
@@ -10,6 +10,7 @@ from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site, news
 from merge_runner_analysis.explorer.sweeps import (
     CAUSES,
     TRUST,
+    Assessment,
     Run,
     arms_of,
     duration,
@@ -34,7 +35,7 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
         runs=runs,
         counted=counted,
         trust=TRUST,
-        audit=audit_of(site, [run for run, _ in runs], asked),
+        audit=audit_of(site, runs, asked),
         duration=duration,
         seen=news_of((runs, site.catalogue.state()), asked.get("seen", "")),
     )
@@ -43,7 +44,8 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
 def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     """One run; raises NotThere, and NothingNew as ``seen``."""
     seen = asked.get("seen", "")
-    found = [(run, said) for run, said in list_runs(site.catalogue) if run.sweep_id == sweep_id]
+    runs = list_runs(site.catalogue)
+    found = [(run, said) for run, said in runs if run.sweep_id == sweep_id]
     if not found:
         raise NotThere(f"the database holds no sweep {sweep_id}")
     run, assessment = found[0]
@@ -56,7 +58,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         assessment=assessment,
         arms=arms_of(site.catalogue, run),
         trust=TRUST,
-        audit=audit_of(site, [run], asked),
+        audit=audit_of(site, runs, asked),
         causes=site.catalogue.ask(CAUSES, sweep_id),
         prompt_text=prompt_text,
         duration=duration,
@@ -67,8 +69,11 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     )
 
 
-def audit_of(site: Site, runs: Iterable[Run], asked: Mapping[str, str]) -> Computed | None:
+def audit_of(
+    site: Site, runs: list[tuple[Run, Assessment]], asked: Mapping[str, str]
+) -> Computed | None:
     """What the audit notes of each run; None while one goes on, which ends with an audit."""
-    if any(run.followed for run in runs):
+    if any(run.followed for run, _ in runs):
         return None
-    return computed(site, ("audit",), {**asked, "anew": "1"})
+    given = {name: value for name, value in asked.items() if name != "seen"}
+    return computed(site, ("audit",), given | {"anew": "1"})
