@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 from merge_runner_analysis.explorer.pages.computed import Computed, computed
 from merge_runner_analysis.explorer.scope import carried, scope_of
@@ -10,6 +10,7 @@ from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site, news
 from merge_runner_analysis.explorer.sweeps import (
     CAUSES,
     TRUST,
+    Assessment,
     Run,
     arms_of,
     duration,
@@ -43,7 +44,8 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
 def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     """One run; raises NotThere, and NothingNew as ``seen``."""
     seen = asked.get("seen", "")
-    found = [(run, said) for run, said in list_runs(site.catalogue) if run.sweep_id == sweep_id]
+    runs = list_runs(site.catalogue)
+    found = [(run, said) for run, said in runs if run.sweep_id == sweep_id]
     if not found:
         raise NotThere(f"the database holds no sweep {sweep_id}")
     run, assessment = found[0]
