@@ -232,9 +232,8 @@ def export(
 ) -> None:
     """Write every table as Parquet and CSV, with all columns explained."""
     from merge_runner.results.export import export_tables
-    from merge_runner_analysis.data.reference_data import outcomes_table
 
-    export_tables(db, folder, [outcomes_table()])
+    export_tables(db, folder)
     print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")
 
 

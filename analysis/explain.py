@@ -11,8 +11,8 @@ import duckdb
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.load import KEYS
 from merge_runner_analysis.data.reference_data import citation
-from merge_runner_analysis.data.studies import KEYS
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.tables.formats import shown_value
 from merge_runner_analysis.tables.model import Column, Row, Table
@@ -156,7 +156,7 @@ def _query(study: Study, group: Group, predicate: str, trials: tuple[str, ...]) 
 def _trials(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
     """A connection in which ``trials`` are those of a group, with what became of their calls."""
     connection = _database().cursor()
-    connection.register("trials", group.trials.merge(study.calls.trials, "left", KEYS))
+    connection.register("trials", group.trials.merge(study.calls, "left", KEYS))
     return connection
 
 

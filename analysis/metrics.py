@@ -52,14 +52,13 @@ class Bounded:
 class HumanReference(Bounded):
     """A published human value in the unit of its metric, with its 95 % interval if it has one.
 
-    ``source`` cites it. ``n``: the trials that a share is of.
+    ``source`` cites it.
     """
 
     value: float
     low: float | None = field(default=None, kw_only=True)
     high: float | None = field(default=None, kw_only=True)
     source: str
-    n: int | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,9 +74,7 @@ class Metric:
     what a proportion is the share. Raises UsageError where these do not fit together.
 
     ``human`` is a published value beside those of the paper: ``paper_of_drivers`` and
-    ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``. ``humans_from`` says
-    what our own human value rests on: the outcomes that are published, the recordings that are
-    imported, or these once they are complete.
+    ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``.
     """
 
     name: str
@@ -89,7 +86,6 @@ class Metric:
     trials: Literal["finished", "ended"] = "finished"
     decimals: int = 2
     human: HumanReference | None = None
-    humans_from: Literal["outcomes", "recordings", "all recordings"] = "recordings"
     paper_of_drivers: str = ""
     paper_of_humans: str = ""
     shown: bool = True
@@ -167,7 +163,6 @@ COLLISIONS = register(
         value="collided",
         estimator="proportion",
         trials="ended",
-        humans_from="all recordings",
         paper_of_drivers="collided_percent",
     )
 )
@@ -181,7 +176,6 @@ BOXES = register(
         value="collided_boxes",
         estimator="proportion",
         trials="ended",
-        humans_from="outcomes",
         paper_of_humans="collided_percent",
     )
 )
@@ -193,7 +187,6 @@ LEFT_FIRST = register(
         meaning="share of finished trials with a first merger in which it is the left vehicle",
         value="merged_first = 'left'",
         estimator="proportion",
-        humans_from="outcomes",
         shown=False,
     )
 )

@@ -17,8 +17,6 @@ digits of a simulation from ruling.
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -27,8 +25,8 @@ Array = NDArray[np.float64]
 
 SAMPLE_S = 0.2
 CLOCK_SAMPLES = 5  # 1 s: the clock of the paper's drivers
-RANDOM_DRIVES, RANDOM_SECONDS, RANDOM_SEED = 1000, 10, 260409609
-HIGHEST_MPS2 = 2.5
+# The mean gain over 10 s of accelerations that are drawn by chance each second, and held.
+RANDOM_GAIN = 0.49
 TOLERANCE = 0.04
 LINE_COEFFICIENTS, CUBIC_COEFFICIENTS = 2, 4
 LINE_SAMPLES, CUBIC_SAMPLES = 3, 5  # one more than coefficients; 3 are 0.6 s
@@ -46,31 +44,23 @@ def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
     stays within STEADY_MPS of its mean; ``gain``; and ``clocked_gain``, that of ``clocked`` speeds.
     Both gains are NaN where the vehicle was steady or under control for less than 2 s.
     """
-    sampled: dict[int, list[tuple[int, Array]]] = {}
     steady = np.zeros(len(speeds), bool)
     gain, clocked_gain = np.full((2, len(speeds)), np.nan)
+    sampled: dict[int, dict[int, Array]] = {}
     columns = (speeds[name] for name in ("time_s", "velocity_mps", "resisted"))
     for row, (time_s, velocity_mps, resisted) in enumerate(zip(*columns, strict=True)):
         time, v = np.asarray(time_s, dtype=float), np.asarray(velocity_mps, dtype=float)
         driven = without_resistance(time, v) if resisted else v
-        steady[row] = _is_steady(v) or _is_steady(driven)
+        apart = [np.abs(each - each.mean()).max() for each in (v, driven) if len(each)]
+        steady[row] = min(apart, default=np.inf) <= STEADY_MPS
         at = at_5_hz(time - time[:1], driven)
         if not steady[row] and len(at) >= SHORTEST_SAMPLES:
-            sampled.setdefault(len(at), []).append((row, at))
+            sampled.setdefault(len(at), {})[row] = at
     for alike in sampled.values():
-        rows, profiles = zip(*alike, strict=True)
-        at = np.stack(profiles)
-        gain[list(rows)], clocked_gain[list(rows)] = gains(at), gains(clocked(at))
-    return (
-        speeds[KEY]
-        .reset_index(drop=True)
-        .assign(steady=steady, gain=gain, clocked_gain=clocked_gain)
-    )
-
-
-def _is_steady(velocity_mps: Array) -> bool:
-    v = velocity_mps
-    return len(v) > 0 and bool(np.abs(v - v.mean()).max() <= STEADY_MPS)
+        at = np.stack([*alike.values()])
+        gain[[*alike]], clocked_gain[[*alike]] = gains(at), gains(clocked(at))
+    found = speeds[KEY].reset_index(drop=True)
+    return found.assign(steady=steady, gain=gain, clocked_gain=clocked_gain)
 
 
 def at_5_hz(time_s: Array, velocity_mps: Array) -> Array:
@@ -101,32 +91,16 @@ def clocked(velocity_mps: Array) -> Array:
     return np.stack([np.interp(at, knots, v[knots]) for v in velocity_mps])
 
 
-@cache
-def random_gain() -> float:
-    """The mean gain of drives at random: each second an acceleration is drawn anew, and held."""
-    rng = np.random.default_rng(RANDOM_SEED)
-    drawn = rng.uniform(-HIGHEST_MPS2, HIGHEST_MPS2, (RANDOM_DRIVES, RANDOM_SECONDS))
-    steps = np.repeat(drawn, CLOCK_SAMPLES, axis=1) * SAMPLE_S
-    start = np.zeros((RANDOM_DRIVES, 1))
-    return float(gains(np.hstack([start, np.cumsum(steps, axis=1)])).mean())
-
-
 def gains(velocity_mps: Array) -> Array:
     """The gains of vehicles with equally many samples at 5 Hz, (vehicles, samples)."""
-    parts = [
-        velocity_mps[start : start + AT_ONCE] for start in range(0, len(velocity_mps), AT_ONCE)
-    ]
-    return np.concatenate([_gains(part) for part in parts])
-
-
-def _gains(v: Array) -> Array:
-    n = v.shape[1]
-    lines, cubics = residuals(v)
-    # One acceleration from beginning to end leaves nothing to explain.
-    whole = np.maximum(lines[0], n * STEADY_MPS**2)
-    moving = _criterion(cubics / whole, CUBIC_COEFFICIENTS, n)
-    held = _criterion(lines / whole, LINE_COEFFICIENTS, n)
-    return np.asarray((moving - held) / n)
+    n, found = velocity_mps.shape[1], []
+    for start in range(0, len(velocity_mps), AT_ONCE):
+        lines, cubics = residuals(velocity_mps[start : start + AT_ONCE])
+        # One acceleration from beginning to end leaves nothing to explain.
+        whole = np.maximum(lines[0], n * STEADY_MPS**2)
+        moving = _criterion(cubics / whole, CUBIC_COEFFICIENTS, n)
+        found.append((moving - _criterion(lines / whole, LINE_COEFFICIENTS, n)) / n)
+    return np.concatenate(found)
 
 
 def _criterion(left: Array, coefficients: int, n: int) -> Array:

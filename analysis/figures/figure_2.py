@@ -284,6 +284,6 @@ def _human_keys(study: Study) -> list[Line2D]:
     if not study.human.measured:
         dashed = Line2D([], [], color="#555555", ls="--", lw=0.8, label="published regression")
         return [*keys, dashed]
-    if study.human.published_outcomes is None:
+    if study.human.traced:
         return keys
     return [*keys, Line2D([], [], ls="", label=f"humans in C: the {HUMAN_TRIALS} published")]

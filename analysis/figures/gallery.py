@@ -38,8 +38,7 @@ from merge_runner_analysis.metrics import METRICS, Metric, shown_in
 from merge_runner_analysis.names import BASELINE
 from merge_runner_analysis.stats.factors import Level, levels_by_factor
 from merge_runner_analysis.stats.first_action import Seat, first_actions, mean, seats
-from merge_runner_analysis.stats.group_scores import score
-from merge_runner_analysis.stats.indicators import INDICATORS
+from merge_runner_analysis.stats.indicators import INDICATORS, score
 from merge_runner_analysis.stats.intervals import Estimate, interval
 from merge_runner_analysis.stats.measures import estimate, human_reference, known, values
 
@@ -206,7 +205,7 @@ def figure_of_first_actions(study: Study) -> Figure:
 
 def _human_first_actions(study: Study) -> list[Point]:
     if study.complete:
-        return _first_actions(study, Seat(study.human, (0, 1)))
+        return _first_actions(study, Seat(study.human))
     return [
         Point(
             row.relative_velocity_mps,

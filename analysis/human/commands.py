@@ -41,7 +41,7 @@ def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
     Those that are there stay as they are.
     """
     from merge_runner.results.store import Store
-    from merge_runner_analysis.data.imported_humans import human_trials, imported
+    from merge_runner_analysis.data.imported_humans import findings, human_trials
     from merge_runner_analysis.human.archive import open_files
     from merge_runner_analysis.human.load import import_trials, sort_files
 
@@ -63,7 +63,7 @@ def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
         say(f"error: {line}")
     if len(errors) > MOST_ERRORS:
         say(f"error: {len(errors) - MOST_ERRORS} more like these")
-    for line in imported(human_trials(db)).findings():
+    for line in findings(human_trials(db)):
         say(f"note: {line}")
     print_out(
         f"{report.added} trials added, {report.there} there already, {len(report.unreadable)} "
@@ -82,7 +82,7 @@ def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None
     notes: list[str] = []
     if db.exists() and not (trials := humans.human_trials(db)).empty:
         tables = {"pairs": humans.by_pair(trials), "conditions": humans.by_condition(trials)}
-        notes = list(humans.imported(trials).findings())
+        notes = list(humans.findings(trials))
     if as_json:
         counts = {name: table.to_dict("index") for name, table in tables.items()}
         print_out(json.dumps({**counts, "notes": notes} if tables else {}, ensure_ascii=False))

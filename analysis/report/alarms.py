@@ -33,7 +33,7 @@ def alarms(study: Study, origin: Provenance) -> list[Alarm]:
         ),
         (
             "Trials or answers repeat earlier ones",
-            [*_equal(study, origin)],
+            [*_equal(study)],
             "Where a cache on the way answered, or the temperature is 0, they are no samples, and "
             "intervals and tests claim too much.",
         ),
@@ -88,14 +88,9 @@ def posing(study: Study) -> list[Group]:
     return [group for group in study.played if group.scripted and MOCKS.isdisjoint(group.models)]
 
 
-def _equal(study: Study, origin: Provenance) -> Iterator[str]:
+def _equal(study: Study) -> Iterator[str]:
     if counts := [f"{g.id}: {g.equal} of {len(g.trials)}" for g in study.models if g.equal]:
         yield f"{', '.join(counts)} trials are as an earlier one to the last state; each counts"
-    for driver, repeated in origin.alike.items():
-        yield (
-            f"all {repeated} answers of {driver} to prompts that it was asked before are word for "
-            "word as before"
-        )
 
 
 def _failures(group: Group) -> str:

@@ -119,7 +119,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     }
     return environment.get_template("report.html").render(
         study=study,
-        design=design(study, origin.sent),
+        design=design(study),
         alarms=alarms(study, origin),
         headline=said[0],
         sentences=said[1:],
@@ -159,11 +159,8 @@ class Design:
     prompts: list[tuple[str, str]]
 
 
-def design(study: Study, sent: Mapping[str, Mapping[str, Mapping[str, object]]]) -> Design:
-    """Read the design of a study from what was played.
-
-    ``sent`` holds the parameters that models were asked with, by spec hash and side.
-    """
+def design(study: Study) -> Design:
+    """Read the design of a study from what was played."""
     found = load_each({"descriptions": DESCRIPTIONS, "prompts": PROMPTS}, study.db)
     specs = {name for group in study.played for name in group.trials["spec_hash"]}
     prompts = found["prompts"]
@@ -175,13 +172,7 @@ def design(study: Study, sent: Mapping[str, Mapping[str, Mapping[str, object]]])
     factors = {name: levels[name] for name in levels if name != "model"}
     drivers = list(dict.fromkeys(group.label for group in study.played))
     driven = {name for group in study.played for name in group.trials["condition"]}
-    parameters = dict.fromkeys(
-        f"{group.label}: " + ", ".join(f"{name} = {value}" for name, value in asked.items())
-        for group in study.played
-        for asked in sent.get(group.spec_hash or "", {}).values()
-        if asked
-    )
-    rows = {"drivers": drivers, "parameters": parameters, **factors, "conditions": sorted(driven)}
+    rows = {"drivers": drivers, **factors, "conditions": sorted(driven)}
     trials = sum(len(group.trials) for group in study.played)
     return Design(
         list(found["descriptions"]["description"])

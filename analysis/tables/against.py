@@ -92,8 +92,7 @@ def _beside(row: Row, group: Group, paper: dict[Key, dict[str, Value]]) -> Row:
     for name, theirs in paper.get((group.models[0], group.setting, item), {}).items():
         values[f"{name}_in_paper"] = theirs
         # A comparison of published values with themselves would test nothing.
-        of_trials = group.measured and group.published_outcomes is None
-        if of_trials and _is_number(ours := values.get(name)) and _is_number(theirs):
+        if group.traced and _is_number(ours := values.get(name)) and _is_number(theirs):
             values[f"{name}_difference"] = ours - theirs
     return replace(row, values=values)
 

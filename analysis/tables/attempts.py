@@ -64,7 +64,7 @@ def _columns(name: str) -> list[Column]:
 
 
 def _condition(name: str) -> str:
-    """Which trials have what a column counts, by the columns of ``Calls.trials``."""
+    """Which trials have what a column counts, by the columns of ``Study.calls``."""
     failures = {heading: failure for failure, heading in ANSWERS.items()}
     if name in failures or name not in MEANINGS:
         return f"list_contains(string_split(failures, chr(10)), {quoted(failures.get(name, name))})"

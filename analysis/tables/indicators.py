@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from merge_runner_analysis.data.intermittency import RANDOM_SECONDS, STEADY_MPS, random_gain
+from merge_runner_analysis.data.intermittency import RANDOM_GAIN, STEADY_MPS
 from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
-from merge_runner_analysis.stats.group_scores import Score, score, total
 from merge_runner_analysis.stats.indicators import (
     INDICATORS,
+    NO_ACTION,
     TESTED,
+    Score,
     disagree,
+    gains,
+    held,
+    less_humans,
+    mean_gain,
+    score,
+    total,
 )
 from merge_runner_analysis.stats.intervals import Estimate
-from merge_runner_analysis.stats.likeness import NO_ACTION, gains, held, less_humans, mean_gain
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
 from merge_runner_analysis.tables.measures import measured
@@ -233,8 +239,8 @@ def velocity_profiles(study: Study) -> Table:
             "resistance",
             "gain at 1 Hz: of the same speeds with one acceleration from each full second to the "
             "next, as any driver has that decides once a second and holds. Accelerations that are "
-            f"drawn by chance each second have {random_gain():.2f}, on average over "
-            f"{RANDOM_SECONDS} s: so much the clock alone can make",
+            f"drawn by chance each second have {RANDOM_GAIN}, on average over 10 s: so much the "
+            "clock alone can make",
             "the difference from the humans, in human SD, is no part of I5, and needs human traces "
             "of every condition",
         ),

@@ -81,17 +81,17 @@ def _studies(study: Study, groups: list[Group]) -> list[str]:
 
 
 def _human_notes(study: Study, table: Table) -> Iterator[str]:
-    if study.imported is None:
+    if not study.human.measured:
         yield (
             f"human: the published outcomes of {HUMAN_TRIALS} trials; for the rest `merge-runner "
             f"human import PATH` reads the recordings (doi {HUMAN_DOI})"
         )
         return
-    yield from (f"human: {finding}" for finding in study.imported.findings())
+    yield from (f"human: {finding}" for finding in study.findings)
     if table.name in POOLING:
         yield (
             "human: intervals and tests take the trials as independent, but the imported ones come "
-            f"from {study.imported.pairs} pairs who differ: they are too narrow"
+            f"from {study.human.trials['pair'].nunique()} pairs who differ: they are too narrow"
         )
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from merge_runner_analysis.data.reference_data import citation, printed_value, published
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.stats.group_scores import fits
+from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import (
     GAP_MARGIN_M,

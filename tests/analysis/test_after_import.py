@@ -13,10 +13,8 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures.gallery import MAKERS
 from merge_runner_analysis.human.archive import open_files
 from merge_runner_analysis.human.load import import_trials, sort_files
-from merge_runner_analysis.stats.group_scores import score
-from merge_runner_analysis.stats.indicators import Verdict
+from merge_runner_analysis.stats.indicators import Verdict, gains, score
 from merge_runner_analysis.stats.intervals import mean
-from merge_runner_analysis.stats.likeness import gains
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding

@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 
 from merge_runner.config import both_sides
-from merge_runner.errors import UsageError
 from merge_runner_analysis.data.driver_words import stand_in
 from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.provenance import provenance
@@ -241,34 +240,6 @@ def test_the_sides_are_those_of_the_scripted_calls(tmp_path):
         "UPDATE trials SET scripted = true",
     )
     assert study.models[0].label == "o3 (scripted stand-in on the left, not o3)"
-
-
-def test_answers_that_are_word_for_word_as_before_are_told_in_the_report(tmp_path):
-    db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
-    study = changed(
-        db,
-        "UPDATE decisions SET call_key = trial_id || side || decision, plan = [0.1], "
-        "rationale = 'as ever', prompt_hash = decision::VARCHAR",
-    )
-    titles = [alarm.title for alarm in alarms(study, provenance(db))]
-    assert "Trials or answers repeat earlier ones" in titles
-
-
-@pytest.mark.parametrize(
-    ("spec", "says"),
-    [
-        ("[]", "Input should be a valid dictionary"),
-        ('{"scenario": {"odd": 1}}', "scenario.odd: Extra inputs are not permitted"),
-        ('{"scenario": {"step_s": 0}}', "scenario.step_s: Input should be greater than 0"),
-        ('{"left": {"body": 3}}', "left.body: Input should be a valid dictionary"),
-    ],
-)
-def test_a_stored_spec_that_cannot_be_read_is_named_with_a_trial_in_one_line(db, spec, says):
-    with pytest.raises(UsageError) as refused:
-        changed(db, f"UPDATE specs SET spec = '{spec}' WHERE spec_hash = 'other-baseline'")
-    (line,) = str(refused.value).splitlines()
-    assert line.startswith("the spec other-baseline, of other/baseline/L_0_-8/rep01, cannot be ")
-    assert says in line
 
 
 def test_a_spec_of_no_trial_keeps_nothing_from_being_read(db):

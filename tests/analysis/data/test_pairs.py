@@ -15,7 +15,7 @@ from merge_runner.config import ego_side
 from merge_runner_analysis.data.load import load, load_trials
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.stats.group_scores import fits
+from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.regressions import who_first_logit
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import write_study, yielding

@@ -189,16 +189,13 @@ def test_a_driver_under_two_specs_is_named(small, tmp_path):
     assert alarm.text.startswith("o3, o3 [changed].")
 
 
-def test_the_report_says_what_the_replies_cost_by_model_and_by_sweep(study, page):
+def test_the_report_says_what_the_replies_cost_by_model(study, page):
     origin = provenance(study.db)
     models = origin.model_costs.set_index("driver")
     # Every attempt cost a cent but the one of unknown fate.
     assert models["attempts"].to_dict() == {"o3": 3510, "other": 705}
     assert models["cost_usd"].to_dict() == pytest.approx({"o3": 35.09, "other": 7.05})
     assert models["attempts_of_unknown_cost"].to_dict() == {"o3": 1, "other": 0}
-    (sweep,) = origin.sweep_costs.itertuples()
-    assert (sweep.sweep_id, sweep.calls, sweep.attempts) == ("sweep-1", 4210, 4215)
-    assert sweep.cost_usd == pytest.approx(42.14)
     assert "35.09" in page.text
     assert "Attempts of unknown cost are not in the sums" in page.text
 

@@ -14,10 +14,14 @@ from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.data.intermittency import measure_profiles
 from merge_runner_analysis.data.load import SPEEDS, load
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.stats.group_scores import score
-from merge_runner_analysis.stats.indicators import Verdict
-from merge_runner_analysis.stats.likeness import compared, mean_gain, piecewise_constant
-from merge_runner_analysis.stats.likeness import gains as trial_gains
+from merge_runner_analysis.stats.indicators import (
+    Verdict,
+    compared,
+    mean_gain,
+    piecewise_constant,
+    score,
+)
+from merge_runner_analysis.stats.indicators import gains as trial_gains
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import SCENARIO, write_study, yielding
 
@@ -192,7 +196,7 @@ def test_a_driver_is_judged_by_its_own_accelerations_before_an_import_too(study)
 )
 def test_i5_is_one_sided_the_mean_gain_is_above_0(monkeypatch, gain, passed):
     rows = gains([(f"t{i}", "N_0_0", None, value) for i, value in enumerate(gain)])
-    monkeypatch.setattr("merge_runner_analysis.stats.likeness.gains", lambda study, group: rows)
+    monkeypatch.setattr("merge_runner_analysis.stats.indicators.gains", lambda study, group: rows)
     assert piecewise_constant(None, None) == Verdict(passed)
 
 
