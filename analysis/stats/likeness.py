@@ -15,35 +15,24 @@ import pandas as pd
 
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.stats.indicators import Verdict
-from merge_runner_analysis.stats.intervals import Estimate, difference, mean, proportion
+from merge_runner_analysis.stats.intervals import Estimate, difference, mean
 
 NO_ACTION = "no finished trial with control action"
 
 
 @cache
 def gains(study: Study, group: Group) -> pd.DataFrame:
-    """One row a finished trial: condition, pair, ``steady`` (nobody acted), and its two gains.
-
-    ``gain`` and ``clocked_gain`` are NaN where no vehicle has them.
-    """
+    """One row a finished trial: condition, pair, ``steady`` (nobody acted), and ``gain`` or NaN."""
     trials = group.finished[["trial_id", "condition", "pair"]]
     by_trial = study.profiles_of(group).groupby("trial_id")
-    found = by_trial.agg(
-        steady=("steady", "all"), gain=("gain", "mean"), clocked_gain=("clocked_gain", "mean")
-    )
+    found = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
     return trials.merge(found, left_on="trial_id", right_index=True)
 
 
-def mean_gain(study: Study, group: Group, column: str = "gain") -> Estimate:
+def mean_gain(study: Study, group: Group) -> Estimate:
     """The mean gain of a group's trials; that of humans over the means of their pairs."""
-    trials = gains(study, group).dropna(subset=column)
-    return replace(mean(_independent(trials, column)), n=len(trials))
-
-
-def held(study: Study, group: Group) -> Estimate:
-    """The share of trials with control action whose gain is above 0."""
-    found = gains(study, group)["gain"].dropna()
-    return proportion(int((found > 0).sum()), len(found))
+    trials = gains(study, group).dropna(subset="gain")
+    return replace(mean(_independent(trials, "gain")), n=len(trials))
 
 
 def less_humans(study: Study, group: Group) -> Estimate | None:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from merge_runner_analysis.data.reference_data import citation, human_outcomes, published
+from merge_runner_analysis.data.reference_data import citation, published
 from merge_runner_analysis.data.study import Group
 from merge_runner_analysis.metrics import BOXES, JUDGED, HumanReference, Metric
 from merge_runner_analysis.stats.intervals import LEVEL, Estimate, mean, proportion
@@ -97,14 +97,11 @@ def known(group: Group, metric: Metric) -> bool:
 
 
 def human_reference(metric: Metric) -> HumanReference | None:
-    """What is published of the humans: in the paper, or as the metric says."""
+    """What the paper says of the humans."""
     if not metric.paper_of_humans:
-        return metric.human
+        return None
     row = published(PAPER).query("driver == 'human'").iloc[0]
-    trials = human_outcomes()
-    if metric.trials == "finished":
-        trials = trials[trials["status"] == "finished"]
-    return HumanReference(float(row[metric.paper_of_humans]), citation(PAPER), n=len(trials))
+    return HumanReference(float(row[metric.paper_of_humans]), None, None, citation(PAPER))
 
 
 def estimate_or_reference(group: Group, metric: Metric) -> Estimate | HumanReference | None:
