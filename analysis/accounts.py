@@ -230,7 +230,7 @@ def _collision(course: Course, name: str) -> str:
     at = judged_at(course)
     changes = (course.change_mps(side, at) for side in SIDES)
     left, right = (f"{abs(mps):.1f} m/s {'faster' if mps >= 0 else 'slower'}" for mps in changes)
-    when = f"{_clock(course, at)}, when one driver alone could last have avoided it"
+    when = f"{course.times_s[at]:.1f} s, when one driver alone could last have avoided it"
     if at == course.last:
         when = "the end; nobody alone could have avoided it"
     return (
@@ -246,8 +246,8 @@ def _avoidable(course: Course, side: Side, chance: int | None) -> str:
     mps2 = course.least_mps2(side, BRAKING, chance)
     done = f"braking at {ceil(mps2 * 10 - TICK_S) / 10:.1f} m/s²" if mps2 else "not speeding up"
     return (
-        f"The {side} driver could still have avoided it at {_clock(course, chance)}, by {done} "
-        "from then on."
+        f"The {side} driver could still have avoided it at {course.times_s[chance]:.1f} s, by "
+        f"{done} from then on."
     )
 
 
@@ -266,7 +266,3 @@ def _marks(
     for side, chance in chances.items():
         if chance is not None:
             yield Mark(course.times_s[chance], side, "last chance", "last moment to brake")
-
-
-def _clock(course: Course, sample: int) -> str:
-    return f"{course.times_s[sample]:.1f} s"

@@ -88,7 +88,7 @@ def options_text(db: Path, **options: object) -> str:
 
 def finished(db: Path, made_of: str, options: str, names: Sequence[str]) -> dict[str, str]:
     """The tables or figures that are kept of this state, by name."""
-    if not _beside(db).exists():
+    if not Path(f"{db}.derived").exists():
         return {}
     query = "SELECT name, content FROM finished WHERE state = ? AND options = ?"
     rows = _run(db, query, [(made_of, options)])
@@ -103,14 +103,10 @@ def keep_finished(db: Path, made_of: str, options: str, contents: Mapping[str, s
         _run(db, "INSERT INTO finished VALUES (?, ?, ?, ?)", rows)
 
 
-def _beside(db: Path) -> Path:
-    return db.with_name(f"{db.name}.derived")
-
-
 def _run(db: Path, sql: str, rows: Sequence[tuple[str, ...]]) -> list[tuple[str, str]]:
     """Run a statement for each of these rows, in one transaction; nothing where that fails."""
     try:
-        with closing(sqlite3.connect(_beside(db), timeout=PATIENCE_S)) as kept, kept:
+        with closing(sqlite3.connect(f"{db}.derived", timeout=PATIENCE_S)) as kept, kept:
             kept.execute(KEPT)
             return [found for row in rows for found in kept.execute(sql, row)]
     except sqlite3.Error as exc:

@@ -24,9 +24,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SAMPLE_S = 0.2
-CLOCK_SAMPLES = 5  # 1 s: the clock of the paper's drivers
-# The mean gain over 10 s of accelerations that are drawn by chance each second, and held.
-RANDOM_GAIN = 0.49
 TOLERANCE = 0.04
 LINE_COEFFICIENTS, CUBIC_COEFFICIENTS = 2, 4
 LINE_SAMPLES, CUBIC_SAMPLES = 3, 5  # one more than coefficients; 3 are 0.6 s
@@ -41,11 +38,11 @@ def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
     """Measure vehicles: rows with KEY, lists time_s and velocity_mps, and whether ``resisted``.
 
     Adds to KEY: ``steady``, no control action, the speed or what it would be without resistance
-    stays within STEADY_MPS of its mean; ``gain``; and ``clocked_gain``, that of ``clocked`` speeds.
-    Both gains are NaN where the vehicle was steady or under control for less than 2 s.
+    stays within STEADY_MPS of its mean; and ``gain``, NaN where the vehicle was steady or under
+    control for less than 2 s.
     """
     steady = np.zeros(len(speeds), bool)
-    gain, clocked_gain = np.full((2, len(speeds)), np.nan)
+    gain = np.full(len(speeds), np.nan)
     sampled: dict[int, dict[int, Array]] = {}
     columns = (speeds[name] for name in ("time_s", "velocity_mps", "resisted"))
     for row, (time_s, velocity_mps, resisted) in enumerate(zip(*columns, strict=True)):
@@ -57,10 +54,8 @@ def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
         if not steady[row] and len(at) >= SHORTEST_SAMPLES:
             sampled.setdefault(len(at), {})[row] = at
     for alike in sampled.values():
-        at = np.stack([*alike.values()])
-        gain[[*alike]], clocked_gain[[*alike]] = gains(at), gains(clocked(at))
-    found = speeds[KEY].reset_index(drop=True)
-    return found.assign(steady=steady, gain=gain, clocked_gain=clocked_gain)
+        gain[[*alike]] = gains(np.stack([*alike.values()]))
+    return speeds[KEY].reset_index(drop=True).assign(steady=steady, gain=gain)
 
 
 def at_5_hz(time_s: Array, velocity_mps: Array) -> Array:
@@ -78,17 +73,6 @@ def without_resistance(time_s: Array, velocity_mps: Array) -> Array:
     moves = velocity_mps[1:] > 0
     lost = moves * (0.5 + 0.005 * velocity_mps[:-1] ** 2) * np.diff(time_s)
     return np.asarray(velocity_mps + np.concatenate([[0.0], np.cumsum(lost)]))
-
-
-def clocked(velocity_mps: Array) -> Array:
-    """Speeds at 5 Hz, (vehicles, samples), with one acceleration from each full second to the next.
-
-    So drives whoever decides once a second and holds its acceleration, whatever it decides.
-    """
-    n = velocity_mps.shape[1]
-    at = np.arange(n)
-    knots = np.union1d(at[::CLOCK_SAMPLES], at[-1:])
-    return np.stack([np.interp(at, knots, v[knots]) for v in velocity_mps])
 
 
 def gains(velocity_mps: Array) -> Array:

@@ -35,6 +35,7 @@ from merge_runner_analysis.data.intermittency import measure_profiles
 from merge_runner_analysis.data.load import (
     ASKED_TRIALS,
     KEYS,
+    LINKS,
     SPEEDS,
     TRACES,
     Order,
@@ -62,7 +63,6 @@ QUERIES = {
     "levels": "FROM trial_levels",
     "traces": TRACES,
 }
-OF_SWEEP = "SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = {sweep}"
 NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
@@ -130,16 +130,6 @@ class Group:
     def stored(self) -> Group:
         """The group with all its trials, as accounts of calls and money count them."""
         return self.whole or self
-
-    @property
-    def is_mixed(self) -> bool:
-        """Whether two different drivers met."""
-        return len(self.models) > 1
-
-    @property
-    def one_sided(self) -> bool:
-        """Whether two different drivers met, and each of them on one side alone."""
-        return self.is_mixed and 0 in self.seats
 
     @property
     def outcomes(self) -> pd.DataFrame:
@@ -241,7 +231,7 @@ class Study:
         self.findings = [*findings(human_trials(self.db))] if recorded.any() else []
         driven, asked = trials[~recorded], self._found["asked"]
         if sweep:
-            driven = driven.merge(load(OF_SWEEP.format(sweep=quoted(sweep)), self.db))
+            driven = driven.merge(load(LINKS, self.db).query("sweep_id == @sweep")[KEYS])
         if condition:
             driven = driven[driven["condition"] == condition]
             self.human = self.human.part(lambda rows: rows["condition"] == condition)
@@ -391,7 +381,7 @@ def _humans(trials: pd.DataFrame) -> Group:
 def _levels(levels: pd.DataFrame, group: Group) -> dict[str, str]:
     """The levels of a group, model and prompt first."""
     found = of_trials(levels, group.trials).drop_duplicates("factor")
-    named = dict(zip(found["factor"], found["value"], strict=True))
+    named = found.set_index("factor")["value"].to_dict()
     return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
 
 

@@ -10,8 +10,7 @@ import pandas as pd
 
 from merge_runner_analysis.data.study import Group, Study, levels_of
 from merge_runner_analysis.metrics import Metric
-from merge_runner_analysis.stats.contrasts import contrast, trials_by_cell
-from merge_runner_analysis.stats.intervals import Difference
+from merge_runner_analysis.stats.contrasts import trials_by_cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +73,6 @@ def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) 
     mark = " [scripted]" if apart and posing else ""
     at = f"{by}={groups[0].levels[by]}" if by else ""
     return Level(factor, name, tuple(group.id for group in groups), pooled, posing, mark, at)
-
-
-def difference(study: Study, metric: Metric, *levels: Level) -> Difference | None:
-    """A level minus the first one, or how far that differs from the same of two others."""
-    return contrast(study, [level.pooled for level in levels], metric, "cell")
 
 
 def difference_of_medians(study: Study, metric: Metric, level: Level, first: Level) -> float | None:

@@ -32,7 +32,7 @@ import pandas as pd
 
 from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.stats.intervals import Estimate, difference, mean, proportion
+from merge_runner_analysis.stats.intervals import Estimate, difference, mean
 from merge_runner_analysis.stats.regressions import (
     Regression,
     gap_ols,
@@ -44,7 +44,6 @@ ALPHA = 0.05
 NO_ACTION = "no finished trial with control action"
 PUBLISHED = "as published, no human traces are imported"
 BY_EYE = "by eye, the paper"
-PAPER_RULE, ROBUST_RULE = "by the paper's test", "by the robust tests"
 NONE_APART = "no two played conditions differ in relative velocity alone"
 INDICATORS = {
     "I1": "The probability of merging first increases with projected headway advantage.",
@@ -98,28 +97,16 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Verdict:
 
 @cache
 def gains(study: Study, group: Group) -> pd.DataFrame:
-    """One row a finished trial: condition, pair, ``steady`` (nobody acted), and its two gains.
-
-    ``gain`` and ``clocked_gain`` are NaN where no vehicle has them.
-    """
+    """One row a finished trial: condition, pair, ``steady`` (nobody acted), and ``gain`` or NaN."""
     trials = group.finished[["trial_id", "condition", "pair"]]
     by_trial = study.profiles_of(group).groupby("trial_id")
-    found = by_trial.agg(
-        steady=("steady", "all"), gain=("gain", "mean"), clocked_gain=("clocked_gain", "mean")
-    )
+    found = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
     return trials.merge(found, left_on="trial_id", right_index=True)
 
 
-def mean_gain(study: Study, group: Group, column: str = "gain") -> Estimate:
+def mean_gain(study: Study, group: Group) -> Estimate:
     """The mean gain of a group's trials; that of humans over the means of their pairs."""
-    trials = gains(study, group).dropna(subset=column)
-    return mean_over(trials, column)
-
-
-def held(study: Study, group: Group) -> Estimate:
-    """The share of trials with control action whose gain is above 0."""
-    found = gains(study, group)["gain"].dropna()
-    return proportion(int((found > 0).sum()), len(found))
+    return mean_over(gains(study, group).dropna(subset="gain"), "gain")
 
 
 def less_humans(study: Study, group: Group) -> Estimate | None:
@@ -200,7 +187,7 @@ class Score(NamedTuple):
     @property
     def rules(self) -> dict[str, dict[str, Verdict]]:
         """The verdicts by the name of their rule, as it stands in a sentence."""
-        return {PAPER_RULE: self.paper, ROBUST_RULE: self.robust}
+        return {"by the paper's test": self.paper, "by the robust tests": self.robust}
 
     @property
     def ceiling(self) -> dict[str, dict[str, float]]:

@@ -89,17 +89,12 @@ def known(group: Group, metric: Metric) -> bool:
     return metric.column in found and bool(found[metric.column].notna().any())
 
 
-def human_reference(metric: Metric) -> HumanReference | None:
-    """What is published of the humans: in the paper, or as the metric says."""
-    if not metric.paper_of_humans:
-        return metric.human
-    row = published(PAPER).query("driver == 'human'").iloc[0]
-    return HumanReference(float(row[metric.paper_of_humans]), citation(PAPER))
-
-
 def estimate_or_reference(group: Group, metric: Metric) -> Estimate | HumanReference | None:
-    """What a group comes to; of humans without traces what is published, None where nothing is."""
-    return estimate(group, metric) if known(group, metric) else human_reference(metric)
+    """What a group comes to; of humans without traces what the paper says, None where nothing."""
+    if known(group, metric) or not metric.paper_of_humans:
+        return estimate(group, metric) if known(group, metric) else None
+    row = published(PAPER).query("driver == 'human'").iloc[0]
+    return HumanReference(float(row[metric.paper_of_humans]), None, None, citation(PAPER))
 
 
 def no_human_value(metric: Metric) -> str:
