@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from merge_runner_analysis.explorer.pages.computed import Computed, computed
 from merge_runner_analysis.explorer.scope import carried, scope_of
@@ -10,7 +10,6 @@ from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site, news
 from merge_runner_analysis.explorer.sweeps import (
     CAUSES,
     TRUST,
-    Assessment,
     Run,
     arms_of,
     duration,
