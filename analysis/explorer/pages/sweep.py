@@ -44,7 +44,8 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
 def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     """One run; raises NotThere, and NothingNew as ``seen``."""
     seen = asked.get("seen", "")
-    found = [(run, said) for run, said in list_runs(site.catalogue) if run.sweep_id == sweep_id]
+    runs = list_runs(site.catalogue)
+    found = [(run, said) for run, said in runs if run.sweep_id == sweep_id]
     if not found:
         raise NotThere(f"the database holds no sweep {sweep_id}")
     run, assessment = found[0]
