@@ -162,7 +162,7 @@ def test_an_alias_that_the_sweep_declares_is_no_other_model(tmp_path):
         with duckdb.connect(str(db)) as connection:
             connection.execute("UPDATE sweeps SET config = ?", [json.dumps({"models": models})])
         study = Study(db)
-        assert [one.served for one in provenance(db).mismatches] == found
+        assert [*provenance(db).mismatches.served] == found
         assert tally(study, study.models[0])["other_model"] == 6 * len(found)
 
 
