@@ -106,6 +106,7 @@ window.startReplay = () => {
   });
 
   charts.draw();
+  clock.seek(begin);
   recall();
 };
 startReplay();
