@@ -34,14 +34,6 @@ from merge_runner_analysis.explorer.reading import PATIENCE_S, Row, reading, rec
 PAGE = 100
 State = tuple[int, int]
 """The number of trials and a sum over them: equal where the same trials are listed."""
-# Trials of a variant and of its driver's baseline in equal conditions and repetitions.
-PAIRS = """
-SELECT one.condition, one.rep, one.trial_id, one.spec_hash, one.outcome,
-    base.trial_id AS base_id, base.spec_hash AS base_hash, base.outcome AS base_outcome
-FROM listed AS one JOIN listed AS base USING (model, model_left, condition, rep)
-WHERE one.model = ? AND one.variant = ? AND base.variant = 'baseline' AND one.source <> 'human'
-ORDER BY one.trial_id, one.spec_hash, base.spec_hash
-"""
 # Differs where what was stored of a trial does: another program may have played it anew.
 PRINTS = """
 SELECT trial_id, spec_hash,
@@ -423,10 +415,6 @@ class Catalogue:
             spec_hash,
         )
         return found[0] if found else None
-
-    def pairs(self, model: str, variant: str) -> list[Row]:
-        """Trials of a variant beside those of the baseline."""
-        return self.ask(PAIRS, model, variant)
 
     def state(self) -> State:
         """What is listed now."""

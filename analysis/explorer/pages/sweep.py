@@ -34,7 +34,7 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
         runs=runs,
         counted=counted,
         trust=TRUST,
-        audit=audit_of(site, [run for run, _ in runs], asked),
+        audit=audit_of(site, [run for run, _ in runs]),
         duration=duration,
         seen=news_of((runs, site.catalogue.state()), asked.get("seen", "")),
     )
@@ -56,7 +56,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         assessment=assessment,
         arms=arms_of(site.catalogue, run),
         trust=TRUST,
-        audit=audit_of(site, [run], asked),
+        audit=audit_of(site, [run]),
         causes=site.catalogue.ask(CAUSES, sweep_id),
         prompt_text=prompt_text,
         duration=duration,
@@ -67,8 +67,8 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     )
 
 
-def audit_of(site: Site, runs: Iterable[Run], asked: Mapping[str, str]) -> Computed | None:
+def audit_of(site: Site, runs: Iterable[Run]) -> Computed | None:
     """What the audit notes of each run; None while one goes on, which ends with an audit."""
     if any(run.followed for run in runs):
         return None
-    return computed(site, ("audit",), {**asked, "anew": "1"})
+    return computed(site, ("audit",))

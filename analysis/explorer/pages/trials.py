@@ -28,7 +28,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     wanted, sort = filter_of(asked), sort_of(asked)
     cell, named = asked.get("cell", ""), None
     if cell:
-        named = computed(site, cell_request(cell), asked)
+        named = computed(site, cell_request(cell))
         if named.content is None:
             return site.render("behind.html", here="trials", cell=cell, computed=named)
         wanted = replace(wanted, trials=tuple(named.content["trials"]))
@@ -72,7 +72,7 @@ def export_filter(site: Site, asked: Mapping[str, str]) -> Filter:
     wanted, cell = filter_of(asked), asked.get("cell", "")
     if not cell:
         return wanted
-    found = awaited(site, cell_request(cell), asked)
+    found = awaited(site, cell_request(cell))
     return replace(wanted, trials=tuple(found["trials"]))
 
 

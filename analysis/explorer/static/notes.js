@@ -3,10 +3,10 @@
 (() => {
   const form = document.getElementById("note");
   if (!form) return;
-  const { text, tags, side, decision } = form.elements;
+  const { text, side, decision } = form.elements;
   // While something is written, what it is about stays.
   form.addEventListener("focusin", () => {
-    if (text.value || tags.value) return;
+    if (text.value) return;
     const chosen = document.querySelector("a.decision[aria-current]")?.dataset;
     side.value = chosen?.side ?? "";
     decision.value = chosen?.n ?? "";
@@ -28,9 +28,8 @@
     document.activeElement.blur();
   });
   document.addEventListener("keydown", (event) => {
-    const field = { n: text, t: tags }[event.key];
-    if (!field || isElsewhere(event)) return;
+    if (event.key !== "n" || isElsewhere(event)) return;
     event.preventDefault();
-    field.focus();
+    text.focus();
   });
 })();

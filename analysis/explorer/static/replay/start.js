@@ -72,12 +72,6 @@ window.startReplay = () => {
     remember(push);
   });
 
-  // A page of this trial holds the other one, too.
-  at("as-page")?.addEventListener("click", ({ target }) => {
-    const wanted = new URL(target.href);
-    wanted.searchParams.set("compare", scene.ghost?.named ?? "");
-    target.href = wanted;
-  });
   at("previous-decision").addEventListener("click", () => step(-1));
   at("next-decision").addEventListener("click", () => step(1));
   at("follow").addEventListener("click", free);
