@@ -160,7 +160,8 @@ def test_the_hardest_acceleration_counts_from_control_on(humans):
     times, accelerations = samples["time_s"], samples["acceleration_mps2"]
     assert min(accelerations) == pytest.approx(-20, abs=0.1)
     own = [a for t, a in zip(times, accelerations, strict=True) if t > 0]
-    said = re.findall(r"hardest acceleration was ([+-][\d.]+) m/s²", page_of(humans))
+    page = page_of(humans).replace("−", "-")
+    said = re.findall(r"hardest acceleration was ([+-][\d.]+) m/s²", page)
     assert said[0] == f"{max(own, key=abs):+z.1f}"
     with duckdb.connect(str(humans), read_only=True) as connection:
         (metric,) = connection.execute(

@@ -100,6 +100,7 @@ window.startReplay = () => {
   });
 
   charts.draw();
+  clock.seek(begin);
   recall();
 };
 startReplay();
