@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import cache, partial
 from html import unescape
-from itertools import count
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -166,8 +166,7 @@ def _file_of(page: str, taken: Collection[str]) -> str:
     words = "-".join([str(path).removesuffix(suffix), *asked])
     name = f"{FILES}/{_ODD.sub('-', words).strip('-')[:LONGEST_NAME]}"
     others = {file.lower() for file in taken}
-    ends = ("" if number == 1 else f"-{number}" for number in count(1))
-    named = (name + end + (suffix or ".html") for end in ends)
+    named = (f"{name}{end}{suffix or '.html'}" for end in chain([""], map("-{}".format, count(2))))
     return next(file for file in named if file.lower() not in others)
 
 
