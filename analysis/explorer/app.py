@@ -35,7 +35,6 @@ from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner_analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
 from merge_runner_analysis.explorer.offline import page_of_trials
 from merge_runner_analysis.explorer.pages import (
-    comparing,
     conditions,
     drivers,
     home,
@@ -148,13 +147,13 @@ def _trial(site: Site, asked: Request) -> str | Response:
     name, state = asked.path_params["name"], asked.query_params
     if state.get("as") != "page":
         return trial.trial_page(site, name, state)
-    rows = [trial.find(site, name, state), comparing.named(site, state.get("compare", ""))]
+    rows = [trial.find(site, name, state), trial.named(site, state.get("compare", ""))]
     page = page_of_trials(site, [row for row in rows if row is not None])
     return _download(page, "text/html", f"{FILE_NAME.sub('-', name)}.html")
 
 
 def _others(site: Site, asked: Request) -> Response:
-    return JSONResponse(comparing.others(site, asked.path_params["name"], asked.query_params))
+    return JSONResponse(trial.others(site, asked.path_params["name"], asked.query_params))
 
 
 def _raw(site: Site, asked: Request) -> Response:

@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_runner_analysis.explorer.catalogue import Filter
-from merge_runner_analysis.explorer.details import read_trial
 from merge_runner_analysis.explorer.pages.trial import decision_fragment, whole_panels
 from merge_runner_analysis.explorer.prompts import parts_of
 from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.views import read_trial
 
 WORDS = st.lists(st.sampled_from(["give", "way", ",", "3.5", "\n", "m/s"])).map(" ".join)
 
@@ -25,7 +24,7 @@ def site(study):
 
 def test_the_panels_of_a_whole_trial_are_those_that_a_server_shows(site):
     panels = 0
-    for row in site.catalogue.every(Filter()):
+    for row in site.catalogue.every({}):
         key = row["trial_id"], row["spec_hash"]
         trial = read_trial(site.db, *key)
         for name, panel in whole_panels(site, row, trial).items():

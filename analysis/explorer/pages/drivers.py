@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from merge_runner_analysis.data.reference_data import human_counts
-from merge_runner_analysis.explorer.conditions import ordered
 from merge_runner_analysis.explorer.display_text import with_minus
 from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.pages.home import (
@@ -22,15 +21,15 @@ from merge_runner_analysis.explorer.pages.home import (
 )
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.scope import Scope, carried, scope_of, unmarked
-from merge_runner_analysis.explorer.search import Wanted
 from merge_runner_analysis.explorer.site import NotThere, Site
+from merge_runner_analysis.explorer.views import ordered
 from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.tables.formats import printed
 from merge_runner_analysis.verdict_words import DIFFERS, MEASURES, OPEN, SHOWN
 
 # How attempts of a driver's trials with a prompt ended, and which model answered.
 ATTEMPTS = """
-SELECT served, outcome, sum(times)::BIGINT AS times
+SELECT served, outcome, count(*) AS times
 FROM tried SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (number)
 GROUP BY ALL ORDER BY ALL
 """
@@ -78,8 +77,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     first, words = "", None
     if own and own.facts and own.facts["asked"]:
         first = _first(site, own, bar.scope, asked)
-        trials = bar.scope.filter(own.name, own.prompt)
-        words = site.words.search(Wanted("rationales", (), trials, {}), 1)
+        words = site.words.search(bar.scope.trials(own.name, own.prompt))
     return site.render(
         "driver.html",
         here="drivers",
@@ -153,7 +151,7 @@ def _attempts(site: Site, own: Driver) -> list[Row]:
 
 def _accounts(site: Site, own: Driver, scope: Scope) -> list[Row]:
     """Why the driver collided: the classes of its collisions."""
-    wanted = scope.filter(own.name, own.prompt, "collided")
+    wanted = {**scope.trials(own.name, own.prompt), "outcome": "collided"}
     return [row for row in site.catalogue.counts(wanted, "account") if row["account"]]
 
 
@@ -161,7 +159,7 @@ def _conditions(site: Site, own: Driver | None, scope: Scope) -> dict[str, Any]:
     """What the driver's trials, and the humans', come to by condition."""
     rows: dict[str, Row] = {}
     if own is not None:
-        counts = site.catalogue.counts(scope.filter(own.name, own.prompt), "condition")
+        counts = site.catalogue.counts(scope.trials(own.name, own.prompt), "condition")
         rows = {row["condition"]: with_merged(row) for row in counts}
     names = ordered(rows or human_counts())
     return {

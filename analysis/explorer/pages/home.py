@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner_analysis.data.reference_data import human_counts
-from merge_runner_analysis.explorer.catalogue import Filter
-from merge_runner_analysis.explorer.conditions import ordered
 from merge_runner_analysis.explorer.marks import Cell, band, cells
 from merge_runner_analysis.explorer.pages.computed import Computed, computed_table
+from merge_runner_analysis.explorer.pages.sweep import standing_of
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.scope import Bar, Scope, carried, scope_of, unmarked
 from merge_runner_analysis.explorer.site import Site, news_of
-from merge_runner_analysis.explorer.sweeps import standing_of
+from merge_runner_analysis.explorer.views import ordered
 from merge_runner_analysis.names import DESCRIPTIONS, HUMAN
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.verdict_words import (
@@ -106,7 +105,7 @@ def verdicts_of(
     part = scope.sweep, scope.condition
     found, table = computed_table(site, TABLE, asked, *part)
     # While a run goes on, a new one would soon be old again.
-    if table and found.older and not any(run.followed for run, _ in standing_of(site.catalogue)):
+    if table and found.older and not any(run["followed"] for run in standing_of(site.catalogue)):
         found, table = computed_table(site, TABLE, {**asked, "anew": "1"}, *part)
     return found, table
 
@@ -130,7 +129,7 @@ def humans_of(table: Table | None, own: Driver | None = None) -> dict[str, Any]:
 
 def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
     """Every driver and prompt with trials in a scope; without a table their facts alone."""
-    counts = site.catalogue.counts(scope.filter(), "model", "variant", "who")
+    counts = site.catalogue.counts(scope.trials(), "model", "variant", "who")
     facts = {(row["model"], row["variant"]): row for row in counts if row["who"] != "humans"}
     endpoints = {
         (row["model"], row["variant"]): row["endpoint"] or ""
@@ -188,13 +187,13 @@ def noted(drivers: list[Driver]) -> list[tuple[str, str, str]]:
 
 def _conditions(site: Site, bar: Bar, shown: list[Driver]) -> dict[str, Any]:
     """Collisions by driver and condition, as the list of trials counts them, beside the humans'."""
-    rows = site.catalogue.counts(bar.scope.filter(), "model", "variant", "condition")
+    rows = site.catalogue.counts(bar.scope.trials(), "model", "variant", "condition")
     counted = {(row["model"], row["variant"], row["condition"]): row for row in rows}
     names = ordered({name for _, _, name in counted})
     return {
         "names": names,
         "humans": humans_by_condition(names),
-        "imported": bool(site.catalogue.counts(Filter(who="humans"), "who")),
+        "imported": bool(site.catalogue.counts({"who": "humans"}, "who")),
         "rows": [
             (one, [counted.get((unmarked(one.name), one.prompt, name)) for name in names])
             for one in shown
