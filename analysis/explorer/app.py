@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-import re
 import shutil
 import socket
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
@@ -17,6 +16,7 @@ from urllib.parse import parse_qsl
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -32,8 +32,8 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from merge_runner.errors import MergeRunnerError, UsageError
-from merge_runner_analysis.explorer.guard import LOOPBACK, Guard, from_elsewhere
-from merge_runner_analysis.explorer.offline import page_of_trials
+from merge_runner_analysis.explorer.glossary import sections
+from merge_runner_analysis.explorer.guard import LOOPBACK, Guard
 from merge_runner_analysis.explorer.pages import (
     conditions,
     drivers,
@@ -48,7 +48,7 @@ from merge_runner_analysis.explorer.pages import (
     words,
 )
 from merge_runner_analysis.explorer.reading import reading
-from merge_runner_analysis.explorer.site import STATIC, NothingNew, NotThere, Site
+from merge_runner_analysis.explorer.site import STATIC, NothingNew, NotThere, Site, download
 from merge_runner_analysis.explorer.urls import whole
 
 LOG = logging.getLogger(__name__)
@@ -56,17 +56,9 @@ FIRST_TIME = (
     "The trials are read for the first time; ten thousand take about ten seconds. This page comes "
     "back by itself."
 )
-CSV = "text/csv; charset=utf-8"
-# What a name of a trial may hold and the name of a file had better not.
-FILE_NAME = re.compile(r"[^A-Za-z0-9_.-]+")
 MOST_NOTED, MOST_FIELDS = 65_536, 10  # bytes and fields of a form with a note
 # Nothing in a reply runs, whatever a browser takes it for.
 SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
-# Matplotlib writes styles into its SVG, and traces as pictures.
-DRAWN = {
-    "content-security-policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
-    "sandbox"
-}
 
 
 def serve(db: Path, port: int, say: Callable[[str], None], reader: str) -> None:
@@ -123,103 +115,54 @@ def explorer(site: Site) -> Starlette:
     )
 
 
-def _page(
-    site: Site, render: Callable[[Site, Request], str | Response], asked: Request
-) -> Response:
+def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> Response:
     """A page, of what the database holds now."""
     if site.beginning:
-        text = _message(site, "Reading the trials", FIRST_TIME)
+        text = site.render("message.html", heading="Reading the trials", text=FIRST_TIME, here="")
         return HTMLResponse(text, headers={"refresh": "1"})  # in s
     site.refresh()
     try:
-        rendered = render(site, asked)
+        rendered = render(site, *asked.path_params.values(), asked.query_params)
     except NothingNew:
         return Response(status_code=204)
     return HTMLResponse(rendered) if isinstance(rendered, str) else rendered
 
 
-def _shown(render: Callable[..., str]) -> Callable[[Site, Request], str]:
-    """The page of what an address names and asks for."""
-    return lambda site, asked: render(site, *asked.path_params.values(), asked.query_params)
+def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
+    wanted = trials.export_filter(site, asked)
+    return download(site.catalogue.export(wanted, trials.sort_of(asked)), "trials.csv")
 
 
-def _trial(site: Site, asked: Request) -> str | Response:
-    name, state = asked.path_params["name"], asked.query_params
-    if state.get("as") != "page":
-        return trial.trial_page(site, name, state)
-    rows = [trial.find(site, name, state), trial.named(site, state.get("compare", ""))]
-    page = page_of_trials(site, [row for row in rows if row is not None])
-    return _download(page, "text/html", f"{FILE_NAME.sub('-', name)}.html")
+def _raw(site: Site, name: str, asked: Mapping[str, str]) -> Response:
+    return PlainTextResponse(trial.raw_reply(site, name, asked), headers=SEALED)
 
 
-def _others(site: Site, asked: Request) -> Response:
-    return JSONResponse(trial.others(site, asked.path_params["name"], asked.query_params))
-
-
-def _raw(site: Site, asked: Request) -> Response:
-    text = trial.raw_reply(site, asked.path_params["name"], asked.query_params)
-    return PlainTextResponse(text, headers=SEALED)
-
-
-def _trials_csv(site: Site, asked: Request) -> Response:
-    wanted = trials.export_filter(site, asked.query_params)
-    content = site.catalogue.export(wanted, trials.sort_of(asked.query_params))
-    return _download(content, CSV, "trials.csv")
-
-
-def _table_file(site: Site, asked: Request) -> Response:
-    name, suffix = asked.path_params["name"], asked.path_params["suffix"]
-    text, kind = tables.table_file(site, name, suffix)
-    return _download(text, kind, f"{name}.{suffix}")
-
-
-def _figure_file(site: Site, asked: Request) -> Response:
-    name, form = asked.path_params["name"], asked.path_params["form"]
-    file = tables.figure_file(site, name, form)
-    return Response(file, media_type=tables.FORMS[form], headers=DRAWN)
-
-
-def _sql(site: Site, asked: Request) -> str:
-    """Only our own pages run a query; where another site leads to one, it is shown and not run."""
-    return sql.sql_page(site, asked.query_params, run=not from_elsewhere(asked.headers))
-
-
-def _sql_csv(site: Site, asked: Request) -> Response:
-    state = asked.query_params
-    if from_elsewhere(asked.headers):
-        return RedirectResponse(site.at.to("sql", q=sql.query_in(state)))
-    try:
-        return _download(site.queries.csv(sql.query_in(state)), CSV, "query.csv")
-    except MergeRunnerError as exc:
-        return HTMLResponse(sql.sql_page(site, state, problem=str(exc)), 400)
-
-
-PAGES: dict[str, Callable[[Site, Request], str | Response]] = {
-    "/": _shown(home.home_page),
-    "/drivers": _shown(drivers.drivers_page),
-    "/drivers/{name:path}": _shown(drivers.driver_page),
-    "/conditions/{name:path}": _shown(conditions.condition_page),
-    "/sweeps": _shown(sweep.sweeps_page),
-    "/sweeps/{name:path}": _shown(sweep.sweep_page),
-    "/trials": _shown(trials.trials_page),
-    "/trials/": lambda site, asked: RedirectResponse(site.at.to("trials", **asked.query_params)),
+# What renders each page, of what its address names and asks for.
+PAGES: dict[str, Callable[..., str | Response]] = {
+    "/": home.home_page,
+    "/drivers": drivers.drivers_page,
+    "/drivers/{name:path}": drivers.driver_page,
+    "/conditions/{name:path}": conditions.condition_page,
+    "/sweeps": sweep.sweeps_page,
+    "/sweeps/{name:path}": sweep.sweep_page,
+    "/trials": trials.trials_page,
+    "/trials/": lambda site, asked: RedirectResponse(site.at.to("trials", **asked)),
     "/trials.csv": _trials_csv,
-    "/trials/{name:path}": _trial,
-    "/decisions/{name:path}": _shown(trial.decision_fragment),
-    "/others/{name:path}": _others,
+    "/trials/{name:path}": trial.trial_page,
+    "/others/{name:path}": lambda *asked: JSONResponse(trial.others(*asked)),
     "/raw/{name:path}": _raw,
-    "/glossary": lambda site, _: site.render("glossary.html", here="glossary"),
-    "/tables": lambda site, _: tables.tables_page(site),
-    "/tables/{name}.{suffix}": _table_file,
-    "/tables/{name}": _shown(tables.table_page),
-    "/figures/{name}.{form}": _figure_file,
-    "/figures/{name}": _shown(tables.figure_page),
-    "/prompts": _shown(prompts.prompts_page),
-    "/discordant": _shown(prompts.discordant_page),
-    "/words": _shown(words.words_page),
-    "/notes": lambda site, _: notes.notes_page(site),
-    "/sql": _sql,
-    "/sql.csv": _sql_csv,
+    "/glossary": lambda site, _: site.render("glossary.html", here="glossary", glossary=sections()),
+    "/tables": tables.tables_page,
+    "/tables/{name}.{suffix}": tables.table_file,
+    "/tables/{name}": tables.table_page,
+    "/figures/{name}.{suffix}": tables.figure_file,
+    "/figures/{name}": tables.figure_page,
+    "/prompts": prompts.prompts_page,
+    "/discordant": prompts.discordant_page,
+    "/words": words.words_page,
+    "/notes": notes.notes_page,
+    "/sql": sql.sql_page,
+    "/sql.csv": sql.sql_csv,
 }
 
 
@@ -228,13 +171,12 @@ async def _noted(site: Site, request: Request) -> Response:
     size = whole(request.headers.get("content-length", ""))
     if size is None or size > MOST_NOTED:
         return PlainTextResponse("nothing was noted: the form is too large", 413)
-    body = await request.body()
+    body = (await request.body()).decode(errors="replace")
 
     def write() -> Response:
         site.refresh()
         try:
-            fields = parse_qsl(body.decode(errors="replace"), max_num_fields=MOST_FIELDS)
-            row = notes.add_note(site, dict(fields))
+            row = notes.add_note(site, dict(parse_qsl(body, max_num_fields=MOST_FIELDS)))
         except (UsageError, ValueError) as exc:
             return PlainTextResponse(str(exc), 400)
         if "hx-request" in request.headers:
@@ -244,35 +186,24 @@ async def _noted(site: Site, request: Request) -> Response:
     return await run_in_threadpool(write)
 
 
-def _download(content: str | bytes, kind: str, name: str) -> Response:
-    """A file that a browser saves under this name."""
-    headers = {"content-disposition": f'attachment; filename="{name}"'}
-    return Response(content, media_type=kind, headers=headers)
-
-
-def _message(site: Site, heading: str, text: str) -> str:
-    return site.render("message.html", heading=heading, text=text, here="")
-
-
 def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
     """The pages that say why there is no other."""
 
-    def said(heading: str, text: str, code: int) -> Response:
-        return HTMLResponse(_message(site, heading, text), code)
-
-    def absent(_: Request, exc: Exception) -> Response:
-        reply = said("Not there", str(exc), 404)
-        reply.headers["hx-refresh"] = "true"  # a page that waited for it is loaded anew, to say so
-        return reply
-
-    def fault(request: Request, exc: Exception) -> Response:
-        LOG.error("%s: a fault of the explorer: %r", request.url.path, exc)
-        LOG.debug("where it happened", exc_info=exc)
-        return said("A fault", f"A fault of the explorer: {exc!r}. The other pages go on.", 500)
+    def said(heading: str, code: int, request: Request, exc: Exception) -> Response:
+        text = str(exc)
+        if isinstance(exc, HTTPException):
+            text = f"there is no page {request.url.path}"
+        if code == 500:
+            LOG.error("%s: a fault of the explorer: %r", request.url.path, exc)
+            LOG.debug("where it happened", exc_info=exc)
+            text = f"A fault of the explorer: {exc!r}. The other pages go on."
+        page = site.render("message.html", heading=heading, text=text, here="")
+        # A page that waited for what is not there is loaded anew, to say so.
+        return HTMLResponse(page, code, {"hx-refresh": "true"} if code == 404 else None)
 
     return {
-        NotThere: absent,
-        404: lambda request, _: said("Not there", f"there is no page {request.url.path}", 404),
-        MergeRunnerError: lambda _, exc: said("Not now", str(exc), 503),
-        Exception: fault,
+        NotThere: partial(said, "Not there", 404),
+        404: partial(said, "Not there", 404),
+        MergeRunnerError: partial(said, "Not now", 503),
+        Exception: partial(said, "A fault", 500),
     }

@@ -24,8 +24,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer, quoted
-from merge_runner_analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
-from merge_runner_analysis.accounts.course import Course
+from merge_runner_analysis.accounts import ALONE, OTHER_ACCOUNTS, Course, collision_class
 from merge_runner_analysis.data.derived_cache import ROWS, program
 from merge_runner_analysis.data.driver_words import language_models, stand_in, unresponsive
 from merge_runner_analysis.explorer.display_text import csv_cell
@@ -40,14 +39,6 @@ Wanted = Mapping[str, Any]
 (trial, spec), where those behind a cell of a table are wanted.
 """
 Facets = dict[str, list[tuple[str, int]]]
-# Trials of a variant and of its driver's baseline in equal conditions and repetitions.
-PAIRS = """
-SELECT one.condition, one.rep, one.trial_id, one.spec_hash, one.outcome,
-    base.trial_id AS base_id, base.spec_hash AS base_hash, base.outcome AS base_outcome
-FROM listed AS one JOIN listed AS base USING (model, model_left, condition, rep)
-WHERE one.model = ? AND one.variant = ? AND base.variant = 'baseline' AND one.source <> 'human'
-ORDER BY one.trial_id, one.spec_hash, base.spec_hash
-"""
 # Differs where what was stored of a trial does: another program may have played it anew.
 PRINTS = """
 SELECT trial_id, spec_hash,
@@ -433,10 +424,6 @@ class Catalogue:
             name: condition_text(one.projected_headway_m, one.relative_velocity_mps)
             for name, one in HUMAN_CONDITIONS.items()
         } | {name: condition_text(*of) for name, *of in map(dict.values, played)}
-
-    def pairs(self, model: str, variant: str) -> list[Row]:
-        """Trials of a variant beside those of the baseline."""
-        return self.ask(PAIRS, model, variant)
 
     def state(self) -> Row:
         """What differs where other ``trials`` are listed, or the same otherwise."""

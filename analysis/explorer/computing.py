@@ -5,6 +5,7 @@ pandas and the fits hold a Python process for seconds, and no page may wait for 
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import signal
@@ -15,13 +16,14 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import duckdb
 
+from merge_runner.audit.checks import audited_database, check_sweep
 from merge_runner.errors import UsageError
 from merge_runner.registry import in_use, use
 from merge_runner.results.database import read_database
@@ -43,8 +45,17 @@ if TYPE_CHECKING:
     from merge_runner_analysis.data.study import Study
 
 REMEMBERED = 100
+# While a run goes on the database changes all the time: an answer stands for a minute.
+STANDS_S = 60.0
+FOUND = 3  # findings of a run that its page shows
 Request = tuple[str, ...]
-"""``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN`` or ``figure NAME FORM``."""
+"""``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN``, ``figure NAME FORM``,
+``audit``."""
+
+RUNS = """
+SELECT sweep_id, coalesce(exit_code = 0, false) FROM sweeps
+ORDER BY started_at DESC, sweep_id DESC
+"""
 
 
 class Numbers:
@@ -52,7 +63,6 @@ class Numbers:
 
     def __init__(self, db: Path) -> None:
         self.db = db
-        self.stamp = stamp_of(db)
 
     def answer(self, request: Request) -> dict[str, Any]:
         """What is asked for, with ``counted``: how many trials the database holds.
@@ -67,16 +77,15 @@ class Numbers:
             case ["figure", name, "svg" | "png" as form]:
                 from merge_runner_analysis.figures.gallery import rendered
 
-                found = {"file": rendered(self.study, name, form), "digest": self._digest}
+                digest, _ = results_digest(self.db)
+                found = {"file": rendered(self.study, name, form), "digest": digest}
+            case ["audit"]:
+                found = {"notes": json.loads(self._kept("audit", self._audit))}
             case _:
                 raise UsageError(f"nothing answers {request!r}")
-        return {"counted": self._counted, **found}
-
-    @cached_property
-    def _counted(self) -> int:
         with read_database(self.db) as connection:
-            rows = connection.execute("SELECT count(*) FROM trials WHERE source <> 'seat'")
-            return int(rows.fetchall()[0][0])
+            counted = connection.execute("SELECT count(*) FROM trials WHERE source <> 'seat'")
+            return {"counted": counted.fetchall()[0][0], **found}
 
     @cached_property
     def study(self) -> Study:
@@ -86,25 +95,38 @@ class Numbers:
         return Study(self.db)
 
     @cached_property
-    def _digest(self) -> str:
-        return results_digest(self.db)[0]
-
-    @cached_property
     def _state(self) -> str:
         return present_state(self.db)
 
-    def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
-        """A table of all trials, or of those of a sweep and a condition; kept for the next time."""
-        options = options_text(self.db, sweep=sweep, condition=condition)
+    def _kept(self, name: str, make: Callable[[], str], options: str = "") -> str:
+        """What is kept of the present state under a name, or else is made, and kept."""
+        options = options or options_text(self.db)
         kept = finished(self.db, self._state, options, [name])
         if not kept:
+            kept = {name: make()}
+            keep_finished(self.db, self._state, options, kept)
+        return kept[name]
+
+    def _table(self, name: str, sweep: str = "", condition: str = "") -> str:
+        """A table of all trials, or of those of a sweep and a condition; kept for the next time."""
+
+        def make() -> str:
             from merge_runner_analysis.data.study import Study
 
             is_part = sweep or condition
             study = Study(self.db, sweep=sweep, condition=condition) if is_part else self.study
-            kept = {name: to_text(make_tables(study, [name])[0])}
-            keep_finished(self.db, study.state, options, kept)
-        return kept[name]
+            return to_text(make_tables(study, [name])[0])
+
+        return self._kept(name, make, options_text(self.db, sweep=sweep, condition=condition))
+
+    def _audit(self) -> str:
+        """What the audit of each run found and notes, by the run's id; nothing is replayed."""
+        told = {}
+        with audited_database(self.db) as connection:
+            for run, ended in connection.execute(RUNS).fetchall():
+                audit = check_sweep(connection, run, (), finished=ended)
+                told[run] = [f"found: {one}" for one in audit.findings[:FOUND]] + audit.notes
+        return json.dumps(told)
 
     def _cell(self, name: str, row: str, column: str) -> dict[str, Any]:
         from merge_runner_analysis.explain import explain
@@ -128,18 +150,26 @@ class Numbers:
         return {"explained": found, "trials": trials}
 
 
-_db: Path
-_numbers: Numbers | None = None
+@lru_cache(1)
+def numbers(db: Path, _: tuple[int, ...]) -> Numbers:
+    """The numbers of a database with a stamp: what was read is read once."""
+    return Numbers(db)
 
 
-def _begin(db: Path, text: str, plugins: Mapping[str, str]) -> None:
+def answer(db: Path, request: Request) -> dict[str, Any]:
+    """The answer of the database as it is now; raises MergeRunnerError."""
+    try:
+        return numbers(db, stamp_of(db)).answer(request)
+    except duckdb.Error as exc:  # as where the file is replaced while it is read
+        raise UsageError(f"{db} cannot be read: {first_line(exc)}") from exc
+
+
+def _begin(text: str, plugins: Mapping[str, str]) -> None:
     """Use the study of the explorer, whatever stands in its files by now."""
-    global _db  # noqa: PLW0603 # of a process that has no other use
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the explorer, which then ends it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if text:
         use(catalogue_of(StudyFile.model_validate(tomllib.loads(text)), text, plugins))
-    _db = db
 
 
 def _end_with_parent() -> None:
@@ -149,54 +179,47 @@ def _end_with_parent() -> None:
     os._exit(0)
 
 
-def _answer(request: Request) -> dict[str, Any]:
-    """The answer of the database as it is now; raises MergeRunnerError."""
-    global _numbers  # noqa: PLW0603 # what was read is read once
-    try:
-        if _numbers is None or _numbers.stamp != stamp_of(_db):
-            _numbers = None  # which makes room first
-            _numbers = Numbers(_db)
-        return _numbers.answer(request)
-    except duckdb.Error as exc:  # as where the file is replaced while it is read
-        raise UsageError(f"{_db} cannot be read: {first_line(exc)}") from exc
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """A computation, of a state of the database (its stamp), begun at a time (s since 1970)."""
-
-    answer: Future[dict[str, Any]]
-    state: tuple[int, ...]
-    at: float
-
-    @property
-    def content(self) -> dict[str, Any] | None:
-        """The answer; None while it is not there, and where there will be none."""
-        is_there = self.answer.done() and self.answer.exception() is None
-        return self.answer.result() if is_there else None
-
-
 class Worker:
     """A process that computes, with the same study's plug-ins as this one."""
 
     def __init__(self, db: Path) -> None:
+        self._db = db
         self._pool = ProcessPoolExecutor(
             max_workers=1,
             mp_context=multiprocessing.get_context("spawn"),
             initializer=_begin,
-            initargs=(db, in_use().text, dict(in_use().plugins)),
+            initargs=(in_use().text, dict(in_use().plugins)),
         )
         self._pid = self._pool.submit(os.getpid)
 
     def submit(self, request: Request) -> Future[dict[str, Any]]:
         """Compute an answer after what was asked before."""
-        return self._pool.submit(_answer, request)
+        return self._pool.submit(answer, self._db, request)
 
     def close(self) -> None:
         """End it, whatever is under way."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         with suppress(BrokenProcessPool, ProcessLookupError):
             os.kill(self._pid.result(), signal.SIGKILL)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A computation, of a state of the database (its stamp), begun at a time (s since 1970).
+
+    ``before`` is that of an earlier state, whose answer stands until this one is there.
+    """
+
+    answer: Future[dict[str, Any]]
+    state: tuple[int, ...]
+    at: float
+    before: Job | None = None
+
+    @property
+    def content(self) -> dict[str, Any] | None:
+        """The answer; None while it is not there, and where there will be none."""
+        is_there = self.answer.done() and self.answer.exception() is None
+        return self.answer.result() if is_there else None
 
 
 class Computing:
@@ -209,32 +232,31 @@ class Computing:
         self._jobs: dict[Request, Job] = {}
         self._worker: Worker | None = None
 
-    def ask(
-        self,
-        request: Request,
-        state: tuple[int, ...],
-        *,
-        anew: bool = False,
-        wait_s: float = 0.0,
-    ) -> Job:
+    def ask(self, request: Request, state: tuple[int, ...], wait_s: float = 0.0) -> Job:
         """A computation, waiting at most ``wait_s`` for its answer; raises MergeRunnerError.
 
-        ``state`` is the present one. An answer of an earlier one will do, since it says which,
-        unless it is wanted ``anew``; what was absent may be there in another state.
+        ``state`` is the present one. An answer of an earlier state is given while a newer one is
+        computed, but what was absent then may be there now.
         """
         with self._lock:
-            job = self._jobs.get(request)
+            job = self._jobs.pop(request, None)
             content = job.content if job else None
+            is_absent = content is not None and "absent" in content
             if job is None or (
-                content is not None and job.state != state and (anew or "absent" in content)
+                content is not None
+                and job.state != state
+                and (is_absent or time.time() - job.at > STANDS_S)
             ):
-                job = Job(self._submit(request), state, time.time())
-                self._jobs.pop(request, None)
-                self._jobs[request] = job
-                if len(self._jobs) > REMEMBERED:
-                    del self._jobs[next(iter(self._jobs))]
+                before = None if job is None or is_absent else replace(job, before=None)
+                job = Job(self._submit(request), state, time.time(), before)
+            self._jobs[request] = job
+            if len(self._jobs) > REMEMBERED:
+                del self._jobs[next(iter(self._jobs))]
         wait([job.answer], timeout=wait_s)
-        if not job.answer.done() or (failure := job.answer.exception()) is None:
+        if not job.answer.done():
+            return job.before or job
+        failure = job.answer.exception()
+        if failure is None:
             return job
         with self._lock:  # no failure stays
             if self._jobs.get(request) is job:

@@ -18,13 +18,15 @@ import duckdb
 from merge_runner.errors import StoreLocked, UsageError
 from merge_runner_analysis.explorer.reading import reading, stamp_of
 
-LOGS = (".wal", ".wal.checkpoint", ".wal.recovery")
+# The database comes after its logs: a process that closes a file loses all its locks on it.
+FILES = (".wal", ".wal.checkpoint", ".wal.recovery", "")
 
 
 class Copy:
     """A copy of a database as an open file without a name: it is gone when nobody holds it.
 
     So nothing is left of it when the program is killed, and no query can say where it lies.
+    ``file`` is its name in SQL.
     """
 
     def __init__(self, db: Path, stamp: tuple[int, ...]) -> None:
@@ -34,8 +36,7 @@ class Copy:
             with tempfile.TemporaryDirectory(prefix="merge-runner-view-") as folder:
                 copy = f"{folder}/results.duckdb"
                 with reading(db):  # so that nobody writes
-                    # The database last: a process that closes a file loses all its locks on it.
-                    for end in (*LOGS, ""):
+                    for end in FILES:
                         with suppress(FileNotFoundError):
                             shutil.copyfile(f"{db}{end}", f"{copy}{end}")
                 with duckdb.connect(copy) as whole:  # it loses its name, and its log with it
@@ -44,11 +45,7 @@ class Copy:
         except OSError as exc:
             raise UsageError(f"the database cannot be copied: {exc.strerror}") from exc
         weakref.finalize(self, os.close, self.fd)
-
-    @property
-    def file(self) -> str:
-        """Its name in SQL."""
-        return f"'/dev/fd/{self.fd}'"
+        self.file = f"'/dev/fd/{self.fd}'"
 
 
 class Copies:
@@ -66,10 +63,9 @@ class Copies:
         """
         with self._copying:
             stamp = stamp_of(self.db)
-            if self._copy is None or self._copy.stamp != stamp:
-                try:
+            if self._copy is None:
+                self._copy = Copy(self.db, stamp)
+            elif self._copy.stamp != stamp:
+                with suppress(StoreLocked):
                     self._copy = Copy(self.db, stamp)
-                except StoreLocked:
-                    if self._copy is None:
-                        raise
             return self._copy

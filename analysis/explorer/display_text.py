@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import unicodedata
-from datetime import datetime
+from contextlib import suppress
 from decimal import Decimal
 
 from merge_runner.text_safety import in_spreadsheet
@@ -14,8 +14,8 @@ MINUS = "−"
 NEGATIVE = re.compile(r"(?<![\w-])-(?=\d)")
 SHOWN = 20_000
 BEGINNING = 800
-# What Python gets for infinite timestamps.
-INFINITE = {"9999-12-31 23:59:59.999999": "infinity", "0001-01-01 00:00:00": "-infinity"}
+# All that may not show.
+_ODD = re.compile(r"[^\n\t -~]")
 # Formats that show nothing, among them those that turn the direction of writing.
 _HIDDEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}
 # Letters and marks that show nothing either: fillers, joiners, and selectors of variants.
@@ -35,15 +35,13 @@ def with_minus(text: str) -> str:
 
 def visible(text: str) -> str:
     """A text with every character that does not show as its code point: ``[U+202E]``."""
-    if text.isascii() and text.isprintable():
-        return text
-    return "".join(c if _shows(c) else f"[U+{ord(c):04X}]" for c in text)
+    return _ODD.sub(lambda odd: odd[0] if _shows(odd[0]) else f"[U+{ord(odd[0]):04X}]", text)
 
 
 def _shows(c: str) -> bool:
     if ord(c) in _BLANK:
         return False
-    return c in "\n\t" or c.isprintable() or unicodedata.category(c) not in _HIDDEN
+    return c.isprintable() or unicodedata.category(c) not in _HIDDEN
 
 
 def shortened(text: str) -> tuple[str, int]:
@@ -65,28 +63,11 @@ def csv_cell(value: object) -> object:
 
 def text_of(value: object) -> str | None:
     """A value of any type as a text; None for NULL."""
-    match value:
-        case None | str():
-            return value
-        case bool():
-            return "true" if value else "false"
-        case bytes():
-            return f"0x{value.hex()}"
-        case datetime():
-            text = value.isoformat(" ")
-            return INFINITE.get(text, text)
-        case list() | tuple() | dict():
-            return json.dumps(_plain(value), ensure_ascii=False, default=text_of)
-        case _:
-            return str(value)
-
-
-def _plain(value: object) -> object:
-    """A nested value whose keys JSON can say."""
-    match value:
-        case list() | tuple():
-            return [_plain(item) for item in value]
-        case dict():
-            return {str(text_of(key)): _plain(item) for key, item in value.items()}
-        case _:
-            return value
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple | dict):
+        with suppress(TypeError):  # there are keys that JSON cannot say
+            return json.dumps(value, ensure_ascii=False, default=str)
+    return str(value)

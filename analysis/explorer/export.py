@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import re
 import shutil
 import tempfile
@@ -50,9 +49,9 @@ POLICY = (
 HTML = b"<!doctype html"
 OURS = f'{HTML.decode()}>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'.encode()
 INDEX, FILES = "index.html", "files"
+SERVED = ("htmx*", "lost.js", "notes.js", "single.js")  # scripts that need a server, or one page
 BUSY, POLL_S = 'class="computing"', 0.1
-_LINKS = re.compile(r'<a\b[^>]*\shref="([^"]*)"')
-_STATIC = re.compile(r'="/static/([^"]+)"')
+_FILE_LINKS = re.compile(r'href="(/(?:tables|figures)/[^"]+\.(?:csv|tex|svg))"')
 _ODD = re.compile(r"[^A-Za-z0-9_.]+")
 LONGEST_NAME = 120
 
@@ -76,12 +75,13 @@ def export_folder(
     refuse_another_kind(index, OURS, "exported study")
     if files.exists() and not index.exists():
         raise UsageError(f"{files} is there, and is no exported study's: name another folder")
-    begin, heads = ("/trials", OF_TRIALS) if wanted else ("/", FOLLOWED)
+    begin, heads = ("/trials", OF_TRIALS) if wanted else ("/", tuple(FOLLOWED))
     with _opened(db, wanted) as (site, rows), _staged(folder) as stage:
         if wanted:
             site.catalogue.keep([row["number"] for row in rows])
         (stage / FILES).mkdir()
-        _rewrite(db, stage, asyncio.run(_crawled(site, begin, heads, stage, told)))
+        asyncio.run(_crawl(site, begin, heads, stage, told))
+        shutil.copytree(STATIC, stage / FILES / "static", ignore=shutil.ignore_patterns(*SERVED))
     return index
 
 
@@ -93,11 +93,20 @@ def export_page(db: Path, file: Path, wanted: Sequence[str]) -> Path:
     return file
 
 
-async def _crawled(
-    site: Site, begin: str, heads: Collection[str], stage: Path, told: Callable[[int], object]
-) -> dict[str, str]:
-    """Save the pages to which links lead, as they are served; returns their files by address."""
-    files, absent, waiting = {begin: INDEX}, set[str](), deque([begin])
+async def _crawl(
+    site: Site, begin: str, heads: tuple[str, ...], stage: Path, told: Callable[[int], object]
+) -> None:
+    """Save the pages to which links lead, as they are served, with links from file to file."""
+    files, waiting = {begin: INDEX}, deque([begin])
+
+    def leads(root: str, address: str) -> str:
+        """The way to the file of an address; empty where there is none."""
+        page, moment = _page_of(address, heads)
+        if page and page not in files:
+            files[page] = _file_of(page, files.values())
+            waiting.append(page)
+        return f"{root}{files[page]}{moment}" if files.get(page) else ""
+
     transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
     plain = {"accept-encoding": "identity"}
     async with httpx.AsyncClient(
@@ -105,54 +114,46 @@ async def _crawled(
     ) as client:
         while waiting:
             address = waiting.popleft()
-            whole = {"as": "whole"} if address.startswith("/trials/") else {}
-            reply = await client.get(httpx.URL(address).copy_merge_params(whole))
-            if reply.is_error:  # no page is there, or a figure cannot be drawn
-                if files[address].endswith(".html") and reply.status_code != httpx.codes.NOT_FOUND:
-                    raise UsageError(
-                        f"nothing was written: {address} answers {reply.status_code}; "
-                        "`merge-runner view` shows why"
-                    )
-                absent.add(address)
-                continue
-            text = reply.text if reply.headers["content-type"].startswith("text/html") else ""
-            for link in _LINKS.findall(text):
-                page, _ = _page_of(unescape(link))
-                if (
-                    page
-                    and page not in files
-                    and _head(page) in heads
-                    and not page.endswith(".png")
-                ):
-                    files[page] = _file_of(page, files.values())
-                    waiting.append(page)
+            reply = await client.get(address)
+            text = reply.text
             if BUSY in text:
                 waiting.append(address)
                 await asyncio.sleep(POLL_S)
                 continue
-            (stage / files[address]).write_bytes(reply.content)
+            if reply.is_error and reply.status_code != httpx.codes.NOT_FOUND:
+                raise UsageError(
+                    f"nothing was written: {address} answers {reply.status_code}; "
+                    "`merge-runner view` shows why"
+                )
+            # Files come before the pages that link to them: a figure that cannot be drawn has none.
+            for link in {unescape(href) for href in _FILE_LINKS.findall(text)} - files.keys():
+                if page := _page_of(link, heads)[0]:
+                    file = await client.get(page)
+                    files[page] = "" if file.is_error else _file_of(page, files.values())
+                    if files[page]:
+                        refuse_leaks(site.db, page, file.text)
+                        (stage / files[page]).write_bytes(file.content)
+            root = "" if address == begin else "../"
+            text = offline(text, site.db.name, POLICY, partial(leads, root))
+            text = text.replace('="/static/', f'="{root}{FILES}/static/')
+            refuse_leaks(site.db, files[address], text)
+            (stage / files[address]).write_text(text, encoding="utf-8")
             told(len(files) - len(waiting))
-    return {address: file for address, file in files.items() if address not in absent}
 
 
-@cache  # a link is read when it is followed, and when it is rewritten
-def _page_of(address: str) -> tuple[str, str]:
+@cache  # pages link to each other
+def _page_of(address: str, heads: tuple[str, ...]) -> tuple[str, str]:
     """Split an address into a page and the moment it shows; two empty texts for other pages."""
     parts = urlsplit(address)
-    known = FOLLOWED.get(_head(address)) if parts.path.startswith("/") else None
-    asked = dict(parse_qsl(parts.query))
-    moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
-    if known is None or parts.netloc:
+    head = parts.path.removeprefix("/").partition("/")[0]
+    if head not in heads or parts.netloc or not parts.path.startswith("/"):
         return "", ""
+    known, asked = FOLLOWED[head], dict(parse_qsl(parts.query))
+    moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
     kept = {name: asked[name] for name in asked if name in known or name.startswith(FACTOR)}
-    if asked.keys() - kept.keys() - {*SCOPE}:
+    if parts.path.endswith(".png") or asked.keys() - kept.keys() - {*SCOPE}:
         return "", ""
     return parts.path + query_of(kept), moment + (f"#{parts.fragment}" if parts.fragment else "")
-
-
-def _head(address: str) -> str:
-    """The first part of a path."""
-    return urlsplit(address).path.removeprefix("/").partition("/")[0]
 
 
 def _file_of(page: str, taken: Collection[str]) -> str:
@@ -167,35 +168,6 @@ def _file_of(page: str, taken: Collection[str]) -> str:
     ends = ("" if number == 1 else f"-{number}" for number in count(1))
     named = (name + end + (suffix or ".html") for end in ends)
     return next(file for file in named if file.lower() not in others)
-
-
-def _rewrite(db: Path, stage: Path, files: dict[str, str]) -> None:
-    """Have the links of all pages lead to files, and put the files beside them that they need."""
-    needed = set[str]()
-    ways = {
-        folder: {page: os.path.relpath(file, folder) for page, file in files.items()}
-        for folder in (".", FILES)
-    }
-    for file in files.values():
-        folder = str(PurePosixPath(file).parent)
-        path = stage / file
-        text = path.read_text(encoding="utf-8")
-        if file.endswith(".html"):
-            text = offline(text, db.name, POLICY, partial(_leads, ways[folder]))
-            needed.update(_STATIC.findall(text))
-            text = _STATIC.sub(rf'="{os.path.relpath(f"{FILES}/static", folder)}/\1"', text)
-            path.write_text(text, encoding="utf-8")
-        refuse_leaks(db, file, text)
-    for name in needed:
-        copy = stage / FILES / "static" / name
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(STATIC / name, copy)
-
-
-def _leads(ways: dict[str, str], address: str) -> str:
-    """Return the way to the file of an address; empty where there is none."""
-    page, moment = _page_of(address)
-    return ways[page] + moment if page in ways else ""
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 from markupsafe import Markup, escape
 
@@ -15,32 +14,24 @@ _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
     (re.compile(r"`(.+?)`"), r"<code>\1</code>"),
+    (re.compile(r" \(\[[^]]+\]\([^)]+\)\)"), ""),
     (re.compile(r"\[(.+?)\]\(.+?\)"), r"\1"),
 )
 
 
-class Word(NamedTuple):
-    """A word, or several of one meaning with commas between, and what is meant by it."""
-
-    term: str
-    meaning: Markup
-
-
 @cache
-def sections() -> dict[str, list[Word]]:
-    """All words by the headings that they stand under."""
-    found: dict[str, list[Word]] = {}
+def sections() -> dict[str, list[tuple[str, Markup]]]:
+    """All words by the headings that they stand under, each with what is meant by it.
+
+    Links of the meanings lead nowhere from a page, and become their texts.
+    """
+    found: dict[str, list[tuple[str, Markup]]] = {}
     for line in FILE.read_text(encoding="utf-8").splitlines():
         if line.startswith("## "):
             words = found.setdefault(line[3:], [])
         elif (row := _ROW.fullmatch(line)) and row[1] not in {"term", "---"}:
-            words.append(Word(row[1], _shown(row[2])))
+            meaning = str(escape(row[2]))
+            for pattern, html in _MARKED:
+                meaning = pattern.sub(html, meaning)
+            words.append((row[1], Markup(meaning)))  # noqa: S704 # escaped above
     return found
-
-
-def _shown(text: str) -> Markup:
-    """A cell of Markdown; its links lead nowhere from a page, and become their texts."""
-    shown = str(escape(text))
-    for pattern, html in _MARKED:
-        shown = pattern.sub(html, shown)
-    return Markup(shown)  # noqa: S704 # escaped above

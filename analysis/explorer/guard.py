@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from urllib.parse import urlsplit
-
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOOPBACK = "127.0.0.1"
+QUERIES = {"/sql", "/sql.csv"}  # where a link alone would run something
 # Scripts and styles are files of ours. What a model wrote could not run even if it were let in.
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -22,20 +21,6 @@ HEADERS = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
-
-
-def from_elsewhere(headers: Headers) -> bool:
-    """Return whether another site's page led here.
-
-    Browsers send ``sec-fetch-site`` to loopback; older ones do not: then ``origin`` and
-    ``referer`` tell.
-    """
-    site = headers.get("sec-fetch-site")
-    if site is not None:
-        return site in {"cross-site", "same-site"}
-    host = headers.get("host", "")
-    led = [headers[name] for name in ("origin", "referer") if name in headers]
-    return any(urlsplit(address).netloc != host for address in led)
 
 
 class Guard:
@@ -57,17 +42,19 @@ class Guard:
                     headers.setdefault(name, value)
             await send(message)
 
-        refusal = _refusal(scope["method"], Headers(scope=scope))
+        refusal = _refusal(scope["method"], scope["path"], Headers(scope=scope))
         app = PlainTextResponse(f"{refusal}\n", 403) if refusal else self._app
         await app(scope, receive, guarded)
 
 
-def _refusal(method: str, headers: Headers) -> str:
+def _refusal(method: str, path: str, headers: Headers) -> str:
     origin = headers.get("origin")
-    if origin not in {None, f"http://{headers.get('host', '')}"}:
-        return "another site's page may not ask here"
-    if method not in {"GET", "HEAD"} and (origin is None or from_elsewhere(headers)):
+    # Every browser that shows our pages says whether another site's page led here.
+    from_elsewhere = headers.get("sec-fetch-site") in {"cross-site", "same-site"}
+    if method not in {"GET", "HEAD"} and (origin is None or from_elsewhere):
         return "only a page of the explorer may write here"
-    if from_elsewhere(headers) and headers.get("sec-fetch-mode", "navigate") != "navigate":
+    followed = headers.get("sec-fetch-mode", "navigate") == "navigate" and path not in QUERIES
+    is_ours = origin in {None, f"http://{headers.get('host', '')}"}
+    if not is_ours or (from_elsewhere and not followed):
         return "another site's page may not ask here"
     return ""

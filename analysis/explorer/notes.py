@@ -8,38 +8,40 @@ from __future__ import annotations
 import fcntl
 import getpass
 import os
-from collections.abc import Sequence
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AwareDatetime, Field, StringConstraints, TypeAdapter, ValidationError
+from pydantic import AwareDatetime, StringConstraints, TypeAdapter, ValidationError
 
 from merge_runner.errors import UsageError
 from merge_runner.records import Side
 
-LONGEST_TEXT, LONGEST_TAG, MOST_TAGS, LONGEST_NAME = 4_000, 40, 10, 60
-Name = Annotated[str, StringConstraints(min_length=1, max_length=LONGEST_NAME)]
-Tag = Annotated[str, StringConstraints(min_length=1, max_length=LONGEST_TAG)]
+LONGEST_TEXT, LONGEST_NAME = 4_000, 60
+TAG = re.compile(r"(?<!\w)#(\w[\w-]*)")
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
     """What a reader noted, of a trial or, with ``side`` and ``decision``, of a decision.
 
-    The spec says which trial is meant in a copy of the study, too.
+    The spec says which trial is meant in a copy of the study, too. ``#words`` of the text are tags.
     """
 
     at: AwareDatetime
-    reader: Name
+    reader: Annotated[str, StringConstraints(min_length=1, max_length=LONGEST_NAME)]
     trial_id: str
     spec_hash: str
     side: Side | None
     decision: int | None
-    tags: Annotated[tuple[Tag, ...], Field(max_length=MOST_TAGS)]
-    text: Annotated[str, StringConstraints(max_length=LONGEST_TEXT)]
+    text: Annotated[str, StringConstraints(min_length=1, max_length=LONGEST_TEXT)]
+
+    def __post_init__(self) -> None:
+        if (self.side is None) != (self.decision is None):
+            raise ValueError("a decision has a side and a number")
 
 
 LINE = TypeAdapter(Note)
@@ -78,20 +80,17 @@ class Notes:
         return [note for note in self.kept().notes if (note.trial_id, note.spec_hash) == at]
 
     def add(
-        self, trial: tuple[str, str], at: tuple[Side, int] | None, tags: Sequence[str], text: str
+        self, trial_id: str, spec_hash: str, side: str, decision: int | None, text: str
     ) -> None:
         """Note something of a trial, or of a decision by its side and number; raises UsageError."""
-        if not tags and not text:
-            raise UsageError("nothing was noted: write a note, or a tag")
-        side, decision = at or (None, None)
-        note = Note(datetime.now(UTC), self.reader, *trial, side, decision, tuple(tags), text)
+        of = {"trial_id": trial_id, "spec_hash": spec_hash, "side": side or None}
+        written = {"at": datetime.now(UTC), "reader": self.reader, "decision": decision}
         try:
-            line = LINE.dump_json(note)
-            LINE.validate_json(line)
-        except ValueError as exc:  # also of letters that are none
+            line = LINE.dump_json(LINE.validate_python({**of, **written, "text": text}))
+        except ValueError as exc:
             raise UsageError(
-                f"nothing was noted: a note has up to {LONGEST_TEXT:,} characters and up to "
-                f"{MOST_TAGS} tags of up to {LONGEST_TAG}"
+                f"nothing was noted: a note has up to {LONGEST_TEXT:,} characters, and is of a "
+                "trial, or of a decision: side left or right, and a number"
             ) from exc
         try:
             with self.path.open("ab+") as file:
@@ -115,18 +114,18 @@ def _parsed(path: Path, _: tuple[int, ...]) -> Kept:
                 notes.append(LINE.validate_json(line))
         except ValidationError:
             damage.append(f"line {number} of {path.name} is damaged, and is left out")
-    tagged = {(note.trial_id, note.spec_hash, tag) for note in notes for tag in note.tags}
-    return Kept(tuple(notes), tuple(damage), tuple(sorted(tagged)))
+    tags = {
+        (of.trial_id, of.spec_hash, tag) for of in notes for tag in TAG.findall(of.text.lower())
+    }
+    return Kept(tuple(notes), tuple(damage), tuple(sorted(tags)))
 
 
 def reader_of(given: str | None) -> str:
     """Who writes: the name that is given, or the system's; raises UsageError."""
-    if given is None:
-        try:
-            given = getpass.getuser()
-        except (KeyError, OSError):  # the system knows no name, as in some containers
-            given = "reader"
-    name = " ".join(given.split())
+    try:
+        name = " ".join((getpass.getuser() if given is None else given).split())
+    except (KeyError, OSError):  # the system knows no name, as in some containers
+        name = "reader"
     if not 0 < len(name) <= LONGEST_NAME:
         raise UsageError(f"--reader needs a name of up to {LONGEST_NAME} characters")
     return name

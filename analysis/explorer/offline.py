@@ -19,10 +19,9 @@ from merge_runner_analysis.explorer.site import STATIC, Site
 from merge_runner_analysis.explorer.urls import query_of
 
 # What a template marks, and forms but these.
-_SERVED = r'<(\w+)\b[^>]*\sdata-served\b[^>]*>.*?</\1>|<form\b(?![^>]*"(?:{})").*?</form>'
-HELP, COMPARE = "dialog", "compare-form"
+_SERVED = re.compile(r"<(\w+)\b[^>]*\sdata-served\b[^>]*>.*?</\1>|<form\b.*?</form>", re.DOTALL)
 # What htmx and our scripts would ask a server for.
-_ASKED = re.compile(r'\s(?:hx-[a-z-]+|data-panel|data-others)="[^"]*"')
+_ASKED = re.compile(r'\s(?:hx-[a-z-]+|data-others)="[^"]*"')
 _LINK = re.compile(r'<a\b([^>]*?)\shref="([^"]*)"([^>]*)>(.*?)</a>', re.DOTALL)
 _BACK = re.compile(r'\sdata-back="([^"]*)"')
 _HEAD, _FOOT = '<meta charset="utf-8">', '<dialog id="help"'
@@ -37,14 +36,8 @@ _SCRIPT = re.compile(r'<script src="/static/([^"]+)" defer></script>\n?')
 _ICON = re.compile(r'<link rel="icon"[^>]*>\n')
 
 
-def offline(
-    text: str,
-    study: str,
-    policy: str,
-    address: Callable[[str], str],
-    forms: Sequence[str] = (HELP,),
-) -> str:
-    """Return a served page as one without a server, with these ``forms`` alone.
+def offline(text: str, study: str, policy: str, address: Callable[[str], str]) -> str:
+    """Return a served page as one without a server.
 
     ``address`` returns where a link leads then; what leads nowhere is text.
     """
@@ -59,8 +52,7 @@ def offline(
     def back(found: re.Match[str]) -> str:
         return f' data-back="{escape(address(unescape(found[1])))}"'
 
-    served = _SERVED.format("|".join(forms))
-    text = _ASKED.sub("", re.sub(served, "", text, flags=re.DOTALL))
+    text = _ASKED.sub("", _SERVED.sub("", text))
     text = _LINK.sub(link, _BACK.sub(back, text))
     text = text.replace(_HEAD, _HEAD + _POLICY.format(policy), 1)
     return text.replace(_FOOT, _NOTE.format(escape(visible(study))) + _FOOT, 1)
@@ -76,11 +68,10 @@ def page_of_trials(site: Site, rows: Sequence[Row]) -> str:
         there = (trial, asked.get("spec")) in held
         return query_of({"trial": trial, **asked}) if there else ""
 
-    forms = (HELP, COMPARE) if len(held) > 1 else (HELP,)
     pages = []
     for trial_id, spec_hash in held:
-        served = trial_page(site, trial_id, {"spec": spec_hash, "as": "whole"})
-        pages.append(offline(served, site.db.name, "POLICY", address, forms))
+        served = trial_page(site, trial_id, {"spec": spec_hash})
+        pages.append(offline(served, site.db.name, "POLICY", address))
     page = pages[0]
     if len(pages) > 1:
         parts = [found[2] for each in pages if (found := _MAIN.search(each))]

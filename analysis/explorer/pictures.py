@@ -35,13 +35,10 @@ class Scale:
 
 def speed_range(rows: Sequence[Row]) -> tuple[int, int]:
     """The whole m/s at the bottom and the top of all sparklines of these trials."""
-    ranges = [row[f"{side}_range_mps"] for row in rows if _drawn(row) for side in SIDES]
-    low = floor(min((low for low, _ in ranges), default=0.0))
-    return low, max(ceil(max((high for _, high in ranges), default=0.0)), low + 1)
-
-
-def _drawn(row: Row) -> bool:
-    return bool(row["left_mps"] and row["right_mps"])
+    every = [end for row in rows for side in SIDES for end in row[f"{side}_range_mps"] or ()]
+    ends = [end for end in every if end is not None]  # a vehicle may have no samples
+    low = floor(min(ends, default=0.0))
+    return low, max(ceil(max(ends, default=0.0)), low + 1)
 
 
 def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
@@ -49,7 +46,7 @@ def sparkline(row: Row, speeds: tuple[int, int]) -> dict[str, str] | None:
 
     None where a vehicle has none.
     """
-    if not _drawn(row):
+    if not (row["left_mps"] and row["right_mps"]):
         return None
     (left_low, left_high), (right_low, right_high) = row["left_range_mps"], row["right_range_mps"]
     return {

@@ -35,13 +35,13 @@ class Part:
 def parts_of(prompt: str, before: str | None) -> list[Part]:
     """The parts of a prompt, each compared with the same block of the one before.
 
-    Without one before, nothing is marked.
+    Those that are only in the one before come last. Without one before, nothing is marked.
     """
-    earlier = dict(_blocks(before)) if before is not None else {}
-    return [
-        Part(name, _compared(earlier.get(name, "") if before is not None else text, text))
-        for name, text in _blocks(prompt)
-    ]
+    if before is None:
+        return [Part(name, (("same", text),)) for name, text in _blocks(prompt)]
+    earlier, now = dict(_blocks(before)), _blocks(prompt)
+    gone = [(name, "") for name in earlier if name not in dict(now)]
+    return [Part(name, _compared(earlier.get(name, ""), text)) for name, text in (*now, *gone)]
 
 
 @lru_cache(KEPT)
@@ -85,7 +85,7 @@ def _compared(before: str, now: str) -> tuple[tuple[Change, str], ...]:
         return (("same", now),)
     old, new = _WORDS.findall(before), _WORDS.findall(now)
     pieces: list[tuple[Change, str]] = []
-    for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new, autojunk=False).get_opcodes():
+    for kind, i1, i2, j1, j2 in SequenceMatcher(None, old, new).get_opcodes():
         if kind != "equal" and i1 < i2:
             pieces.append(("gone", "".join(old[i1:i2]).strip()))
         if j1 < j2:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import duckdb
 
 from merge_runner.errors import UsageError
-from merge_runner.results.database import SHARED, Instance, names_of, read_database
+from merge_runner.results.database import SHARED, Instance, by_name, read_database
 from merge_runner.text_safety import first_line
 
 ALONE = threading.RLock()
@@ -44,24 +44,18 @@ def records(
     connection: duckdb.DuckDBPyConnection, sql: str, values: Mapping[str, object] | Sequence[object]
 ) -> list[Row]:
     """The rows of a query, by the names of their columns."""
-    found = connection.execute(sql, values)
-    names = names_of(found)
-    return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
+    return list(by_name(connection.execute(sql, values)))
 
 
 def stamp_of(db: Path) -> tuple[int, ...]:
     """What changes when a database does; raises UsageError where there is none."""
-    found: list[int] = []
-    for path in (db, db.with_name(f"{db.name}.wal")):
-        try:
-            stat = path.stat()
-        except FileNotFoundError:
-            found += [0, 0, 0]
-        else:
-            found += [stat.st_ino, stat.st_mtime_ns, stat.st_size]
-    if not found[0]:
+    try:
+        stats = [db.stat()]
+    except FileNotFoundError:
         raise UsageError(
             f"there is no database {db}; `merge-runner sweep baseline` makes one, --db names "
             "another"
-        )
-    return tuple(found)
+        ) from None
+    with suppress(FileNotFoundError):
+        stats.append(db.with_name(f"{db.name}.wal").stat())
+    return tuple(n for of in stats for n in (of.st_ino, of.st_mtime_ns, of.st_size))

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import jinja2
+from starlette.responses import Response
 
 from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
@@ -17,24 +18,20 @@ from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.database_copy import Copies
 from merge_runner_analysis.explorer.display_text import MINUS, shown_number, visible, with_minus
-from merge_runner_analysis.explorer.glossary import sections
-from merge_runner_analysis.explorer.notes import LONGEST_TAG, LONGEST_TEXT, MOST_TAGS, Notes
+from merge_runner_analysis.explorer.notes import LONGEST_TEXT, Notes
 from merge_runner_analysis.explorer.queries import Queries
 from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.explorer.search import Words
 from merge_runner_analysis.explorer.urls import HOME, Links
 from merge_runner_analysis.explorer.views import clock, condition_text
 from merge_runner_analysis.metrics import METRICS
-from merge_runner_analysis.verdict_words import TABLE
+from merge_runner_analysis.verdict_words import MEASURES, TABLE
 
 TEMPLATES, STATIC = (Path(__file__).with_name(name) for name in ("templates", "static"))
-STYLES = (
-    "vendor/uplot-1.6.32.min.css",
-    *(f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")),
-)
+STYLES = [f"styles/{name}.css" for name in ("base", "answers", "trial", "pages")]
 # What draws and moves a trial, in the order in which it is loaded.
-_PARTS = "moment track marks charts ribbons panel clock comparison start"
-REPLAY = ("vendor/uplot-1.6.32.min.js", *(f"replay/{part}.js" for part in _PARTS.split()))
+_PARTS = "moment track charts ribbons panel clock comparison start"
+REPLAY = [f"replay/{part}.js" for part in _PARTS.split()]
 PAGES = {
     "Study": HOME,
     "Drivers": "drivers",
@@ -56,6 +53,13 @@ class NotThere(Exception):
 
 class NothingNew(Exception):
     """What was seen of a page is what it still shows."""
+
+
+def download(text: str, name: str) -> Response:
+    """A file that a browser saves under this name."""
+    kind = {".csv": "text/csv", ".tex": "application/x-tex"}[Path(name).suffix]
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return Response(text, headers=headers, media_type=f"{kind}; charset=utf-8")
 
 
 def news_of(shown: object, seen: str, state: str = "all") -> str:
@@ -107,11 +111,11 @@ class Site:
             at=self.at,
             metrics=METRICS,
             notes=self.notes,
-            note_limits={"text": LONGEST_TEXT, "tags": MOST_TAGS * (LONGEST_TAG + 2)},
+            longest_note=LONGEST_TEXT,
+            measures=MEASURES,
             pages=PAGES,
             lists=LISTS,
             share=self.share,
-            db_option=self.db_option,
             program=self.program,
             styles=STYLES,
             study=str(self.db),
@@ -121,7 +125,6 @@ class Site:
             clock=clock,
             condition_text=condition_text,
             in_words=self.in_words,
-            glossary=sections(),
         )
 
     def begin(self) -> None:
@@ -156,13 +159,8 @@ class Site:
 
     def share(self, *options: str) -> str:
         """The command that writes what is shown here as files."""
-        parts = shlex.join([self.program, "view"]), self.db_option, shlex.join(options)
-        return " ".join(filter(None, parts))
-
-    @property
-    def db_option(self) -> str:
-        """The option that names this database; empty where it is the usual one."""
-        return "" if self.db == DEFAULT_DB else shlex.join(["--db", str(self.db)])
+        db = [] if self.db == DEFAULT_DB else ["--db", str(self.db)]
+        return shlex.join([self.program, "view", *db, *options])
 
     def render(self, template: str, **values: object) -> str:
         """Return a page, or a part of one."""

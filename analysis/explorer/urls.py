@@ -36,12 +36,8 @@ class Links:
     trial = partialmethod(_of_trial, "trials")
     others = partialmethod(_of_trial, "others")
 
-    def _of_decision(self, kind: str, row: Mapping[str, Any], side: str, number: int, /) -> str:
-        return self._of_trial(kind, row, side=side, decision=number)
-
-    # What a decision's panel shows, and its reply as a plain text.
-    decision = partialmethod(_of_decision, "decisions")
-    raw = partialmethod(_of_decision, "raw")
+    # The reply to a decision as a plain text; the state names the decision.
+    raw = partialmethod(_of_trial, "raw")
 
     def cell(self, table: str, row: str, column: str) -> str:
         """The trials behind a cell.

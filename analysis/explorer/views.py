@@ -17,8 +17,7 @@ from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner_analysis.accounts.account import Account, account
-from merge_runner_analysis.accounts.course import Course
+from merge_runner_analysis.accounts import Account, Course, account
 from merge_runner_analysis.explorer.display_text import visible
 from merge_runner_analysis.explorer.reading import Row, reading, records
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from importlib.resources import files
 from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ from merge_runner.llm.cache import CachedCall
 from merge_runner.records import ANSWERED_FIELD, SIDES, canonical_json
 from merge_runner.results.database import (
     SETTINGS,
-    Instance,
     append,
     by_name,
     fetched,
@@ -57,6 +57,7 @@ FROM ({ASKED_DECISIONS}) JOIN (SELECT trial_id, spec_hash, variant FROM trials)
 JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
+OF_CALLS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
 BATCH = 100
 SHOWN = 20
 REPLIES_AT_ONCE = 4_000
@@ -117,9 +118,8 @@ class Audit:
 def audited_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open a database with the views of checks.sql; raises UsageError or StoreError."""
     try:
-        with read_database(path, Instance()) as connection:
-            if limit_memory(connection):
-                connection.execute("SET threads = 1")
+        with read_database(path) as connection:
+            limit_memory(connection)
             prepare(connection)
             yield connection
     except duckdb.Error as exc:
@@ -188,7 +188,8 @@ def check_sweep(
     append(connection, "planned", planned)
     connection.execute(AUDITED)
     counts = {"trials": len(planned), **next(by_name(connection.execute("FROM counts")))}
-    findings = [*_findings(connection, "findings", sweep_id)]
+    views = ("list_findings", "state_findings", *OF_CALLS)
+    findings = _findings(connection, views, sweep_id)
     audit = Audit(sweep_id, counts, findings, [*_notes(connection)])
     connection.execute("INSERT INTO done FROM audited")
     return audit
@@ -204,18 +205,21 @@ def check_rest(connection: duckdb.DuckDBPyConnection, path: Path) -> Audit:
             count(*) FILTER (source = 'human') AS "human trials" FROM trials)
     """
     counts = next(by_name(connection.execute(sql)))
-    orphans = "(SELECT kind, trial_id, NULL AS side, NULL AS decision, text FROM orphans)"
     shared = connection.execute("FROM calls_in_common").fetchall()
     notes = [f"{first} and {second} share {calls} calls" for first, second, calls in shared]
-    return Audit(str(path), counts, list(_findings(connection, orphans)), notes)
+    return Audit(str(path), counts, _findings(connection, ["orphans"]), notes)
 
 
 def _findings(
-    connection: duckdb.DuckDBPyConnection, view: str, sweep_id: str | None = None
-) -> Iterator[Finding]:
-    rows = connection.execute(f"SELECT DISTINCT * FROM {view} ORDER BY ALL").fetchall()  # noqa: S608 # constants
-    for kind, trial, side, decision, text in rows:
-        yield Finding(kind, text, sweep_id, trial, side, decision)
+    connection: duckdb.DuckDBPyConnection, views: Iterable[str], sweep_id: str | None = None
+) -> list[Finding]:
+    """What the views hold, read one by one: as one query they would hold their memory together."""
+    selects = (f"SELECT DISTINCT * FROM {view} ORDER BY ALL" for view in views)  # noqa: S608 # constants
+    rows = [row for select in selects for row in by_name(connection.execute(select))]
+    return [
+        Finding(r["kind"], r["text"], sweep_id, r["trial_id"], r.get("side"), r.get("decision"))
+        for r in sorted(rows, key=itemgetter("kind"))
+    ]
 
 
 def _notes(connection: duckdb.DuckDBPyConnection) -> Iterator[str]:
@@ -254,8 +258,7 @@ def audit_recording(file: Path) -> Audit:
         connection.execute("INSERT INTO audited SELECT trial_id, spec_hash FROM trials")
         columns = 'calls, attempts, "reply ids"'
         counts = next(by_name(connection.execute(f"SELECT {columns} FROM counts")))  # noqa: S608 # constants
-        of_calls = "(FROM call_findings UNION ALL FROM shared_findings)"
-        findings = [*_findings(connection, of_calls)]
+        findings = _findings(connection, OF_CALLS)
         return Audit(str(file), counts, findings, notes=[*_notes(connection)])
 
 

@@ -160,7 +160,7 @@ FROM judged WHERE gap_m IS DISTINCT FROM view_gap_m
 -- the id of each, a hash of its answer, and which request it answers, if it says so.
 CREATE OR REPLACE TEMP TABLE told (place BIGINT, reply_id VARCHAR, content VARCHAR, answered JSON);
 
-CREATE OR REPLACE TEMP VIEW call_findings AS
+CREATE OR REPLACE TEMP VIEW served_findings AS
 -- One finding for each pair of models, at its first answer.
 SELECT 'served' AS kind, arg_min(trial_id, (trial_id, decision, side)) AS trial_id,
     arg_min(side, (trial_id, decision, side)) AS side,
@@ -169,9 +169,11 @@ SELECT 'served' AS kind, arg_min(trial_id, (trial_id, decision, side)) AS trial_
         model_requested, model_served, count(*)) AS text
 FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
 SEMI JOIN other_models USING (model_requested, model_served)
-WHERE http_status = 200 GROUP BY model_requested, model_served
+WHERE http_status = 200 GROUP BY model_requested, model_served;
+
 -- An empty answer may be asked for again; any other is the last attempt.
-UNION ALL SELECT 'attempt', trial_id, side, decision, text FROM (
+CREATE OR REPLACE TEMP VIEW attempt_findings AS
+SELECT 'attempt' AS kind, trial_id, side, decision, text FROM (
     SELECT trial_id, side, decision, CASE
         WHEN list(attempt ORDER BY attempt) <> range(1, count(*) + 1)
             THEN format('its attempts are numbered {}', list(attempt ORDER BY attempt)::VARCHAR)
@@ -179,10 +181,12 @@ UNION ALL SELECT 'attempt', trial_id, side, decision, text FROM (
             THEN 'an answer was followed by another attempt' END AS text
     FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
     GROUP BY trial_id, spec_hash, side, decision, call_key
-) WHERE text IS NOT NULL
+) WHERE text IS NOT NULL;
+
 -- The emulator says in each reply what it answers.
-UNION ALL SELECT 'exchanged', trial_id, side, decision,
-    'its reply is, as the server says in it, the answer to another request'
+CREATE OR REPLACE TEMP VIEW exchanged_findings AS
+SELECT 'exchanged' AS kind, trial_id, side, decision,
+    'its reply is, as the server says in it, the answer to another request' AS text
 FROM (
     SELECT trial_id, calls.side, calls.decision, condition, rep, sample_set, request, answered
     FROM calls SEMI JOIN audited USING (trial_id, spec_hash)
@@ -241,12 +245,6 @@ SELECT 'shared' AS kind, places[1][1] AS trial_id, places[1][2] AS side, places[
 FROM shared WHERE len(places) > 1
     AND list_has_any(trials, (SELECT list((trial_id, spec_hash)) FROM audited))
     AND NOT coalesce(list_has_any(trials, (SELECT list((trial_id, spec_hash)) FROM done)), false);
-
-CREATE OR REPLACE TEMP VIEW findings AS
-SELECT kind, trial_id, NULL AS side, NULL AS decision, text FROM list_findings
-UNION ALL SELECT kind, trial_id, NULL, NULL, text FROM state_findings
-UNION ALL FROM call_findings
-UNION ALL FROM shared_findings;
 
 -- What is no fault.
 

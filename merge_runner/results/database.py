@@ -27,7 +27,7 @@ SCHEMA = Path(__file__).with_name("schema.sql")
 LOCK_RETRY_S = 0.05
 PATIENCE_S = 60.0
 ROWS_AT_ONCE = 100
-ROWS_OF_A_GROUP = 8_192
+ROWS_OF_A_GROUP = 4_096
 """Of what is written: a group is rewritten, in memory, with each transaction until it is full."""
 BYTES_OF_A_CALL, MERGED_BYTES = 3_000, 2**26
 """How many a call takes where replies are short, compressed and with its share of the states, and
@@ -174,17 +174,16 @@ def _holder(exc: duckdb.Error) -> str:
     return f"{Path(found[1]).name} (PID {found[2]})" if found else "another program"
 
 
-def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> bool:
-    """Let DuckDB use little memory, and return True, where texts are short and calls not many.
+def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> None:
+    """Let DuckDB use little memory, and one thread, where texts are short and calls not many.
 
     ``longest`` is the length of the longest text that will be stored. A row group of such calls
-    takes two thirds of that memory; more would only cache the file.
+    takes 64 MB, an audit 110 MB; more would only cache the file.
     """
     [(stored, calls)] = connection.execute(SIZES).fetchall()
     is_little = bool(max(stored, longest) < 8_192 and calls < 210_000)
-    limit = "180MB" if is_little else SETTINGS["memory_limit"]
-    connection.execute(f"SET memory_limit = '{limit}'")
-    return is_little
+    limit = "140MB" if is_little else SETTINGS["memory_limit"]
+    connection.execute(f"SET memory_limit = '{limit}'; SET threads = {2 - is_little}")
 
 
 def merge_small_groups(connection: duckdb.DuckDBPyConnection) -> None:

@@ -289,6 +289,7 @@ def recorded_sweeps(path: Path, sweep_ids: Sequence[str]) -> tuple[list[dict[str
 def sweep_facts(path: Path, sweep_id: str) -> dict[str, Any]:
     """Count a sweep's trials, decisions and answers, by the views of facts.sql."""
     with read_database(path) as connection:
+        limit_memory(connection)
         connection.execute("SET VARIABLE sweep_id = ?", [sweep_id])
         connection.execute(FACTS.read_text(encoding="utf-8"))
         append(connection, "other_models", other_models(connection))

@@ -21,7 +21,7 @@ PAGES = (
     "/tables/attempts",
     "/tables/indicators",
     "/prompts",
-    "/figures/ablation-matrix",
+    "/figures/first-action",
     "/discordant?model=emulator&variant=A1",
     "/trials/o4/baseline/L_4_0/rep01?side=left&decision=2",
     "/trials/human/baseline/N_0_0/rep01",
@@ -69,20 +69,18 @@ def test_exported_pages_fit_and_axe_finds_nothing_serious(page, exported):
             continue
         page.goto(f"file://{path}")
         if "rep01" in path.name:
-            expect(page.locator("#charts .uplot")).to_have_count(3)
+            expect(page.locator("#charts .chart")).to_have_count(3)
         assert (path.name, findings(page)) == (path.name, [])
 
 
-def test_the_dialog_of_a_page_has_its_words_and_leads_to_all(page):
+def test_the_dialog_of_a_page_has_the_keys_and_leads_to_all_words(page):
     page.goto("/trials")
-    page.locator("#help-button").click()
-    words = page.locator("#page-words dt:visible")
-    expect(words.get_by_text("gap", exact=True)).to_be_visible()
-    assert "tunnel" not in words.all_inner_texts()
+    page.get_by_role("button", name="?").click()
+    expect(page.locator("#help")).to_contain_text("play and pause")
     for scheme, _ in LOOKS:
         page.emulate_media(color_scheme=scheme)
         assert serious(page) == []
-    page.get_by_role("link", name="All words").click()
+    page.get_by_role("link", name="What words mean").click()
     expect(page.locator("#main dt", has_text="tunnel")).to_be_visible()
 
 

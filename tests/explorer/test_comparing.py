@@ -109,32 +109,6 @@ def test_a_name_with_several_specs_is_told_with_its_spec(db, tmp_path):
     assert data["spec"] == "abc"
 
 
-def test_a_page_of_a_trial_with_a_secret_is_refused_with_the_reason(db, tmp_path):
-    secret = shutil.copy(db, tmp_path / "t.duckdb")
-    with duckdb.connect(str(secret)) as connection:
-        connection.execute("UPDATE decisions SET rationale = 'sk-proj-abcdefghijklmnop0123'")
-    client = TestClient(explorer(Site(secret)), base_url=f"http://{HOST}")
-    reply = client.get("/trials/o3/A1/N_0_0/rep01", params={"as": "page"})
-    assert reply.status_code == 503
-    assert "holds what looks like a key: sk-pro" in reply.text
-    assert "content-disposition" not in reply.headers
-
-
-@pytest.mark.long
-def test_a_page_of_a_trial_holds_the_one_it_is_compared_with(page, tmp_path):
-    page.goto(f"/trials/{TRIAL}?t=2.5&compare=emulator/baseline/L_4_0/rep01")
-    expect(page.locator("#ghost-key")).to_contain_text("L_4_0")
-    with page.expect_download() as begun:
-        page.get_by_role("link", name="export this trial").click()
-    file = tmp_path / begun.value.suggested_filename
-    begun.value.save_as(file)
-    assert file.name == "emulator-baseline-N_0_0-rep01.html"
-    page.goto(f"file://{file}?compare=emulator/baseline/L_4_0/rep01&t=2.5")
-    expect(page.locator("h1")).to_have_text(TRIAL)
-    expect(page.locator("#ghost-key")).to_contain_text("L_4_0")
-    expect(page.locator("#decision .decision-panel")).to_have_count(4)
-
-
 def test_both_ribbons_and_both_words_stand_beside_each_other(page):
     other = "emulator/baseline/L_4_0/rep02"
     page.goto(f"/trials/{TRIAL}?t=2.5&compare={other}")

@@ -62,14 +62,3 @@ def test_a_trial_that_no_list_led_to_has_no_neighbours(page):
     page.goto("/trials/emulator/baseline/N_0_0/rep01")
     expect(page.locator("#track")).to_be_visible()
     expect(page.locator("#next-trial")).to_be_hidden()
-
-
-@pytest.mark.long
-def test_the_next_page_of_the_list_follows_its_last_row(page, monkeypatch):
-    monkeypatch.setattr("merge_runner_analysis.explorer.catalogue.PAGE", 2)
-    monkeypatch.setattr("merge_runner_analysis.explorer.pages.trials.PAGE", 2)
-    page.goto(LIST)
-    page.locator("tbody th a").last.click()
-    expect(page.locator("#track")).to_be_visible()
-    page.keyboard.press("j")
-    page.wait_for_url("**page=2")

@@ -47,22 +47,22 @@ def lines(db):
 
 def test_a_note_is_a_line_beside_the_database_and_the_database_stays_as_it_was(db):
     before = db.read_bytes()
-    reply = noted(asking(db), text="It hesitates.", tags="Late,  too  careful", side="left",
-                  decision="2")  # fmt: skip
+    reply = noted(asking(db), text="It hesitates. #Late", side="left", decision="2")
     assert reply.status_code == 303
     (line,) = lines(db)
     assert line["spec_hash"]
     assert {name: line[name] for name in ("reader", "trial_id", "side", "decision")} == {
         "reader": "anna", "trial_id": TRIAL, "side": "left", "decision": 2
     }  # fmt: skip
-    assert (line["tags"], line["text"]) == (["late", "too careful"], "It hesitates.")
+    assert line["text"] == "It hesitates. #Late"
+    assert [tag for _, _, tag in Notes(db).kept().tags] == ["late"]
     assert db.read_bytes() == before
     assert Notes(db).path == db.with_name("study.notes.jsonl")
 
 
 def test_notes_are_shown_on_the_trial_in_the_list_and_on_a_page_of_their_own(db):
     client = asking(db)
-    noted(client, text="It hesitates.", tags="late")
+    noted(client, text="It hesitates. #late")
     assert "It hesitates." in client.get(f"/trials/{TRIAL}").text
     assert "It hesitates." not in client.get("/trials/emulator/baseline/N_0_0/rep02").text
     assert "It hesitates." in client.get("/notes").text
@@ -95,11 +95,8 @@ def test_only_a_page_of_ours_writes(db, headers):
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({}, "write a note, or a tag"),
-        ({"text": "  ", "tags": " , "}, "write a note, or a tag"),
+        ({"text": "  "}, "up to 4,000 characters"),
         ({"text": "x" * (LONGEST_TEXT + 1)}, "up to 4,000 characters"),
-        ({"tags": "x" * 41}, "tags of up to 40"),
-        ({"tags": ",".join(map(str, range(11)))}, "up to 10 tags"),
         ({"text": "x", "side": "left"}, "a decision"),
         ({"text": "x", "side": "up", "decision": "1"}, "a decision"),
         ({f"field{number}": "x" for number in range(11)}, "fields"),
@@ -121,7 +118,7 @@ def test_a_form_is_bounded_and_a_trial_must_be_there(db):
 
 def test_what_a_reader_wrote_is_text_everywhere(db):
     client = asking(db, HOSTILE[:LONGEST_NAME])
-    noted(client, text=HOSTILE, tags="<b>\u202e")
+    noted(client, text=f"{HOSTILE} #<b>\u202e #b")
     for address in (f"/trials/{TRIAL}", "/notes", "/trials"):
         text = client.get(address).text
         assert "<script>document" not in text
@@ -155,7 +152,7 @@ def test_where_nothing_can_be_written_a_line_says_so(db):
 def _write(db, reader):
     notes = Notes(db, reader)
     for number in range(100):
-        notes.add((TRIAL, "spec"), None, [f"t{number}"], "x" * 3000)
+        notes.add(TRIAL, "spec", "", None, f"#t{number} {'x' * 3000}")
 
 
 @pytest.mark.long
@@ -165,8 +162,8 @@ def test_two_explorers_that_write_at_once_lose_nothing(tmp_path):
         list(pool.map(_write, [db, db], ["anna", "ben"]))
     kept = Notes(db).kept()
     assert kept.damage == ()
-    assert sorted((note.reader, note.tags) for note in kept.notes) == sorted(
-        (reader, (f"t{number}",)) for reader in ("anna", "ben") for number in range(100)
+    assert sorted((note.reader, note.text.split()[0]) for note in kept.notes) == sorted(
+        (reader, f"#t{number}") for reader in ("anna", "ben") for number in range(100)
     )
 
 
@@ -208,14 +205,14 @@ def test_notes_are_written_from_the_keyboard(page, db):
     page.keyboard.press("Enter")
     expect(page.locator("#noted")).to_contain_text("The whole trial")
     page.keyboard.press("]")
-    page.keyboard.press("t")
+    page.keyboard.press("n")
     expect(page.locator("#note-about")).to_have_text("on the left decision 0")
-    page.keyboard.type("late, odd")
+    page.keyboard.type("#late and #odd")
     page.keyboard.press("Enter")
-    expect(page.locator("#noted .tag")).to_have_text(["late", "odd"])
+    expect(page.locator("#noted")).to_contain_text("#late and #odd")
     assert [(line["side"], line["decision"], line["text"]) for line in lines(db)] == [
         (None, None, "The whole trial"),
-        ("left", 0, ""),
+        ("left", 0, "#late and #odd"),
     ]
     page.keyboard.press("n")
     page.keyboard.press("Escape")
@@ -232,7 +229,7 @@ def test_notes_are_written_from_the_keyboard(page, db):
 @pytest.mark.long
 def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(page, db, tmp_path):
     client = asking(db)
-    noted(client, text="It hesitates.", tags="late", side="left", decision="1")
+    noted(client, text="It hesitates. #late", side="left", decision="1")
     other = "emulator/baseline/L_4_0/rep01"
     noted(asking(db, "ben"), trial=other, text="not of these trials")
     files = export_with_a_table(db, tmp_path / "pages")

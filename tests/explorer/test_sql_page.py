@@ -17,7 +17,7 @@ from merge_runner.results.export import tables
 from merge_runner.results.store import query
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.pages.sql import EXAMPLES
-from merge_runner_analysis.explorer.queries import Limits, QueryResult
+from merge_runner_analysis.explorer.queries import QueryResult
 from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import write_study, yielding
 from tests.harness import PROJECT
@@ -31,7 +31,7 @@ NAVIGATION = {"sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
 def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sql")
     site = Site(write_study(folder / "study.duckdb", yielding("o3", reps=1)[:2]))
-    site.queries.limits = Limits(seconds=60)  # others may use the machine
+    site.queries.longest_s = 60  # others may use the machine
     return site
 
 
@@ -51,7 +51,7 @@ def asked(site, monkeypatch):
         return QueryResult([("x", "INTEGER")], [[("1", 0)]], False, 0.0)
 
     monkeypatch.setattr(site.queries, "result", result)
-    monkeypatch.setattr(site.queries, "csv", lambda sql: queries.append(sql) or b"x\n1\n")
+    monkeypatch.setattr(site.queries, "csv", lambda sql: queries.append(sql) or "x\n1\n")
     return queries
 
 
@@ -107,45 +107,18 @@ def test_a_query_is_in_the_address_and_back_in_the_box(client, asked, sql):
     # A form sends the ends of lines like this.
     assert box(client.get("/sql", params={"q": sql.replace("\n", "\r\n")}).text) == sql
     assert asked == [sql, sql, sql]
-    assert ("characters that do not show" in page) == ("\u202e" in sql)
 
 
-def test_a_query_of_another_site_is_shown_and_not_run(client, asked):
+def test_a_query_of_another_site_is_refused(client, asked):
     for site in ("cross-site", "same-site"):
-        headers = {**NAVIGATION, "sec-fetch-site": site}
-        page = client.get("/sql?q=select+1", headers=headers)
-        assert (page.status_code, box(page.text)) == (200, "select 1")
-        assert "press Run" in page.text
-        reply = client.get("/sql.csv?q=select+1", headers=headers, follow_redirects=False)
-        assert (reply.status_code, reply.headers["location"]) == (307, "/sql?q=select+1")
-        for address in ("/sql?q=select+1", "/sql.csv?q=select+1"):
-            headers["sec-fetch-mode"] = "no-cors"
-            assert client.get(address, headers=headers).status_code == 403
+        for mode in ("navigate", "no-cors"):
+            headers = {"sec-fetch-site": site, "sec-fetch-mode": mode}
+            for address in ("/sql?q=select+1", "/sql.csv?q=select+1"):
+                assert client.get(address, headers=headers).status_code == 403
     assert asked == []
     for site in ("same-origin", "none"):
         client.get("/sql?q=select+1", headers={**NAVIGATION, "sec-fetch-site": site})
     assert asked == ["select 1", "select 1"]
-
-
-@pytest.mark.parametrize(
-    ("referer", "runs"),
-    [
-        (None, True),
-        (f"http://{HOST}/sql?q=select+2", True),
-        ("http://evil.example/", False),
-        ("https://127.0.0.1:8701/", False),
-        ("null", False),
-    ],
-)
-def test_where_a_browser_says_no_more_the_page_that_leads_here_counts(client, asked, referer, runs):
-    headers = {} if referer is None else {"referer": referer}
-    page = client.get("/sql?q=select+1", headers=headers)
-    assert (page.status_code, box(page.text)) == (200, "select 1")
-    assert ("press Run" in page.text) != runs
-    reply = client.get("/sql.csv?q=select+1", headers=headers, follow_redirects=False)
-    assert reply.status_code == (200 if runs else 307)
-    assert asked == (["select 1"] * 2 if runs else [])
-    assert client.get("/trials", headers=headers).status_code == 200
 
 
 @pytest.mark.parametrize("spec", [True, False])
@@ -207,8 +180,7 @@ def test_a_download_is_a_file_or_says_why_not(client):
     assert reply.headers["content-type"] == "text/csv; charset=utf-8"
     assert reply.headers["content-disposition"] == 'attachment; filename="query.csv"'
     reply = client.get("/sql.csv", params={"q": "selekt"})
-    assert reply.status_code == 400
-    assert box(reply.text) == "selekt"
+    assert reply.status_code == 503
     assert "syntax error at or near &#34;selekt&#34;</p>" in reply.text
 
 

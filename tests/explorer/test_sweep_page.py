@@ -15,6 +15,7 @@ from starlette.testclient import TestClient
 
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.progress import remove_standing, write_standing
+from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.pages import sweep as page
@@ -23,6 +24,7 @@ from merge_runner_analysis.explorer.pages.trials import filter_of
 from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import Said, write_study, yielding
 from tests.explorer.serving import held
+from tests.explorer.test_tables_pages import Awaited, InProcess
 from tests.run.standings import progress, runner
 
 URL = "/sweeps/sweep-1"
@@ -55,7 +57,8 @@ TROUBLE = (
 )
 END = datetime(2026, 11, 21, 1)  # noqa: DTZ001 # as the database keeps times
 ROW = {"sweep_id": "s", "name": "baseline", "exit_code": 0, "trials": 1, "ended": 1, "failed": 0,
-       "others": 0, "scripted": 0, "started_at": END, "ended_at": END}  # fmt: skip
+       "others": 0, "asked": 9, "invalid": 0, "scripted": 0, "started_at": END,
+       "ended_at": END}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +86,7 @@ def study(written, tmp_path):
 
 def browser(db):
     site = Site(db)
+    site.computing = Awaited(db, InProcess)
     return TestClient(explorer(site), base_url="http://127.0.0.1:1")
 
 
@@ -105,6 +109,17 @@ def test_a_run_says_how_long_it_lasted(study):
         connection.execute("UPDATE sweeps SET ended_at = started_at + INTERVAL 2 HOURS")
     assert ">2.0 h<" in browser(study).get("/sweeps").text
     assert "lasted 2.0 h" in text_of(browser(study))
+
+
+def test_runs_show_what_the_audit_finds_and_notes_and_keep_it(study):
+    with duckdb.connect(str(study)) as connection:
+        connection.execute("UPDATE sweeps SET ended_at = started_at, exit_code = 1")
+        connection.execute("UPDATE trials SET end_time_s = 99 WHERE status = 'finished'")
+    for address in (URL, "/sweeps"):
+        text = text_of(browser(study), address)
+        assert "found: outcome: sweep-1" in text
+    [run] = audit_database(study, "sweep-1")
+    assert all(" ".join(note.split()) in text for note in run.notes)
 
 
 def share(name, count, of, things):
@@ -260,8 +275,11 @@ def test_the_command_to_go_on_names_what_the_run_was_begun_with(tmp_path):
     )
 
 
-def test_a_finished_sweep_that_another_model_answered_is_doubtful():
-    assert run_of({**ROW, "others": 7}, {}, None)["kind"] == "doubtful"
+@pytest.mark.parametrize("doubt", [{"others": 7}, {"invalid": 8}])
+def test_a_finished_sweep_of_another_model_or_without_valid_replies_is_doubtful(doubt):
+    run = run_of(ROW | doubt, {}, None)
+    assert run["kind"] == "doubtful"
+    assert ("no problems" in run["text"]) == ("others" in doubt)
 
 
 def test_what_runs_and_trials_share_counts_once_over_all_runs(study):

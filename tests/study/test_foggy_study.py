@@ -147,7 +147,8 @@ def test_the_panel_of_a_decision_shows_both_beside_each_other(db):
 
     def panel(level):
         trial = f"emulator/told_more/L_4_0/rep01/perception={level}"
-        text = client.get(f"/decisions/{trial}?side=right&decision=0").text
+        text = client.get(f"/trials/{trial}").text
+        text = text.partition('">right</span> decision 0 at')[2].partition("</article>")[0]
         return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", text)).replace("−", "-").split())
 
     with duckdb.connect(str(db), read_only=True) as connection:

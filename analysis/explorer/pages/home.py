@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.explorer.marks import Cell, band, cells
-from merge_runner_analysis.explorer.pages.computed import Computed, computed_table
+from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.pages.sweep import standing_of
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.scope import Bar, Scope, carried, scope_of, unmarked
@@ -23,7 +24,6 @@ from merge_runner_analysis.verdict_words import (
     MOCK,
     PROGRAM,
     TABLE,
-    Values,
     by_group,
     capital,
     headline,
@@ -35,9 +35,10 @@ KINDS = {
     PROGRAM: ("Programs", "compute their plans; asked nobody"),
     MOCK: ("Mock models", "a script answered in a model's name; in no conclusion"),
 }
-# Where each driver's decisions were asked, as their specs name it.
-ENDPOINTS = """
-SELECT model, variant, any_value(spec->>'$.left.endpoint') AS endpoint
+# Where each driver's decisions were asked, and what was sent with them, as the specs say it.
+ASKED = """
+SELECT model, variant, coalesce(any_value(spec->>'$.left.endpoint'), '') AS endpoint,
+    any_value(coalesce(spec->'$.left.body', spec->'$.right.body'))::VARCHAR AS body
 FROM listed JOIN specs USING (spec_hash) GROUP BY ALL
 """
 
@@ -46,7 +47,8 @@ FROM listed JOIN specs USING (spec_hash) GROUP BY ALL
 class Driver:
     """A driver with a prompt: its verdicts, and what its trials come to.
 
-    ``facts`` are counts of the list of trials, None where it has none of them.
+    ``facts`` are counts of the list of trials, None where it has none of them; ``parameters`` are
+    those of the requests to its model.
     """
 
     name: str
@@ -56,14 +58,7 @@ class Driver:
     sentence: str
     facts: Row | None
     endpoint: str
-    verdicts: dict[str, Values]
-
-    @property
-    def valid_percent(self) -> float | None:
-        """Valid decisions of those that were asked, in percent."""
-        if self.facts is None or not self.facts["asked"]:
-            return None
-        return 100 * (1 - float(self.facts["invalid"]) / float(self.facts["asked"]))
+    parameters: str
 
 
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
@@ -71,43 +66,45 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
     standing = standing_of(site.catalogue)
     seen = news_of((standing, site.catalogue.state(), site.catalogue.held), asked.get("seen", ""))
     bar = scope_of(site, asked)
-    given = {name: value for name, value in asked.items() if name != "seen"}
-    found, table = verdicts_of(site, bar.scope, given)
-    drivers = drivers_of(site, table, bar.scope)
-    shown = [one for one in drivers if _is_shown(one, bar.scope)]
+    scope = bar.scope
+    drivers, values = judged(site, bar, asked)
+    shown = [
+        one
+        for one in drivers
+        if one.prompt == scope.prompt and (not scope.drivers or unmarked(one.name) in scope.drivers)
+    ]
+    models = {
+        one.name: {name: cell.values for name, cell in one.cells.items()}
+        for one in shown
+        if one.kind == LANGUAGE_MODEL and one.cells
+    }
     return site.render(
         "home.html",
         here="index",
+        **values,
         standing=standing,
         seen=seen,
         descriptions=[row["description"] for row in site.catalogue.ask(DESCRIPTIONS)],
-        bar=bar,
-        carried=carried(asked),
-        computed=found,
-        table=table,
-        kinds={kind: [one for one in shown if one.kind == kind] for kind in KINDS},
-        headings=KINDS,
-        measures=MEASURES,
-        human=humans_of(table),
-        headline=headline(
-            {one.name: one.verdicts for one in shown if one.kind == LANGUAGE_MODEL and one.cells}
-        ),
-        other_prompts=[name for name, _ in bar.prompts if name != bar.scope.prompt],
+        kinds=by_kind(shown),
+        headline=headline(models),
+        other_prompts=[name for name, _ in bar.prompts if name != scope.prompt],
         notes=noted(shown),
-        conditions=_conditions(site, bar, shown),
+        conditions=by_condition(site, scope, shown),
+        imported=bool(site.catalogue.counts({"who": "humans"}, "who")),
     )
 
 
-def verdicts_of(
-    site: Site, scope: Scope, asked: Mapping[str, str]
-) -> tuple[Computed, Table | None]:
-    """The table of verdicts of a scope, once it is computed."""
-    part = scope.sweep, scope.condition
-    found, table = computed_table(site, TABLE, asked, *part)
-    # While a run goes on, a new one would soon be old again.
-    if table and found.older and not any(run["followed"] for run in standing_of(site.catalogue)):
-        found, table = computed_table(site, TABLE, {**asked, "anew": "1"}, *part)
-    return found, table
+def judged(site: Site, bar: Bar, asked: Mapping[str, str]) -> tuple[list[Driver], dict[str, Any]]:
+    """The drivers of a scope, and the values of every page that shows their verdicts."""
+    found, table = computed_table(site, TABLE, bar.scope.sweep, bar.scope.condition)
+    return drivers_of(site, table, bar.scope), {
+        "bar": bar,
+        "carried": carried(asked),
+        "computed": found,
+        "table": table,
+        "headings": KINDS,
+        "human": humans_of(table),
+    }
 
 
 def humans_of(table: Table | None, own: Driver | None = None) -> dict[str, Any]:
@@ -117,8 +114,8 @@ def humans_of(table: Table | None, own: Driver | None = None) -> dict[str, Any]:
     """
     found = by_group(table.rows).get(HUMAN, {}) if table else {}
     label = str(next(iter(found.values()))["driver"]) if found else HUMAN
-    for name, values in own.verdicts.items() if own and own.cells else ():
-        beside = {"estimate": values.get("human"), "ci": values.get("human_ci")}
+    for name, cell in own.cells.items() if own else ():
+        beside = {"estimate": cell.values.get("human"), "ci": cell.values.get("human_ci")}
         found[name] = {**found[name], **beside}
     return {
         "about": label.partition("(")[2].rstrip(")") or "990 trials of nine pairs, as published",
@@ -131,51 +128,47 @@ def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
     """Every driver and prompt with trials in a scope; without a table their facts alone."""
     counts = site.catalogue.counts(scope.trials(), "model", "variant", "who")
     facts = {(row["model"], row["variant"]): row for row in counts if row["who"] != "humans"}
-    endpoints = {
-        (row["model"], row["variant"]): row["endpoint"] or ""
-        for row in site.catalogue.ask(ENDPOINTS)
-    }
-    if table is None:
-        return [
-            Driver(name, prompt, _kind(row), {}, "", row, endpoints.get((name, prompt), ""), {})
-            for (name, prompt), row in facts.items()
-        ]
+    specs = {(row["model"], row["variant"]): row for row in site.catalogue.ask(ASKED)}
+    groups = by_group(table.rows) if table else {"/".join(key): {} for key in facts}
     drivers = []
-    for group, verdicts in by_group(table.rows).items():
-        first = next(iter(verdicts.values()))
-        if first["kind"] == HUMANS:
+    for group, verdicts in groups.items():
+        name, _, prompt = group.rpartition("/")
+        of, spec = (rows.get((unmarked(name), prompt)) for rows in (facts, specs))
+        kind = next((str(values["kind"]) for values in verdicts.values()), _kind(of))
+        if kind == HUMANS:
             continue
-        prompt = str(first["setting"])
-        name = group.removesuffix(f"/{prompt}")
-        key = unmarked(name), prompt
+        body = json.loads((spec and spec["body"]) or "{}")
+        parameters = [
+            f"{key} {value}" for key, value in body.items() if isinstance(value, str | int | float)
+        ]
         drivers.append(
             Driver(
                 name,
                 prompt,
-                str(first["kind"]),
+                kind,
                 cells(verdicts),
-                sentence(verdicts),
-                facts.get(key),
-                endpoints.get(key, ""),
-                verdicts,
+                sentence(verdicts) if verdicts else "",
+                of,
+                spec["endpoint"] if spec else "",
+                ", ".join(parameters),
             )
         )
     return drivers
 
 
-def _kind(row: Row) -> str:
+def _kind(facts: Row | None) -> str:
     """What kind of driver the list of trials tells."""
-    if row["who"] == "stand-ins":
+    if facts and facts["who"] == "stand-ins":
         return MOCK
-    return LANGUAGE_MODEL if row["asked"] else PROGRAM
+    return LANGUAGE_MODEL if facts and facts["asked"] else PROGRAM
 
 
-def _is_shown(one: Driver, scope: Scope) -> bool:
-    chosen = not scope.drivers or unmarked(one.name) in scope.drivers
-    return one.prompt == scope.prompt and chosen
+def by_kind(drivers: Sequence[Driver]) -> dict[str, list[Driver]]:
+    """Drivers by their kinds."""
+    return {kind: [one for one in drivers if one.kind == kind] for kind in KINDS}
 
 
-def noted(drivers: list[Driver]) -> list[tuple[str, str, str]]:
+def noted(drivers: Sequence[Driver]) -> list[tuple[str, str, str]]:
     """What is to be known of a number: driver, measure and note, each at its cell (†)."""
     return [
         (one.name, cell.measure.trait, capital(str(cell.values["note"])))
@@ -185,29 +178,25 @@ def noted(drivers: list[Driver]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _conditions(site: Site, bar: Bar, shown: list[Driver]) -> dict[str, Any]:
-    """Collisions by driver and condition, as the list of trials counts them, beside the humans'."""
-    rows = site.catalogue.counts(bar.scope.trials(), "model", "variant", "condition")
-    counted = {(row["model"], row["variant"], row["condition"]): row for row in rows}
-    names = ordered({name for _, _, name in counted})
+def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[str, Any]:
+    """What drivers' trials, and the humans' as published, come to by condition.
+
+    None stands for a condition that somebody did not drive; without a driver they are the humans'.
+    """
+    rows = site.catalogue.counts(scope.trials(), "model", "variant", "condition")
+    counted = {(row["model"], row["variant"], row["condition"]): _merged(row) for row in rows}
+    of = [(one, (unmarked(one.name), one.prompt)) for one in drivers]
+    known = {name: _merged(counts._asdict()) for name, counts in human_counts().items()}
+    played = {name for *key, name in counted if tuple(key) in [driver for _, driver in of]}
+    names = ordered(played or known)
     return {
         "names": names,
-        "humans": humans_by_condition(names),
-        "imported": bool(site.catalogue.counts({"who": "humans"}, "who")),
-        "rows": [
-            (one, [counted.get((unmarked(one.name), one.prompt, name)) for name in names])
-            for one in shown
-        ],
+        "humans": [known.get(name) for name in names],
+        "rows": [(one, [counted.get((*key, name)) for name in names]) for one, key in of],
     }
 
 
-def humans_by_condition(names: Iterable[str]) -> list[Row | None]:
-    """The published counts of conditions; None for one that no human drove."""
-    known = {name: with_merged(counts._asdict()) for name, counts in human_counts().items()}
-    return [known.get(name) for name in names]
-
-
-def with_merged(row: Row) -> Row:
+def _merged(row: Row) -> Row:
     """Counts of trials with how many merged, and without other counts how many ended."""
     merged = row["left_first"] + row["right_first"]
     return {"ended": merged + row["collided"], **row, "merged": merged}

@@ -5,19 +5,27 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
+from starlette.responses import Response
+
 from merge_runner.errors import MergeRunnerError
 from merge_runner.results.export import tables, units
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.explorer.display_text import visible
 from merge_runner_analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST
 from merge_runner_analysis.explorer.scope import carried, scope_of
-from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.explorer.site import Site, download
 
 # Types of which values stand to the right.
 NUMBER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|BIGNUM|DECIMAL\(.*\)")
 
-# The parts of a scope as columns.
-SCOPED = {"sweep": "sweep_id", "model": "driver", "variant": "variant", "condition": "condition"}
+# What holds of the trials of each part of a scope.
+SCOPED = {
+    "sweep": "(trial_id, spec_hash) in (select trial_id, spec_hash from sweep_trials\n"
+    "    where sweep_id in ({}))",
+    "model": "driver in ({})",
+    "variant": "variant in ({})",
+    "condition": "condition in ({})",
+}
 # Queries to begin with: those of the README.
 EXAMPLES = {
     "Who merged first, and how often did they collide?": """\
@@ -41,18 +49,15 @@ limit 20""",
 }
 
 
-def sql_page(
-    site: Site, asked: Mapping[str, str], *, run: bool = True, problem: str | None = None
-) -> str:
-    """The page of a query, with its result if it is to be run and had no problem before."""
+def sql_page(site: Site, asked: Mapping[str, str]) -> str:
+    """The page of a query, with its result."""
     query = query_in(asked)
-    is_asked = bool(query.strip())
-    result = None
-    if is_asked and run and problem is None:
+    is_asked, result, problem = bool(query.strip()), None, None
+    if is_asked:
         try:
             result = site.queries.result(query)
         except MergeRunnerError as exc:
-            problem = str(exc)
+            problem = visible(str(exc))
     names = [name for name, _ in result.columns] if result else []
     return site.render(
         "sql.html",
@@ -61,13 +66,11 @@ def sql_page(
         carried=carried(asked),
         query=query if is_asked else scoped_query(carried(asked)),
         asked=is_asked,
-        run=run,
-        hides=visible(query) != query,
         longest=LONGEST,
         examples=EXAMPLES,
         tables=tables(),
         units=units(),
-        problem=None if problem is None else visible(problem),
+        problem=problem,
         result=result,
         spec=names.index("spec_hash") if "spec_hash" in names else None,
         is_number=NUMBER.fullmatch,
@@ -75,24 +78,20 @@ def sql_page(
     )
 
 
+def sql_csv(site: Site, asked: Mapping[str, str]) -> Response:
+    """All that a query finds, as a file; raises UsageError."""
+    return download(site.queries.csv(query_in(asked)), "query.csv")
+
+
 def scoped_query(chosen: Mapping[str, Sequence[str]]) -> str:
     """A query of the trials of a scope; the first example where none is chosen."""
     if not chosen:
         return next(iter(EXAMPLES.values()))
-    members = (
-        "(trial_id, spec_hash) in (select trial_id, spec_hash from sweep_trials\n    where {})"
-    )
-    parts = {
-        name: f"{SCOPED[name]} in ({', '.join(map(quoted, values))})"
-        for name, values in chosen.items()
-    }
-    if "sweep" in parts:
-        parts["sweep"] = members.format(parts["sweep"])
+    parts = [SCOPED[name].format(", ".join(map(quoted, of))) for name, of in chosen.items()]
     return (
         "select trial_id, status, merged_first, gap_m\n"
         "from trials join trial_metrics using (trial_id, spec_hash)\n"
-        "    join trial_drivers using (trial_id, spec_hash)\nwhere "
-        + "\n    and ".join(parts.values())
+        "    join trial_drivers using (trial_id, spec_hash)\nwhere " + "\n    and ".join(parts)
     )
 
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import shlex
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC
 from pathlib import Path
 from typing import Any
 
+from merge_runner.audit.checks import not_judged
 from merge_runner.config import both_sides, pair_name
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.run.progress import Standing, read_standing
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.file import study_files
 from merge_runner_analysis.explorer.catalogue import Catalogue, Wanted
+from merge_runner_analysis.explorer.pages.computed import Computed, computed
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.scope import carried, scope_of
 from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site, news_of
@@ -189,8 +191,11 @@ def assessment_of(run: Row) -> tuple[str, str]:
         if ended < planned:
             text = f"It had finished, but the database holds only {ended} of its {planned} trials."
             return "stopped", text
-        text = f"Finished: all {ended} trials ended, and no problems were found"
-        if others := run["row"]["others"]:
+        row, text = run["row"], f"Finished: all {ended} trials ended"
+        if why := not_judged(run["driver"], row["invalid"], row["asked"]):
+            return "doubtful", f"{text}; {why}."
+        text += ", and no problems were found"
+        if others := row["others"]:
             return "doubtful", f"{text}; but another model gave {others} answers."
         return "finished", f"{text}."
     if state == "lost":
@@ -225,6 +230,7 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
         carried=part,
         runs=[run for run in runs if not part or counted[run["sweep_id"]]["trials"]],
         counted=counted,
+        audit=audit_of(site, runs),
         trust=TRUST,
         duration=duration,
         seen=news_of((runs, site.catalogue.state()), asked.get("seen", "")),
@@ -245,6 +251,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         "sweep.html",
         here="sweeps",
         entry=run,
+        audit=audit_of(site, [run]),
         arms=site.catalogue.counts({"sweep": sweep_id}, "model", "variant"),
         trust=TRUST,
         causes=site.catalogue.ask(CAUSES, sweep_id),
@@ -254,3 +261,8 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
         quiet=seen.startswith(f"{state}-"),
         heard=bool(seen),
     )
+
+
+def audit_of(site: Site, runs: Sequence[Row]) -> Computed | None:
+    """What the audit notes of each run; None while one goes on, which ends with an audit."""
+    return None if any(run["followed"] for run in runs) else computed(site, ("audit",))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import itemgetter
 from typing import Any
 
@@ -54,20 +54,14 @@ ORDER BY avg((told.headway_m - mine.headway_m) ** 2), told.trial_id, told.spec_h
 
 
 def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
-    """Return a trial, with the decision that the address names.
-
-    With ``as=whole`` it has the panels of all of its decisions, and needs no server for them.
-    """
+    """Return a trial with all of its decisions."""
     row, trial = found(site, trial_id, asked)
     account = views.account_of(row, trial)
     return site.render(
         "trial.html",
         here="trials",
         scripts=REPLAY,
-        panel=decision_panel(site, row, trial, decision_at(trial, asked))
-        if "decision" in asked
-        else "",
-        panels=whole_panels(site, row, trial) if asked.get("as") == "whole" else {},
+        panels=panels(site, row, trial),
         row=row,
         outcome=views.outcome_text(row),
         facts=views.facts(row),
@@ -102,17 +96,11 @@ def found(site: Site, trial_id: str, asked: Mapping[str, str]) -> tuple[Row, vie
     return row, views.read_trial(site.db, row["trial_id"], row["spec_hash"])
 
 
-def whole_panels(site: Site, row: Row, trial: views.Trial) -> dict[str, Markup]:
-    """Return the panels of all decisions of a trial, by side and number."""
-    return {
-        f"{d['side']}/{d['decision']}": decision_panel(site, row, trial, d) for d in trial.decisions
-    }
-
-
-def decision_fragment(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
-    """The panel of one decision; raises NotThere."""
-    row, trial = found(site, trial_id, asked)
-    return decision_panel(site, row, trial, decision_at(trial, asked))
+def panels(site: Site, row: Row, trial: views.Trial) -> list[Markup]:
+    """Return the panels of all decisions of a trial, in the order of its ribbons."""
+    others = site.catalogue.ask("FROM others")
+    decisions = (d for mine in trial.by_side.values() for d in mine)
+    return [decision_panel(site, row, trial, d, others) for d in decisions]
 
 
 def decision_at(trial: views.Trial, asked: Mapping[str, str]) -> Row:
@@ -124,20 +112,24 @@ def decision_at(trial: views.Trial, asked: Mapping[str, str]) -> Row:
     raise NotThere(f"the trial has no decision {number} of the {side} driver")
 
 
-def decision_panel(site: Site, row: Row, trial: views.Trial, decision: Row) -> Markup:
-    """What a driver was told, said, planned and did."""
+def decision_panel(
+    site: Site, row: Row, trial: views.Trial, decision: Row, others: Sequence[Row]
+) -> Markup:
+    """What a driver was told, said, planned and did; ``others`` are answers of another model."""
+    named = {"side": decision["side"], "decision": decision["decision"]}
     before = decision["before"]
     panel = site.render(
         "_decision.html",
         d=decision,
         driver=row[f"model_{decision['side']}"],
+        page=site.at.trial(row, **named),
         clamped=clamped,
         before=before,
         parts=parts_of(decision["prompt"] or "", before["prompt"] if before else None),
         meaning=views.block_meaning,
-        others=site.catalogue.ask("FROM others"),
+        others=others,
         reply=shortened(decision["reply"]) if decision["reply"] else None,
-        raw=site.at.raw(row, decision["side"], decision["decision"]),
+        raw=site.at.raw(row, **named),
         chart=views.plan_chart(decision, trial),
         points=step_points,
     )
@@ -191,9 +183,11 @@ def _laid(site: Site, row: Row) -> dict[str, Any] | None:
     trial = views.read_trial(site.db, row["trial_id"], row["spec_hash"])
     if not trial.states:
         return None
-    data = views.replay_data(row, trial, views.account_of(row, trial), site.at.trial(row))
-    ribbons = site.render("_ribbons.html", row=row, trial_decisions=trial.by_side)
-    return {**data, "ribbons": ribbons}
+    return {
+        **views.replay_data(row, trial, views.account_of(row, trial), site.at.trial(row)),
+        "ribbons": site.render("_ribbons.html", row=row, trial_decisions=trial.by_side),
+        "panels": "".join(panels(site, row, trial)),
+    }
 
 
 def _nearest_human(site: Site, row: Row) -> tuple[str, str] | None:

@@ -27,7 +27,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     chosen, sort, cell = filter_of(asked), sort_of(asked), asked.get("cell", "")
     wanted, named = chosen, None
     if cell:
-        named = computed(site, cell_request(cell), asked)
+        named = computed(site, cell_request(cell))
         if named.content is None:
             return site.render("behind.html", here="trials", cell=cell, computed=named)
         wanted = {**chosen, "trials": named.content["trials"]}
@@ -63,9 +63,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
 def export_filter(site: Site, asked: Mapping[str, str]) -> Wanted:
     """The filter in an address, whose cell may have to be computed; raises NotThere, StoreError."""
     wanted, cell = filter_of(asked), asked.get("cell", "")
-    return (
-        {**wanted, "trials": awaited(site, cell_request(cell), asked)["trials"]} if cell else wanted
-    )
+    return {**wanted, "trials": awaited(site, cell_request(cell))["trials"]} if cell else wanted
 
 
 def cell_request(cell: str) -> tuple[str, str, str, str]:

@@ -6,32 +6,23 @@
     const { pathname, searchParams } = new URL(href);
     return [pathname, searchParams.get("trial"), searchParams.get("spec")].join();
   };
-  const keep = (list) => sessionStorage.setItem("list", JSON.stringify(list));
-  // A file cannot read another one.
-  const page = (rel) =>
-    location.protocol === "file:" ? undefined : document.querySelector(`.paging a[rel=${rel}]`)?.href;
-
-  document.addEventListener("click", (event) => {
-    const row = event.target.closest("[data-list] tbody tr");
-    if (!row || event.target.closest("a") !== row.querySelector("a")) return;
+  document.addEventListener("click", ({ target }) => {
+    const row = target.closest("[data-list] tbody tr");
+    if (!row || target.closest("a") !== row.querySelector("a")) return;
     const hrefs = [...document.querySelectorAll("[data-list] tbody tr")].map((one) => one.querySelector("a")?.href);
     // Where several rows are of one trial, as its decisions are, it counts once.
     const rows = [...new Map(hrefs.filter(Boolean).map((href) => [key(href), href])).values()];
-    keep({ address: location.href, rows, next: page("next"), prev: page("prev") });
+    sessionStorage.setItem("list", JSON.stringify({ address: location.href, rows }));
   });
 
   const list = JSON.parse(sessionStorage.getItem("list") ?? "null");
   const here = () => list?.rows.findIndex((href) => key(href) === key(location.href)) ?? -1;
-  const links = () => ["previous-trial", "next-trial"].map((id) => document.getElementById(id));
   window.place = {
     lead: () => {
       const at = here();
-      if (at < 0) return;
-      const hrefs = [list.rows[at - 1] ?? list.prev, list.rows[at + 1] ?? list.next];
-      links().forEach((link, i) => {
-        link.hidden = !hrefs[i];
-        if (hrefs[i]) link.href = hrefs[i];
-      });
+      for (const [id, href] of Object.entries({ previous: list?.rows[at - 1], next: at >= 0 && list.rows[at + 1] })) {
+        if (href) Object.assign(document.getElementById(`${id}-trial`), { href, hidden: false });
+      }
     },
     // The page that led here, or the list whose rows were gone through.
     back: () => {
@@ -40,9 +31,6 @@
       if (led && from.pathname !== location.pathname) return from.href;
       return here() >= 0 ? list.address : document.getElementById("trial").dataset.back;
     },
-    step: (by) => {
-      const link = document.getElementById("trial") && links()[by > 0 ? 1 : 0];
-      if (link && !link.hidden) link.click();
-    },
+    step: (id) => document.querySelector(`#${id}-trial[href]`)?.click(),
   };
 })();

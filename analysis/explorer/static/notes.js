@@ -3,11 +3,10 @@
 (() => {
   const form = document.getElementById("note");
   if (!form) return;
-  const { text, tags, side, decision } = form.elements;
-  const said = document.getElementById("note-said");
+  const { text, side, decision } = form.elements;
   // While something is written, what it is about stays.
   form.addEventListener("focusin", () => {
-    if (text.value || tags.value) return;
+    if (text.value) return;
     const chosen = document.querySelector("a.decision[aria-current]")?.dataset;
     side.value = chosen?.side ?? "";
     decision.value = chosen?.n ?? "";
@@ -21,14 +20,16 @@
     form.requestSubmit();
   });
   form.addEventListener("htmx:afterRequest", ({ detail: { successful, xhr } }) => {
-    said.textContent = successful ? "saved" : xhr.responseText || "not saved: no answer";
-    if (successful) form.reset();
-    if (successful) document.activeElement.blur();
+    document.getElementById("note-said").textContent = successful
+      ? "saved"
+      : xhr.responseText || "not saved: no answer";
+    if (!successful) return;
+    form.reset();
+    document.activeElement.blur();
   });
   document.addEventListener("keydown", (event) => {
-    const field = { n: text, t: tags }[event.key];
-    if (!field || isElsewhere(event)) return;
+    if (event.key !== "n" || isElsewhere(event)) return;
     event.preventDefault();
-    field.focus();
+    text.focus();
   });
 })();

@@ -1,151 +1,107 @@
 "use strict";
-// Charts on one time axis, and a line in each for the clock.
-replay.charts = (scene, { seek, marks, placed }) => {
-  const HEIGHT = 130,
-    PAPER = 660; // of a chart, and the width of one in print, in pixels
-  const holder = document.getElementById("charts");
-  const { trial } = scene,
-    road = trial.track;
-  // Read anew at each drawing: the page may turn from light to dark, and paper is light.
-  const colour = (name) => {
-    holder.style.color = `var(--${name})`;
-    const computed = getComputedStyle(holder).color;
-    holder.style.color = "";
-    return computed;
+// Ribbons and charts on one axis of time, with lines at the moments that matter and at the clock.
+replay.charts = (scene, ribbons, seek) => {
+  const { at, element, svg, minus, SIDES } = replay;
+  const { trial } = scene;
+  const part = (t) => (100 * (t - scene.begin)) / (scene.end - scene.begin || 1);
+  const percent = (t) => `${part(t)}%`;
+  const ticks = (low, high, most) => {
+    const least = (high - low) / most,
+      size = 10 ** Math.floor(Math.log10(least));
+    const step = [1, 2, 5, 10].find((times) => times * size >= least) * size;
+    const first = Math.ceil(low / step);
+    return Array.from({ length: Math.floor(high / step) - first + 1 }, (_, i) => +((first + i) * step).toFixed(6));
   };
-  const plots = [];
-  let times = [],
-    width = 0;
-
-  const pointed = (plot) => plot.cursor.left >= 0 && plot.cursor.idx !== null;
-  // The legend tells the moment that is pointed at, or else that of the clock.
-  const line = (label, stroke, value, extra) => ({
-    value,
-    series: {
-      label,
-      stroke,
-      width: 1.6,
-      points: { show: false },
-      value: (plot, v) => replay.fixed(pointed(plot) ? v : value(scene.now), 2),
-      ...extra,
-    },
-  });
-  const nearest = () =>
-    times.reduce((best, t, i) => (Math.abs(t - scene.now) < Math.abs(times[best] - scene.now) ? i : best), 0);
-  const show = () => {
-    const idx = nearest();
-    for (const plot of plots) {
-      plot.playhead.style.transform = `translateX(${plot.valToPos(scene.now, "x")}px)`;
-      if (!pointed(plot)) plot.setLegend({ idx });
-    }
-  };
-  const fit = () => {
-    for (const plot of plots) marks.onto(plot);
-    placed(plots[0]);
-    show();
-  };
-  const clickable = (plot) => {
-    plot.over.addEventListener("click", (event) => {
-      seek(plot.posToVal(event.clientX - plot.over.getBoundingClientRect().left, "x"));
-    });
-    plot.over.addEventListener("mouseleave", show);
-  };
-  const chart = (id, heading, unit, lines, { scales, ...extra } = {}) => {
-    const axis = { stroke: colour("ink"), grid: { stroke: colour("line") }, ticks: { stroke: colour("line") } };
-    const plot = new uPlot(
-      {
-        title: heading,
-        width: width || holder.clientWidth,
-        height: HEIGHT,
-        legend: { live: true },
-        cursor: { sync: { key: "replay" }, drag: { x: false, y: false } },
-        scales: { x: { time: false }, ...scales },
-        axes: [
-          { ...axis, size: 24, gap: 2, values: (_, ticks) => ticks.map((t) => `${t} s`) },
-          { ...axis, size: 54, label: unit, labelSize: 18, labelGap: 0, values: (_, ticks) => ticks.map(replay.minus) },
-        ],
-        series: [
-          { label: "t", value: (u, v) => `${(pointed(u) ? v : scene.now).toFixed(1)} s` },
-          ...lines.map((one) => one.series),
-        ],
-        hooks: { ready: [clickable, fit] },
-        ...extra,
-      },
-      [times, ...lines.map((one) => times.map(one.value))],
-      document.getElementById(id),
-    );
-    plot.playhead = replay.element("div", { class: "playhead" });
-    plot.over.append(plot.playhead);
-    plots.push(plot);
-  };
-  const dashed = { dash: [4, 4], width: 1.2 };
-  const runs = () => [[trial, "", {}], ...(scene.ghost ? [[scene.ghost, ", other", dashed]] : [])];
-  const both = (id, heading, unit, what, extra, options) =>
-    chart(
-      id,
-      heading,
-      unit,
-      runs().flatMap(([run, note, style]) =>
-        replay.SIDES.map((side) =>
-          line(`${side}${note}`, colour(side), (t) => replay.value(run, side, what, t), { ...style, ...extra }),
+  // Lines are [class, [[time, value], ...]]; the axis holds them, and these values.
+  const chart = (id, lines, ...held) => {
+    const values = [...held, ...lines.flatMap(([, points]) => points.map(([, value]) => value))];
+    const low = Math.min(...values),
+      high = Math.max(...values, low + 0.1);
+    const y = (value) => (100 * (high - value)) / (high - low);
+    const rows = ticks(low, high, 4);
+    at(id).replaceChildren(
+      ...rows.map((value) => svg("line", { x2: "100%", y1: `${y(value)}%`, y2: `${y(value)}%` })),
+      ...rows.map((value) => svg("text", { x: -6, y: `${y(value)}%`, dy: 4 }, minus(value))),
+      ...ticks(scene.begin, scene.end, 9).map((t) =>
+        svg("text", { class: "second", x: percent(t), y: "100%", dy: 13 }, `${minus(t)} s`),
+      ),
+      svg(
+        "svg",
+        { viewBox: "0 0 100 100", preserveAspectRatio: "none" },
+        ...lines.map(([kind, points]) =>
+          svg("polyline", { class: kind, points: points.map(([t, value]) => `${part(t)},${y(value)}`).join(" ") }),
         ),
       ),
-      options,
     );
-  // Where no headway is a collision, the band has no width.
-  const bound = (t) => {
-    if (!replay.inside(trial, t) || !trial.bounds.length) return null;
-    const own = Object.values(trial.sides)[0].t,
-      i = own.findIndex((x) => x >= t - 1e-9);
-    return trial.bounds[i < 0 ? own.length - 1 : i] ?? 0;
   };
   const draw = () => {
-    for (const plot of plots.splice(0)) plot.destroy();
-    const own = Object.values(trial.sides)[0].t;
-    // With a second trial the time goes on to the end of the later one.
-    times = [...own, ...(scene.ghost ? Object.values(scene.ghost.sides)[0].t : []).filter((t) => t > trial.end + 1e-9)];
-    both("chart-v", "Velocity", "m/s", "v", {});
-    both(
-      "chart-a",
-      "Acceleration",
-      "m/s²",
-      "a",
-      { paths: uPlot.paths.stepped({ align: -1 }) },
-      { scales: { y: { range: (_, low, high) => [Math.min(low, -road.hardest), Math.max(high, road.hardest)] } } },
-    );
-    const edge = { width: 0.5 };
-    const [first, ...others] = runs().map(([run, note, style]) =>
-      line(`headway${note}`, colour("ink"), (t) => replay.headway(run, t), style),
-    );
+    const runs = [[trial, ""], ...(scene.ghost ? [[scene.ghost, "ghost"]] : [])];
+    const both = (points) =>
+      runs.flatMap(([{ sides }, kind]) => Object.entries(sides).map(([side, of]) => [`${side} ${kind}`, points(of)]));
     chart(
-      "chart-h",
-      "Headway: how far the left vehicle is ahead; shaded: collision",
-      "m",
-      [
-        first,
-        line("collision below", colour("edge"), bound, edge),
-        line("and above", colour("edge"), (t) => (bound(t) === null ? null : -bound(t)), edge),
-        ...others,
-      ],
-      { bands: [{ series: [2, 3], fill: colour("collision") }] },
+      "chart-v",
+      both(({ t, v }) => t.map((time, i) => [time, v[i]])),
     );
-    fit();
+    // A sample's acceleration is that of the step before it.
+    const steps = ({ t, a }) => t.slice(1).flatMap((time, i) => [t[i], time].map((edge) => [edge, a[i + 1]]));
+    chart("chart-a", both(steps), trial.track.hardest, -trial.track.hardest);
+    const headways = runs
+      .filter(([{ sides }]) => SIDES.every((side) => sides[side]))
+      .map(([{ sides }, kind]) => [kind, sides.left.t.map((t, i) => [t, sides.left.x[i] - sides.right.x[i]])]);
+    // Where no headway is a collision, the band has no width.
+    const bounds = trial.bounds.map((bound, i) => [Object.values(trial.sides)[0].t[i], bound ?? 0]);
+    const band = [...bounds, ...bounds.map(([t, bound]) => [t, -bound]).reverse()];
+    chart("chart-h", [["bound", band], ...headways]);
+    for (const { link, t, usual, until } of ribbons.all()) {
+      Object.assign(link.parentElement.style, {
+        left: percent(t),
+        width: `calc(${part(until) - part(t)}% - 2px)`,
+        // The last one may be short: it has its letter still, but no more room than the others.
+        minWidth: `min(14px, ${part(usual) - part(t)}% - 1px)`,
+      });
+    }
+    at("timeline").classList.add("placed");
+    mark();
   };
-  const resize = (wanted) => {
-    if (wanted === width) return;
-    width = wanted;
-    for (const plot of plots) plot.setSize({ width, height: HEIGHT });
-    if (plots.length) fit();
+
+  // The moments: who merges, a collision, whatever else the page was told of.
+  const mark = () => {
+    const others = (scene.ghost?.marks ?? []).map((one) => ({ ...one, other: true }));
+    const all = [...trial.marks, ...others]
+      .sort((a, b) => a.t - b.t)
+      .map((one) => {
+        const symbol = ({ merge: "▾", collision: "✸" }[one.kind] ?? "◆") + (one.side[0] ?? "").toUpperCase();
+        return {
+          ...one,
+          symbol: one.other ? `(${symbol})` : symbol,
+          kind: `moment ${one.kind.replaceAll(" ", "-")} ${one.side}${one.other ? " other" : ""}`,
+          words: `${one.t.toFixed(1)} s: ${one.other ? "the other trial: " : ""}${one.text}`,
+        };
+      });
+    at("lines").replaceChildren(
+      ...all.map(({ t, kind, symbol, words }, i) => {
+        // In three rows, so that moments close to each other do not cover each other.
+        const line = element("span", { class: kind, title: words }, element("b", { class: `row${i % 3}` }, symbol));
+        line.style.left = percent(t);
+        return line;
+      }),
+    );
+    at("moments").replaceChildren(
+      ...all.map(({ t, kind, symbol, words }) => {
+        const button = element("button", { type: "button", class: kind }, `${symbol} ${words}`);
+        button.addEventListener("click", () => seek(t));
+        return element("li", {}, button);
+      }),
+    );
   };
-  const paper = (on) => {
-    document.documentElement.classList.toggle("paper", on);
-    resize(on ? PAPER : holder.clientWidth);
-    draw();
+  at("charts").addEventListener("click", ({ clientX, currentTarget }) => {
+    const { left, width } = currentTarget.getBoundingClientRect();
+    seek(scene.begin + ((scene.end - scene.begin) * (clientX - left)) / width);
+  });
+  return {
+    draw,
+    show: () => {
+      at("playhead").style.left = percent(scene.now);
+    },
   };
-  new ResizeObserver(() => resize(holder.clientWidth)).observe(holder);
-  addEventListener("beforeprint", () => paper(true));
-  addEventListener("afterprint", () => paper(false));
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-  addEventListener("themed", draw);
-  return { draw, show };
 };

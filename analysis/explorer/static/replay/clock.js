@@ -1,23 +1,22 @@
 "use strict";
 // The clock: it plays, stops and is set, and whatever shows the moment is told.
 replay.clock = (scene, { show, settled }) => {
-  const SPEEDS = [0.25, 0.5, 1, 2, 4];
-  const at = (id) => document.getElementById(id);
+  const { at, sampled, minus } = replay;
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  let speed = 1,
-    last = 0;
+  let last = 0;
   const tell = () => {
+    const now = `${scene.now.toFixed(1)} s`;
     at("scrub").max = scene.end;
     at("scrub").value = scene.now;
-    at("scrub").setAttribute("aria-valuetext", `${scene.now.toFixed(1)} s`);
-    at("clock").textContent = `${scene.now.toFixed(1)} s of ${scene.end.toFixed(1)} s`;
-    const { sides } = scene.trial;
-    at("now").textContent = replay.SIDES.filter((side) => sides[side])
-      .map((side) => {
-        const [v, x] = ["v", "x"].map((what) => replay.sampled(sides[side].t, sides[side][what], scene.now).toFixed(1));
-        return `${side} ${v} m/s at ${x} m`;
-      })
-      .join("; ");
+    at("scrub").ariaValueText = now;
+    at("clock").textContent = `${now} of ${scene.end.toFixed(1)} s`;
+    const sides = Object.entries(scene.trial.sides);
+    const places = sides.map(([, { t, x }]) => sampled(t, x, scene.now));
+    const said = sides.map(
+      ([side, { t, v }], i) => `${side} ${sampled(t, v, scene.now).toFixed(1)} m/s at ${places[i].toFixed(1)} m`,
+    );
+    if (sides.length > 1) said.push(`headway ${minus((places[0] - places[1]).toFixed(1))} m`);
+    at("now").textContent = said.join("; ");
     show();
   };
   const seek = (t, keep = false) => {
@@ -29,14 +28,15 @@ replay.clock = (scene, { show, settled }) => {
     if (on && scene.now >= scene.end - 1e-9) scene.now = scene.begin;
     scene.playing = on;
     at("play").textContent = on ? "Pause" : "Play";
-    at("play").setAttribute("aria-pressed", String(on));
+    at("play").ariaPressed = String(on);
     last = performance.now();
     if (on) requestAnimationFrame(tick);
     else settled();
   };
   const tick = (moment) => {
     if (!scene.playing) return;
-    const passed = (speed * (moment - last)) / 1000;
+    const speed = Number(at("speed").value),
+      passed = (speed * (moment - last)) / 1000;
     // Where the system asks for reduced motion, still pictures, two a second.
     if (!calm || passed >= 0.5 * speed) {
       last = moment;
@@ -45,29 +45,22 @@ replay.clock = (scene, { show, settled }) => {
     if (scene.now >= scene.end - 1e-9) play(false);
     else requestAnimationFrame(tick);
   };
-  const setSpeed = (value) => {
-    speed = value;
-    at("speed").value = String(value);
-  };
   at("scrub").min = scene.begin;
-  at("scrub").addEventListener("input", (event) => seek(Number(event.target.value)));
+  at("scrub").addEventListener("input", ({ target }) => seek(Number(target.value)));
   at("scrub").addEventListener("change", settled);
   at("play").addEventListener("click", () => play(!scene.playing));
   at("back").addEventListener("click", () => seek(scene.now - 0.1, true));
   at("on").addEventListener("click", () => seek(scene.now + 0.1, true));
   // What is chosen is done with: the keys are the replay's again.
-  at("speed").addEventListener("change", (event) => {
-    setSpeed(Number(event.target.value));
-    event.target.blur();
-  });
+  at("speed").addEventListener("change", ({ target }) => target.blur());
   return {
     seek,
-    key: (event) => {
-      const by = event.shiftKey ? 1 : 0.1;
-      if (event.key === " " && !event.target.matches("a, button, summary")) play(!scene.playing);
-      else if (event.key === "ArrowLeft") seek(scene.now - by, true);
-      else if (event.key === "ArrowRight") seek(scene.now + by, true);
-      else if (/^[1-5]$/.test(event.key)) setSpeed(SPEEDS[Number(event.key) - 1]);
+    key: ({ key, shiftKey, target }) => {
+      const by = shiftKey ? 1 : 0.1;
+      if (key === " " && !target.matches("a, button, summary")) play(!scene.playing);
+      else if (key === "ArrowLeft") seek(scene.now - by, true);
+      else if (key === "ArrowRight") seek(scene.now + by, true);
+      else if (/^[1-5]$/.test(key)) at("speed").selectedIndex = Number(key) - 1;
       else return false;
       return true;
     },
