@@ -83,7 +83,7 @@ def test_a_sweep_is_named_by_its_driver_and_says_that_a_stand_in_answered(site, 
     assert [run["driver"] for run in runs] == names
     shown = client.get("/sweeps").text
     for entry, name in zip(runs, names, strict=True):
-        assert f"{name} (scripted stand-in, not o3)" in shown
+        assert f"{name} (scripted stand-in)" in shown
         page = client.get(f"/sweeps/{entry['sweep_id']}").text
         assert f"{name} drives" in page
         assert "<strong>scripted stand-in, not o3.</strong>" in page
