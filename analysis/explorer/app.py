@@ -57,8 +57,6 @@ FIRST_TIME = (
     "back by itself."
 )
 MOST_NOTED, MOST_FIELDS = 65_536, 10  # bytes and fields of a form with a note
-# Nothing in a reply runs, whatever a browser takes it for.
-SEALED = {"content-security-policy": "default-src 'none'; sandbox"}
 
 
 def serve(db: Path, port: int, say: Callable[[str], None], reader: str) -> None:
@@ -130,10 +128,6 @@ def _trials_csv(site: Site, asked: Mapping[str, str]) -> Response:
     return download(site.catalogue.export(wanted, trials.sort_of(asked)), "trials.csv")
 
 
-def _raw(site: Site, name: str, asked: Mapping[str, str]) -> Response:
-    return PlainTextResponse(trial.raw_reply(site, name, asked), headers=SEALED)
-
-
 # What renders each page, of what its address names and asks for.
 PAGES: dict[str, Callable[..., str | Response]] = {
     "/": home.home_page,
@@ -147,7 +141,6 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/trials.csv": _trials_csv,
     "/trials/{name:path}": trial.trial_page,
     "/others/{name:path}": lambda *asked: JSONResponse(trial.others(*asked)),
-    "/raw/{name:path}": _raw,
     "/glossary": lambda site, _: site.render("glossary.html", here="glossary", glossary=sections()),
     "/tables": tables.tables_page,
     "/tables/{name}.{suffix}": tables.table_file,

@@ -36,9 +36,6 @@ class Links:
     trial = partialmethod(_of_trial, "trials")
     others = partialmethod(_of_trial, "others")
 
-    # The reply to a decision as a plain text; the state names the decision.
-    raw = partialmethod(_of_trial, "raw")
-
     def cell(self, table: str, row: str, column: str) -> str:
         """The trials behind a cell.
 

@@ -42,7 +42,6 @@ def change(db, sql):
         (f"{TRIAL}?side=left&decision=٣", 200),
         (f"{TRIAL}?side=left&decision={'9' * 5000}", 200),
         (f"{TRIAL}?side=left&decision=99", 200),
-        ("/raw/emulator/baseline/N_0_0/rep01?side=left&decision=99", 404),
         ("/trials?page=٣", 200),
         ("/trials?page=99999999999", 200),
         ("/trials?sort=drop", 200),

@@ -15,7 +15,6 @@ from merge_runner_analysis.explorer.pictures import step_points
 from merge_runner_analysis.explorer.prompts import parts_of
 from merge_runner_analysis.explorer.reading import Row, reading
 from merge_runner_analysis.explorer.site import REPLAY, NotThere, Site
-from merge_runner_analysis.explorer.urls import whole
 
 # What is offered to lay beside a trial, and by what rule.
 HUMAN, REPETITION = "nearest human", "next repetition"
@@ -24,6 +23,7 @@ OFFERS = {
     "stays closest to this one's until its first vehicle has merged (root mean square)",
     REPETITION: "the next repetition with the same driver, prompt and condition",
 }
+REPLY = "select max_by(reply, attempt) as reply from calls where call_key = '{}'"
 SAMPLES = "from states where trial_id = {} and spec_hash = {} order by step, side"
 FOUND = 12
 # An address calls a trial by its name, and by its spec where that name has several.
@@ -69,6 +69,7 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
         view_box=views.VIEW_BOX,
         data=views.replay_data(row, trial, account, site.at.trial(row)) if trial.states else None,
         account=account,
+        reply_of=REPLY,
         samples=SAMPLES.format(quoted(row["trial_id"]), quoted(row["spec_hash"])),
         lines=views.summary(trial),
         trial_decisions=trial.by_side,
@@ -103,15 +104,6 @@ def panels(site: Site, row: Row, trial: views.Trial) -> list[Markup]:
     return [decision_panel(site, row, trial, d, others) for d in decisions]
 
 
-def decision_at(trial: views.Trial, asked: Mapping[str, str]) -> Row:
-    """The decision that an address names; raises NotThere."""
-    side, number = asked.get("side", ""), asked.get("decision", "")
-    for decision in trial.decisions:
-        if (decision["side"], decision["decision"]) == (side, whole(number)):
-            return decision
-    raise NotThere(f"the trial has no decision {number} of the {side} driver")
-
-
 def decision_panel(
     site: Site, row: Row, trial: views.Trial, decision: Row, others: Sequence[Row]
 ) -> Markup:
@@ -129,20 +121,11 @@ def decision_panel(
         meaning=views.block_meaning,
         others=others,
         reply=shortened(decision["reply"]) if decision["reply"] else None,
-        raw=site.at.raw(row, **named),
+        raw=site.at.to("sql.csv", q=REPLY.format(decision["call_key"])),
         chart=views.plan_chart(decision, trial),
         points=step_points,
     )
     return Markup(panel)  # noqa: S704 # rendered by a template of ours, which escapes
-
-
-def raw_reply(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
-    """The body of the last reply to a call, whole; raises NotThere."""
-    _, trial = found(site, trial_id, asked)
-    reply: str | None = decision_at(trial, asked)["reply"]
-    if reply is None:
-        raise NotThere(f"{trial_id} has no reply to this decision")
-    return reply
 
 
 def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any] | str | None:

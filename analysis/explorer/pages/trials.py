@@ -39,7 +39,7 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     return site.render(
         "trials.html",
         here="trials",
-        facets=site.catalogue.facets(wanted),
+        facets={} if site.is_still else site.catalogue.facets(wanted),  # an export has no filters
         chosen=chosen,
         headings=HEADINGS,
         carried=carried(asked),
