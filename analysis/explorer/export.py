@@ -150,7 +150,8 @@ def _page_of(address: str, heads: tuple[str, ...]) -> tuple[str, str]:
         return "", ""
     known, asked = FOLLOWED[head], dict(parse_qsl(parts.query))
     moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
-    kept = {name: asked[name] for name in asked if name in known or name.startswith(FACTOR)}
+    # In one order, whatever the page that links to it says first.
+    kept = {n: asked[n] for n in sorted(asked) if n in known or n.startswith(FACTOR)}
     if parts.path.endswith(".png") or asked.keys() - kept.keys() - {*SCOPE}:
         return "", ""
     return parts.path + query_of(kept), moment + (f"#{parts.fragment}" if parts.fragment else "")
