@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,7 +31,7 @@ from merge_runner.cli.options import (
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, refuse_another_kind
 from merge_runner.text_safety import say
-from merge_runner_analysis.human.commands import INTERRUPTED, human_app
+from merge_runner_analysis.human.commands import human_app
 from merge_runner_analysis.table_format import TableFormat
 
 if TYPE_CHECKING:
@@ -91,9 +89,6 @@ def tables(
     output: Annotated[
         TableFormat, typer.Option("--format", help="Form of the tables.")
     ] = TableFormat.TEXT,
-    columns: Annotated[
-        str | None, option("A,B", "Only these columns, by the names of CSV.", "--columns")
-    ] = None,
     against: Annotated[
         str | None,
         option("paper", "Published values and differences, for drivers of that name.", "--against"),
@@ -110,12 +105,12 @@ def tables(
         raise UsageError("--by FACTOR goes with the table factors: tables factors --by FACTOR")
     use_study(study_file, trust=trust)
     from merge_runner_analysis.tables import finished_tables
-    from merge_runner_analysis.tables.formats import render, with_columns
+    from merge_runner_analysis.tables.formats import render
 
     study = None
     chosen: dict[str, Any] = {
         "models": drivers(models),
-        "where": _at(where),
+        "where": cli.levels(where or (), "--where") or None,
         "file": study_file,
         "by": by,
         "without_fallbacks": without_fallbacks,
@@ -131,8 +126,6 @@ def tables(
     made = finished_tables(db, names or (), study, chosen)
     if study is not None:
         made = [beside(table, study) for table in made]
-    if columns is not None:
-        made = with_columns(made, listed(columns) or ())
     print_out(render(made, TableFormat.JSON if as_json else output, terminal_width()))
 
 
@@ -158,7 +151,9 @@ def explain(
     (made,) = finished_tables(db, [table], study)
     found = explain_cell(study, made, cell)
     if as_json:
-        print_out(json.dumps(asdict(found), indent=2, ensure_ascii=False))
+        sources = [source._asdict() for source in found.sources]
+        shown = {**found._asdict(), "sources": sources}
+        print_out(json.dumps(shown, indent=2, ensure_ascii=False))
     else:
         print_out("\n".join(found.lines()))
 
@@ -232,9 +227,8 @@ def export(
 ) -> None:
     """Write every table as Parquet and CSV, with all columns explained."""
     from merge_runner.results.export import export_tables
-    from merge_runner_analysis.data.reference_data import outcomes_table
 
-    export_tables(db, folder, [outcomes_table()])
+    export_tables(db, folder)
     print_out(f"wrote every table into {folder}: begin with {folder / 'dictionary.csv'}")
 
 
@@ -253,11 +247,11 @@ def report(
     trust: TrustOption = False,
 ) -> None:
     """Write conclusions, tables and figures as one HTML file."""
-    use_study(study_file, trust=trust)
+    refuse_another_kind(out, HTML, "page of HTML")
+    study = _study(db, models, where, study_file, trust=trust)
     from merge_runner_analysis.report.page import write_report
 
-    refuse_another_kind(out, HTML, "page of HTML")
-    deque(write_report(db, drivers(models), out, files, _at(where), study_file), maxlen=0)
+    deque(write_report(study, out, files), maxlen=0)
     also = "" if files is None else f", and its tables and figures into {files}"
     print_out(f"wrote {out}{also}")
 
@@ -274,11 +268,7 @@ def _study(
     use_study(file, trust=trust)
     from merge_runner_analysis.data.study import Study
 
-    return Study(db, drivers(models), _at(where), file, by)
-
-
-def _at(where: Sequence[str] | None) -> dict[str, list[str]] | None:
-    return cli.levels(where, "--where") if where else None
+    return Study(db, drivers(models), cli.levels(where or (), "--where") or None, file, by)
 
 
 def drivers(text: str | None) -> list[str] | None:
@@ -318,41 +308,26 @@ def view(
 ) -> None:
     """Serve the explorer: trials, decisions and sweeps in a browser."""
     use_study(study_file, trust=trust)
-    if export is None and single is None:
-        if trials is not None:
-            raise UsageError("--trials goes with --export DIR or --single FILE.html")
-        _serve(db, port, reader)
-    elif single is not None and trials is None:
+    wanted = listed(trials) or []
+    if trials is not None and export is None and single is None:
+        raise UsageError("--trials goes with --export DIR or --single FILE.html")
+    if trials is None and single is not None:
         raise UsageError("--single FILE.html needs --trials: name some, or all with '*'")
-    else:
-        _export(db, export, single, listed(trials) or [])
-
-
-def _serve(db: Path, port: int, reader: str | None) -> None:
     from merge_runner_analysis.explorer.app import serve
+    from merge_runner_analysis.explorer.export import export_folder, export_page
     from merge_runner_analysis.explorer.notes import reader_of
 
     def announce(address: str) -> None:
         print_out(address)
         say("open this address in a browser; Ctrl-C ends the explorer")
 
-    serve(db, port, announce, reader_of(reader))
+    def told(pages: int) -> None:
+        if pages % TOLD_EVERY == 0:
+            say(f"{pages} pages so far")
 
-
-def _export(db: Path, folder: Path | None, file: Path | None, wanted: Sequence[str]) -> None:
-    from merge_runner_analysis.explorer.export import export_folder, export_page
-
-    try:
-        if folder is not None:
-            index = export_folder(db, folder, wanted, _told)
-            say(f"open {index}, or send the folder {folder}")
-        if file is not None:
-            say(f"wrote {export_page(db, file, wanted)}")
-    except KeyboardInterrupt:
-        say("interrupted: run the same command again")
-        sys.exit(INTERRUPTED)
-
-
-def _told(pages: int) -> None:
-    if pages % TOLD_EVERY == 0:
-        say(f"{pages} pages so far")
+    if export is not None:
+        say(f"open {export_folder(db, export, wanted, told)}, or send the folder {export}")
+    if single is not None:
+        say(f"wrote {export_page(db, single, wanted)}")
+    if export is None and single is None:
+        serve(db, port, announce, reader_of(reader))

@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import duckdb
 
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.registry import require
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.load import KEYS
 from merge_runner_analysis.data.reference_data import citation
-from merge_runner_analysis.data.studies import KEYS
 from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.tables.formats import shown_value
 from merge_runner_analysis.tables.model import Column, Row, Table
 
-ACCOUNTS = "attempts"  # the table that counts repetitions of deterministic drivers, too
 SEE_NOTES = "see the notes of the table"
+ACCOUNTS = "attempts"  # the table that counts repetitions of deterministic drivers, too
 # What no column of the database holds: the analysis finds it out of each trial.
 FOUND_OUT = re.compile(r"\b(counted_|collided\b|collided_boxes\b)")
 
 
-@dataclass(frozen=True, slots=True)
-class Source:
+class Source(NamedTuple):
     """The trials of one group that a row rests on, and how to list them.
 
     ``numerator``: those of them that a share or a count counts.
@@ -32,13 +32,12 @@ class Source:
 
     group: str
     text: str
-    query: str
-    trials: tuple[str, ...]
+    query: str = ""
+    trials: tuple[str, ...] = ()
     numerator: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Explanation:
+class Explanation(NamedTuple):
     """A row or a cell with its values as printed, its meaning and its sources."""
 
     cell: str
@@ -82,11 +81,6 @@ def explain(study: Study, table: Table, cell: str) -> Explanation:
     )
 
 
-RESAMPLED = Source(
-    "human", "data sets resampled from the published counts and regression, not trials", "", ()
-)
-
-
 def sql_command(study: Study) -> str:
     """How a query is run on a study's database."""
     return "merge-runner sql" + ("" if study.db == DEFAULT_DB else f" --db {study.db}")
@@ -97,7 +91,8 @@ def sources_of(
 ) -> tuple[Source, ...]:
     """The trials of each group behind a row, and those of them that a share of it counts."""
     if column is not None and column.name.startswith("ceiling"):
-        return (RESAMPLED,)
+        resampled = "data sets resampled from the published counts and regression, not trials"
+        return (Source(HUMAN, resampled),)
     known = (*study.groups, *study.asked, *study.unjudged, *study.unjudged_asked)
     groups = [group for group in known if group.id in row.groups]
     if table.name == ACCOUNTS:
@@ -106,7 +101,7 @@ def sources_of(
     return tuple(
         _source(study, group, row.counts, condition)
         if row.counts and group.measured
-        else Source(group.id, f"published, not from traces: {row.note or SEE_NOTES}", "", ())
+        else Source(group.id, f"published, not from traces: {row.note or SEE_NOTES}")
         for group in groups
     )
 
@@ -119,16 +114,17 @@ def _source(study: Study, group: Group, predicate: str, condition: str) -> Sourc
     found = dict(rows.fetchall())
     trials = tuple(found)
     numerator = tuple(trial for trial, counts in found.items() if counts)
-    text = f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}"
-    if group.said:
-        text += f"; {group.said}"
-    if group.published_outcomes is not None:
-        text += (
-            "; collisions and who merged first are those of "
-            f"{len(group.published_outcomes)} published outcomes: {citation('human_outcomes')}"
-        )
-    if condition:
-        text += f"; the value counts {len(numerator)} of them"
+    outcomes = group.published_outcomes
+    said = (
+        f"{len(trials)} of {len(group.trials)} trials; not finished: {group.left_out}",
+        group.said,
+        f"collisions and who merged first are those of {len(outcomes)} published outcomes: "
+        f"{citation('human_outcomes')}"
+        if outcomes is not None
+        else "",
+        f"the value counts {len(numerator)} of them" if condition else "",
+    )
+    text = "; ".join(filter(None, said))
     return Source(group.id, text, _query(study, group, predicate, trials), trials, numerator)
 
 
@@ -155,12 +151,6 @@ def _query(study: Study, group: Group, predicate: str, trials: tuple[str, ...]) 
 @cache
 def _trials(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
     """A connection in which ``trials`` are those of a group, with what became of their calls."""
-    connection = _database().cursor()
-    connection.register("trials", group.trials.merge(study.calls.trials, "left", KEYS))
+    connection = duckdb.connect()
+    connection.register("trials", group.trials.merge(study.calls, "left", KEYS))
     return connection
-
-
-@cache
-def _database() -> duckdb.DuckDBPyConnection:
-    """One for all groups: what a cursor registers is its own."""
-    return duckdb.connect()

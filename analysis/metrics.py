@@ -5,8 +5,7 @@ Tables, figures and pages ask this list, and name no metric that is not in it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from merge_runner.errors import UsageError
@@ -15,19 +14,11 @@ from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 
 Estimator = Literal["proportion", "mean", "median"]
 # By place the estimators of what it shows. tables: Tables V and VII, the contrasts and the pages
-# made of these; criticality: the table of this name; distributions: the figure.
-SHOWN = {
-    "tables": ("proportion", "mean"),
-    "criticality": ("median",),
-    "distributions": ("mean",),
-}
+# made of these; criticality: the table of this name.
+SHOWN = {"tables": ("proportion", "mean"), "criticality": ("median",)}
 # The trials that a metric may be of, in SQL.
 STATUS = {"finished": "status = 'finished'", "ended": "status <> 'failed'"}
-INTERVALS: dict[Estimator, str] = {
-    "proportion": "Wilson for rates",
-    "mean": "Student's t for means",
-    "median": "order statistics for medians",
-}
+INTERVALS = "Wilson for rates, Student's t for means, order statistics for medians"
 # What the analysis finds out of each trial that no column of the database has: whether it collided
 # by the rule of its scenario, and by that of the human experiment.
 JUDGED = ("collided", "collided_boxes")
@@ -50,16 +41,9 @@ class Bounded:
 
 @dataclass(frozen=True, slots=True)
 class HumanReference(Bounded):
-    """A published human value in the unit of its metric, with its 95 % interval if it has one.
+    """A published human value in the unit of its metric, which ``source`` cites."""
 
-    ``source`` cites it. ``n``: the trials that a share is of.
-    """
-
-    value: float
-    low: float | None = field(default=None, kw_only=True)
-    high: float | None = field(default=None, kw_only=True)
     source: str
-    n: int | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,10 +58,7 @@ class Metric:
     ``label`` and ``unit`` head a column, ``meaning`` says what the number of one trial is, or of
     what a proportion is the share. Raises UsageError where these do not fit together.
 
-    ``human`` is a published value beside those of the paper: ``paper_of_drivers`` and
-    ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``. ``humans_from`` says
-    what our own human value rests on: the outcomes that are published, the recordings that are
-    imported, or these once they are complete.
+    ``paper_of_drivers`` and ``paper_of_humans`` are columns of ``paper_ablation_quantitative.csv``.
     """
 
     name: str
@@ -88,20 +69,15 @@ class Metric:
     estimator: Estimator = "mean"
     trials: Literal["finished", "ended"] = "finished"
     decimals: int = 2
-    human: HumanReference | None = None
-    humans_from: Literal["outcomes", "recordings", "all recordings"] = "recordings"
     paper_of_drivers: str = ""
     paper_of_humans: str = ""
     shown: bool = True
 
     def __post_init__(self) -> None:
-        wrong = ""
         if not self.name.isidentifier():
-            wrong = "needs a name of letters, digits and _"
+            raise UsageError(f"the metric {self.name!r} needs a name of letters, digits and _")
         if self.value in JUDGED and self.trials != "ended":
-            wrong = f"is {self.value}, which ended trials are judged by: it needs trials='ended'"
-        if wrong:
-            raise UsageError(f"the metric {self.name!r} {wrong}")
+            raise UsageError(f"the metric {self.name!r} is {self.value}: it needs trials='ended'")
 
     @property
     def heading(self) -> str:
@@ -112,11 +88,6 @@ class Metric:
     def rate(self) -> bool:
         """Whether it is a share, in percent."""
         return self.estimator == "proportion"
-
-    @property
-    def kind(self) -> Literal["percent", "number"]:
-        """The kind of its columns."""
-        return "percent" if self.rate else "number"
 
     @property
     def column(self) -> str:
@@ -151,12 +122,6 @@ def shown_in(place: str) -> list[Metric]:
     return [one for one in METRICS.values() if one.shown and one.estimator in SHOWN[place]]
 
 
-def intervals_of(metrics: Iterable[Metric]) -> str:
-    """``Wilson for rates, Student's t for means``, as far as there are such."""
-    used = {metric.estimator for metric in metrics}
-    return ", ".join(text for estimator, text in INTERVALS.items() if estimator in used)
-
-
 COLLISIONS = register(
     Metric(
         name="collided_percent",
@@ -167,7 +132,6 @@ COLLISIONS = register(
         value="collided",
         estimator="proportion",
         trials="ended",
-        humans_from="all recordings",
         paper_of_drivers="collided_percent",
     )
 )
@@ -181,7 +145,6 @@ BOXES = register(
         value="collided_boxes",
         estimator="proportion",
         trials="ended",
-        humans_from="outcomes",
         paper_of_humans="collided_percent",
     )
 )
@@ -193,7 +156,6 @@ LEFT_FIRST = register(
         meaning="share of finished trials with a first merger in which it is the left vehicle",
         value="merged_first = 'left'",
         estimator="proportion",
-        humans_from="outcomes",
         shown=False,
     )
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -23,8 +24,7 @@ from merge_runner_analysis.data.study import Group
 from merge_runner_analysis.names import BASELINE
 from merge_runner_analysis.stats import regressions
 from merge_runner_analysis.stats.contrasts import contrast_means, shared_cells
-from merge_runner_analysis.stats.group_scores import fits
-from merge_runner_analysis.stats.indicators import ALPHA, TESTED, verdicts
+from merge_runner_analysis.stats.indicators import ALPHA, TESTED, fits, verdicts
 from merge_runner_analysis.stats.intervals import POWER
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
@@ -131,8 +131,7 @@ def findings(own: pd.DataFrame, other: pd.DataFrame | None) -> dict[str, bool]:
         judged = verdicts(regressions.who_first_firth(own), gap, robust=True)
         return {name: verdict.passed is True for name, verdict in judged.items()}
     slopes = regressions.who_first_firth(own, less=other).terms
-    gaps = contrast_means(own, other, "gap_m")
-    cells = shared_cells(own, other, "collided")
+    gaps, cells = contrast_means(own, other, "gap_m"), shared_cells(own, other, "collided")
     p = {name.replace("_", " "): slope.p for name, slope in slopes.items()}
     p |= {"gap": gaps.p if gaps else 1.0, "collisions": cells.p if cells else 1.0}
     return {question: value < ALPHA for question, value in p.items()}
@@ -151,28 +150,28 @@ class Case:
     @property
     def effects(self) -> dict[str, float]:
         """By question the effect that there is to find; that of I4 is to be small."""
-        effects = {}
-        for question, (_, number, _) in QUESTIONS.items():
-            size = getattr(self.own, number) - (getattr(self.other, number) if self.other else 0.0)
-            known = question != "gap" or self.against != HUMANS
-            if (question in TESTED) is (self.other is None) and size and known:
-                effects[question] = size
-        return effects
+        sizes = {
+            question: getattr(self.own, number)
+            - (getattr(self.other, number) if self.other else 0.0)
+            for question, (_, number, _) in QUESTIONS.items()
+            if (question in TESTED) is (self.other is None)
+        }
+        known = {*QUESTIONS} - {"gap"} if self.against == HUMANS else {*QUESTIONS}
+        return {question: size for question, size in sizes.items() if size and question in known}
 
     def chances(
         self, conditions: Sequence[str], multiple: float, simulations: int
     ) -> dict[str, float]:
         """By question the share of simulated studies, of so many times this size, that find it."""
-        rng = np.random.default_rng(SEED)
-        counts = dict.fromkeys(self.effects, 0)
-        for _ in range(simulations if counts else 0):
+        rng, found = np.random.default_rng(SEED), Counter[str]()
+        effects = self.effects
+        for _ in range(simulations if effects else 0):
             own = simulate(self.own, conditions, round(multiple * self.repetitions), rng)
             other, size = None, round(multiple * self.other_repetitions)
             if self.other:
                 other = simulate(self.other, conditions, size, rng) if size else human_trials()
-            found = findings(own, other)
-            counts = {name: count + found.get(name, False) for name, count in counts.items()}
-        return {question: count / simulations for question, count in counts.items()}
+            found.update(findings(own, other))
+        return {question: found[question] / simulations for question in effects}
 
 
 def chances(
@@ -210,16 +209,17 @@ def power_table(title: str, rows: Sequence[Row]) -> Table:
 
 
 def _cases(plan: Plan, groups: Sequence[Group]) -> Iterator[tuple[str, Case]]:
-    first, *others = plan.arms
-    for arm in plan.arms:
-        for own in _truths(plan, arm, groups):
+    arms = [(arm, _truths(plan, arm, groups)) for arm in plan.arms]
+    for arm, truths in arms:
+        for own in truths:
             yield arm.label, Case(own, arm.repetitions)
             yield arm.label, Case(own, arm.repetitions, HUMANS, human())
-    for arm in others:
-        pairs = zip(_truths(plan, arm, groups), _truths(plan, first, groups), strict=False)
-        for own, other in pairs:
-            nothing_named = own == other == human()
-            more = own.plus(Effect(gap_m=1.0, collided=own.collided)) if nothing_named else own
+    (first, others), *rest = arms
+    for arm, truths in rest:
+        for own, other in zip(truths, others, strict=False):
+            more = own
+            if own == other == human():  # nothing is named
+                more = own.plus(Effect(gap_m=1.0, collided=own.collided))
             yield arm.label, Case(more, arm.repetitions, first.label, other, first.repetitions)
 
 

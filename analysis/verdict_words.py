@@ -48,6 +48,16 @@ class Measure:
     margin: float | None = None
 
 
+def _trait(does: str, does_not: str) -> dict[str, str]:
+    """The driver's part of a sentence by the state of a trait that humans have."""
+    return {
+        SHOWN: f"{does} as humans do",
+        WEAKER: f"{does} less than humans",
+        STRONGER: f"{does} more than humans",
+        UNLIKE: f"{does_not} as humans do",
+    }
+
+
 MERGED = "status = 'finished' AND merged_first IS NOT NULL"
 # Those that are undecided count, too; what the first part names is a share with a numerator.
 ENDED = "(collided_boxes IS NOT NULL OR status <> 'failed')"
@@ -64,12 +74,7 @@ MEASURES = {
             "Firth's fit: above 0, likelihood-ratio test at 5 %",
             "gains {of} log-odds of going first per m of headway, humans {humans}",
             (-0.25, 2.5),
-            {
-                SHOWN: "goes first by headway as humans do",
-                WEAKER: "goes first by headway, less than humans",
-                STRONGER: "goes first by headway, more than humans",
-                UNLIKE: "does not go first by headway as humans do",
-            },
+            _trait("goes first by headway", "does not go first by headway"),
         ),
         Measure(
             "velocity",
@@ -81,12 +86,7 @@ MEASURES = {
             "changes its log-odds of going first by {of} per m/s of relative velocity, humans by "
             "{humans}",
             (-6.5, 3.0),
-            {
-                SHOWN: "when faster, yields as humans do",
-                WEAKER: "when faster, yields less than humans",
-                STRONGER: "when faster, yields more than humans",
-                UNLIKE: "when faster, does not yield as humans do",
-            },
+            _trait("when faster, yields", "when faster, does not yield"),
         ),
         Measure(
             "collisions",
@@ -163,16 +163,12 @@ def by_group(rows: Iterable[Any]) -> dict[str, dict[str, Values]]:
 def sentences(rows: Iterable[Any]) -> list[str]:
     """The headline of a table's rows, then a sentence on each driver and prompt."""
     groups = by_group(rows)
-    kinds = {name: next(iter(verdicts.values()))["kind"] for name, verdicts in groups.items()}
-    judged = {
-        name: verdicts
-        for name, verdicts in groups.items()
-        if kinds[name] == LANGUAGE_MODEL and "" not in verdicts
-    }
+    kinds = {name: next(iter(of.values()))["kind"] for name, of in groups.items()}
+    judged = {n: of for n, of in groups.items() if kinds[n] == LANGUAGE_MODEL and "" not in of}
     suffix = f"/{BASELINE}"
-    models = {name.removesuffix(suffix): judged[name] for name in judged if name.endswith(suffix)}
+    # A study may call its first prompt otherwise.
+    models = {n.removesuffix(suffix): of for n, of in judged.items() if n.endswith(suffix)}
     return [
-        # A study may call its first prompt otherwise.
         " ".join(filter(None, headline(models or judged))),
         *(f"{name}: {sentence(of)}" for name, of in groups.items() if kinds[name] != HUMANS),
     ]
@@ -236,21 +232,18 @@ def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
     unlike = [
         (name, values) for name, of in drivers.items() for values in filter(differs, of.values())
     ]
-    others = [name for name in compared if name not in dict(unlike)]
     if not unlike:
-        return f"No difference from humans is shown for {joined(others)}.", ""
+        return f"No difference from humans is shown for {joined(compared)}.", ""
     # The surest one by its corrected p; that of I5 has none.
     name, values = min(
         unlike, key=lambda one: 1.0 if one[1].get("p_holm") is None else one[1]["p_holm"]
     )
+    if others := [name for name in compared if name not in dict(unlike)]:
+        claim = f"No difference from humans is shown for {joined(others)};"
+        return claim, f"but {name} {told(values)}."
     if len(drivers) == 1:
         return f"{name} does not drive like humans:", f"it {told(values)}."
-    if not others:
-        return "No language model here drives like humans:", f"{name} {told(values)}."
-    return (
-        f"No difference from humans is shown for {joined(others)};",
-        f"but {name} {told(values)}.",
-    )
+    return "No language model here drives like humans:", f"{name} {told(values)}."
 
 
 def told(values: Values) -> str:

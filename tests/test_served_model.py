@@ -13,7 +13,6 @@ from merge_runner.audit.checks import audit_sweep
 from merge_runner.results.database import in_memory
 from merge_runner.results.store import sweep_facts
 from merge_runner.served_model import others_among, sql_of
-from merge_runner_analysis.data.load import load_calls
 from merge_runner_analysis.data.provenance import provenance, tally
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
@@ -49,7 +48,6 @@ def db(tmp_path):
 
 def test_all_that_tell_of_other_models_tell_the_same(db):
     assert sorted(served for _, served, _ in sweep_facts(db, "sweep-1")["others"]) == OTHERS
-    assert sorted(served for _, served in load_calls(db).others) == OTHERS
     assert sorted(provenance(db).mismatches.served) == OTHERS
     found = [
         f.text for f in audit_sweep(db, "sweep-1", [], finished=True).findings if f.kind == "served"
@@ -68,7 +66,7 @@ def test_a_configuration_that_declares_nonsense_declares_nothing(db):
             "UPDATE sweeps SET config = ? WHERE sweep_id = 'sweep-2'",
             ['{"models": {"o3": {"id": "o3", "aliases": 5}, "x": [], "y": null}}'],
         )
-    assert sorted(served for _, served in load_calls(db).others) == [*OTHERS, "o3-2026"]
+    assert sorted(provenance(db).mismatches.served) == [*OTHERS, "o3-2026"]
 
 
 def test_the_table_and_the_trials_behind_its_cell_agree(db):

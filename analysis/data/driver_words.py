@@ -24,9 +24,10 @@ def has_chance(spec: Mapping[str, Any], sides: Collection[Side] = SIDES) -> bool
     A language model samples; a program declares it.
     """
     scenario = ScenarioConfig.model_validate(spec.get("scenario", {}))
-    drivers = [spec.get(side) or {} for side in sides]
-    return any("program" not in driver or driver.get("chance") for driver in drivers) or any(
-        scenario.perception(side).is_random for side in sides
+    drivers = {side: spec.get(side) or {} for side in sides}
+    return any(
+        "program" not in driver or driver.get("chance") or scenario.perception(side).is_random
+        for side, driver in drivers.items()
     )
 
 

@@ -17,8 +17,6 @@ digits of a simulation from ruling.
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -26,9 +24,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SAMPLE_S = 0.2
-CLOCK_SAMPLES = 5  # 1 s: the clock of the paper's drivers
-RANDOM_DRIVES, RANDOM_SECONDS, RANDOM_SEED = 1000, 10, 260409609
-HIGHEST_MPS2 = 2.5
 TOLERANCE = 0.04
 LINE_COEFFICIENTS, CUBIC_COEFFICIENTS = 2, 4
 LINE_SAMPLES, CUBIC_SAMPLES = 3, 5  # one more than coefficients; 3 are 0.6 s
@@ -43,34 +38,24 @@ def measure_profiles(speeds: pd.DataFrame) -> pd.DataFrame:
     """Measure vehicles: rows with KEY, lists time_s and velocity_mps, and whether ``resisted``.
 
     Adds to KEY: ``steady``, no control action, the speed or what it would be without resistance
-    stays within STEADY_MPS of its mean; ``gain``; and ``clocked_gain``, that of ``clocked`` speeds.
-    Both gains are NaN where the vehicle was steady or under control for less than 2 s.
+    stays within STEADY_MPS of its mean; and ``gain``, NaN where the vehicle was steady or under
+    control for less than 2 s.
     """
-    sampled: dict[int, list[tuple[int, Array]]] = {}
     steady = np.zeros(len(speeds), bool)
-    gain, clocked_gain = np.full((2, len(speeds)), np.nan)
+    gain = np.full(len(speeds), np.nan)
+    sampled: dict[int, dict[int, Array]] = {}
     columns = (speeds[name] for name in ("time_s", "velocity_mps", "resisted"))
     for row, (time_s, velocity_mps, resisted) in enumerate(zip(*columns, strict=True)):
         time, v = np.asarray(time_s, dtype=float), np.asarray(velocity_mps, dtype=float)
         driven = without_resistance(time, v) if resisted else v
-        steady[row] = _is_steady(v) or _is_steady(driven)
+        apart = [np.abs(each - each.mean()).max() for each in (v, driven) if len(each)]
+        steady[row] = min(apart, default=np.inf) <= STEADY_MPS
         at = at_5_hz(time - time[:1], driven)
         if not steady[row] and len(at) >= SHORTEST_SAMPLES:
-            sampled.setdefault(len(at), []).append((row, at))
+            sampled.setdefault(len(at), {})[row] = at
     for alike in sampled.values():
-        rows, profiles = zip(*alike, strict=True)
-        at = np.stack(profiles)
-        gain[list(rows)], clocked_gain[list(rows)] = gains(at), gains(clocked(at))
-    return (
-        speeds[KEY]
-        .reset_index(drop=True)
-        .assign(steady=steady, gain=gain, clocked_gain=clocked_gain)
-    )
-
-
-def _is_steady(velocity_mps: Array) -> bool:
-    v = velocity_mps
-    return len(v) > 0 and bool(np.abs(v - v.mean()).max() <= STEADY_MPS)
+        gain[[*alike]] = gains(np.stack([*alike.values()]))
+    return speeds[KEY].reset_index(drop=True).assign(steady=steady, gain=gain)
 
 
 def at_5_hz(time_s: Array, velocity_mps: Array) -> Array:
@@ -90,43 +75,16 @@ def without_resistance(time_s: Array, velocity_mps: Array) -> Array:
     return np.asarray(velocity_mps + np.concatenate([[0.0], np.cumsum(lost)]))
 
 
-def clocked(velocity_mps: Array) -> Array:
-    """Speeds at 5 Hz, (vehicles, samples), with one acceleration from each full second to the next.
-
-    So drives whoever decides once a second and holds its acceleration, whatever it decides.
-    """
-    n = velocity_mps.shape[1]
-    at = np.arange(n)
-    knots = np.union1d(at[::CLOCK_SAMPLES], at[-1:])
-    return np.stack([np.interp(at, knots, v[knots]) for v in velocity_mps])
-
-
-@cache
-def random_gain() -> float:
-    """The mean gain of drives at random: each second an acceleration is drawn anew, and held."""
-    rng = np.random.default_rng(RANDOM_SEED)
-    drawn = rng.uniform(-HIGHEST_MPS2, HIGHEST_MPS2, (RANDOM_DRIVES, RANDOM_SECONDS))
-    steps = np.repeat(drawn, CLOCK_SAMPLES, axis=1) * SAMPLE_S
-    start = np.zeros((RANDOM_DRIVES, 1))
-    return float(gains(np.hstack([start, np.cumsum(steps, axis=1)])).mean())
-
-
 def gains(velocity_mps: Array) -> Array:
     """The gains of vehicles with equally many samples at 5 Hz, (vehicles, samples)."""
-    parts = [
-        velocity_mps[start : start + AT_ONCE] for start in range(0, len(velocity_mps), AT_ONCE)
-    ]
-    return np.concatenate([_gains(part) for part in parts])
-
-
-def _gains(v: Array) -> Array:
-    n = v.shape[1]
-    lines, cubics = residuals(v)
-    # One acceleration from beginning to end leaves nothing to explain.
-    whole = np.maximum(lines[0], n * STEADY_MPS**2)
-    moving = _criterion(cubics / whole, CUBIC_COEFFICIENTS, n)
-    held = _criterion(lines / whole, LINE_COEFFICIENTS, n)
-    return np.asarray((moving - held) / n)
+    n, found = velocity_mps.shape[1], []
+    for start in range(0, len(velocity_mps), AT_ONCE):
+        lines, cubics = residuals(velocity_mps[start : start + AT_ONCE])
+        # One acceleration from beginning to end leaves nothing to explain.
+        whole = np.maximum(lines[0], n * STEADY_MPS**2)
+        moving = _criterion(cubics / whole, CUBIC_COEFFICIENTS, n)
+        found.append((moving - _criterion(lines / whole, LINE_COEFFICIENTS, n)) / n)
+    return np.concatenate(found)
 
 
 def _criterion(left: Array, coefficients: int, n: int) -> Array:

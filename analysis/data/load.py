@@ -6,20 +6,18 @@ A query that a single table, page or statistic needs stands beside it.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-from pydantic import BaseModel, JsonValue, ValidationError
 
-from merge_runner.config import ScenarioConfig
-from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.served_model import Pair, other_models, sql_of
+from merge_runner.served_model import other_models, sql_of
+from merge_runner.study.crossing import MODEL, PROMPT
 from merge_runner.text_safety import quoted
 
 # A trial that was driven to its end, as its ego sees it (see ``trial_drivers``): one whose ego sat
@@ -117,24 +115,16 @@ FROM trials LEFT JOIN (
     FROM decisions GROUP BY ALL
 ) USING (trial_id, spec_hash) ORDER BY ALL
 """
-SPECS = """
-SELECT spec_hash, spec, min(trial_id) AS trial_id
-FROM specs JOIN trials USING (spec_hash) GROUP BY ALL ORDER BY ALL
+SPECS = "SELECT DISTINCT spec_hash, spec FROM specs JOIN trials USING (spec_hash) ORDER BY ALL"
+KEYS = ["trial_id", "spec_hash"]
+# The newest run comes first: the order of its levels counts.
+SWEEPS = """
+SELECT sweep_id, name, coalesce('-' || nullif(config->>'$.seat', ''), '') AS seat,
+    coalesce(config->'$.levels', '{}') AS levels
+FROM sweeps ORDER BY started_at DESC, sweep_id
 """
-
-
-class _Driver(BaseModel):
-    """What a spec says of a driver: a model has the body of its requests, a program has none."""
-
-    body: dict[str, JsonValue] = {}
-
-
-class _Spec(BaseModel):
-    """What is read of a spec; that of humans says none of this."""
-
-    scenario: ScenarioConfig = ScenarioConfig()
-    left: _Driver = _Driver()
-    right: _Driver = _Driver()
+LINKS = "SELECT DISTINCT trial_id, spec_hash, sweep_id FROM sweep_trials"
+Order = Mapping[str, list[str]]
 
 
 def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
@@ -158,37 +148,53 @@ def load_each(queries: Mapping[str, str], db: Path | str = DEFAULT_DB) -> dict[s
 
 
 def load_specs(db: Path | str = DEFAULT_DB) -> dict[str, dict[str, Any]]:
-    """The specs of all trials by their hash; raises UsageError for one that cannot be read."""
-    found = {}
-    for row in load_each({"specs": SPECS}, db)["specs"].itertuples():
-        found[row.spec_hash] = json.loads(row.spec)
-        try:
-            _Spec.model_validate(found[row.spec_hash])
-        except ValidationError as exc:
-            first = exc.errors()[0]
-            place = ".".join(map(str, first["loc"])) or "all of it"
-            raise UsageError(
-                f"the spec {row.spec_hash}, of {row.trial_id}, cannot be read: {place}: "
-                f"{first['msg']}; `merge-runner audit` names what else is wrong"
-            ) from exc
-    return found
+    """The specs of all trials by their hash."""
+    rows = load_each({"specs": SPECS}, db)["specs"].itertuples()
+    return {row.spec_hash: json.loads(row.spec) for row in rows}
 
 
-class Calls(NamedTuple):
-    """What became of the calls: the rows of CALLS, and pairs of a model's id and another's.
+def load_calls(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
+    """Read what became of the calls: the rows of CALLS."""
+    with read_database(Path(db)) as connection:
+        sql = CALLS.format(answered=ANSWERED, others=sql_of(other_models(connection)))
+        trials = frames.frame(connection.execute(sql))
+    counts = [name for name in trials if name not in {"trial_id", "spec_hash", "failures"}]
+    return trials.fillna(dict.fromkeys(counts, 0))
 
-    The other is that of a model which answered in its place.
+
+class Studies(NamedTuple):
+    """The studies of a database.
+
+    ``trials`` has a row for each trial and study that it was played for; ``orders`` holds by study
+    the levels of each factor, in the order of the study.
     """
 
     trials: pd.DataFrame
-    others: list[Pair]
+    orders: Mapping[str, Order]
+
+    def holds(self, study: str, frame: pd.DataFrame) -> pd.Series:
+        """Return which rows of a frame are of trials that were played for a study."""
+        own = self.trials.loc[self.trials["study"] == study, KEYS]
+        held = pd.MultiIndex.from_frame(frame[KEYS]).isin(pd.MultiIndex.from_frame(own))
+        return pd.Series(held, index=frame.index)
 
 
-def load_calls(db: Path | str = DEFAULT_DB) -> Calls:
-    """Read what became of the calls."""
-    with read_database(Path(db)) as connection:
-        others = other_models(connection)
-        sql = CALLS.format(answered=ANSWERED, others=sql_of(others))
-        trials = frames.frame(connection.execute(sql))
-    counts = [name for name in trials if name not in {"trial_id", "spec_hash", "failures"}]
-    return Calls(trials.fillna(dict.fromkeys(counts, 0)), others)
+def read_studies(db: Path) -> Studies:
+    """Read the studies of a database from its sweeps."""
+    found = load_each({"sweeps": SWEEPS, "links": LINKS}, db)
+    names: dict[str, str] = {}
+    orders: dict[str, dict[str, list[str]]] = {}
+    for row in found["sweeps"].itertuples():
+        order = json.loads(row.levels)
+        names[row.sweep_id] = study_name(row.name.removesuffix(row.seat), order)
+        known = orders.setdefault(names[row.sweep_id], {})
+        for factor, levels in order.items():
+            known[factor] = list(dict.fromkeys([*known.get(factor, ()), *levels]))
+    trials = found["links"].assign(study=found["links"]["sweep_id"].map(names))
+    return Studies(trials[[*KEYS, "study"]].drop_duplicates(), orders)
+
+
+def study_name(name: str, factors: Iterable[str]) -> str:
+    """``mood (opponent, temperature)``: studies of one name but other factors are others."""
+    own = sorted({*factors} - {MODEL, PROMPT})
+    return f"{name} ({', '.join(own)})" if own else name

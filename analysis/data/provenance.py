@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import duckdb
 import pandas as pd
 
-from merge_runner.audit.checks import make_views
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.results import frames
@@ -64,10 +61,6 @@ FROM attempts LEFT JOIN sweep_trials USING (trial_id, spec_hash)
 WHERE fate IN {answered} AND {others}
 GROUP BY ALL ORDER BY ALL
 """
-SWEEP_COSTS = """
-SELECT sweep_id, name, sweep_costs.* EXCLUDE (sweep_id)
-FROM sweeps JOIN sweep_costs USING (sweep_id) ORDER BY started_at, sweep_id
-"""
 MODEL_COSTS = """
 SELECT driver, count(*) AS trials,
     sum(calls) AS calls, sum(attempts) AS attempts,
@@ -79,60 +72,36 @@ FROM trials JOIN trial_costs USING (trial_id, spec_hash)
 JOIN trial_drivers USING (trial_id, spec_hash)
 WHERE source <> 'human' GROUP BY ALL ORDER BY ALL
 """
-# Trials that are looked through for answers that repeat each other, of a driver at a time.
-OF_DRIVER = """
-CREATE OR REPLACE TEMP TABLE audited AS
-SELECT trial_id, spec_hash FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
-WHERE driver = ? AND NOT scripted
-"""
-DRIVERS = """
-SELECT DISTINCT driver FROM trials JOIN trial_drivers USING (trial_id, spec_hash)
-WHERE source = 'llm' AND NOT scripted ORDER BY ALL
-"""
 
 
-@dataclass(frozen=True, slots=True)
-class Provenance:
-    """What the report says about the origin of its numbers.
+class Provenance(NamedTuple):
+    """What the report says about the origin of its numbers: rows of the queries here.
 
-    ``sweeps``, ``calls``, ``sweep_costs``, ``model_costs`` and ``mismatches`` are rows of the
-    queries here. By driver, variant and spec_hash ``switches`` holds the settings of the driving
-    task that differ from the defaults, and by spec_hash and side ``sent`` what was sent to the
-    models beside the prompt. ``alike`` has the drivers all of whose answers to a prompt that was
-    asked before are word for word as before, with their number.
+    By driver, variant and spec_hash ``settings`` are those of the driving task that differ from the
+    defaults, and what was sent to the models beside the prompt.
     """
 
     sweeps: pd.DataFrame
     calls: pd.DataFrame
-    sweep_costs: pd.DataFrame
     model_costs: pd.DataFrame
     mismatches: pd.DataFrame
-    switches: dict[str, str]
-    alike: dict[str, int]
-    sent: dict[str, dict[str, dict[str, object]]]
+    settings: dict[str, str]
 
 
 def provenance(db: Path) -> Provenance:
     """Read the origin of a database's results."""
     with read_database(db) as connection:
-        others = sql_of(other_models(connection))
-        queries = {
-            "sweeps": SWEEPS,
-            "calls": CALLS,
-            "sweep_costs": SWEEP_COSTS,
-            "model_costs": MODEL_COSTS,
-            "mismatches": SERVED.format(answered=ANSWERED, others=others),
-        }
-        found = {name: frames.frame(connection.execute(sql)) for name, sql in queries.items()}
+        served = SERVED.format(answered=ANSWERED, others=sql_of(other_models(connection)))
+        sweeps, calls, model_costs, mismatches = (
+            frames.frame(connection.execute(sql)) for sql in (SWEEPS, CALLS, MODEL_COSTS, served)
+        )
         played = connection.execute(SPECS).fetchall()
-        alike = _alike(connection)
     specs = load_specs(db)
-    switches = {
-        f"{driver}/{variant} ({name})": _switched(specs[name]) or "defaults"
+    settings = {
+        f"{driver}/{variant} ({name})": ", ".join(dict.fromkeys(_settings(specs[name])))
         for driver, variant, name in played
     }
-    sent = {name: _sent(specs[name]) for *_, name in played}
-    return Provenance(**found, switches=switches, alike=alike, sent=sent)
+    return Provenance(sweeps, calls, model_costs, mismatches, settings)
 
 
 def tally(study: Study, group: Group) -> Counter[str]:
@@ -143,51 +112,32 @@ def tally(study: Study, group: Group) -> Counter[str]:
     valid plan, for a reason that has a count of its own, too. ``fallback`` counts the ``decisions``
     that were driven from an older plan, or none.
     """
-    trials = of_trials(study.calls.trials, group.trials)
+    trials = of_trials(study.calls, group.trials)
     counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
-    failures = Counter("\n".join(trials["failures"].dropna()).splitlines())
-    return Counter(
-        dict(failures)
-        | counts
-        | {
-            "trials": len(group.trials),
-            "failed": len(group.trials) - len(group.ended),
-            "answers": counts["calls"] - counts["lost"],
-            "invalid": failures.total(),
-        }
-    )
-
-
-def _switched(spec: Mapping[str, Any]) -> str:
-    """The settings of a spec's driving task that differ from the defaults."""
-    defaults, scenario = ScenarioConfig().model_dump(), spec.get("scenario", {})
-    return ", ".join(f"{name} = {v}" for name, v in scenario.items() if defaults.get(name) != v)
-
-
-def _alike(connection: duckdb.DuckDBPyConnection) -> dict[str, int]:
-    make_views(connection)
-    found = {}
-    for (driver,) in connection.execute(DRIVERS).fetchall():
-        connection.execute(OF_DRIVER, [driver])
-        ((found[driver],),) = connection.execute("FROM alike").fetchall()
-    return {driver: repeated for driver, repeated in found.items() if repeated}
-
-
-def _sent(spec: Mapping[str, Any]) -> dict[str, dict[str, object]]:
-    """The parameters of the model on each side of a spec, by the last part of their names.
-
-    A program on a side has none, and is left out. A spec is made with an empty prompt, by which
-    that is known in any format.
-    """
-    bodies = {side: spec[side]["body"] for side in SIDES if "body" in spec.get(side, {})}
-    return {
-        side: dict(
-            _leaves({k: v for k, v in body.items() if k != "model" and '""' not in json.dumps(v)})
-        )
-        for side, body in bodies.items()
+    found = Counter("\n".join(trials["failures"].dropna()).splitlines())
+    counts |= {
+        "trials": len(group.trials),
+        "failed": len(group.trials) - len(group.ended),
+        "answers": counts["calls"] - counts["lost"],
+        "invalid": found.total(),
     }
+    return Counter({**found, **counts})
 
 
-def _leaves(values: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+def _settings(spec: Mapping[str, Any]) -> Iterator[str]:
+    """What is unusual of a driving task, and the parameters of the models on each side of it.
+
+    A spec is made with an empty prompt, by which that is known in any format.
+    """
+    defaults = ScenarioConfig().model_dump()
+    task = spec.get("scenario", {})
+    yield from _leaves({k: v for k, v in task.items() if defaults.get(k) != v})
+    for side in SIDES:
+        body = spec.get(side, {}).get("body", {})
+        sent = {k: v for k, v in body.items() if k != "model" and '""' not in json.dumps(v)}
+        yield from _leaves(sent)
+
+
+def _leaves(values: Mapping[str, Any]) -> Iterator[str]:
     for name, value in values.items():
-        yield from _leaves(value) if isinstance(value, dict) else [(name, value)]
+        yield from _leaves(value) if isinstance(value, dict) else [f"{name} = {value}"]

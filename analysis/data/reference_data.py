@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from merge_runner.results.export import SchemaColumn, SchemaTable
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 
 if TYPE_CHECKING:
@@ -29,26 +28,12 @@ PAIRS = {
 HUMAN_DOI = "10.4121/19550377"
 
 
-QUARTILES = {
-    "min": "smallest",
-    "q1": "first quartile of the",
-    "median": "median",
-    "q3": "third quartile of the",
-    "max": "largest",
-}
-
-
 class HumanCounts(NamedTuple):
     """Human trials of a condition by their outcome."""
 
     left_first: int
     right_first: int
     collided: int
-
-    @property
-    def trials(self) -> int:
-        """All of them: each has one of these outcomes."""
-        return sum(self)
 
 
 @cache
@@ -58,23 +43,6 @@ def human_counts() -> dict[str, HumanCounts]:
         row["condition"]: HumanCounts(*(int(row[name]) for name in HumanCounts._fields))
         for row in _rows("human_outcomes")
     }
-
-
-def outcomes_table() -> tuple[SchemaTable, Path]:
-    """The published outcomes as a table of an export, and their file."""
-    columns = [
-        SchemaColumn("condition", "VARCHAR", "of the experiment"),
-        SchemaColumn("left_first", "BIGINT", "trials in which the left vehicle merged first"),
-        SchemaColumn("right_first", "BIGINT", "trials in which the right vehicle merged first"),
-        SchemaColumn("collided", "BIGINT", "trials in which boxes overlapped"),
-        *(
-            SchemaColumn(f"crt_{name}_s", "DOUBLE", f"{word} conflict resolution time")
-            for name, word in QUARTILES.items()
-        ),
-    ]
-    source = citation("human_outcomes")
-    table = SchemaTable("human_outcomes", is_view=False, comment=source, columns=columns)
-    return table, DATA / "human_outcomes.csv"
 
 
 @cache
@@ -101,14 +69,6 @@ def printed_value(value: str | float) -> str | float:
     return float(value) if isinstance(value, str) and not value.startswith("<") else value
 
 
-def human_gap_pair_sd_m() -> float:
-    """Standard deviation in m of the mean gap between the nine human pairs.
-
-    It is that of their published random intercepts, which are shrunken: rather too small.
-    """
-    return float(published("human_gap_intercepts")["intercept_m"].std())
-
-
 def human_outcomes() -> pd.DataFrame:
     """The 990 human trials as far as they are published.
 
@@ -117,13 +77,13 @@ def human_outcomes() -> pd.DataFrame:
     """
     import pandas as pd
 
-    rows: list[tuple[object, ...]] = []
-    for name, counts in human_counts().items():
-        at = HUMAN_CONDITIONS[name]
-        cell = name, at.projected_headway_m, at.relative_velocity_mps
-        rows += [(*cell, "finished", "left")] * counts.left_first
-        rows += [(*cell, "finished", "right")] * counts.right_first
-        rows += [(*cell, "collided", None)] * counts.collided
+    fates = (("finished", "left"), ("finished", "right"), ("collided", None))
+    rows = [
+        (name, at.projected_headway_m, at.relative_velocity_mps, *fate)
+        for name, at in HUMAN_CONDITIONS.items()
+        for fate, n in zip(fates, human_counts()[name], strict=True)
+        for _ in range(n)
+    ]
     names = ["condition", "projected_headway_m", "relative_velocity_mps", "status", "merged_first"]
     trials = pd.DataFrame(rows, columns=names)
     return trials.assign(collided_boxes=trials["status"] == "collided")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pandas as pd
 
@@ -23,7 +23,6 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.study.crossing import DEFAULT, MODEL, PROMPT, SELF, listed_levels
 from merge_runner.study.file import StudySource, read_study
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.data.collision_rules import judged
 from merge_runner_analysis.data.derived_cache import options_text, present_state
 from merge_runner_analysis.data.driver_words import (
     has_chance,
@@ -31,25 +30,25 @@ from merge_runner_analysis.data.driver_words import (
     stand_in,
     unresponsive,
 )
-from merge_runner_analysis.data.imported_humans import (
-    RECORDINGS,
-    Imported,
-    imported,
-    of_published_pairs,
-)
+from merge_runner_analysis.data.imported_humans import findings, human_trials, of_published_pairs
 from merge_runner_analysis.data.intermittency import measure_profiles
 from merge_runner_analysis.data.load import (
     ASKED_TRIALS,
+    KEYS,
+    LINKS,
     SPEEDS,
     TRACES,
-    Calls,
+    Order,
+    Studies,
     load,
     load_calls,
     load_each,
     load_specs,
+    read_studies,
+    study_name,
 )
-from merge_runner_analysis.data.metric_values import outcomes_with_metrics, trials_with_metrics
-from merge_runner_analysis.data.studies import KEYS, Order, Studies, read_studies, study_name
+from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
+from merge_runner_analysis.data.trials import judged, outcomes_with_metrics, trials_with_metrics
 from merge_runner_analysis.names import BASELINE, HUMAN
 
 MEAN_SPEED = "mean_speed_mps"
@@ -64,7 +63,6 @@ QUERIES = {
     "levels": "FROM trial_levels",
     "traces": TRACES,
 }
-OF_SWEEP = "SELECT DISTINCT trial_id, spec_hash FROM sweep_trials WHERE sweep_id = {sweep}"
 NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # So many human trials in every condition make a reference; fewer are shown, but not compared with.
 ENOUGH_PER_CONDITION = 5
@@ -82,13 +80,12 @@ class Group:
     with ``[scripted]`` where a stand-in answered only some of its trials. ``label`` is how tables
     name the driver, ``models`` are the names that were asked for, the ego's first, an equal one
     once, ``seats`` are how many of the trials have the ego on the left and on the right, ``posing``
-    is what is said of a scripted stand-in, which answered for the models ``posed``, and ``caution``
-    what is said of a human who is replayed: such trials are not judged. The ``trials`` of a
-    deterministic driver are distinct, and ``whole`` is the group with their repetitions; ``equal``
-    counts the trials of a language model that went as an earlier one.
+    is what is said of a scripted stand-in, and ``caution`` of a human who is replayed: such trials
+    are not judged. The ``trials`` of a deterministic driver are distinct, and ``whole`` is the
+    group with their repetitions; ``equal`` counts the trials of a language model that went as an
+    earlier one.
     ``unjudged`` says why nothing is concluded from them, and is empty where something is.
-    ``published_outcomes`` stand in the place of the trials' outcomes where these are a part of the
-    published ones.
+    ``published_outcomes`` are those of humans, which imported trials do not replace.
     """
 
     driver: str
@@ -102,7 +99,6 @@ class Group:
     seats: tuple[int, int] = (0, 0)
     measured: bool = True
     posing: str = ""
-    posed: frozenset[str] = frozenset()
     caution: str = ""
     whole: Group | None = None
     equal: int = 0
@@ -114,11 +110,6 @@ class Group:
     def id(self) -> str:
         """``o3/A2``, or ``human``."""
         return f"{self.driver}/{self.setting}" if self.setting else self.driver
-
-    def label_of(self, model: str) -> str:
-        """How tables name one driver of a mixed pair: a program is no stand-in."""
-        posing = self.posing if model in self.posed else ""
-        return _label(f"{model} of {self.driver}", posing, self.caution)
 
     @property
     def said(self) -> str:
@@ -141,19 +132,14 @@ class Group:
         return self.whole or self
 
     @property
-    def is_mixed(self) -> bool:
-        """Whether two different drivers met."""
-        return len(self.models) > 1
-
-    @property
-    def one_sided(self) -> bool:
-        """Whether two different drivers met, and each of them on one side alone."""
-        return self.is_mixed and 0 in self.seats
-
-    @property
     def outcomes(self) -> pd.DataFrame:
         """The trials that count for collisions and for who merged first."""
         return self.trials if self.published_outcomes is None else self.published_outcomes
+
+    @property
+    def traced(self) -> bool:
+        """Whether the speeds behind all outcomes are known."""
+        return self.measured and len(self.trials) >= len(self.outcomes)
 
     def part(self, wanted: Callable[[pd.DataFrame], pd.Series]) -> Group:
         """The group with only those trials, and outcomes, of which ``wanted`` holds."""
@@ -182,19 +168,19 @@ class Group:
     @property
     def sizes(self) -> tuple[int, ...]:
         """How many outcomes there are in each condition of humans, in their order."""
-        counts = self.ended_outcomes["condition"].value_counts()
-        return tuple(int(counts.get(name, 0)) for name in HUMAN_CONDITIONS)
+        return in_human_conditions(self.ended_outcomes)
 
-    @cached_property
+    @property
     def left_out(self) -> str:
         """Which trials are not among the finished ones, in words."""
         counts = self.trials["status"].value_counts()
-        parts = [
-            f"{counts[status]} {status}"
-            for status in ("collided", "timeout", "failed")
-            if counts.get(status, 0)
-        ]
-        return ", ".join(parts) or "none"
+        statuses = [name for name in ("collided", "timeout", "failed") if name in counts]
+        return ", ".join(f"{counts[name]} {name}" for name in statuses) or "none"
+
+
+def in_human_conditions(trials: pd.DataFrame) -> tuple[int, ...]:
+    """How many trials there are in each condition of humans, in their order."""
+    return tuple(trials["condition"].value_counts().reindex(HUMAN_CONDITIONS, fill_value=0))
 
 
 class Study:
@@ -202,8 +188,9 @@ class Study:
 
     ``played`` are those of drivers, and ``models`` the ones of them that something is concluded
     from, as ``unjudged`` are the others; ``asked`` and ``unjudged_asked`` are the same of drivers
-    that were only asked what they do first, each marked so by its name. ``state`` is that of the
-    results before they were read: rows may be stored meanwhile.
+    that were only asked what they do first, each marked so by its name. ``findings`` say what to
+    know of imported humans. ``state`` is that of the results before they were read: rows may be
+    stored meanwhile.
     """
 
     def __init__(
@@ -229,70 +216,62 @@ class Study:
         self.by = by
         self.without_fallbacks = without_fallbacks
         self.options = options_text(
-            self.db, models, where, file, by, without_fallbacks, sweep, condition
-        )
+            self.db, models=models, where=where, file=file, by=by,
+            without_fallbacks=without_fallbacks, sweep=sweep, condition=condition,
+        )  # fmt: skip
         self.state = present_state(self.db)
         self.studies = read_studies(self.db)
         self.source = None if file is None else read_study(file)
         self.file, self.order = _chosen(self.db, self.studies, self.source)
         self.specs = load_specs(self.db)
-        found = load_each(QUERIES, self.db)
+        self._found = load_each(QUERIES, self.db)
         trials = judged(self.db, trials_with_metrics(self.db))
         recorded = trials["source"] == HUMAN
-        self.imported = _imported(trials[recorded], self.specs) if recorded.any() else None
-        self.human = _human_group(of_published_pairs(trials[recorded]), self.imported)
-        driven, asked = trials[~recorded], found["asked"]
+        self.human = _humans(of_published_pairs(trials[recorded]))
+        self.findings = [*findings(human_trials(self.db))] if recorded.any() else []
+        driven, asked = trials[~recorded], self._found["asked"]
         if sweep:
-            driven = driven.merge(load(OF_SWEEP.format(sweep=quoted(sweep)), self.db))
+            driven = driven.merge(load(LINKS, self.db).query("sweep_id == @sweep")[KEYS])
         if condition:
             driven = driven[driven["condition"] == condition]
             self.human = self.human.part(lambda rows: rows["condition"] == condition)
-        played = self._groups(driven, found)
-        every = pd.concat([trials[SPEC], asked[SPEC]])
-        self._sizes = every.value_counts(dropna=False).reset_index(name="trials")
-        asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED), found)
-        self.empty = not played
-        kept, human = self._chosen(played, asked, models, where or {})
-        self.played = [group for group in played if group in kept]
-        self.models, self.unjudged = _by_judgement(self.played)
-        self.asked, self.unjudged_asked = _by_judgement([g for g in asked if g in kept])
-        self.groups = [self.human, *self.models] if human else self.models
-
-    def _chosen(
-        self,
-        played: list[Group],
-        asked: list[Group],
-        models: Sequence[str] | None,
-        where: Mapping[str, Sequence[str]],
-    ) -> tuple[list[Group], bool]:
-        """Those of the chosen drivers at these levels, and whether humans are among them."""
+        self._every = pd.concat([trials[SPEC], asked[SPEC]])
         # Those that were only asked are chosen by the names of their models.
-        names = {group: group.driver for group in played}
-        names |= {group: group.name.removesuffix(ONLY_ASKED) for group in asked}
+        played = {group: group.driver for group in self._groups(driven)}
+        only_asked = self._groups(asked.assign(driver=asked["driver"] + ONLY_ASKED))
+        names = played | {group: group.name.removesuffix(ONLY_ASKED) for group in only_asked}
         valid = dict.fromkeys([HUMAN, *names.values()])
         wanted = list(valid) if models is None else models
         for name in wanted or [""]:
             if name not in valid:
                 raise unknown_name("driver", name, valid, f"in {self.db}")
         kept = [group for group, name in names.items() if name in wanted]
-        return _at(where, kept, self.db, self.order) if where else kept, HUMAN in wanted
+        if where:
+            kept = _at(where, kept, self.db, self.order)
+        self.empty = not played
+        self.played = [group for group in kept if group in played]
+        self.models = [group for group in self.played if not group.unjudged]
+        self.unjudged = [group for group in self.played if group.unjudged]
+        only_asked = [group for group in kept if group not in played]
+        self.asked = [group for group in only_asked if not group.unjudged]
+        self.unjudged_asked = [group for group in only_asked if group.unjudged]
+        self.groups = [self.human] * (HUMAN in wanted) + self.models
 
-    def _groups(self, trials: pd.DataFrame, found: Mapping[str, pd.DataFrame]) -> list[Group]:
+    def _groups(self, trials: pd.DataFrame) -> list[Group]:
         """The groups of these trials that were played for the study, if one was chosen."""
         if self.file:
             trials = trials[self.studies.holds(self.file, trials)]
-        trials = trials.merge(found["traces"], on=KEYS, how="left")
-        groups = _model_groups(trials, self.specs, found["decisions"])
+        trials = trials.merge(self._found["traces"], on=KEYS, how="left")
         return [
-            self._kept_trials(replace(group, levels=_levels(found["levels"], group)))
-            for group in groups
+            self._kept_trials(replace(group, levels=_levels(self._found["levels"], group)))
+            for group in _model_groups(trials, self.specs, self._found["decisions"])
         ]
 
     def _kept_trials(self, group: Group) -> Group:
         """The group, perhaps without its trials that had a fallback; it is judged by all."""
         if not self.without_fallbacks:
             return group
-        calls = of_trials(self.calls.trials, group.trials)
+        calls = of_trials(self.calls, group.trials)
         fallen = calls.loc[calls["fallback"] > 0, "trial_id"]
         kept = group.part(lambda trials: ~trials["trial_id"].isin(fallen))
         if kept.trials.empty:
@@ -301,28 +280,30 @@ class Study:
 
     def holds_more(self, group: Group) -> bool:
         """Whether the database has other trials with the specs and the prompt of a group."""
-        sizes = self._sizes
-        alike = sizes["spec_hash"].isin(group.trials["spec_hash"])
+        alike = self._every["spec_hash"].isin(group.trials["spec_hash"])
         if group.setting:
-            alike &= sizes["variant"] == group.setting
-        return int(sizes.loc[alike, "trials"].sum()) > len(group.trials)
+            alike &= self._every["variant"] == group.setting
+        return int(alike.sum()) > len(group.trials)
 
     @property
     def reference(self) -> str:
         """The prompt that others are compared with."""
         return next(iter(levels_of(self.played, self.order).get(PROMPT, ())), BASELINE)
 
+    @cached_property
+    def _human_traces(self) -> int:
+        """So many human traces there are in each condition, or more."""
+        return min(in_human_conditions(self.human.ended)) if self.human.measured else 0
+
     @property
     def calibrated(self) -> bool:
         """Whether there are human traces enough of every condition to compare others with."""
-        found = self.human.ended["condition"].value_counts()
-        counts = found.reindex(HUMAN_CONDITIONS, fill_value=0)
-        return self.human.measured and bool(counts.min() >= ENOUGH_PER_CONDITION)
+        return self._human_traces >= ENOUGH_PER_CONDITION
 
     @property
     def complete(self) -> bool:
         """Whether the human traces are all there, so that whole trials can be drawn from them."""
-        return self.imported is not None and self.imported.complete
+        return self._human_traces >= HUMAN_TRIALS / len(HUMAN_CONDITIONS)
 
     @cached_property
     def conditions(self) -> dict[str, tuple[float, float]]:
@@ -366,7 +347,7 @@ class Study:
         return self._frames[sql]
 
     @cached_property
-    def calls(self) -> Calls:
+    def calls(self) -> pd.DataFrame:
         """What became of the calls, by trial."""
         return load_calls(self.db)
 
@@ -378,33 +359,29 @@ def of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:
     return frame[near].merge(trials[KEYS], on=KEYS)
 
 
-def _imported(trials: pd.DataFrame, specs: Mapping[str, Mapping[str, Any]]) -> Imported:
-    origins = {name: spec.get("origin", RECORDINGS) for name, spec in specs.items()}
-    return imported(trials.assign(origin=trials["spec_hash"].map(origins)))
-
-
-def _human_group(trials: pd.DataFrame, known: Imported | None) -> Group:
-    if known is None:
-        return _published_group()
-    outcomes = None if known.complete else outcomes_with_metrics()
-    spec = str(trials["spec_hash"].iloc[0])
-    return replace(
-        _published_group(), spec_hash=spec, trials=trials, label=known.label, measured=True,
+@cache
+def _published_humans() -> Group:
+    """One object for all studies: what is computed from it is computed once."""
+    outcomes = outcomes_with_metrics()
+    return Group(
+        HUMAN, "", None, outcomes, HUMAN, models=(HUMAN,), name=HUMAN, measured=False,
         published_outcomes=outcomes,
     )  # fmt: skip
 
 
-@cache
-def _published_group() -> Group:
-    """One object for all studies: what is computed from it is computed once."""
-    outcomes = outcomes_with_metrics()
-    return Group(HUMAN, "", None, outcomes, HUMAN, models=(HUMAN,), name=HUMAN, measured=False)
+def _humans(trials: pd.DataFrame) -> Group:
+    """The humans, with the trials that are imported."""
+    if trials.empty:
+        return _published_humans()
+    n = len(trials)
+    label = HUMAN if n >= HUMAN_TRIALS else f"humans ({n} of {HUMAN_TRIALS} imported)"
+    return replace(_published_humans(), trials=trials, label=label, measured=True)
 
 
 def _levels(levels: pd.DataFrame, group: Group) -> dict[str, str]:
     """The levels of a group, model and prompt first."""
     found = of_trials(levels, group.trials).drop_duplicates("factor")
-    named = dict(zip(found["factor"], found["value"], strict=True))
+    named = found.set_index("factor")["value"].to_dict()
     return {name: named[name] for name in sorted(named, key=lambda n: (n not in FIRST, n))}
 
 
@@ -432,8 +409,10 @@ def _place(level: str, listed: Sequence[str]) -> tuple[int, bool, float, str]:
 @cache
 def in_one_study(study: Study, *groups: Group) -> bool:
     """Whether one study was played with all trials of these groups of drivers."""
-    held = (study.studies.of_all(group.trials) for group in groups)
-    return len(study.studies.orders) < 2 or bool(frozenset.intersection(*held))
+    known = study.studies
+    return len(known.orders) < 2 or any(
+        all(known.holds(name, group.trials).all() for group in groups) for name in known.orders
+    )
 
 
 def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str, Order]:
@@ -463,56 +442,38 @@ def _at(
 
     Raises UsageError where there is none, or no such level.
     """
-    there = levels_of(groups, order)
+    there, kept = levels_of(groups, order), groups
     for factor, levels in where.items():
         known = require(there, "factor", factor)
         for level in levels:
             require(dict.fromkeys(known), f"level of {factor}", level)
-    kept = [
-        group
-        for group in groups
-        if all(group.levels.get(factor) in levels for factor, levels in where.items())
-    ]
+        kept = [group for group in kept if group.levels.get(factor) in levels]
     if not kept:
         named = " and ".join(f"{factor}={'|'.join(levels)}" for factor, levels in where.items())
         raise UsageError(f"{db} holds no trial with {named}: there are some with each alone")
     return kept
 
 
-def _by_judgement(groups: list[Group]) -> tuple[list[Group], list[Group]]:
-    """Those that something is concluded from, and the others."""
-    judged_ones = [group for group in groups if not group.unjudged]
-    return judged_ones, [group for group in groups if group.unjudged]
-
-
-class _Seen(NamedTuple):
+def _as_seen(stored: Mapping[str, Any] | None, name: str, ego: str) -> dict[str, Any]:
     """A spec as the ego sees it: with the ego's driver on the left.
 
     ``image`` is its hash, ``usual`` its hash at the usual mean speed. ``task`` is a hash of what
     it covers beside the prompt and the mean speed: equal for all prompts and conditions of a study.
     """
-
-    spec: Mapping[str, Any]
-    image: str
-    usual: str
-    task: str
-
-
-def _seen(spec: Mapping[str, Any] | None, name: str, ego: str) -> _Seen:
-    if spec is None:
-        return _Seen({}, name, name, name[:8])
-    image = usual = name
+    spec, image = stored or {}, name
     if ego == "right" and {*SIDES} <= spec.keys():
         spec = {**spec, "left": spec["right"], "right": spec["left"]}
-        image = usual = spec_hash(canonical_json(spec))
-    if MEAN_SPEED in spec:
-        usual = spec_hash(canonical_json(_without(spec, MEAN_SPEED)))
-    text = json.dumps(_without(spec, "prompt_blocks", MEAN_SPEED), sort_keys=True)
-    return _Seen(spec, image, usual, hashlib.sha256(text.encode()).hexdigest()[:8])
-
-
-def _without(spec: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    return {name: value for name, value in spec.items() if name not in names}
+        image = spec_hash(canonical_json(spec))
+    at_usual = {name: value for name, value in spec.items() if name != MEAN_SPEED}
+    usual = spec_hash(canonical_json(at_usual)) if MEAN_SPEED in spec else image
+    task = {name: value for name, value in at_usual.items() if name != "prompt_blocks"}
+    hashed = hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()
+    return {
+        "spec": spec,
+        "image": image,
+        "usual": usual,
+        "task": name if stored is None else hashed,
+    }
 
 
 def _model_groups(
@@ -529,7 +490,7 @@ def _model_groups(
     if trials.empty:
         return []
     pairs = [*zip(trials["spec_hash"], trials["ego"], strict=True)]
-    seen = {pair: _seen(specs.get(pair[0]), *pair) for pair in {*pairs}}
+    seen = {pair: _as_seen(specs.get(pair[0]), *pair) for pair in {*pairs}}
     keyed = trials.join(pd.DataFrame([seen[pair] for pair in pairs], index=trials.index))
     # A condition that was driven at several mean speeds must not be mixed.
     speeds = keyed.groupby(["usual", "condition"])["image"].transform("nunique")
@@ -541,13 +502,12 @@ def _model_groups(
     keys = ["driver", "mark", "apart", "scripted", "variant", "usual"]
     groups = []
     for _, rows in keyed.groupby(keys):
-        group = _model_group(trials.loc[rows.index], rows.iloc[0])
         counts = of_trials(decisions, rows).groupby("model")[["invalid", "asked"]].sum()
         reasons = (not_judged(row.Index, row.invalid, row.asked) for row in counts.itertuples())
+        group = _model_group(trials.loc[rows.index], rows.iloc[0])
         group = replace(group, unjudged="; ".join(filter(None, reasons)))
-        groups.append(
-            _distinct(group, [specs.get(name, {}) for name in rows["spec_hash"].unique()])
-        )
+        chance = any(has_chance(specs.get(name, {})) for name in rows["spec_hash"].unique())
+        groups.append(_distinct(group, chance=chance))
     return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
 
 
@@ -557,31 +517,24 @@ def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
     models: dict[Side, str] = {side: first[f"model_{side}"] for side in SIDES}
     sides = [side for side in SIDES if rows[f"{side}_scripted"].any()]
     posing = stand_in(language_models(models, first["spec"]), sides or SIDES) if scripted else ""
-    caution = unresponsive(first["spec"])
-    seats = rows["ego"].value_counts()
     driver = first["driver"] + first["mark"] + " [scripted]" * (scripted and bool(first["apart"]))
-    return Group(
+    group = Group(
         driver,
         first["variant"],
         min(rows["spec_hash"].unique(), key=lambda name: (name != first["usual"], name)),
         rows,
-        label=_label(driver, posing, caution),
+        label=driver,
         models=tuple(dict.fromkeys(models.values())),
         name=first["driver"],
         mark=first["mark"],
-        seats=(int(seats.get("left", 0)), int(seats.get("right", 0))),
+        seats=(int((rows["ego"] == "left").sum()), int((rows["ego"] == "right").sum())),
         posing=posing,
-        posed=frozenset(models[side] for side in sides),
-        caution=caution,
+        caution=unresponsive(first["spec"]),
     )
+    return replace(group, label=f"{driver} ({group.said})") if group.said else group
 
 
-def _label(driver: str, *said: str) -> str:
-    text = "; ".join(filter(None, said))
-    return f"{driver} ({text})" if text else driver
-
-
-def _distinct(group: Group, specs: list[Mapping[str, Any]]) -> Group:
+def _distinct(group: Group, *, chance: bool) -> Group:
     """The group with its equal trials counted, or left out where its drivers have no chance.
 
     They declare it, and their repetitions do not contradict it.
@@ -590,11 +543,10 @@ def _distinct(group: Group, specs: list[Mapping[str, Any]]) -> Group:
     ended = rows[rows["trace"].notna()].sort_values(["rep", "ego"], kind="stable")
     again = ended.index[ended.duplicated(["condition", "trace"])]
     ways = rows.groupby(["condition", "ego"])["trace"].nunique()
-    program = rows["source"].iloc[0] == "driver"
-    whole = replace(group, equal=0 if program else len(again))
-    if again.empty or any(map(has_chance, specs)) or (ways > 1).any():
-        return whole
-    return replace(whole, trials=rows.drop(index=again), whole=whole)
+    if again.empty or chance or (ways > 1).any():
+        program = rows["source"].iloc[0] == "driver"
+        return replace(group, equal=0 if program else len(again))
+    return replace(group, trials=rows.drop(index=again), whole=group)
 
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:

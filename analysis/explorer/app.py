@@ -122,10 +122,7 @@ def _page(site: Site, render: Callable[..., str | Response], asked: Request) -> 
         text = site.render("message.html", heading="Reading the trials", text=FIRST_TIME, here="")
         return HTMLResponse(text, headers={"refresh": "1"})  # in s
     site.refresh()
-    try:
-        rendered = render(site, *asked.path_params.values(), asked.query_params)
-    except NothingNew:
-        return Response(status_code=204)
+    rendered = render(site, *asked.path_params.values(), asked.query_params)
     return HTMLResponse(rendered) if isinstance(rendered, str) else rendered
 
 
@@ -203,6 +200,7 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
         return HTMLResponse(page, code, {"hx-refresh": "true"} if code == 404 else None)
 
     return {
+        NothingNew: lambda *_: Response(status_code=204),
         NotThere: partial(said, "Not there", 404),
         404: partial(said, "Not there", 404),
         MergeRunnerError: partial(said, "Not now", 503),

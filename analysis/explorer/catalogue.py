@@ -23,8 +23,7 @@ from merge_runner.results.database import Instance, schema_sql
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer, quoted
-from merge_runner_analysis.accounts.classes import ALONE, OTHER_ACCOUNTS, collision_class
-from merge_runner_analysis.accounts.course import Course
+from merge_runner_analysis.accounts import ALONE, OTHER_ACCOUNTS, Course, collision_class
 from merge_runner_analysis.data.derived_cache import program
 from merge_runner_analysis.data.driver_words import language_models, stand_in, unresponsive
 from merge_runner_analysis.explorer.details import scenario_of

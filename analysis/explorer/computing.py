@@ -17,6 +17,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import duckdb
 
 from merge_runner.audit.checks import audited_database, check_sweep
-from merge_runner.errors import UsageError
+from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner.registry import in_use, use
 from merge_runner.results.database import read_database
 from merge_runner.results.store import results_digest
@@ -47,6 +48,10 @@ if TYPE_CHECKING:
 REMEMBERED = 100
 # While a run goes on the database changes all the time: an answer stands for a minute.
 STANDS_S = 60.0
+BROKEN = (
+    "the computation ended without an answer; what it said stands where `merge-runner view` was "
+    "started"
+)
 FOUND = 3  # findings of a run that its page shows
 Request = tuple[str, ...]
 """``table NAME [SWEEP CONDITION]``, ``cell TABLE ROW COLUMN``, ``figure NAME FORM``,
@@ -207,13 +212,26 @@ class Worker:
 class Job:
     """A computation, of a state of the database (its stamp), begun at a time (s since 1970).
 
-    ``before`` is that of an earlier state, whose answer stands until this one is there.
+    ``before`` is that of an earlier state, whose answer stands until this one is there. It has an
+    answer, or a ``failure``, or goes on; the database has changed since where it is ``older``.
     """
 
     answer: Future[dict[str, Any]]
     state: tuple[int, ...]
-    at: float
+    begun: float
     before: Job | None = None
+    failure: str = ""
+    older: bool = False
+
+    @property
+    def at(self) -> str:
+        """When it was begun, in local time with its zone."""
+        return f"{datetime.fromtimestamp(self.begun).astimezone():%Y-%m-%d %H:%M:%S %Z}"
+
+    @property
+    def elapsed_s(self) -> float:
+        """How long it takes so far."""
+        return time.time() - self.begun
 
     @property
     def content(self) -> dict[str, Any] | None:
@@ -233,7 +251,7 @@ class Computing:
         self._worker: Worker | None = None
 
     def ask(self, request: Request, state: tuple[int, ...], wait_s: float = 0.0) -> Job:
-        """A computation, waiting at most ``wait_s`` for its answer; raises MergeRunnerError.
+        """A computation, waiting at most ``wait_s`` for its answer.
 
         ``state`` is the present one. An answer of an earlier state is given while a newer one is
         computed, but what was absent then may be there now.
@@ -245,7 +263,7 @@ class Computing:
             if job is None or (
                 content is not None
                 and job.state != state
-                and (is_absent or time.time() - job.at > STANDS_S)
+                and (is_absent or job.elapsed_s > STANDS_S)
             ):
                 before = None if job is None or is_absent else replace(job, before=None)
                 job = Job(self._submit(request), state, time.time(), before)
@@ -254,19 +272,17 @@ class Computing:
                 del self._jobs[next(iter(self._jobs))]
         wait([job.answer], timeout=wait_s)
         if not job.answer.done():
-            return job.before or job
-        failure = job.answer.exception()
-        if failure is None:
-            return job
-        with self._lock:  # no failure stays
-            if self._jobs.get(request) is job:
-                del self._jobs[request]
-        if isinstance(failure, BrokenProcessPool):
-            raise UsageError(
-                "the computation ended without an answer; what it said stands where "
-                "`merge-runner view` was started"
-            ) from failure
-        raise failure
+            job = job.before or job
+        elif failure := job.answer.exception():
+            with self._lock:  # no failure stays
+                if self._jobs.get(request) is job:
+                    del self._jobs[request]
+            if isinstance(failure, BrokenProcessPool):
+                return replace(job, failure=BROKEN)
+            if not isinstance(failure, MergeRunnerError):
+                raise failure
+            return replace(job, failure=str(failure))
+        return replace(job, older=job.state != state)
 
     def _submit(self, request: Request) -> Future[dict[str, Any]]:
         if self._worker is not None:

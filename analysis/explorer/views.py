@@ -11,8 +11,7 @@ from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner_analysis.accounts.account import Account, account
-from merge_runner_analysis.accounts.course import Course
+from merge_runner_analysis.accounts import Account, Course, account
 from merge_runner_analysis.explorer.details import Trial
 from merge_runner_analysis.explorer.display_text import visible
 from merge_runner_analysis.explorer.reading import Row

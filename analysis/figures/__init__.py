@@ -23,8 +23,8 @@ OF_FIGURE_2 = (
     "with Wilson intervals. (D) Mean gap at the merge point and (E) mean RMSE of the speed from "
     "the initial speed, two values a trial, with intervals of Student's t. Of two different "
     "drivers, the left vehicle is that of the one named first. Colours and markers tell the "
-    "relative velocities apart, dotted lines are the humans; few very wide intervals of D and E "
-    "are cut at the frame."
+    "relative velocities apart, dotted lines are the humans (in C as published until all are "
+    "imported); few very wide intervals of D and E are cut at the frame."
 )
 FIGURES = {
     "figure2": About(
@@ -34,23 +34,6 @@ FIGURES = {
     "figure2-variants": About(
         "the same with a row for every driver and prompt",
         f"Behaviour by prompt, a row for each driver and prompt. {OF_FIGURE_2}",
-    ),
-    "ablation-matrix": About(
-        "I1 to I5 of every driver and prompt",
-        "Indicators of human behaviour by the paper's rule; where the robust tests disagree, their "
-        "verdict stands after a stroke.",
-        "ablation-qualitative",
-    ),
-    "distributions": About(
-        "gaps, RMSE and every other metric that is not a share, trial by trial",
-        "Every metric that is not a share, of all trials that count in it: medians, quartiles, "
-        "whiskers to 1.5 times the quartiles' distance, and every trial.",
-    ),
-    "factors": About(
-        "the values of the table of this name, a panel for each metric",
-        "Each factor's levels, pooled over all other factors, by every metric: its rate, mean or "
-        "median with the 95 % interval that the table of this name prints.",
-        "factors",
     ),
     "first-action": About(
         "means of the first action by own relative velocity",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -14,27 +17,25 @@ from numpy.typing import NDArray
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import HUMAN_TRIALS, published
+from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Group, Study, of_trials
-from merge_runner_analysis.figures.drawing import (
-    PAGE_IN,
-    Point,
-    Style,
-    draw_points,
-    key,
-    row_height_in,
-    say,
-    style,
-    wrapped,
-)
 from merge_runner_analysis.metrics import Bounded
 from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.stats.intervals import Estimate, mean, proportion
 from merge_runner_analysis.stats.regressions import gap_design
 
+# IEEE transactions: one column and the whole page, in inches.
+COLUMN_IN, PAGE_IN = 3.5, 7.16
+# A character of the figures' font, as wide as the wider ones are.
+CHARACTER_IN = 0.06
+BREAK = "\u200b"  # a zero-width space
+# The palette of Okabe and Ito (2008), safe for the colour-blind.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+MARKERS = "v^sDPX"
+Points = list[tuple[float, Bounded]]  # estimates at their places on an axis
 Array = NDArray[np.float64]
-# Laid out by hand: many rows of equal panels need no solver. In inches.
-LABEL_IN, ROW_IN = 1.15, 0.62
+# Laid out by hand, in inches: many rows of equal panels need no solver.
+LABEL_IN, ROW_IN, LINE_IN = 1.15, 0.62, 0.12
 # A few rows share this height, each of at most the other.
 FEW_ROWS_IN, HIGHEST_ROW_IN = 4.4, 1.1
 LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = LABEL_IN + 0.35, 0.08, 0.4, 0.62
@@ -48,18 +49,56 @@ SEMI JOIN (FROM trials WHERE status = 'finished') USING (trial_id, spec_hash)
 WHERE time_s >= 0 AND side = ego GROUP BY ALL ORDER BY ALL
 """
 HUMAN_VELOCITIES_MPS = sorted({c.relative_velocity_mps for c in HUMAN_CONDITIONS.values()})
-Styles = dict[float, Style]  # of relative velocities in m/s
-HEADINGS = (
-    "left first:\nv left (m/s)",
-    "left second:\nv left (m/s)",
-    "P(left\nmerges first)",
-    "gap at\nmerge (m)",
-    "RMSE of\nspeed (m/s)",
-)
-XLABELS = ("time (s)", "time (s)", *["headway (m)"] * 3)
+HEADINGS = {
+    "left first:\nv left (m/s)": "time (s)",
+    "left second:\nv left (m/s)": "time (s)",
+    "P(left\nmerges first)": "headway (m)",
+    "gap at\nmerge (m)": "headway (m)",
+    "RMSE of\nspeed (m/s)": "headway (m)",
+}
 MISSING = "human recordings\nare not imported"
-# The share of bounds of intervals that a scale shows.
+# The share of bounds of intervals that a scale shows: a few wide ones must not flatten the others.
 SHOWN = 0.95
+
+
+class Style(NamedTuple):
+    """A colour, and a marker as matplotlib names it."""
+
+    colour: str
+    marker: str
+
+
+Styles = dict[float, Style]  # of relative velocities in m/s
+
+
+def style(number: int) -> Style:
+    """A style, counted from 0; once the colours are used up, each comes with another marker."""
+    turn = number + number // len(COLOURS)
+    return Style(COLOURS[number % len(COLOURS)], MARKERS[turn % len(MARKERS)])
+
+
+def wrapped(text: str, width_in: float) -> str:
+    """A name in lines no wider than this, broken at blanks or punctuation, or else anywhere."""
+    marked = re.sub(r"([+/])", f"\\1{BREAK} ", text)
+    lines = textwrap.wrap(marked, max(6, int(width_in / CHARACTER_IN)))
+    return "\n".join(re.sub(f"{BREAK} ?", "", line) for line in lines)
+
+
+def key(style: Style, label: str) -> Line2D:
+    """A line of a legend."""
+    return Line2D(
+        [], [], color=style.colour, marker=style.marker, ms=3, lw=0.8, mfc="white", label=label
+    )
+
+
+def draw_points(axis: Axes, points: Points, shift: float, style: Style) -> None:
+    """Draw estimates with their intervals, ``shift`` beside their places on the axis."""
+    rows = [(x + shift, one.value, one.low, one.high) for x, one in points]
+    x, y, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
+    axis.errorbar(
+        x, y, yerr=np.nan_to_num(np.vstack([y - low, high - y])), color=style.colour,
+        marker=style.marker, ms=3, lw=0.8, elinewidth=0.7, capsize=1.5, mfc="white", mew=0.8,
+    )  # fmt: skip
 
 
 def figure_2(study: Study, chosen: list[Group]) -> Figure:
@@ -70,7 +109,8 @@ def figure_2(study: Study, chosen: list[Group]) -> Figure:
     ]
     velocities = sorted({velocity for _, velocity in study.conditions.values()})
     styles = {velocity: style(number) for number, velocity in enumerate(velocities)}
-    names = [_name(group) for group in groups]
+    parts = [(group.label, title_of(group.setting)) for group in groups]
+    names = ["\n".join(wrapped(part, LABEL_IN) for part in pair).strip() for pair in parts]
     figure, axes = _panels(names)
     for row, group, name in zip(axes, groups, names, strict=False):
         row[0].annotate(
@@ -82,15 +122,21 @@ def figure_2(study: Study, chosen: list[Group]) -> Figure:
         for axis, summary in zip(row[2:], SUMMARIES, strict=True):
             _draw_estimates(axis, group, summary, styles)
             if group.setting and groups[0].driver == HUMAN:
-                _draw_humans(axis, groups[0], summary, styles)
-    _scale(axes, groups, study, velocities)
+                _draw_humans(axis, groups[0], summary, styles, ":")
+    _scale(axes, groups, study)
     for axis, heading, panel in zip(axes[0], HEADINGS, "ABCDE", strict=True):
         axis.set_title(heading)
         axis.text(-0.02, 1.1, panel, transform=axis.transAxes, fontweight="bold", ha="right")
-    for axis, label in zip(axes[-1], XLABELS, strict=True):
+    for axis, label in zip(axes[-1], HEADINGS.values(), strict=True):
         axis.set_xlabel(label)
-    handles = [key(styles[v], f"Δv = {_velocity_text(v)}") for v in velocities]
-    handles += _human_keys(study)
+    signed = (f"{v:+g}".replace("-", "−") if v else "0" for v in velocities)
+    handles = [key(styles[v], f"Δv = {text} m/s") for v, text in zip(styles, signed, strict=True)]
+    lines = {":": "humans", "--": "published regression"} if study.human in study.groups else {}
+    handles += [
+        Line2D([], [], color="#555555", ls=dashes, lw=0.8, label=label)
+        for dashes, label in lines.items()
+        if dashes == ":" or not study.human.measured
+    ]
     figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False)
     return figure
 
@@ -115,7 +161,7 @@ Summary = Callable[[pd.DataFrame], Estimate]
 SUMMARIES: tuple[Summary, ...] = (left_first, gap, deviation)
 
 
-def points(group: Group, velocity_mps: float, summary: Summary) -> list[Point]:
+def points(group: Group, velocity_mps: float, summary: Summary) -> Points:
     """A summary of the finished trials of each condition with this velocity, by headway in m."""
     if summary is not left_first and not group.measured:
         return []
@@ -123,11 +169,9 @@ def points(group: Group, velocity_mps: float, summary: Summary) -> list[Point]:
     chosen = trials[
         (trials["status"] == "finished") & (trials["relative_velocity_mps"] == velocity_mps)
     ]
-    found = (
-        Point(headway_m, summary(rows))
-        for (headway_m, _), rows in chosen.groupby(["projected_headway_m", "condition"])
-    )
-    return [point for point in found if point.estimate.value is not None]
+    conditions = chosen.groupby(["projected_headway_m", "condition"])
+    found = [(headway_m, summary(rows)) for (headway_m, _), rows in conditions]
+    return [(x, estimate) for x, estimate in found if estimate.value is not None]
 
 
 def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Array]]:
@@ -140,10 +184,8 @@ def left_traces(study: Study, group: Group, first: str) -> dict[float, list[Arra
     found: dict[float, list[Array]] = {}
     for velocity, trials in group.finished.groupby("relative_velocity_mps"):
         rows = of_trials(study.read(EGO_SPEEDS), trials[trials["merged_first"] == first])
-        times, speeds = rows["time_s"], rows["velocity_mps"]
-        found[float(velocity)] = [
-            np.column_stack(trace) for trace in zip(times, speeds, strict=True)
-        ]
+        traces = zip(rows["time_s"], rows["velocity_mps"], strict=True)
+        found[float(velocity)] = [np.column_stack(trace) for trace in traces]
     return found
 
 
@@ -158,55 +200,38 @@ def published_gap_line(velocity_mps: float) -> tuple[Array, Array]:
     return headway, gap_design(headway, np.full_like(headway, velocity_mps)) @ terms
 
 
-def _name(group: Group) -> str:
-    driver = wrapped(group.label, LABEL_IN)
-    if not group.setting:
-        return driver
-    return f"{driver}\n{wrapped(title_of(group.setting), LABEL_IN)}"
-
-
-def _velocity_text(velocity_mps: float) -> str:
-    sign = "−" if velocity_mps < 0 else "+" if velocity_mps > 0 else ""
-    return f"{sign}{abs(velocity_mps):g} m/s"
-
-
 def _panels(names: list[str]) -> tuple[Figure, NDArray[np.object_]]:
     """A figure of page width with a row of panels of equal size for each name."""
     rows = max(len(names), 1)
-    row_in = row_height_in([*names, ""], max(ROW_IN, min(HIGHEST_ROW_IN, FEW_ROWS_IN / rows)))
+    lines = max((name.count("\n") + 1 for name in names), default=1)
+    row_in = max(ROW_IN, min(HIGHEST_ROW_IN, FEW_ROWS_IN / rows), LINE_IN * lines + 0.05)
     height_in = TOP_IN + BOTTOM_IN + rows * row_in - BETWEEN_ROWS_IN
     panel_in = (PAGE_IN - LEFT_IN - RIGHT_IN + BETWEEN_COLUMNS_IN) / len(HEADINGS)
     figure = Figure(figsize=(PAGE_IN, height_in))
-    axes = figure.subplots(
-        rows,
-        len(HEADINGS),
-        sharex="col",
-        sharey="col",
-        squeeze=False,
-        gridspec_kw={
-            "left": LEFT_IN / PAGE_IN,
-            "right": 1 - RIGHT_IN / PAGE_IN,
-            "top": 1 - TOP_IN / height_in,
-            "bottom": BOTTOM_IN / height_in,
-            "hspace": BETWEEN_ROWS_IN / (row_in - BETWEEN_ROWS_IN),
-            "wspace": BETWEEN_COLUMNS_IN / (panel_in - BETWEEN_COLUMNS_IN),
-        },
+    figure.subplots_adjust(
+        left=LEFT_IN / PAGE_IN,
+        right=1 - RIGHT_IN / PAGE_IN,
+        top=1 - TOP_IN / height_in,
+        bottom=BOTTOM_IN / height_in,
+        hspace=BETWEEN_ROWS_IN / (row_in - BETWEEN_ROWS_IN),
+        wspace=BETWEEN_COLUMNS_IN / (panel_in - BETWEEN_COLUMNS_IN),
     )
-    return figure, axes
+    return figure, figure.subplots(rows, len(HEADINGS), sharex="col", sharey="col", squeeze=False)
 
 
 def _draw_traces(axis: Axes, study: Study, group: Group, first: str, styles: Styles) -> None:
     """The left speeds of those trials in which this side merged first."""
     traces = left_traces(study, group, first)
-    parts = [traces.get(velocity, []) for velocity in styles]
-    count = sum(map(len, parts))
+    count = sum(len(traces.get(velocity, ())) for velocity in styles)
     if not count:
-        say(axis, "no such trial" if group.measured else MISSING)
+        _say(axis, "no such trial" if group.measured else MISSING)
         return
-    for part, look in zip(parts, styles.values(), strict=True):
+    for velocity, look in styles.items():
         # Many traces must not be one blot.
         alpha = min(0.4, max(0.06, 25 / count))
-        lines = LineCollection(part, color=look.colour, lw=0.4, alpha=alpha, rasterized=True)
+        lines = LineCollection(
+            traces.get(velocity, []), color=look.colour, lw=0.4, alpha=alpha, rasterized=True
+        )
         lines.set(capstyle="projecting", joinstyle="round")
         axis.add_collection(lines)
     axis.autoscale_view()
@@ -221,69 +246,49 @@ def _draw_estimates(axis: Axes, group: Group, summary: Summary, styles: Styles) 
     found = [points(group, velocity, summary) for velocity in styles]
     for index, (part, look) in enumerate(zip(found, styles.values(), strict=True)):
         draw_points(axis, part, 0.3 * (index - (len(styles) - 1) / 2), look)
-    if group.measured:
-        if not any(found):
-            say(axis, "no such trial")
-    elif summary is deviation:
-        say(axis, MISSING)
-    elif summary is gap:
+    if summary is gap and not group.measured:
         _draw_humans(axis, group, summary, styles, "--")
+    elif not any(found):
+        _say(axis, "no such trial" if group.measured else MISSING)
 
 
-def _draw_humans(
-    axis: Axes, human: Group, summary: Summary, styles: Styles, dashes: str = ":"
-) -> None:
+def _say(axis: Axes, text: str) -> None:
+    """A remark in a panel."""
+    axis.text(
+        0.5, 0.9, text, transform=axis.transAxes, ha="center", va="top", fontsize=6,
+        color="#555555",
+    )  # fmt: skip
+
+
+def _draw_humans(axis: Axes, human: Group, summary: Summary, styles: Styles, dashes: str) -> None:
     """The humans as lines, of gaps before an import as the paper's regression has them."""
     for velocity in {*styles} & {*HUMAN_VELOCITIES_MPS}:
         if summary is gap and not human.measured:
             x, y = published_gap_line(velocity)
         else:
-            found = points(human, velocity, summary)
-            x = np.array([point.x for point in found], dtype=float)
-            y = np.array([point.estimate.value for point in found], dtype=float)
+            found = [(x, one.value) for x, one in points(human, velocity, summary)]
+            x, y = np.array(found, dtype=float).reshape(-1, 2).T
         axis.plot(x, y, color=styles[velocity].colour, ls=dashes, lw=0.8)
 
 
-def _scale(
-    axes: NDArray[np.object_], groups: list[Group], study: Study, velocities: list[float]
-) -> None:
-    """One scale per quantity; a few very wide intervals must not flatten all the others."""
+def _scale(axes: NDArray[np.object_], groups: list[Group], study: Study) -> None:
+    """One scale per quantity, which shows all values and lines, and most intervals."""
     speeds = [limit for axis in axes[0, :2] for limit in axis.get_ylim()]
     for axis in axes[0, :2]:
         axis.set_ylim(min(speeds), max(speeds))
-    axes[0, 2].set_ylim(-0.08, 1.08)
-    axes[0, 2].set_yticks([0, 0.5, 1])
+    axes[0, 2].set(ylim=(-0.08, 1.08), yticks=[0, 0.5, 1])
+    velocities = {velocity for _, velocity in study.conditions.values()}
     for axis, summary in zip(axes[0, 3:], SUMMARIES[1:], strict=True):
-        found = [p.estimate for g in groups for v in velocities for p in points(g, v, summary)]
-        as_published = summary is gap and not all(group.measured for group in groups)
-        lines = [published_gap_line(v)[1] for v in HUMAN_VELOCITIES_MPS if as_published]
-        if found:
-            axis.set_ylim(*_limits(found, [float(y) for line in lines for y in line]))
+        found = [one for g in groups for v in velocities for _, one in points(g, v, summary)]
+        if not found:
+            continue
+        frame = pd.DataFrame([(one.value, one.low, one.high) for one in found], dtype=float)
+        values = [*frame[0], frame[1].quantile(1 - SHOWN), frame[2].quantile(SHOWN)]
+        if summary is gap and not all(group.measured for group in groups):
+            values += [y for v in HUMAN_VELOCITIES_MPS for y in published_gap_line(v)[1]]
+        low, high = np.nanmin(values), np.nanmax(values)
+        margin = 0.08 * (high - low) or 1.0
+        axis.set_ylim(low - margin, high + margin)
     farthest_m = max(abs(headway_m) for headway_m, _ in study.conditions.values())
     for axis in axes[0, 2:]:
-        axis.set_xlim(-farthest_m - 1, farthest_m + 1)
-        axis.set_xticks([-farthest_m, 0, farthest_m])
-
-
-def _limits(found: list[Bounded], lines: list[float]) -> tuple[float, float]:
-    """Limits that contain all values and lines, and 19 of 20 bounds of intervals."""
-    values = [*lines, *(one.value for one in found if one.value is not None)]
-    lows = [one.low for one in found if one.low is not None] or values
-    highs = [one.high for one in found if one.high is not None] or values
-    low = min(*values, float(np.quantile(lows, 1 - SHOWN)))
-    high = max(*values, float(np.quantile(highs, SHOWN)))
-    margin = 0.08 * (high - low) or 1.0
-    return low - margin, high + margin
-
-
-def _human_keys(study: Study) -> list[Line2D]:
-    """How humans are shown beside drivers, and by what other than their own trials."""
-    if study.human not in study.groups:
-        return []
-    keys = [Line2D([], [], color="#555555", ls=":", lw=0.8, label="humans")]
-    if not study.human.measured:
-        dashed = Line2D([], [], color="#555555", ls="--", lw=0.8, label="published regression")
-        return [*keys, dashed]
-    if study.human.published_outcomes is None:
-        return keys
-    return [*keys, Line2D([], [], ls="", label=f"humans in C: the {HUMAN_TRIALS} published")]
+        axis.set(xlim=(-farthest_m - 1, farthest_m + 1), xticks=[-farthest_m, 0, farthest_m])

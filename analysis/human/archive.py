@@ -16,7 +16,6 @@ from merge_runner.text_safety import one_line
 
 MAX_FILE_BYTES = 64 * 2**20
 MAX_TOTAL_BYTES = 4 * 2**30
-PAGE = ".html"
 # Only these two can be unpacked in parts of a limited size.
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 # RuntimeError: a member is encrypted, or packed by a newer method.
@@ -49,11 +48,9 @@ class File:
 
 @contextmanager
 def open_files(path: Path) -> Iterator[list[File]]:
-    """All files of a folder and those below it, of a zip, or a page; raises UsageError."""
+    """All files of a folder and those below it, or of a zip; raises UsageError."""
     if path.is_dir():
         yield list(_files_below(path))
-    elif path.is_file() and path.suffix.lower() == PAGE:
-        yield [_file(path, path.name)]
     elif not path.exists():
         raise UsageError(f"there is no {path}: name the downloaded zip, or the folder of its files")
     else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,8 +17,6 @@ from merge_runner.text_safety import say
 if TYPE_CHECKING:
     import pandas as pd
 
-INTERRUPTED = 130
-MOST_ERRORS = 20
 
 human_app = typer.Typer(
     help="The human recordings, 4TU doi 10.4121/19550377.", no_args_is_help=True
@@ -28,8 +25,7 @@ PathArgument = Annotated[
     Path,
     typer.Argument(
         metavar="PATH",
-        help="The downloaded zip, the folder of its files, or the public velocity pages: a folder, "
-        "or one of them.",
+        help="The downloaded zip, the folder of its files, or one of the velocity pages.",
     ),
 ]
 
@@ -41,29 +37,23 @@ def human_import(path: PathArgument, db: DbOption = DEFAULT_DB) -> None:
     Those that are there stay as they are.
     """
     from merge_runner.results.store import Store
-    from merge_runner_analysis.data.imported_humans import human_trials, imported
+    from merge_runner_analysis.data.imported_humans import findings, human_trials
     from merge_runner_analysis.human.archive import open_files
     from merge_runner_analysis.human.load import import_trials, sort_files
 
-    try:
-        with open_files(path) as files:
-            sources = sort_files(files)
-            if not sources:
-                raise UsageError(
-                    f"no trial is in {path}: trials are experiment_N_iter_M.csv, and velocity "
-                    "pages are named like 4_-8.html; unpack a zip within the download first"
-                )
-            report = import_trials(sources, Store(db))
-    except KeyboardInterrupt:
-        say("interrupted: what is stored stays; run the same command again to go on")
-        sys.exit(INTERRUPTED)
+    with open_files(path) as files:
+        sources = sort_files(files)
+        if not sources:
+            raise UsageError(
+                f"no trial is in {path}: trials are experiment_N_iter_M.csv, and velocity pages "
+                "are named like 4_-8.html; unpack a zip within the download first"
+            )
+        report = import_trials(sources, Store(db))
     errors = [f"{name}: {reason}" for name, reason in report.unreadable]
     errors += [f"{trial} is stored with other values, which stay" for trial in report.differing]
-    for line in islice(errors, MOST_ERRORS):
+    for line in errors:
         say(f"error: {line}")
-    if len(errors) > MOST_ERRORS:
-        say(f"error: {len(errors) - MOST_ERRORS} more like these")
-    for line in imported(human_trials(db)).findings():
+    for line in findings(human_trials(db)):
         say(f"note: {line}")
     print_out(
         f"{report.added} trials added, {report.there} there already, {len(report.unreadable)} "
@@ -82,7 +72,7 @@ def human_status(db: DbOption = DEFAULT_DB, as_json: JsonOption = False) -> None
     notes: list[str] = []
     if db.exists() and not (trials := humans.human_trials(db)).empty:
         tables = {"pairs": humans.by_pair(trials), "conditions": humans.by_condition(trials)}
-        notes = list(humans.imported(trials).findings())
+        notes = list(humans.findings(trials))
     if as_json:
         counts = {name: table.to_dict("index") for name, table in tables.items()}
         print_out(json.dumps({**counts, "notes": notes} if tables else {}, ensure_ascii=False))

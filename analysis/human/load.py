@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import PurePath
 from typing import NamedTuple
 
-from rich.console import Console
-from rich.progress import track
-
 from merge_runner.records import TrialRecord
 from merge_runner.results.store import Store, query
 from merge_runner_analysis.data.reference_data import PAIRS
 from merge_runner_analysis.human.archive import File, Unreadable, refuse_bombs
-from merge_runner_analysis.human.record import SPECS, parse_csv, trial_record
-from merge_runner_analysis.human.velocity_pages import condition_of, trace_of, trials_of
+from merge_runner_analysis.human.record import (
+    SPECS,
+    condition_of,
+    parse_csv,
+    trace_of,
+    trial_record,
+    trials_of,
+)
 
 CHUNK = 100
 # The recorder wrote a PKL of each trial, too; unpickling it would run code in the file.
@@ -64,24 +66,14 @@ def sort_files(files: Iterable[File]) -> list[Source]:
 def import_trials(sources: Iterable[Source], store: Store) -> Report:
     """Store trials, some at a time; an error does not undo earlier ones. Raises StoreError."""
     report = Report()
-    shown = track(
-        sources,
-        "importing",
-        console=Console(stderr=True),
-        transient=True,
-        disable=not sys.stderr.isatty(),
-    )
-    records = (record for source in shown for record in _records(source, report))
+    records = (record for source in sources for record in _records(source, report))
     while chunk := list(islice(records, CHUNK)):
         # A trial that was imported from the other kind of file is there.
         known = dict(query(store.path, IMPORTED)[1])
-        new = []
-        for record in chunk:
-            spec = record.spec
-            if known.setdefault(spec.trial_id, spec.spec_hash) == spec.spec_hash:
-                new.append(record)
-        specs = {name: SPECS[name] for name in {record.spec.spec_hash for record in new}}
-        added, there, differing = store.add_recorded(new, specs)
+        specs = (known.setdefault(one.spec.trial_id, one.spec.spec_hash) for one in chunk)
+        new = [one for one, spec in zip(chunk, specs, strict=True) if one.spec.spec_hash == spec]
+        used = {name: SPECS[name] for name in {record.spec.spec_hash for record in new}}
+        added, there, differing = store.add_recorded(new, used)
         report.added += added
         report.there += there + len(chunk) - len(new)
         report.differing += differing
@@ -90,18 +82,17 @@ def import_trials(sources: Iterable[Source], store: Store) -> Report:
 
 def _records(source: Source, report: Report) -> Iterator[TrialRecord]:
     """The trials of a file; what cannot be read is reported."""
-    file, condition = source.file, source.condition
+    name, condition = source.file.name, source.condition
     try:
+        content = source.file.read()
         if not condition:
-            yield trial_record(parse_csv(file.read()), source.experiment, source.iteration)
+            yield trial_record(parse_csv(content), source.experiment, source.iteration)
             return
-        trials = list(trials_of(file.read(), condition))
+        for experiment, iteration, lines in trials_of(content, condition):
+            try:
+                yield trial_record(trace_of(lines, condition), experiment, iteration, condition)
+            except Unreadable as exc:
+                trial = f"{name}: {PAIRS[experiment]}, trial {iteration}"
+                report.unreadable.append((trial, str(exc)))
     except Unreadable as exc:
-        report.unreadable.append((file.name, str(exc)))
-        return
-    for experiment, iteration, lines in trials:
-        try:
-            yield trial_record(trace_of(lines, condition), experiment, iteration, condition)
-        except Unreadable as exc:
-            name = f"{file.name}: {PAIRS[experiment]}, trial {iteration}"
-            report.unreadable.append((name, str(exc)))
+        report.unreadable.append((name, str(exc)))

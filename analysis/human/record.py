@@ -1,15 +1,25 @@
-"""A recorded trial: read from its CSV file, and converted for the database.
+"""A recorded trial: read from its CSV file or a velocity page, and converted for the database.
 
-The experiment's recorder wrote series under dotted names, and scalars only in the first row.
+The experiment's recorder wrote series under dotted names, and scalars only in the first row. The
+pages docs/plots/CONDITION.html of github.com/tud-hri/simple-merging-experiment show the speed of
+both vehicles of every trial at 20 Hz, from its start: the left vehicle in the first panel, the
+right one in the second, drawn solid where it went first, dashed where second, and dotted after a
+collision. Positions follow: the experiment moves a vehicle by the mean of its speeds before and
+after a step. Plotly's ``write_html`` made the pages; nothing of a page is run.
 """
 
 from __future__ import annotations
 
+import base64
 import io
+import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
+from pathlib import PurePath
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -70,6 +80,17 @@ PAGE_SPEC = canonical_json(
 )
 PAGE_SPEC_HASH = spec_hash(PAGE_SPEC)
 SPECS = {SPEC_HASH: SPEC, PAGE_SPEC_HASH: PAGE_SPEC}
+# The pages leave out the letter of a condition.
+PAGES = {f"{name.partition('_')[2]}.html": name for name in HUMAN_CONDITIONS}
+BEGIN = b"Plotly.newPlot("
+TRIAL = re.compile(r"([1-9])-([0-9]{1,4})(?:<extra></extra>)?")
+PANELS: dict[str, Side] = {"x": "left", "x2": "right"}
+FIRST, SECOND, COLLIDED = "solid", "dash", "dot"
+TIME_OUT_S = 30.0
+# Times are written in s, so that equal steps differ by a rounding.
+STEP_TOLERANCE_S = 1e-6
+EXPERIMENTS = {int(pair.removeprefix("pair")): experiment for experiment, pair in PAIRS.items()}
+Lines = dict[Side, dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +110,10 @@ class Trace:
 def parse_csv(content: bytes) -> Trace:
     """Read a trial's CSV file; raises Unreadable."""
     try:
-        table = pd.read_csv(io.BytesIO(content), usecols=NEEDED.__contains__, dtype=str)
-        # pandas' own parser of numbers may miss the last bit.
-        numbers = [name for name in table if name != "end_state"]
-        table[numbers] = table[numbers].astype(float)
+        table = pd.read_csv(
+            io.BytesIO(content), usecols=NEEDED.__contains__, dtype=dict.fromkeys(SERIES, float),
+            float_precision="round_trip",  # or the last bit may be missed
+        )  # fmt: skip
     except (ValueError, MemoryError) as exc:  # pandas' own errors are ValueErrors
         raise Unreadable(f"it is not the CSV table of a trial: {one_line(str(exc))}") from exc
     if missing := sorted(set(NEEDED) - set(table)):
@@ -198,3 +219,78 @@ def _states(trace: Trace) -> Iterator[StateRow]:
             acceleration_mps2 = (mps[sample] - mps[max(sample - 1, 0)]) / trace.step_s
             position_m = trace.positions_m[side][sample]
             yield StateRow(step, time_s, side, position_m, mps[sample], acceleration_mps2)
+
+
+def condition_of(name: str) -> str | None:
+    """The condition whose page has this file name, or None."""
+    file = PurePath(name).name
+    return PAGES.get(file) or PAGES.get(file.partition("_")[2])
+
+
+def trials_of(page: bytes, condition: str) -> Iterator[tuple[int, int, Lines]]:
+    """Experiment, iteration and both lines of each trial; raises Unreadable for a whole page."""
+    trials: dict[tuple[int, int], Lines] = {}
+    try:
+        # The page holds all of Plotly before the last plot, whose lines are its first list.
+        call = page[page.rindex(BEGIN) + len(BEGIN) :].decode("utf-8")
+        lines, _ = json.JSONDecoder().raw_decode(call, call.index("["))
+        for line in lines:
+            # The words that the page shows at the pointer: pair-iteration.
+            words = line.get("hovertemplate") or line.get("text") or ""
+            label = TRIAL.fullmatch(str(words[0] if isinstance(words, list) else words))
+            side = PANELS.get(line.get("xaxis", "x"))
+            if label and side:  # the legend has lines of its own
+                trial = EXPERIMENTS[int(label[1])], int(label[2])
+                trials.setdefault(trial, {})[side] = line
+    except (ValueError, AttributeError, TypeError, RecursionError) as exc:
+        raise Unreadable("it is no page that Plotly wrote, or is cut off") from exc
+    if not trials:
+        raise Unreadable(f"it shows no trial, as the page of {condition} does")
+    for (experiment, iteration), shown in sorted(trials.items()):
+        yield experiment, iteration, shown
+
+
+def trace_of(trial: Lines, condition: str) -> Trace:
+    """A trial's trace, with positions from its speeds; raises Unreadable."""
+    try:
+        numbers = {(axis, side): _numbers(trial[side][axis]) for axis in "xy" for side in SIDES}
+        shown = pd.DataFrame(numbers, dtype=float)
+    except (KeyError, TypeError, ValueError) as exc:
+        raise Unreadable(f"it does not show both vehicles, sample by sample: {exc!r}") from exc
+    times_s, velocities = shown["x"].to_numpy(), shown["y"]
+    step_s = round(float(times_s[-1, 0]) / max(len(times_s) - 1, 1), 9) if len(times_s) else 0.0
+    off_s = np.abs(times_s - np.arange(len(times_s))[:, None] * step_s)
+    equal = step_s > 0 and (off_s <= STEP_TOLERANCE_S).all()
+    if not equal or not np.isfinite(velocities).all(axis=None):
+        raise Unreadable("its samples are no finite numbers at equal steps from 0 s on")
+    steps = (velocities + velocities.shift()).fillna(0.0) / 2 * step_s
+    positions = steps.cumsum() + HUMAN_CONDITIONS[condition].starts_m(TRACK)
+    return Trace(
+        step_s=step_s,
+        end_state=_end_state(trial, dict(positions.iloc[-1]), times_s[-1, 0]),
+        positions_m={side: positions[side].tolist() for side in SIDES},
+        velocities_mps={side: velocities[side].tolist() for side in SIDES},
+    )
+
+
+def _numbers(values: object) -> object:
+    """The numbers of a line: a list, or base64 of little-endian ones."""
+    if isinstance(values, dict):
+        content = base64.b64decode(values["bdata"], validate=True)
+        return np.frombuffer(content, np.dtype(values["dtype"]).newbyteorder("<"))
+    return values
+
+
+def _end_state(trial: Lines, ends_m: dict[Side, float], end_s: float) -> str:
+    """The recorder's word for the end, of how the lines are drawn and where the vehicles are."""
+    dashes = [(trial[side].get("line") or {}).get("dash", FIRST) for side in SIDES]
+    if dashes == [COLLIDED, COLLIDED]:
+        return "Collided"
+    first = max(SIDES, key=lambda side: ends_m[side])
+    if dashes != [FIRST if side == first else SECOND for side in SIDES]:
+        raise Unreadable(f"its lines are {' and '.join(dashes)}, but {first} is ahead at the end")
+    if ends_m[first] >= TRACK.end_m - END_TOLERANCE_M:
+        return "Finished"
+    if end_s >= TIME_OUT_S - STEP_TOLERANCE_S:
+        return "Time ran out"
+    raise Unreadable(f"it ends after {end_s:g} s with no vehicle beyond {ends_m[first]:.1f} m")

@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from difflib import unified_diff
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import pandas as pd
+from markupsafe import Markup
 
+from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import title_of
 from merge_runner.results.provenance import program
 from merge_runner_analysis.data.derived_cache import finished, keep_finished
 from merge_runner_analysis.data.load import load_each
-from merge_runner_analysis.data.provenance import provenance
+from merge_runner_analysis.data.provenance import Provenance, provenance, tally
 from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Study, levels_of
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
 from merge_runner_analysis.names import BASELINE, DESCRIPTIONS
-from merge_runner_analysis.report.alarms import alarms, posing
-from merge_runner_analysis.stats.factors import levels_by_factor
 from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import finished_tables
 from merge_runner_analysis.tables.against import FILES, against
+from merge_runner_analysis.tables.differences import verdicts
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
-from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.verdict_words import TABLE, sentences
 
 # What each variant asks first: of all of them in the same condition, as far as that was played.
@@ -42,26 +40,36 @@ FROM decisions JOIN trials USING (trial_id, spec_hash)
 WHERE decision = 0 AND prompt IS NOT NULL GROUP BY variant, spec_hash
 ORDER BY min((condition, decisions.side, trial_id)) DESC
 """
-TEMPLATES = Path(__file__).with_name("templates")
 # At most so many trials are listed for a row: a page with all of them would be unwieldy.
 LISTED = 300
+# The share of a group's decisions above which an alarm is raised: a convention.
+MANY_FALLBACKS = 0.05
+# The worst first: what each alarm says of the groups that it names.
+MEANINGS = {
+    "Another model answered": "These trials are not what they claim to be.",
+    "A scripted stand-in answered": "These rows stand last, are in no conclusion, and never beside "
+    "the paper's row of that model.",
+    "Too few valid decisions": "What was driven is mostly not what the model decided: no value, "
+    "test or conclusion rests on these trials.",
+    "Trials or answers repeat earlier ones": "Where a cache on the way answered, or the "
+    "temperature is 0, they are no samples, and intervals and tests claim too much.",
+    "Trials failed": "They are in no measure; the same sweep again plays them anew.",
+    "Many fallbacks": "There the older plan was driven, or none: tables --without-fallbacks shows "
+    "whether that changes the results.",
+    "Attempts of unknown fate": "A run was killed before their reply was seen: they may have been "
+    "paid for.",
+    "Several settings under one name": "They are never pooled: all but the most frequent carry a "
+    "mark.",
+}
 LIBRARIES = ("statsmodels", "scipy", "numpy", "pandas", "matplotlib")
 
 
-def write_report(
-    db: Path,
-    models: Sequence[str] | None,
-    out: Path,
-    files: Path | None,
-    where: Mapping[str, Sequence[str]] | None = None,
-    file: str | None = None,
-) -> Iterator[Path]:
+def write_report(study: Study, out: Path, files: Path | None) -> Iterator[Path]:
     """Write the report, and every table and figure into the folder ``files``; yields the paths.
 
-    ``models``, ``where`` and ``file`` restrict the report as they do a study. Raises UsageError.
+    Raises UsageError.
     """
-    study = Study(db, models, where, file)
-    tables = finished_tables(db, study=study)
+    tables = finished_tables(study.db, study=study)
     if files is not None:
         yield from write_figures(study, files)
         for table in tables:
@@ -100,9 +108,8 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     def number(table: Table, row: Row, _column: Column) -> int:
         return numbers.setdefault(sources_of(study, table, row), len(numbers) + 1)
 
-    without_factors = not levels_by_factor(study)
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
+        loader=jinja2.FileSystemLoader(Path(__file__).with_name("templates")),
         autoescape=True,
         # A misspelt name fails the report rather than leaving a blank in it.
         undefined=jinja2.StrictUndefined,
@@ -111,92 +118,61 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
     )
     origin = provenance(study.db)
     finished = next((table for table in tables if table.name == TABLE), None)
-    said = sentences((finished or verdicts(study)).rows)
-    views = {
-        table.name: table_view(table, number)
-        for table in tables
-        if table.name != "factors" or not without_factors
-    }
+    descriptions, levels, prompts = design(study)
+    headline, *others = sentences((finished or verdicts(study)).rows)
+    beside = (against(table, study) if table.name in FILES else table for table in tables)
     return environment.get_template("report.html").render(
         study=study,
-        design=design(study, origin.sent),
+        descriptions=descriptions,
+        levels=levels,
+        prompts=prompts,
         alarms=alarms(study, origin),
-        headline=said[0],
-        sentences=said[1:],
-        posing=posing(study),
-        figures=[
-            {"name": name, "caption": FIGURES[name].caption, "data": data}
-            for name, data in figures.items()
-            if name != "factors" or not without_factors
-        ],
-        factors=views.pop("factors", None),
-        tables=list(views.values()),
-        beside=[
-            table_view(against(table, study), number) for table in tables if table.name in FILES
-        ],
-        sources=[(place, sources) for sources, place in numbers.items()],
+        headline=headline,
+        sentences=others,
+        figures=[(name, FIGURES[name].caption, data) for name, data in figures.items()],
+        tables=[table_view(table, number) for table in beside],
+        numbers=numbers,
         listed=LISTED,
         command=sql_command(study),
         libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
         origin=origin,
-        records=_records,
-        readings=_records(published("readings")),
-        sources_cited=_records(published("sources")),
+        plain=_plain,
+        readings=published("readings"),
+        cited=published("sources"),
         program=program(),
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Design:
-    """What a report says before any result.
+def design(study: Study) -> tuple[list[str], dict[str, list[str]], dict[str, str]]:
+    """Read the design of a study from what was played: descriptions, levels, prompts.
 
-    ``rows`` name the levels of each factor, the conditions and the trials; ``prompts`` have a title
-    and the text of the first prompt, of variants the lines that differ from the baseline's.
-    """
-
-    descriptions: list[str]
-    rows: list[tuple[str, str]]
-    prompts: list[tuple[str, str]]
-
-
-def design(study: Study, sent: Mapping[str, Mapping[str, Mapping[str, object]]]) -> Design:
-    """Read the design of a study from what was played.
-
-    ``sent`` holds the parameters that models were asked with, by spec hash and side.
+    The levels are those of each factor, the conditions and the trials; prompts have by title the
+    text of the first one, of variants the lines that differ from the baseline's.
     """
     found = load_each({"descriptions": DESCRIPTIONS, "prompts": PROMPTS}, study.db)
-    specs = {name for group in study.played for name in group.trials["spec_hash"]}
-    prompts = found["prompts"]
-    own = prompts.loc[prompts["spec_hash"].isin(specs), ["variant", "prompt"]]
-    texts = dict(own.itertuples(index=False))
-    shown = [name for name in dict.fromkeys(g.setting for g in study.played) if name in texts]
+    played, levels = study.played, levels_of(study.played, study.order)
+    levels.pop("model", None)  # the drivers say it
+    specs = {name for group in played for name in group.trials["spec_hash"]}
+    prompts = found["prompts"][found["prompts"]["spec_hash"].isin(specs)]
+    texts = dict(zip(prompts["variant"], prompts["prompt"], strict=True))
     baseline = texts.get(BASELINE)
-    levels = levels_of(study.played, study.order)
-    factors = {name: levels[name] for name in levels if name != "model"}
-    drivers = list(dict.fromkeys(group.label for group in study.played))
-    driven = {name for group in study.played for name in group.trials["condition"]}
-    parameters = dict.fromkeys(
-        f"{group.label}: " + ", ".join(f"{name} = {value}" for name, value in asked.items())
-        for group in study.played
-        for asked in sent.get(group.spec_hash or "", {}).values()
-        if asked
-    )
-    rows = {"drivers": drivers, "parameters": parameters, **factors, "conditions": sorted(driven)}
-    trials = sum(len(group.trials) for group in study.played)
-    return Design(
+    shown = {}
+    for name in dict.fromkeys(group.setting for group in played if group.setting in texts):
+        title, text = title_of(name), texts[name]
+        if baseline and name != BASELINE:
+            title, text = f"{title}: against the baseline", _changes(baseline, text)
+        shown[title] = text
+    return (
         list(found["descriptions"]["description"])
         if study.source is None
         else [study.source.file.description] * bool(study.source.file.description),
-        [
-            *((name, ", ".join(values)) for name, values in rows.items() if values),
-            ("trials", str(trials)),
-        ],
-        [
-            (f"{title_of(name)}: first prompt", texts[name])
-            if baseline is None or name == BASELINE
-            else (f"{title_of(name)}: against the baseline", _changes(baseline, texts[name]))
-            for name in shown
-        ],
+        {
+            "drivers": [group.label for group in played],
+            **{name: [*known] for name, known in levels.items()},
+            "conditions": sorted({name for group in played for name in group.trials["condition"]}),
+            "trials": [str(sum(len(group.trials) for group in played))],
+        },
+        shown,
     )
 
 
@@ -206,9 +182,60 @@ def _changes(baseline: str, prompt: str) -> str:
     return "\n".join(line for line in lines if not line.startswith(("---", "+++", "@@")))
 
 
-def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """Rows for a template: missing values become empty text, whole floats integers."""
-    rounded = frame.round(dict.fromkeys(frame.select_dtypes("number"), 6)).convert_dtypes()
-    shown = rounded.astype(object).where(frame.notna(), "")
-    records: list[dict[str, Any]] = shown.to_dict(orient="records")
-    return records
+def _plain(rows: pd.DataFrame) -> Markup:
+    """Rows of the database as HTML, under the names of their columns."""
+    named = rows.convert_dtypes().rename(
+        columns=lambda name: name.replace("_usd", " (USD)").replace("_", " ")
+    )
+    with pd.option_context("display.max_colwidth", None):
+        return Markup(  # noqa: S704 # pandas escapes it
+            named.to_html(index=False, na_rep="", classes="plain", float_format="{:.6g}".format)
+        )
+
+
+def alarms(study: Study, origin: Provenance) -> dict[str, str]:
+    """What casts doubt on the results of a study by title, the worst first."""
+    found: dict[str, list[str]] = {title: [] for title in MEANINGS}
+    for title, text in _found(study, origin):
+        found[title].append(text)
+    return {
+        title: f"{'; '.join(texts)}. {MEANINGS[title]}" for title, texts in found.items() if texts
+    }
+
+
+def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
+    for one in origin.mismatches.itertuples():
+        answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
+        said = f"{one.requested} was asked for, {one.served} answered: {answers}, in {one.sweeps}"
+        yield "Another model answered", said
+    for group in (*study.unjudged, *study.unjudged_asked):
+        yield "Too few valid decisions", f"{group.id}: {group.unjudged}"
+    names: dict[str, dict[str, None]] = {}
+    for group in study.played:
+        names.setdefault(group.name, {})[group.name + group.mark] = None
+        trials, counts = len(group.trials), tally(study, group)
+        # A mock model's own name is honest.
+        if group.scripted and MOCKS.isdisjoint(group.models):
+            yield "A scripted stand-in answered", f"{group.id}: {group.posing}"
+        if group.equal:
+            yield (
+                "Trials or answers repeat earlier ones",
+                f"{group.id}: {group.equal} of {trials} trials are as an earlier one to the last "
+                "state; each counts",
+            )
+        if failed := counts["failed"]:
+            reasons = group.trials["error"].dropna()
+            why = reasons.mode().get(0, "no reason is stored")
+            more = ", among other reasons" if reasons.nunique() > 1 else ""
+            yield "Trials failed", f"{failed} of {trials} of {group.id} ({why}{more})"
+        fallbacks, decisions = counts["fallback"], counts["decisions"]
+        if not group.unjudged and fallbacks > MANY_FALLBACKS * decisions:
+            share = f"{100 * fallbacks / decisions:.1f} %"
+            said = f"{fallbacks} of {decisions} decisions of {group.id} ({share})"
+            yield "Many fallbacks", said
+        if counts["unknown"]:
+            said = f"{counts['unknown']} of {counts['attempts']} of {group.id}"
+            yield "Attempts of unknown fate", said
+    for marked in names.values():
+        if len(marked) > 1:
+            yield "Several settings under one name", ", ".join(marked)

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
+from scipy import optimize, stats
 
 from merge_runner_analysis.data.study import Group, Study, in_one_study
 from merge_runner_analysis.metrics import Metric
@@ -42,12 +42,7 @@ class Cells:
     def rates(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Both rates with these weights, each with the trials that it is as good as."""
         weights = self.n * self.m / (self.n + self.m)
-        weights = weights / weights.sum()
-        first, second = (
-            (float(weights @ (k / size)), 1 / float(weights**2 @ (1 / size)))
-            for k, size in ((self.a, self.n), (self.b, self.m))
-        )
-        return first, second
+        return weighted(self.a, self.n, weights), weighted(self.b, self.m, weights)
 
     @property
     def p(self) -> float:
@@ -60,6 +55,14 @@ class Cells:
         # As likely but for rounding is as likely.
         likely = chances <= chances[self.a.sum() - least] * (1 + 1e-7)
         return min(1.0, float(chances[likely].sum() / chances.sum()))
+
+
+def weighted(
+    k: NDArray[np.int_], n: NDArray[np.int_], weights: NDArray[np.float64]
+) -> tuple[float, float]:
+    """A rate of which conditions have weights, and the trials that it is as good as."""
+    shares = weights / weights.sum()
+    return float(shares @ (k / n)), 1 / float(shares**2 @ (1 / n))
 
 
 def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cells | None:
@@ -84,18 +87,17 @@ def difference_of_rates(rates: Sequence[tuple[float, float]]) -> Difference:
 
     Its p is the level at which that interval leaves 0 out.
     """
-    value = sum(rate if place % 2 == 0 else -rate for place, (rate, _) in enumerate(rates))
+    low, high = newcombe(rates)
+    value = sum(rate for rate, _ in rates[::2]) - sum(rate for rate, _ in rates[1::2])
 
     def excludes_zero_by(z: float) -> float:
         low, high = newcombe(rates, z)
         return low if value > 0 else -high
 
-    largest = 30.0  # of this quantile p is 0 to 190 digits
-    z = 0.0
-    if value:
-        ends = excludes_zero_by(largest)
-        z = largest if ends > 0 else float(optimize.brentq(excludes_zero_by, 0.0, largest))
-    return Difference(value, *newcombe(rates), two_sided_p(z), None)
+    z = 30.0 if value else 0.0  # the largest; of this quantile p is 0 to 190 digits
+    if value and excludes_zero_by(z) <= 0:
+        z = float(optimize.brentq(excludes_zero_by, 0.0, z))
+    return Difference(value, low, high, two_sided_p(z), None)
 
 
 def detectable_rate(n: int, m: int, rate: float) -> float | None:
@@ -106,28 +108,20 @@ def detectable_rate(n: int, m: int, rate: float) -> float | None:
     """
     found = rejected(n, m) @ stats.binom.pmf(np.arange(m + 1), m, rate)
 
-    def power(other: float) -> float:
-        return float(stats.binom.pmf(np.arange(n + 1), n, other) @ found)
+    def enough(other: float) -> float:
+        return float(stats.binom.pmf(np.arange(n + 1), n, other) @ found) - POWER
 
-    ends = [end for end in (0.0, 1.0) if power(end) >= POWER]
-    return min(
-        (abs(optimize.brentq(lambda x: power(x) - POWER, rate, end) - rate) for end in ends),
-        default=None,
-    )
+    ends = [end for end in (0.0, 1.0) if enough(end) >= 0]
+    return min((abs(optimize.brentq(enough, rate, end) - rate) for end in ends), default=None)
 
 
 @cache
 def rejected(n: int, m: int) -> NDArray[np.bool_]:
     """Of all outcomes, successes of n by successes of m, those with a Fisher's p below .05."""
-    counts = np.arange(n + 1), np.arange(m + 1)
-    # Log of k! (n - k)!: what is left of binomial coefficients when they are normalised.
-    first, second = (special.gammaln(k + 1) + special.gammaln(k[::-1] + 1) for k in counts)
     found = np.empty((n + 1, m + 1), dtype=bool)
     for total in range(n + m + 1):
         a = np.arange(max(0, total - m), min(n, total) + 1)
-        log = -first[a] - second[total - a]
-        p = np.exp(log - log.max())
-        p /= p.sum()
+        p = stats.hypergeom.pmf(a, n + m, total, n)
         order = np.argsort(p)
         # As likely but for rounding is as likely.
         last = np.searchsorted(p[order], p * (1 + 1e-7), side="right") - 1
@@ -165,43 +159,36 @@ def contrast(
     the cells that all have. None where these are of several studies, share no cell or have
     undecided trials; and for medians, which have no test.
     """
-    frames = trials_by_cell(study, groups, metric, cell)
-    if frames is None or metric.estimator == "median":
+    frames = trials_by_cell(study, groups, metric, cell, shared=len(groups) > 2)
+    if metric.estimator == "median" or not frames:
         return None
-    if len(frames) > 2:
-        frames = in_shared_cells(frames)
     pairs = list(zip(frames[::2], frames[1::2], strict=True))
-    if metric.rate:
-        cells = [shared_cells(*pair, metric.column) for pair in pairs]
-        if None in cells:
-            return None
-        one, *other = filter(None, cells)
-        if not other:
-            return contrast_cells(one)
-        return difference_of_rates([*one.rates, *reversed(other[0].rates)])
-    one_mean, *other_mean = (contrast_means(*pair, metric.column) for pair in pairs)
-    if one_mean is None or not other_mean:
-        return one_mean
-    return difference(one_mean, other_mean[0]) if other_mean[0] else None
+    if not metric.rate:
+        one_mean, *other_mean = (contrast_means(*pair, metric.column) for pair in pairs)
+        if one_mean is None or not other_mean:
+            return one_mean
+        return difference(one_mean, other_mean[0]) if other_mean[0] else None
+    cells = [found for pair in pairs if (found := shared_cells(*pair, metric.column))]
+    if len(cells) < len(pairs):
+        return None
+    if len(cells) == 1:
+        return contrast_cells(cells[0])
+    return difference_of_rates([*cells[0].rates, *cells[1].rates[::-1]])
 
 
 def trials_by_cell(
-    study: Study, groups: Sequence[Group], metric: Metric, cell: str
-) -> list[pd.DataFrame] | None:
-    """The trials of each group with a measure, their cell as ``condition``.
+    study: Study, groups: Sequence[Group], metric: Metric, cell: str, *, shared: bool
+) -> list[pd.DataFrame]:
+    """The trials of each group with a measure, their cell as ``condition``, perhaps as all have.
 
-    None where the groups are of several studies or have undecided trials.
+    Nothing where the groups are of several studies or have undecided trials.
     """
     if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
-        return None
+        return []
     every = [trials_of(group, metric).dropna(subset=[metric.column]) for group in groups]
-    return [frame.assign(condition=frame[cell]) for frame in every]
-
-
-def in_shared_cells(frames: list[pd.DataFrame]) -> list[pd.DataFrame]:
-    """The trials in the conditions that all frames have."""
-    shared = set.intersection(*(set(frame["condition"]) for frame in frames))
-    return [frame[frame["condition"].isin(shared)] for frame in frames]
+    every = [frame.assign(condition=frame[cell]) for frame in every]
+    kept = (set.intersection if shared else set.union)(*(set(one["condition"]) for one in every))
+    return [frame[frame["condition"].isin(kept)] for frame in every]
 
 
 def corrected(p: list[float]) -> list[float]:

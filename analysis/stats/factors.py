@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cache
 from math import isnan
@@ -11,10 +10,7 @@ import pandas as pd
 
 from merge_runner_analysis.data.study import Group, Study, levels_of
 from merge_runner_analysis.metrics import Metric
-from merge_runner_analysis.stats.contrasts import contrast, in_shared_cells, trials_by_cell
-from merge_runner_analysis.stats.intervals import Difference
-
-Cell = tuple[str, ...]
+from merge_runner_analysis.stats.contrasts import trials_by_cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +36,9 @@ class Level:
         return f"{self.at}/" * bool(self.at) + f"{self.factor}={self.name}{self.mark}"
 
     @property
-    def cells(self) -> Counter[Cell]:
-        """How many trials each cell has that ended."""
-        return Counter(self.pooled.ended["cell"])
+    def cells(self) -> set[tuple[str, ...]]:
+        """The cells of its trials that ended."""
+        return {*self.pooled.ended["cell"]}
 
 
 @cache
@@ -79,22 +75,18 @@ def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) 
     return Level(factor, name, tuple(group.id for group in groups), pooled, posing, mark, at)
 
 
-def difference(study: Study, metric: Metric, *levels: Level) -> Difference | None:
-    """A level minus the first one, or how far that differs from the same of two others."""
-    return contrast(study, [level.pooled for level in levels], metric, "cell")
-
-
 def difference_of_medians(study: Study, metric: Metric, level: Level, first: Level) -> float | None:
     """A level's median minus that of the first one, in the cells that both have."""
-    frames = trials_by_cell(study, [level.pooled, first.pooled], metric, "cell")
-    if frames is None:
-        return None
-    one, other = (frame[metric.column].median() for frame in in_shared_cells(frames))
-    return None if isnan(one) or isnan(other) else float(one - other)
+    groups = (level.pooled, first.pooled)
+    medians = [
+        frame[metric.column].median()
+        for frame in trials_by_cell(study, groups, metric, "cell", shared=True)
+    ]
+    return None if not medians or isnan(sum(medians)) else float(medians[0] - medians[1])
 
 
 def balance(levels: list[Level]) -> str:
-    """Whether all levels of a factor have the same cells, equally often."""
+    """Whether all levels of a factor have the same cells."""
     found = {level.name: level.cells for level in levels}
     every = set().union(*found.values())
     lacking = [
@@ -104,9 +96,4 @@ def balance(levels: list[Level]) -> str:
     ]
     if lacking:
         return f"not balanced, so that values over all trials are confounded: {'; '.join(lacking)}"
-    often = (
-        "equally often"
-        if len({tuple(sorted(c.items())) for c in found.values()}) == 1
-        else ("but not equally often, so that values over all trials weigh these differently")
-    )
-    return f"every level has the same {len(every)} cells, {often}"
+    return f"every level has the same {len(every)} cells"

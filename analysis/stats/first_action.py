@@ -7,21 +7,20 @@ pair.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from math import sqrt
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 from merge_runner.records import SIDES
 from merge_runner_analysis.data.driver_words import has_chance
 from merge_runner_analysis.data.reference_data import human_outcomes
 from merge_runner_analysis.data.study import Group, Study, of_trials
 from merge_runner_analysis.stats.intervals import Estimate, estimate
-from merge_runner_analysis.stats.regressions import Array, unfit_for_logit
+from merge_runner_analysis.stats.regressions import Array, unfit_for_logit, who_first_data
 
 # One row a vehicle: the acceleration of the first step that its driver controls, and the word of
 # the first decision. Where each driver takes control at its own exit the other one cruises yet:
@@ -42,28 +41,22 @@ HOLD_MPS2 = 0.2
 SAME_MPS2 = 1e-9
 
 
-@dataclass(frozen=True)
-class Seat:
-    """A driver of a group: one on both sides, or one of a mixed pair, the ego on the left."""
+class Seat(NamedTuple):
+    """A driver of a group: of a mixed pair one on a ``side``, the ego on the left, else both."""
 
     group: Group
-    sides: tuple[int, ...]
-
-    @property
-    def side(self) -> str:
-        """``left`` or ``right`` of a mixed pair, else empty."""
-        return SIDES[self.sides[0]] if len(self.sides) == 1 else ""
+    side: str = ""
 
     @property
     def name(self) -> str:
         """The group's label, or that of one of a mixed pair."""
-        model = self.group.models[self.sides[0]]
-        return self.group.label_of(model) if self.side else self.group.label
+        one = f"{self.group.models[SIDES.index(self.side)]} of " if self.side else ""
+        return one + self.group.label
 
 
 def seats(group: Group) -> list[Seat]:
     """Return the drivers of a group."""
-    return [Seat(group, (0, 1))] if len(group.models) == 1 else [Seat(group, (s,)) for s in (0, 1)]
+    return [Seat(group)] if len(group.models) == 1 else [Seat(group, side) for side in SIDES]
 
 
 @cache
@@ -105,7 +98,7 @@ def _stored(study: Study, seat: Seat) -> pd.DataFrame:
                "pair", "ego"]  # fmt: skip
     trials = seat.group.ended[columns]
     rows = of_trials(study.read(FIRST_ACTIONS), trials).merge(trials, on=["trial_id", "spec_hash"])
-    return rows[rows["side"].isin([SIDES[side] for side in seat.sides])]
+    return rows[rows["side"] == seat.side] if seat.side else rows
 
 
 def slope(rows: pd.DataFrame) -> Estimate | None:
@@ -122,14 +115,12 @@ def _least_squares(rows: pd.DataFrame, design: Array) -> Estimate | None:
     """Return the last coefficient; None where the rows do not determine it or its error."""
     from statsmodels.regression.linear_model import OLS
 
-    terms = design.shape[1]
-    if rows["cluster"].nunique() <= terms or np.linalg.matrix_rank(design) < terms:
+    clusters, terms = rows["cluster"].nunique(), design.shape[1]
+    if clusters <= terms or np.linalg.matrix_rank(design) < terms:
         return None
-    by_cluster = {"groups": rows["cluster"].to_numpy()}
     fit = OLS(rows["first_mps2"].to_numpy(float), design).fit(
-        cov_type="cluster", cov_kwds=by_cluster, use_t=True
+        cov_type="cluster", cov_kwds={"groups": rows["cluster"].to_numpy()}, use_t=True
     )
-    clusters = rows["cluster"].nunique()
     return estimate(float(fit.params[-1]), float(fit.bse[-1]), clusters - 1, len(rows))
 
 
@@ -141,27 +132,25 @@ def exchange_rate(rows: pd.DataFrame) -> Estimate | None:
     """
     spoken = rows[rows["tactical"].notna()]
     points = spoken[["headway_m", "velocity_mps"]].to_numpy(float)
-    merging = (spoken["tactical"] == "M").to_numpy(float)
-    return _ratio(points, merging, spoken["cluster"].to_numpy())
+    return _ratio(points, spoken["tactical"] == "M", spoken["cluster"])
 
 
 @cache
 def human_exchange_rate() -> Estimate | None:
     """Return the same of who merged first in the published human trials: 3.304 / 1.111."""
-    trials = human_outcomes().query("status == 'finished'")
-    points = trials[["projected_headway_m", "relative_velocity_mps"]].to_numpy(float)
-    left = (trials["merged_first"] == "left").to_numpy(float)
-    return _ratio(points, left, np.arange(len(trials)))
+    design, left = who_first_data(human_outcomes())
+    return _ratio(design[:, 1:], left, np.arange(len(left)))
 
 
-def _ratio(points: Array, chosen: Array, cluster: NDArray[Any]) -> Estimate | None:
+def _ratio(points: Array, chosen: ArrayLike, cluster: ArrayLike) -> Estimate | None:
     from statsmodels.discrete.discrete_model import Logit
 
-    design = np.column_stack([np.ones(len(points)), points])
+    design, chosen = np.column_stack([np.ones(len(points)), points]), np.asarray(chosen, float)
     if unfit_for_logit(design, chosen):
         return None
-    fit = Logit(chosen, design).fit(disp=0, cov_type="cluster", cov_kwds={"groups": cluster})
+    groups = np.asarray(cluster)
+    fit = Logit(chosen, design).fit(disp=0, cov_type="cluster", cov_kwds={"groups": groups})
     _, headway, velocity = map(float, fit.params)
     gradient = np.array([0.0, velocity / headway**2, -1 / headway])
     se = sqrt(float(gradient @ fit.cov_params() @ gradient))
-    return estimate(-velocity / headway, se, len(np.unique(cluster)) - 1, len(points))
+    return estimate(-velocity / headway, se, len(np.unique(groups)) - 1, len(points))

@@ -1,4 +1,4 @@
-"""The qualitative indicators I1 to I4: by the paper's rule, and by tests that hold.
+"""The qualitative indicators I1 to I5: by the paper's rule, and by tests that hold.
 
 I1: merging first becomes likelier with projected headway. I2: and less likely with relative
 velocity. I3: the gap grows with the size of the projected headway. I4: it does not depend on the
@@ -13,15 +13,37 @@ paper's own regression (its eq. 2) tells a vehicle that is ahead and faster from
 and slower, so that no further term is needed. Each difference is tested by two one-sided tests
 (Schuirmann 1987) with HC3 errors; all of them must pass, which needs no correction for their number
 (an intersection-union test; Berger 1982).
+
+I5 asks whether the acceleration is piecewise constant. A trial counts once, with the mean gain (see
+``intermittency``) of its vehicles that acted. The test is one-sided: I5 holds where the whole 95 %
+interval of the mean gain lies above 0. How like the humans a driver is in it is a number beside
+that, in human standard deviations, which decides nothing. That difference is taken within
+conditions, as another mix of conditions is none.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
 
-from merge_runner_analysis.stats.regressions import Regression
+import numpy as np
+import pandas as pd
+
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats.intervals import Estimate, difference, mean
+from merge_runner_analysis.stats.regressions import (
+    Regression,
+    gap_ols,
+    who_first_firth,
+    who_first_logit,
+)
 
 ALPHA = 0.05
+NO_ACTION = "no finished trial with control action"
+PUBLISHED = "as published, no human traces are imported"
+BY_EYE = "by eye, the paper"
 NONE_APART = "no two played conditions differ in relative velocity alone"
 INDICATORS = {
     "I1": "The probability of merging first increases with projected headway advantage.",
@@ -39,8 +61,7 @@ TESTED = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(NamedTuple):
     """Whether an indicator holds; None where the data cannot tell, for the reason ``why``."""
 
     passed: bool | None
@@ -72,3 +93,145 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Verdict:
     if fit.equivalence_p is None:
         return Verdict(None, NONE_APART)
     return Verdict(fit.equivalence_p < ALPHA)
+
+
+@cache
+def gains(study: Study, group: Group) -> pd.DataFrame:
+    """One row a finished trial: condition, pair, ``steady`` (nobody acted), and ``gain`` or NaN."""
+    trials = group.finished[["trial_id", "condition", "pair"]]
+    by_trial = study.profiles_of(group).groupby("trial_id")
+    found = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
+    return trials.merge(found, left_on="trial_id", right_index=True)
+
+
+def mean_gain(study: Study, group: Group) -> Estimate:
+    """The mean gain of a group's trials; that of humans over the means of their pairs."""
+    return mean_over(gains(study, group).dropna(subset="gain"), "gain")
+
+
+def less_humans(study: Study, group: Group) -> Estimate | None:
+    """The mean gain less that of humans in the same conditions, in human standard deviations.
+
+    None for the humans, and without a spread of human trials in every condition.
+    """
+    if group is study.human or not study.calibrated:
+        return None
+    return compared(gains(study, group), gains(study, study.human))
+
+
+def compared(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
+    """The difference between rows of ``gains``, with Welch's interval over trials and pairs.
+
+    The standard deviation is that of human trials within conditions.
+    """
+    driver, human = driver.dropna(subset="gain"), human.dropna(subset="gain")
+    usual = human.groupby("condition")["gain"].mean()
+    human = human.assign(apart=human["gain"] - human["condition"].map(usual))
+    spread = float((human["apart"] ** 2).sum() / max(len(human) - len(usual), 1)) ** 0.5
+    apart = (driver["gain"] - driver["condition"].map(usual)).dropna()
+    if not spread:
+        return Estimate(None, None, None, len(apart))
+    own, pairs = mean(apart / spread), mean(_independent(human, "apart") / spread)
+    if own.value is None or own.se is None or pairs.se is None:
+        return Estimate(own.value, None, None, own.n)
+    found = difference(own, replace(pairs, value=0.0))
+    low, high = (found and found.bounds()) or (own.value, own.value)
+    return replace(own, low=low, high=high)
+
+
+def mean_over(trials: pd.DataFrame, column: str) -> Estimate:
+    """A mean of trials, or of the means of human pairs, whose trials hang together."""
+    return replace(mean(_independent(trials, column)), n=len(trials))
+
+
+def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
+    return trials.groupby(trials["pair"].fillna(trials["trial_id"]))[column].mean()
+
+
+def piecewise_constant(study: Study, group: Group) -> Verdict:
+    """I5: whether the accelerations of a group are held and jump, rather than move."""
+    found = mean_gain(study, group)
+    if not found.n:
+        return Verdict(None, NO_ACTION)
+    if found.low is None:
+        return Verdict(None, "a single trial, or a single human pair, with control action")
+    return Verdict(found.low > 0)
+
+
+class Fits(NamedTuple):
+    """The regressions of one group."""
+
+    logit: Regression
+    firth: Regression
+    ols: Regression
+    hc3: Regression
+
+
+@cache
+def fits(group: Group) -> Fits:
+    """Fit a group's trials; without gaps the linear fits say so."""
+    logit, firth = who_first_logit(group.outcomes), who_first_firth(group.outcomes)
+    if not group.measured:
+        missing = Regression(0, {}, PUBLISHED)
+        return Fits(logit, firth, missing, missing)
+    return Fits(logit, firth, gap_ols(group.trials), gap_ols(group.trials, robust=True))
+
+
+class Score(NamedTuple):
+    """A group's verdicts by both rules, with I5 in both; ``sizes`` are its trials per condition."""
+
+    paper: dict[str, Verdict]
+    robust: dict[str, Verdict]
+    sizes: tuple[int, ...]
+
+    @property
+    def rules(self) -> dict[str, dict[str, Verdict]]:
+        """The verdicts by the name of their rule, as it stands in a sentence."""
+        return {"by the paper's test": self.paper, "by the robust tests": self.robust}
+
+    @property
+    def ceiling(self) -> dict[str, dict[str, float]]:
+        """The human ceiling for the group's size."""
+        return ceiling(self.sizes)
+
+
+def ceiling(sizes: tuple[int, ...]) -> dict[str, dict[str, float]]:
+    """Return by rule the shares of human data sets that pass each indicator, and ``I1-I4`` at once.
+
+    It is that of the mean of ``sizes``, the trials in the conditions of the humans: of a shipped
+    curve, which ``benchmarks/ceiling.py`` computed once from the published counts and the published
+    regression of the gap with normal residuals; linear between its sizes, and constant beyond the
+    largest. Without a trial in some condition there is no share.
+    """
+    shares: dict[str, dict[str, float]] = {"paper": {}, "robust": {}}
+    if min(sizes):
+        curves = published("human_ceiling").groupby(["rule", "indicator"], sort=False)
+        for (rule, indicator), curve in curves:
+            shares[rule][indicator] = float(np.interp(np.mean(sizes), curve["n"], curve["share"]))
+    return shares
+
+
+def total(judged: dict[str, Verdict]) -> str | None:
+    """How many indicators hold by one rule, ``3 of 4``; None where none can be judged."""
+    known = [verdict.passed for verdict in judged.values() if verdict.passed is not None]
+    return f"{sum(known)} of {len(known)}" if known else None
+
+
+@cache
+def score(study: Study, group: Group) -> Score:
+    """Judge a group's indicators."""
+    fit = fits(group)
+    paper = verdicts(fit.logit, fit.ols, robust=False)
+    robust = verdicts(fit.firth, fit.hc3, robust=True)
+    if not group.measured:
+        row = published("paper_ablation_qualitative").query("driver == 'human'").iloc[0]
+        for name in ("I3", "I4"):
+            paper[name] = Verdict(bool(row[name.lower()]), PUBLISHED)
+        paper["I5"] = Verdict(bool(row["i5"]), BY_EYE)
+        robust["I5"] = Verdict(None, BY_EYE)
+    elif group.caution:
+        paper = robust = dict.fromkeys(INDICATORS, Verdict(None, group.caution))
+    else:
+        # The paper judged by eye: there is no rule to apply, whatever is driven.
+        paper["I5"], robust["I5"] = Verdict(None), piecewise_constant(study, group)
+    return Score(paper, robust, group.sizes)

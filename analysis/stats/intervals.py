@@ -6,7 +6,8 @@ Every test against Student's t is made here; one with infinite degrees of freedo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import cycle
 from math import hypot, inf, sqrt
 
 import numpy as np
@@ -51,6 +52,9 @@ class Difference(Bounded):
     se: float | None = None
 
 
+NOTHING = Estimate(None, None, None, 0)
+
+
 def proportion(successes: int, n: int) -> Estimate:
     """A proportion with its Wilson score interval (Wilson 1927).
 
@@ -58,7 +62,7 @@ def proportion(successes: int, n: int) -> Estimate:
     60 times as long and seconds to import; a test holds both against each other.
     """
     if n == 0:
-        return Estimate(None, None, None, 0)
+        return NOTHING
     return Estimate(successes / n, *wilson(successes / n, n), n)
 
 
@@ -76,23 +80,21 @@ def newcombe(rates: Sequence[tuple[float, float]], z: float = Z) -> tuple[float,
     The first is added, the second subtracted, and so on in turn.
     """
     value, below, above = 0.0, 0.0, 0.0
-    for place, (rate, n) in enumerate(rates):
-        low, high = rate - wilson(rate, n, z)[0], wilson(rate, n, z)[1] - rate
-        if place % 2:
-            value, low, high = value - rate, high, low
-        else:
-            value += rate
-        below, above = hypot(below, low), hypot(above, high)
+    for sign, (rate, n) in zip(cycle((1, -1)), rates, strict=False):
+        apart = [sign * (end - rate) for end in wilson(rate, n, z)]
+        value += sign * rate
+        below, above = hypot(below, min(apart)), hypot(above, max(apart))
     return value - below, value + above
 
 
 def mean(values: Sequence[float] | NDArray[np.float64]) -> Estimate:
-    """A mean with its interval of Student's t; no interval for fewer than two values."""
-    sample = finite(values)
+    """A mean of numbers with its interval of Student's t; none for fewer than two of them."""
+    sample = np.asarray(values, dtype=float)
+    sample = sample[np.isfinite(sample)]
     n = len(sample)
     if n < 2:
-        return Estimate(float(sample[0]) if n else None, None, None, n)
-    return estimate(float(sample.mean()), standard_error(sample), n - 1, n)
+        return replace(NOTHING, value=float(sample[0]) if n else None, n=n)
+    return estimate(float(sample.mean()), float(sample.std(ddof=1) / sqrt(n)), n - 1, n)
 
 
 def estimate(value: float, se: float, freedom: float, n: int) -> Estimate:
@@ -100,22 +102,9 @@ def estimate(value: float, se: float, freedom: float, n: int) -> Estimate:
     return Estimate(value, *interval(value, se, freedom), n, se, freedom)
 
 
-def finite(values: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """The values that are numbers."""
-    sample: NDArray[np.float64] = np.asarray(values, dtype=float)
-    return np.asarray(sample[np.isfinite(sample)])
-
-
-def standard_error(sample: NDArray[np.float64]) -> float:
-    """The standard error of the mean of two values or more."""
-    return float(sample.std(ddof=1) / sqrt(len(sample)))
-
-
-def interval(
-    value: float, se: float, freedom: float = inf, level: float = LEVEL
-) -> tuple[float, float]:
-    """The interval of an estimate with this standard error, of 95 % unless told."""
-    half = float(stats.t.ppf((1 + level) / 2, freedom)) * se
+def interval(value: float, se: float, freedom: float = inf) -> tuple[float, float]:
+    """The 95 % interval of an estimate with this standard error."""
+    half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * se
     return value - half, value + half
 
 
@@ -137,20 +126,15 @@ def difference(one: Estimate | Difference, other: Estimate | Difference) -> Diff
     """One independent estimate less another.
 
     It is tested as Welch (1947) does, so that the 5 % hold also where the groups differ in size and
-    in variance. None where a value or an error is missing, and where neither has an error: there is
-    nothing to test.
+    in variance, with the degrees of freedom of a sum of variances (Satterthwaite 1946). None where
+    a value or an error is missing, and where neither has an error: there is nothing to test.
     """
     if one.value is None or other.value is None or one.se is None or other.se is None:
         return None
-    se = hypot(one.se, other.se)
-    errors = (one.se, one.freedom), (other.se, other.freedom)
-    return tested(one.value - other.value, se, satterthwaite(*errors)) if se else None
-
-
-def satterthwaite(*errors: tuple[float, float]) -> float:
-    """Degrees of freedom of a sum of variances, se² of each (Satterthwaite 1946)."""
-    spread = sum(se**4 / freedom for se, freedom in errors)
-    return sum(se**2 for se, _ in errors) ** 2 / spread if spread else inf
+    if not (se := hypot(one.se, other.se)):
+        return None
+    spread = one.se**4 / one.freedom + other.se**4 / other.freedom
+    return tested(one.value - other.value, se, se**4 / spread if spread else inf)
 
 
 def detectable(se: float, freedom: float = inf) -> float:

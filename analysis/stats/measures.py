@@ -6,17 +6,17 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from merge_runner_analysis.data.reference_data import citation, human_outcomes, published
+from merge_runner_analysis.data.reference_data import citation, published
 from merge_runner_analysis.data.study import Group
 from merge_runner_analysis.metrics import BOXES, JUDGED, HumanReference, Metric
-from merge_runner_analysis.stats.intervals import LEVEL, Estimate, mean, proportion
+from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, Estimate, mean, wilson
 
 PAPER = "paper_ablation_quantitative"
 
 
 def trials_of(group: Group, metric: Metric) -> pd.DataFrame:
-    """The trials that a metric is found in, of humans perhaps the published outcomes."""
-    return group.outcomes if metric.humans_from == "outcomes" else group.trials
+    """The trials that a metric is found in, of humans the published outcomes if these have it."""
+    return group.outcomes if metric.column in group.outcomes else group.trials
 
 
 def values(group: Group, metric: Metric) -> pd.Series:
@@ -36,26 +36,22 @@ def estimate(group: Group, metric: Metric) -> Estimate:
     Where trials end undecided a rate has no value, and the interval is that of both worst cases
     (Manski 1989): from none of them to all of them.
     """
-    match metric.estimator:
-        case "mean":
-            return mean(values(group, metric).to_numpy(float))
-        case "median":
-            return median(values(group, metric).to_numpy(float))
-    k, n = counts(group, metric)
-    cut_off = undecided(group, metric)
-    if not n + cut_off:
-        return Estimate(None, None, None, 0)
-    least, most = (proportion(k + more, n + cut_off) for more in (0, cut_off))
-    assert least.value is not None
-    assert least.low is not None
-    assert most.high is not None
-    return Estimate(None if cut_off else 100 * least.value, 100 * least.low, 100 * most.high, n)
+    sample = values(group, metric).to_numpy(float)
+    if metric.estimator == "mean":
+        return mean(sample)
+    if metric.estimator == "median":
+        return median(sample)
+    k, cut_off = float(sample.sum()), undecided(group, metric)
+    if not (every := len(sample) + cut_off):
+        return NOTHING
+    low, high = wilson(k / every, every)[0], wilson((k + cut_off) / every, every)[1]
+    return Estimate(None if cut_off else 100 * k / every, 100 * low, 100 * high, len(sample))
 
 
 def median(sample: np.ndarray) -> Estimate:
     """A median with its interval of order statistics; fewer than six values have no interval."""
     if not len(sample):
-        return Estimate(None, None, None, 0)
+        return NOTHING
     value = float(np.median(sample))
     found = stats.quantile_test(sample, q=value, p=0.5).confidence_interval(LEVEL)
     low, high = (None if np.isnan(end) else float(end) for end in found)
@@ -72,8 +68,7 @@ def undecided(group: Group, metric: Metric) -> int:
 
 def undecided_note(group: Group, metric: Metric) -> str:
     """What is known of a rate some of whose trials are undecided; empty where none is."""
-    cut_off = undecided(group, metric)
-    if not cut_off:
+    if not (cut_off := undecided(group, metric)):
         return ""
     k, n = counts(group, metric)
     every = n + cut_off
@@ -81,53 +76,39 @@ def undecided_note(group: Group, metric: Metric) -> str:
         f"{metric.heading}: {cut_off} of {every} trials are undecided, since another collision "
         f"rule ended them; between {100 * k / every:.1f} and {100 * (k + cut_off) / every:.1f} %"
     )
-    if metric is not BOXES:  # what humans did is recorded
-        return said
-    return f'{said}. A study whose [scenario] has collision_rule = "rectangle" decides them'
+    if metric is BOXES:
+        said += '. A study whose [scenario] has collision_rule = "rectangle" decides them'
+    return said
 
 
 def known(group: Group, metric: Metric) -> bool:
-    """Whether a group's trials hold this metric.
-
-    Before an import humans have outcomes alone, and until it is complete no collisions but these.
-    """
-    if metric.humans_from == "all recordings":
-        return group.measured and group.published_outcomes is None
-    return group.measured or metric.humans_from == "outcomes"
-
-
-def human_reference(metric: Metric) -> HumanReference | None:
-    """What is published of the humans: in the paper, or as the metric says."""
-    if not metric.paper_of_humans:
-        return metric.human
-    row = published(PAPER).query("driver == 'human'").iloc[0]
-    trials = human_outcomes()
-    if metric.trials == "finished":
-        trials = trials[trials["status"] == "finished"]
-    return HumanReference(float(row[metric.paper_of_humans]), citation(PAPER), n=len(trials))
+    """Whether a group's trials hold this metric: before an import humans have outcomes alone."""
+    found = trials_of(group, metric)
+    if group.published_outcomes is None:
+        return True
+    return metric.column in found and bool(found[metric.column].notna().any())
 
 
 def estimate_or_reference(group: Group, metric: Metric) -> Estimate | HumanReference | None:
-    """What a group comes to; of humans without traces what is published, None where nothing is."""
-    return estimate(group, metric) if known(group, metric) else human_reference(metric)
+    """What a group comes to; of humans without traces what the paper says, None where nothing."""
+    if known(group, metric) or not metric.paper_of_humans:
+        return estimate(group, metric) if known(group, metric) else None
+    row = published(PAPER).query("driver == 'human'").iloc[0]
+    return HumanReference(float(row[metric.paper_of_humans]), None, None, citation(PAPER))
 
 
 def no_human_value(metric: Metric) -> str:
     """Why the humans have no value of a metric before their recordings are imported."""
     if metric.value in JUDGED:
         return f"{metric.heading}: published human collisions are boxes that overlap"
-    if metric.humans_from == "all recordings":
-        imported = "not all human recordings are imported"
-    else:
-        imported = "no human traces are imported"
-    return f"{metric.heading}: no human value is published, and {imported}"
+    return f"{metric.heading}: no human value is published, and none is imported"
 
 
 def outcomes_note(group: Group) -> str:
     """What rests on the published outcomes, where only a part of the traces is imported."""
-    if not group.measured or group.published_outcomes is None:
+    if not group.measured or group.traced:
         return ""
     return (
-        f"who merged first and {BOXES.heading}: the {len(group.published_outcomes)} published "
+        f"who merged first and {BOXES.heading}: the {len(group.outcomes)} published "
         f"outcomes; the rest: {len(group.trials)} imported trials, {len(group.finished)} finished"
     )

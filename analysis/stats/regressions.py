@@ -1,13 +1,13 @@
 """The regressions of arXiv 2604.09609 (eqs. 1 and 2), and tests that hold where theirs do not.
 
 A fit that the data do not allow has no terms but a ``problem`` in words. Data frames have the
-columns of ``load_trials``; only finished trials count.
+columns of ``load_trials``; only finished trials count. Firth's penalised logit is finite under
+separation (Firth 1993; Heinze and Schemper 2002).
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import inf, sqrt
 
@@ -15,23 +15,146 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.optimize import brentq, linprog, minimize
+from scipy.special import expit
 
-from merge_runner_analysis.stats import firth, intervals
+from merge_runner_analysis.stats import intervals
 
 Array = NDArray[np.float64]
 
 WHO_FIRST_TERMS = ("intercept", "projected_headway", "relative_velocity")
 GAP_TERMS = (
-    "intercept",
-    "abs_projected_headway",
-    "abs_relative_velocity",
-    "headway_x_velocity",
-)
+    "intercept", "abs_projected_headway", "abs_relative_velocity", "headway_x_velocity",
+)  # fmt: skip
+CONDITION = ["projected_headway_m", "relative_velocity_mps"]
 MIN_PAIRS = 3  # fewer say nothing of how pairs vary
 # Gaps of a program can be equal but for the rounding of a step: that is no effect.
 STEADY_GAP_M = 0.01
 # Equivalence margin of I4: how far relative velocity alone may move the gap.
 GAP_MARGIN_M = 1.0
+# The largest slope of a likelihood at its top: what is aimed at, and what is still taken for one.
+FLAT, SLOPING = 1e-8, 1e-3
+# Below this logarithm of its determinant the information is singular but for rounding.
+SINGULAR = -600.0
+# A bound is looked for in steps that widen so much, up to so many standard errors.
+WIDER, FARTHEST = 1.3, 1e5
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """Rows of a ``design`` (rows, terms) with ``n`` trials each, ``chosen`` of them a success."""
+
+    design: Array
+    n: Array
+    chosen: Array
+
+    def fit(self, term: int = -1, value: float = 0.0, start: Array | None = None) -> Fit | None:
+        """Return the fit, with one ``term`` held at a value, or None where it does not converge.
+
+        Quasi-Newton steps on Firth's score, since far from the estimate and under separation the
+        information misses the curvature of the penalty.
+        """
+        b = np.zeros(self.design.shape[1]) if start is None else start.copy()
+        free = np.arange(len(b)) != term
+        b[~free] = value
+        origin = b[free]
+        try:  # in these units the first step is Newton's
+            unit = np.linalg.inv(np.linalg.cholesky(self.information(b)[np.ix_(free, free)])).T
+        except np.linalg.LinAlgError:
+            return None
+
+        def loss(steps: Array) -> tuple[float, Array]:
+            b[free] = origin + unit @ steps
+            likelihood, score = self._penalised(b)
+            return -likelihood, -unit.T @ score[free]
+
+        found = minimize(loss, 0 * origin, jac=True, method="BFGS", options={"gtol": FLAT})
+        b[free] = origin + unit @ found.x
+        flat = np.isfinite(found.fun) and np.abs(found.jac).max(initial=0) < SLOPING
+        return Fit(self, b, -float(found.fun)) if flat else None
+
+    def infinite(self) -> NDArray[np.bool_]:
+        """Return which coefficients have no finite maximum likelihood estimate, (terms,).
+
+        Separation is a direction in which no row's outcome becomes less likely; the linear program
+        of Konis (2007) finds the one that gains most.
+        """
+        signed = np.vstack([self.design[self.chosen > 0], -self.design[self.chosen < self.n]])
+        found = linprog(
+            -signed.sum(axis=0), A_ub=-signed, b_ub=np.zeros(len(signed)), bounds=(-1, 1)
+        )
+        return np.asarray(np.abs(found.x) > 1e-4)
+
+    def information(self, b: Array) -> Array:
+        """Return Fisher's information, (terms, terms)."""
+        p = expit(self.design @ b)
+        return np.asarray((self.design.T * (self.n * p * (1 - p))) @ self.design)
+
+    def _penalised(self, b: Array) -> tuple[float, Array]:
+        """Return the log-likelihood of ``b`` with Firth's penalty, and its gradient, (terms,).
+
+        The penalty is half the logarithm of the determinant of the information: Jeffreys' prior.
+        Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
+        split, and half of its leverage had gone either way (Heinze and Schemper 2002).
+        """
+        linear, information = self.design @ b, self.information(b)
+        sign, log_determinant = np.linalg.slogdet(information)
+        if sign <= 0 or log_determinant < SINGULAR:
+            return -np.inf, np.zeros_like(b)
+        likelihood = self.chosen @ linear - self.n @ np.logaddexp(0, linear)
+        p = expit(linear)
+        spread = ((self.design @ np.linalg.inv(information)) * self.design).sum(axis=1)
+        leverage = self.n * p * (1 - p) * spread
+        score = (self.chosen - self.n * p + leverage * (0.5 - p)) @ self.design
+        return float(likelihood + log_determinant / 2), score
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The coefficients ``b`` (terms,) where the penalised log-likelihood ``best`` is maximal."""
+
+    counts: Counts
+    b: Array
+    best: float
+
+    @property
+    def errors(self) -> Array:
+        """Wald's standard errors, (terms,)."""
+        return np.sqrt(np.diag(np.linalg.inv(self.counts.information(self.b))))
+
+    def p(self, term: int) -> float:
+        """Return the p-value of the penalised likelihood ratio against a coefficient of 0."""
+        without = self.counts.fit(term)
+        return float(stats.chi2.sf(2 * (self.best - without.best), 1)) if without else np.nan
+
+    def interval(self, term: int, level: float) -> tuple[float, float] | None:
+        """Return the profile interval: what the penalised likelihood ratio does not reject.
+
+        None where no bound is found.
+        """
+        lost = stats.chi2.ppf(level, 1) / 2
+        near = self.b  # the last profile: far out the other terms are far from the estimate, too
+        aside = self.b + self.errors  # of symmetric data the best profile may lie beside
+
+        def excess(value: float) -> float:
+            nonlocal near
+            fits = [self.counts.fit(term, value, start) for start in (near, aside)]
+            profile = max(filter(None, fits), key=lambda each: each.best, default=None)
+            if profile is None:
+                return np.nan
+            near = profile.b
+            return float(self.best - profile.best - lost)
+
+        bounds = []
+        for width in (-self.errors[term], self.errors[term]):
+            near, inside, farthest = self.b, self.b[term], FARTHEST * abs(width)
+            while excess(inside + width) < 0 and abs(inside - self.b[term]) < farthest:
+                inside, width = inside + width, WIDER * width  # noqa: PLW2901
+            try:
+                bounds.append(float(brentq(excess, inside, inside + width, xtol=1e-9)))
+            except ValueError:  # there is no bound, or a profile does not converge
+                return None
+        return bounds[0], bounds[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,53 +186,39 @@ class Regression:
     remark: str = ""
     equivalence_p: float | None = None
     velocity_p: float | None = None
-    profile: firth.Fit | None = field(default=None, compare=False)
+    profile: Fit | None = field(default=None, compare=False)
 
-    def interval(self, term: str) -> tuple[float, float] | None:
-        """Return the 95 % interval of a term of Firth's fit, which agrees with its test.
+    def difference(self, term: str) -> intervals.Difference | None:
+        """Return a term of Firth's fit against 0, with its test and the interval that agrees.
 
-        None where its profile does not converge.
+        None where there is no fit, or its profile does not converge.
         """
-        assert self.profile is not None
-        return self.profile.interval([*self.terms].index(term), intervals.LEVEL)
+        if self.profile is None:
+            return None
+        found = self.terms[term]
+        ends = self.profile.interval([*self.terms].index(term), intervals.LEVEL)
+        least = intervals.detectable(found.se)
+        return intervals.Difference(found.b, *ends, found.p, least, se=found.se) if ends else None
 
 
 def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:
     """Design (n, 3) of intercept, h in m, dv in m/s; and left-first as 0 or 1, shape (n,)."""
     chosen = trials[(trials["status"] == "finished") & trials["merged_first"].notna()]
-    design = np.column_stack(
-        [
-            np.ones(len(chosen)),
-            chosen["projected_headway_m"].to_numpy(float),
-            chosen["relative_velocity_mps"].to_numpy(float),
-        ]
-    )
+    design = np.column_stack([np.ones(len(chosen)), chosen[CONDITION].to_numpy(float)])
     return design, (chosen["merged_first"] == "left").to_numpy(float)
 
 
 def gap_data(trials: pd.DataFrame, measure: str = "gap_m") -> tuple[Array, Array, pd.DataFrame]:
     """Design (n, 4) of intercept, |h|, |dv|, h*dv; gaps in m, shape (n,); and their trials."""
     chosen = trials[(trials["status"] == "finished") & trials[measure].notna()]
-    return (
-        gap_design(
-            chosen["projected_headway_m"].to_numpy(float),
-            chosen["relative_velocity_mps"].to_numpy(float),
-        ),
-        chosen[measure].to_numpy(float),
-        chosen,
-    )
+    design = gap_design(*chosen[CONDITION].to_numpy(float).T)
+    return design, chosen[measure].to_numpy(float), chosen
 
 
 def gap_design(headway_m: Array, velocity_mps: Array) -> Array:
     """The regressors of the gap: intercept, |h|, |dv| and the signed product h*dv."""
-    return np.column_stack(
-        [
-            np.ones(len(headway_m)),
-            np.abs(headway_m),
-            np.abs(velocity_mps),
-            headway_m * velocity_mps,
-        ]
-    )
+    columns = (np.ones(len(headway_m)), np.abs(headway_m), np.abs(velocity_mps))
+    return np.column_stack([*columns, headway_m * velocity_mps])
 
 
 def equivalence_p(b: float, se: float, freedom: float) -> float:
@@ -125,21 +234,15 @@ def equivalence_p(b: float, se: float, freedom: float) -> float:
 def who_first_logit(trials: pd.DataFrame) -> Regression:
     """Logit of left-first on h and dv by maximum likelihood, with Wald tests (eq. 1)."""
     from statsmodels.discrete.discrete_model import Logit
-    from statsmodels.tools.sm_exceptions import ConvergenceWarning
 
     design, left = who_first_data(trials)
     problem = unfit_for_logit(design, left)
     if problem:
         return Regression(len(left), {}, problem)
-    with warnings.catch_warnings():
-        # Convergence is checked right below.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        fit = Logit(left, design).fit(disp=0)
+    fit = Logit(left, design).fit(disp=0, warn_convergence=False)
     if not fit.mle_retvals["converged"] or not np.isfinite(fit.bse).all():
         return Regression(len(left), {}, "the maximum likelihood fit does not converge")
-    return Regression(
-        len(left), _terms(WHO_FIRST_TERMS, fit.params, fit.bse, fit.tvalues, fit.pvalues)
-    )
+    return Regression(len(left), _terms(WHO_FIRST_TERMS, fit.params, fit.bse))
 
 
 def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> Regression:
@@ -161,8 +264,8 @@ def who_first_firth(trials: pd.DataFrame, less: pd.DataFrame | None = None) -> R
     tests = [fit.p(place) for place in range(len(WHO_FIRST_TERMS))] if fit else [np.nan]
     if fit is None or not np.isfinite(tests).all():
         return Regression(n, {}, "Firth's penalised fit does not converge")
-    found = zip(WHO_FIRST_TERMS, fit.b, fit.errors, tests, strict=False)
-    terms = {name: Term(float(b), float(se), None, p) for name, b, se, p in found}
+    found = zip(WHO_FIRST_TERMS, fit.b.tolist(), fit.errors.tolist(), tests, strict=False)
+    terms = {name: Term(b, se, None, p) for name, b, se, p in found}
     return Regression(n, terms, profile=fit)
 
 
@@ -191,7 +294,7 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
     told_apart = np.linalg.matrix_rank(covariance[2:, 2:]) == len(with_velocity)
     return Regression(
         len(gap),
-        _terms(GAP_TERMS, fit.params, fit.bse, fit.tvalues, fit.pvalues),
+        _terms(GAP_TERMS, fit.params, fit.bse, freedom),
         freedom=freedom,
         equivalence_p=_velocity_alone(chosen, fit.params, covariance, freedom),
         velocity_p=float(fit.f_test(with_velocity).pvalue) if told_apart else None,
@@ -206,8 +309,7 @@ def _velocity_alone(
     That of an intersection-union test (Berger 1982), the largest over all pairs of played
     conditions that differ in relative velocity alone; None where there is no such pair.
     """
-    played = trials[["projected_headway_m", "relative_velocity_mps"]].drop_duplicates()
-    headway, velocity = played.to_numpy(float).T
+    headway, velocity = trials[CONDITION].drop_duplicates().to_numpy(float).T
     design = gap_design(headway, velocity)
     more, less = np.nonzero((headway[:, None] == headway) & (velocity[:, None] > velocity))
     tests = [
@@ -230,31 +332,36 @@ def by_pairs(
     whole, pairs = fit(used), used["pair"].dropna().unique()
     if len(pairs) < MIN_PAIRS:
         return Regression(whole.n, {}, f"{len(pairs)} pairs are too few for errors by pair")
-    parts = {pair: fit(used[used["pair"] != pair]) for pair in pairs} if whole.terms else {}
+    parts = {pair: fit(used[used["pair"] != pair]) for pair in pairs}
     lacking = [f"without {pair}: {part.problem}" for pair, part in parts.items() if part.problem]
-    if whole.problem or lacking:
-        return Regression(whole.n, {}, whole.problem or lacking[0])
+    if problem := whole.problem or "".join(lacking[:1]):
+        return Regression(whole.n, {}, problem)
     # CV3: the squares of what each pair moves an estimate by, about the whole fit and not the mean.
+    b = np.array([[term.b for term in fit.terms.values()] for fit in (whole, *parts.values())])
     freedom = len(pairs) - 1
-    terms = {}
-    for name, term in whole.terms.items():
-        moved = sum((part.terms[name].b - term.b) ** 2 for part in parts.values())
-        se = sqrt(moved * freedom / len(pairs))
-        statistic = term.b / se if se else inf
-        terms[name] = Term(term.b, se, statistic, intervals.two_sided_p(statistic, freedom))
+    se = np.sqrt(((b[1:] - b[0]) ** 2).sum(axis=0) * freedom / len(pairs))
+    terms = _terms([*whole.terms], b[0], se, freedom)
     remark = f"errors by jackknife over {len(pairs)} pairs"
     return Regression(whole.n, terms, freedom=freedom, remark=remark)
 
 
-def _terms(names: tuple[str, ...], *columns: Array) -> dict[str, Term]:
-    """The terms from columns of estimates, errors, statistics and p."""
-    rows = np.column_stack(columns).tolist()
-    return {name: Term(*row) for name, row in zip(names, rows, strict=True)}
+def _terms(names: Sequence[str], b: Array, se: Array, freedom: float = inf) -> dict[str, Term]:
+    """The terms of these estimates and errors, with their tests against 0."""
+    found = {}
+    for name, value, error in zip(names, b.tolist(), se.tolist(), strict=True):
+        statistic = value / error if error else inf
+        found[name] = Term(value, error, statistic, intervals.two_sided_p(statistic, freedom))
+    return found
 
 
 def unfit_for_logit(design: Array, left: Array) -> str:
     """Why a logit has no finite maximum likelihood estimate, empty where it has."""
-    return _unidentified(design, left) or _separated(design, left)
+    problem = _unidentified(design, left)
+    if problem or not any(infinite := _cells(design, left).infinite()):
+        return problem
+    # The level comes last, as it is said.
+    named = np.array([*WHO_FIRST_TERMS[1:], WHO_FIRST_TERMS[0]])[np.roll(infinite, -1)]
+    return f"separation: no finite estimate of {', '.join(named)}; see Firth's fit"
 
 
 def _unidentified(design: Array, left: Array) -> str:
@@ -265,19 +372,10 @@ def _unidentified(design: Array, left: Array) -> str:
     return ""
 
 
-def _separated(design: Array, left: Array) -> str:
-    infinite = _cells(design, left).infinite()
-    if not infinite.any():
-        return ""
-    # The level comes last, as it is said.
-    named = np.array([*WHO_FIRST_TERMS[1:], WHO_FIRST_TERMS[0]])[np.roll(infinite, -1)]
-    return f"separation: no finite estimate of {', '.join(named)}; see Firth's fit"
-
-
-def _cells(design: Array, left: Array) -> firth.Counts:
+def _cells(design: Array, left: Array) -> Counts:
     """Trials of equal regressors as one binomial."""
     cells, place, trials = np.unique(design, axis=0, return_inverse=True, return_counts=True)
-    return firth.Counts(cells, trials.astype(float), np.bincount(place, weights=left).astype(float))
+    return Counts(cells, trials.astype(float), np.bincount(place, weights=left).astype(float))
 
 
 def _too_few(n: int, what: str) -> str:

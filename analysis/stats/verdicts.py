@@ -18,21 +18,34 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import PAIRS, human_gap_pair_sd_m, published
+from merge_runner_analysis.data.reference_data import PAIRS, published
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import BOXES, GAP
 from merge_runner_analysis.stats import intervals
-from merge_runner_analysis.stats.contrasts import corrected, detectable_rate, difference_of_rates
-from merge_runner_analysis.stats.group_scores import fits, score
-from merge_runner_analysis.stats.indicators import TESTED, Verdict
-from merge_runner_analysis.stats.intervals import Difference, Estimate, wilson
-from merge_runner_analysis.stats.likeness import less_humans
-from merge_runner_analysis.stats.measures import counts, undecided, undecided_note, values
+from merge_runner_analysis.stats.contrasts import (
+    corrected,
+    detectable_rate,
+    difference_of_rates,
+    weighted,
+)
+from merge_runner_analysis.stats.indicators import (
+    TESTED,
+    Verdict,
+    fits,
+    less_humans,
+    mean_over,
+    score,
+)
+from merge_runner_analysis.stats.intervals import NOTHING, Difference, Estimate, wilson
+from merge_runner_analysis.stats.measures import (
+    counts,
+    estimate,
+    undecided,
+    undecided_note,
+)
 from merge_runner_analysis.stats.regressions import (
-    GAP_TERMS,
     MIN_PAIRS,
     Regression,
-    Term,
     by_pairs,
     gap_ols,
     who_first_firth,
@@ -110,14 +123,15 @@ def _compared(study: Study, group: Group, measure: Measure, verdict: Verdict | N
     if measure.name == "collisions":
         difference = _of_rates(own, human)
     elif measure.name in WHO_FIRST:
-        difference = _of_slopes(group, study.human, measure.name)
+        # One model of both, in which every term may differ.
+        less = who_first_firth(group.outcomes, less=study.human.outcomes)
+        difference = less.difference(TESTED[SLOPES[measure.name]][0])
     else:
         difference = intervals.difference(own.estimate, human.estimate)
     state = _state(measure, own, human.estimate, difference, verdict)
-    notes = [own.problem, human.problem]
-    if verdict and verdict.passed is None and not own.problem:
-        notes.append(verdict.why)
-    return Comparison(measure, own, human, difference, state, "; ".join(filter(None, notes)))
+    why = verdict.why if verdict and verdict.passed is None and not own.problem else ""
+    note = "; ".join(filter(None, (own.problem, human.problem, why)))
+    return Comparison(measure, own, human, difference, state, note)
 
 
 def _state(
@@ -133,29 +147,16 @@ def _state(
         return ""
     if measure.margin is not None:
         low, high = ends
-        if verdict.passed if verdict else max(-low, high) < measure.margin:
-            return SHOWN
-        return UNLIKE if max(low, -high) > measure.margin else OPEN
+        inside = verdict.passed if verdict else max(-low, high) < measure.margin
+        return SHOWN if inside else UNLIKE if max(low, -high) > measure.margin else OPEN
     if difference is None or human.value is None or (verdict and verdict.passed is None):
         return ""
     low, high = difference.bounds() or ends
     differs = not low <= 0 <= high
     if verdict is None or not verdict.passed:
         return UNLIKE if differs else OPEN
-    if not differs:
-        return SHOWN
-    return WEAKER if abs(value or 0.0) < abs(human.value) else STRONGER
-
-
-def _of_slopes(group: Group, human: Group, name: str) -> Difference | None:
-    """How a slope of who goes first differs, by Firth's fit of one model of both."""
-    term, _ = TESTED[SLOPES[name]]
-    fit = who_first_firth(group.outcomes, less=human.outcomes)
-    ends = fit.interval(term) if fit.terms else None
-    if ends is None:
-        return None
-    slope = fit.terms[term]
-    return Difference(slope.b, *ends, slope.p, intervals.detectable(slope.se))
+    weaker = abs(value or 0.0) < abs(human.value)
+    return (WEAKER if weaker else STRONGER) if differs else SHOWN
 
 
 def _of_rates(own: Known, human: Known) -> Difference | None:
@@ -182,15 +183,18 @@ def _own(study: Study, group: Group, name: str) -> Known:
     """A driver's estimate, of its trials in the humans' conditions."""
     if name == "collisions":
         return _collided(group)
-    if name == "held":
-        return _held(study, group)
     if name in WHO_FIRST:
         return _slope(group, name)
     if name == "gap":
-        found = intervals.mean(values(group, GAP).to_numpy(float))
-        problem = "a single trial has no error" if found.n else "no trial finished with a gap"
-        return Known(found, problem if found.se is None else "")
-    return _gap_slope(fits(group).hc3, name)
+        return _gap(group, group)
+    if name != "held":
+        return _gap_slope(fits(group).hc3, name)
+    # I5: how far accelerations are held, less the humans, in human standard deviations.
+    likeness = less_humans(study, group) if len(group.finished) else None
+    if likeness is not None and likeness.value is not None:
+        return Known(likeness)
+    why = "no trial acted" if study.calibrated else "too few human recordings are imported"
+    return Known(replace(NOTHING, n=len(group.finished)), f"I5 is not compared: {why}")
 
 
 def _human(study: Study, group: Group, name: str) -> Known:
@@ -202,90 +206,83 @@ def _human(study: Study, group: Group, name: str) -> Known:
         return Known(Estimate(0.0, None, None, len(human.finished)))
     if name in WHO_FIRST:
         return _slope(human, name)
-    pairs = human.finished["pair"].nunique() if "pair" in human.finished else 0
-    if study.imported is None or study.imported.contradicting or pairs < MIN_PAIRS:
-        return _published_gap(group) if name == "gap" else _published_gap_slope(name)
+    if not human.measured or human.finished["pair"].nunique() < MIN_PAIRS:
+        return _published(group, name)
     if name == "gap":
-        alike = human.finished["condition"].isin(group.trials["condition"].unique())
-        trials = human.finished[alike].dropna(subset=["gap_m"])
-        found = intervals.mean(trials.groupby("pair")["gap_m"].mean().to_numpy(float))
-        return Known(replace(found, n=len(trials)))
+        return _gap(human, group)
     return _gap_slope(by_pairs(gap_ols, human.trials, "gap_m"), name, "humans: ")
+
+
+def _gap(group: Group, like: Group) -> Known:
+    """The mean gap of a group in the conditions of another one."""
+    alike = group.finished["condition"].isin(like.trials["condition"])
+    found = mean_over(group.finished[alike].dropna(subset=[GAP.column]), GAP.column)
+    problem = "a single trial has no error" if found.n else "no trial finished with a gap"
+    return Known(found, problem if found.se is None else "")
 
 
 @cache
 def _slope(group: Group, name: str) -> Known:
     """A slope of who goes first by Firth's fit."""
-    fit, (term, _) = fits(group).firth, TESTED[SLOPES[name]]
-    ends = fit.interval(term) if fit.terms else None
-    if ends is None:
+    fit = fits(group).firth
+    found = fit.difference(TESTED[SLOPES[name]][0])
+    if found is None:
         problem = fit.problem or "no profile of Firth's likelihood converges"
-        return Known(Estimate(None, None, None, fit.n), problem)
-    return Known(Estimate(fit.terms[term].b, *ends, fit.n, fit.terms[term].se))
+        return Known(replace(NOTHING, n=fit.n), problem)
+    return Known(Estimate(found.value, found.low, found.high, fit.n, found.se))
 
 
 def _gap_slope(fit: Regression, name: str, whose: str = "") -> Known:
     """A slope of the gap, on relative velocity what that of the conditions does."""
     if fit.problem:
-        return Known(Estimate(None, None, None, fit.n), whose + fit.problem)
+        return Known(replace(NOTHING, n=fit.n), whose + fit.problem)
     term = fit.terms[TESTED[SLOPES[name]][0]]
+    return Known(_at_its_velocity(name, term.b, term.se, fit.freedom, fit.n))
+
+
+def _at_its_velocity(name: str, b: float, se: float, freedom: float, n: int) -> Estimate:
     factor = VELOCITY_MPS if name == "gap-velocity" else 1.0
-    return Known(intervals.estimate(factor * term.b, factor * term.se, fit.freedom, fit.n))
+    return intervals.estimate(factor * b, factor * se, freedom, n)
 
 
-def _published_gap_slope(name: str) -> Known:
+def _published(group: Group, name: str) -> Known:
+    """The published gap: its regression, or its mean over all conditions.
+
+    The mean has the spread of the nine pairs: of their random intercepts, which are shrunken, so
+    that it is rather too small.
+    """
     rows = published("paper_gap").query("driver == 'human'")
-    terms = {row.term: Term(float(row.b), float(row.se), None, 1.0) for row in rows.itertuples()}
     n = int(rows["n"].iloc[0])
-    fit = Regression(n, terms, freedom=n - len(GAP_TERMS))
-    return replace(_gap_slope(fit, name), remark=PUBLISHED)
-
-
-def _published_gap(group: Group) -> Known:
-    """The published mean of all conditions, with the spread of the nine pairs."""
-    row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
-    n = int(published("paper_gap").query("driver == 'human'")["n"].iloc[0])
+    if name != "gap":
+        row = rows.set_index("term").loc[TESTED[SLOPES[name]][0]]
+        b, se = float(row["b"]), float(row["se"])
+        return Known(_at_its_velocity(name, b, se, n - len(rows), n), remark=PUBLISHED)
     if {*HUMAN_CONDITIONS} - {*group.trials["condition"]}:
         problem = "the published human gap is that of all 11 conditions"
-        return Known(Estimate(None, None, None, n), problem)
-    se = human_gap_pair_sd_m() / len(PAIRS) ** 0.5
-    found = intervals.estimate(float(row["gap_m"]), se, len(PAIRS) - 1, n)
+        return Known(replace(NOTHING, n=n), problem)
+    mean = published("paper_ablation_quantitative").query("driver == 'human'")["gap_m"].iloc[0]
+    se = published("human_gap_intercepts")["intercept_m"].std() / len(PAIRS) ** 0.5
+    found = intervals.estimate(float(mean), float(se), len(PAIRS) - 1, n)
     return Known(found, remark=PUBLISHED)
 
 
 def _collided(group: Group) -> Known:
     """The share of ended trials with a collision by the humans' rule, in percent."""
-    k, decided = counts(group, BOXES)
-    n = decided + (cut_off := undecided(group, BOXES))
-    if not n:
-        return Known(Estimate(None, None, None, 0), f"no trial ended: {group.left_out}")
-    (low, _), (_, high) = (wilson((k + more) / n, n) for more in (0, cut_off))
-    value = None if cut_off else 100 * k / n
-    found = Estimate(value, 100 * low, 100 * high, n, weight=n)
+    (k, decided), cut_off = counts(group, BOXES), undecided(group, BOXES)
+    if not (n := decided + cut_off):
+        return Known(NOTHING, f"no trial ended: {group.left_out}")
+    found = replace(estimate(group, BOXES), n=n, weight=n)
     return Known(found, undecided_note(group, BOXES), k=k, undecided=cut_off)
 
 
 def _standardised(human: Group, group: Group) -> Known:
     """The humans' collisions in the conditions of a group, which weigh as they do there."""
-    trials = human.outcomes.dropna(subset=[BOXES.column])
-    by_condition = trials.astype({BOXES.column: bool}).groupby("condition")[BOXES.column]
-    rates, sizes = by_condition.mean(), by_condition.size()
-    played = group.ended_outcomes["condition"]  # with those that are undecided
-    weights = played.value_counts(normalize=True).reindex(rates.index).dropna()
-    if weights.empty:
-        return Known(Estimate(None, None, None, 0), "no human drove its conditions")
-    weights /= weights.sum()
-    as_good_as = 1 / float((weights**2 / sizes[weights.index]).sum())
-    rate, n = float((weights * rates[weights.index]).sum()), int(sizes[weights.index].sum())
+    played = group.ended_outcomes["condition"].value_counts()  # with those that are undecided
+    there = human.outcomes[human.outcomes["condition"].isin(played.index)]
+    if there.empty:
+        return Known(NOTHING, "no human drove its conditions")
+    humans = there.groupby("condition")[BOXES.column].agg(["sum", "size"]).astype(int)
+    k, n = humans.to_numpy().T
+    rate, as_good_as = weighted(k, n, played[humans.index].to_numpy(float))
     low, high = wilson(rate, as_good_as)
-    return Known(Estimate(100 * rate, 100 * low, 100 * high, n, weight=as_good_as))
-
-
-def _held(study: Study, group: Group) -> Known:
-    """How far accelerations are held, less the humans, in human standard deviations (I5)."""
-    found = less_humans(study, group) if group.measured and len(group.finished) else None
-    if found is None or found.value is None:
-        why = "too few human recordings are imported" if not study.calibrated else "no trial acted"
-        nothing = Estimate(None, None, None, len(group.finished))
-        return Known(nothing, f"I5 is not compared: {why}")
-    return Known(found)
+    return Known(Estimate(100 * rate, 100 * low, 100 * high, len(there), weight=as_good_as))

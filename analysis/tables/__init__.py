@@ -16,12 +16,12 @@ from merge_runner_analysis.data.derived_cache import (
     present_state,
 )
 from merge_runner_analysis.tables.formats import value_rows
-from merge_runner_analysis.tables.model import Row, Table, Value, from_text, to_text
+from merge_runner_analysis.tables.model import Row, Table, from_text, to_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from merge_runner_analysis.data.study import Group, Study
+    from merge_runner_analysis.data.study import Study
 
 
 class Listed(NamedTuple):
@@ -40,7 +40,7 @@ class Listed(NamedTuple):
 # A module is imported only when its table is computed, so that a table that is kept can be shown
 # without waiting for pandas.
 TABLES = {
-    "verdicts": Listed("verdicts", "What drivers show beside the humans"),
+    "verdicts": Listed("differences", "What drivers show beside the humans"),
     "who-first": Listed(
         "regressions", "Logistic regression of which driver merged first (1: left)", "Table III"
     ),
@@ -60,19 +60,18 @@ TABLES = {
         "Table VI",
     ),
     "ablation-quantitative": Listed(
-        "measures", "Quantitative measures across prompt ablations", "Table VII"
+        "indicators", "Quantitative measures across prompt ablations", "Table VII"
     ),
     "contrasts": Listed("differences", "Differences between prompts"),
     "factors": Listed(
         "differences", "Each factor's levels: every metric, and the difference from the reference"
     ),
-    "velocity-profiles": Listed("indicators", "Piecewise-linear velocity profiles (I5)"),
     "criticality": Listed(
-        "measures", "When conflicts are resolved, and how close the vehicles come"
+        "indicators", "When conflicts are resolved, and how close the vehicles come"
     ),
     "attempts": Listed("attempts", "What became of the calls"),
     "first-action": Listed(
-        "first_action", "Net acceleration (m/s²) at the first decision, by own relative velocity"
+        "regressions", "Net acceleration (m/s²) at the first decision, by own relative velocity"
     ),
 }
 # The table that also has drivers that were only asked.
@@ -81,24 +80,32 @@ OF_ASKED = "first-action"
 
 def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
     """Compute the named tables, or all of them; raises UsageError for an unknown name."""
+    return [_made(name, study) for name in _valid(names)]
+
+
+def _made(name: str, study: Study) -> Table:
+    """A table with its notes, and a row, of a note alone, for each group that is not judged."""
     from merge_runner_analysis.tables.notes import footnoted
 
-    made = (_with_unjudged(_made(name, study), study) for name in _valid(names))
-    return [footnoted(table, study) for table in made]
-
-
-def _with_unjudged(table: Table, study: Study) -> Table:
-    """The table with a row, of a note alone, for each group that it leaves out as not judged."""
-    groups = study.unjudged + (study.unjudged_asked if table.name == OF_ASKED else [])
-    rows = [Row(group.id, (group.id,), _named(table, group), group.unjudged) for group in groups]
+    module = import_module(f"merge_runner_analysis.tables.{TABLES[name].module}")
+    maker: Callable[[Study], Table] = getattr(module, name.replace("-", "_"))
+    table = maker(study)
     shown = {name for row in table.rows for name in row.groups}
-    return replace(table, rows=[*table.rows, *(row for row in rows if row.id not in shown)])
-
-
-def _named(table: Table, group: Group) -> dict[str, Value]:
-    if any(column.name == "driver" for column in table.columns):
-        return {"driver": group.label, "setting": group.setting}
-    return {table.columns[0].name: group.id}
+    first = table.columns[0].name
+    of_drivers = any(column.name == "driver" for column in table.columns)
+    rows = [
+        Row(
+            group.id,
+            (group.id,),
+            {"driver": group.label, "setting": group.setting} if of_drivers else {first: group.id},
+            group.unjudged,
+        )
+        for group in study.unjudged + (study.unjudged_asked if name == OF_ASKED else [])
+        if group.id not in shown
+    ]
+    title, number = TABLES[name].title, TABLES[name].number
+    whole = replace(table, rows=[*table.rows, *rows], title=title, number=number)
+    return footnoted(whole, study)
 
 
 def finished_tables(
@@ -152,9 +159,3 @@ def _valid(names: Sequence[str]) -> Sequence[str]:
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)
     return names or tuple(TABLES)
-
-
-def _made(name: str, study: Study) -> Table:
-    module = import_module(f"merge_runner_analysis.tables.{TABLES[name].module}")
-    maker: Callable[[Study], Table] = getattr(module, name.replace("-", "_"))
-    return replace(maker(study), title=TABLES[name].title, number=TABLES[name].number)

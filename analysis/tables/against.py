@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TypeGuard
 
 from merge_runner.drivers.registry import MOCKS
 from merge_runner_analysis.data.reference_data import citation, printed_value, published
@@ -12,7 +11,7 @@ from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import shown_in
 from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.stats.indicators import INDICATORS
-from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value
+from merge_runner_analysis.tables.model import Optional, Row, Table, Value
 
 PAPER = "paper"
 # The files of the tables that the paper prints. Table V has values of Tables VI and VII.
@@ -38,11 +37,15 @@ def against(table: Table, study: Study) -> Table:
         if column in known:
             paper.setdefault(key, {})[column] = value
     named = {column for values in paper.values() for column in values}
-    columns = [
-        added
-        for column in table.columns
-        for added in (column, *(_columns(column) if column.name in named else ()))
-    ]
+    columns = []
+    for one in table.columns:
+        columns.append(one)
+        if one.name in named:
+            meaning = f"{one.heading} as printed in the paper"
+            columns += [
+                Optional(f"{one.name}_in_paper", "paper", one.kind, one.digits, meaning),
+                Optional(f"{one.name}_difference", "diff.", "number", one.digits),
+            ]
     groups = {group.id: group for group in (*study.groups, *study.unjudged)}
     rows = [_beside(row, groups[row.groups[0]], paper) for row in table.rows]
     notes = [*table.notes, *(f"paper: {citation(name)}" for name in FILES[table.name])]
@@ -75,38 +78,20 @@ def _printed(table: str) -> Iterator[tuple[Key, str, Value]]:
                 yield key, "value" if items else metric.name, printed_value(row[column])
 
 
-def _columns(column: Column) -> tuple[Column, Column]:
-    meaning = f"{column.heading} as printed in the paper"
-    return (
-        Optional(f"{column.name}_in_paper", "paper", column.kind, column.digits, meaning),
-        Optional(f"{column.name}_difference", "diff.", "number", column.digits),
-    )
-
-
 def _beside(row: Row, group: Group, paper: dict[Key, dict[str, Value]]) -> Row:
     """The row with the paper's values, and the differences of numbers unless ours are published."""
-    if not _in_paper(group):
+    # In each of the paper's rows one model drives both vehicles. Another sample set is still the
+    # same driver: it only draws other samples. A mock model poses as none.
+    asked, posing = group.models[0], group.scripted and not MOCKS.issuperset(group.models)
+    sample_set = "" if group.name == asked else f"/set{group.trials['sample_set'].iloc[0]}"
+    if group.unjudged or posing or group.name != asked + sample_set:
         return row
     item = row.id.removeprefix(group.id).lstrip("/")
     values = dict(row.values)
-    for name, theirs in paper.get((group.models[0], group.setting, item), {}).items():
+    for name, theirs in paper.get((asked, group.setting, item), {}).items():
         values[f"{name}_in_paper"] = theirs
+        ours = None if isinstance(theirs, bool) else values.get(name)
         # A comparison of published values with themselves would test nothing.
-        of_trials = group.measured and group.published_outcomes is None
-        if of_trials and _is_number(ours := values.get(name)) and _is_number(theirs):
+        if isinstance(theirs, float | int) and isinstance(ours, float | int) and group.traced:
             values[f"{name}_difference"] = ours - theirs
     return replace(row, values=values)
-
-
-def _is_number(value: Value) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _in_paper(group: Group) -> bool:
-    """Whether a group is of a driver that the paper may have: a mock model poses as none."""
-    # In each of the paper's rows one model drives both vehicles. Another sample set is still the
-    # same driver: it only draws other samples.
-    (asked, *others) = group.models
-    sample_set = "" if group.name == asked else f"/set{group.trials['sample_set'].iloc[0]}"
-    posing = group.scripted and not MOCKS.issuperset(group.models)
-    return not others and group.name == asked + sample_set and not group.unjudged and not posing

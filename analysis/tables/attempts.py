@@ -10,9 +10,9 @@ from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Table, row_of
 
 NO_CALLS = "no call: this driver asks no model, or its calls are not in the database"
-# Failures with a share of the answers beside their number, and how they are called; the others are
-# malformed answers, and have a column where they occur.
-ANSWERS = {"refusal": "refused", "truncated": "truncated", "empty": "empty"}
+# Failures with a share of the answers beside their number; the others are malformed answers, and
+# have a column where they occur.
+FAILURES = {"refused": "refusal", "truncated": "truncated", "empty": "empty"}
 # What each share is of: a call may take several attempts, and a lost call has no answer that could
 # be invalid.
 OF = {"retried": "attempts", "lost": "calls", "fallback": "decisions"}
@@ -23,19 +23,19 @@ MEANINGS = {
     "attempts": "HTTP attempts at these calls",
     "retried": "attempts that were followed by another",
     "lost": "calls that ended without an answer",
-    **{name: f"answers that are {name}, without a plan" for name in ANSWERS.values()},
+    **{name: f"answers that are {name}, without a plan" for name in FAILURES},
     "invalid": "answers without a valid plan, for any reason",
     "fallback": "decisions driven from an older plan, or from none",
     "unknown": "attempts of unknown fate",
     "other_model": "answers of another model",
 }
-SHARES = {"retried", "lost", *ANSWERS.values(), "invalid", "fallback"}
+SHARES = {"retried", "lost", *FAILURES, "invalid", "fallback"}
 
 
 def attempts(study: Study) -> Table:
     """A row per driver and variant: trials, calls, attempts, and what went wrong with them."""
     found = {group: tally(study, group.stored) for group in study.played}
-    known = {"answers", "decisions", *MEANINGS, *ANSWERS}
+    known = {"answers", "decisions", *MEANINGS, *FAILURES.values()}
     reasons = dict.fromkeys(name for one in found.values() for name in sorted({*one} - known))
     names = [*MEANINGS]
     names[names.index("invalid") : names.index("invalid")] = reasons
@@ -64,29 +64,26 @@ def _columns(name: str) -> list[Column]:
 
 
 def _condition(name: str) -> str:
-    """Which trials have what a column counts, by the columns of ``Calls.trials``."""
-    failures = {heading: failure for failure, heading in ANSWERS.items()}
-    if name in failures or name not in MEANINGS:
-        return f"list_contains(string_split(failures, chr(10)), {quoted(failures.get(name, name))})"
+    """Which trials have what a column counts, by the columns of ``Study.calls``."""
+    if name in FAILURES or name not in MEANINGS:
+        failure = quoted(FAILURES.get(name, name))
+        return f"list_contains(string_split(failures, chr(10)), {failure})"
     own = {"trials": "", "failed": "status = 'failed'", "invalid": "failures IS NOT NULL"}
     return own.get(name, f"{name} > 0")
 
 
 def _values(columns: list[Column], counts: Counter[str]) -> dict[str, int | float | None]:
-    counts = Counter({**counts, **{name: counts[failure] for failure, name in ANSWERS.items()}})
     values: dict[str, int | float | None] = {}
     for column in columns:
         name = column.name.removesuffix("_percent")
-        of = counts[OF.get(name, "answers")]
+        count, of = counts[FAILURES.get(name, name)], counts[OF.get(name, "answers")]
         # No calls at all is not 0 %.
-        share = 100 * counts[name] / of if of else None
-        values[column.name] = counts[name] if column.kind == "count" else share
+        values[column.name] = count if column.kind == "count" else 100 * count / of if of else None
     return values
 
 
 def _note(counts: Counter[str]) -> str:
-    if not counts["calls"]:
-        return NO_CALLS if counts["decisions"] else f"{NO_CALLS}; no decision is stored"
-    if not counts["answers"]:
-        return "no call was answered" + ("" if counts["decisions"] else ", and no decision made")
-    return ""
+    if counts["answers"]:
+        return ""
+    decided = "" if counts["decisions"] else "; no decision is stored"
+    return ("no call was answered" if counts["calls"] else NO_CALLS) + decided

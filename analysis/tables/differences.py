@@ -1,4 +1,7 @@
-"""Differences between prompts, and between the levels of factors; for humans see ``verdicts``."""
+"""Differences from the humans, between prompts, and between the levels of factors.
+
+Headlines, sentences, the report and the pages read the table ``verdicts`` and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +10,54 @@ from dataclasses import replace
 from itertools import product
 from math import isinf
 
+from merge_runner.records import SIDES
 from merge_runner.registry import require
 from merge_runner.text_safety import quoted
+from merge_runner_analysis.data.driver_words import language_models
+from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
 from merge_runner_analysis.data.study import Group, Study, levels_of
-from merge_runner_analysis.metrics import METRICS, RULES_NOTE, Metric, intervals_of, shown_in
+from merge_runner_analysis.metrics import INTERVALS, METRICS, RULES_NOTE, Metric, shown_in
+from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.stats.contrasts import contrast, corrected
 from merge_runner_analysis.stats.factors import (
     Level,
     balance,
-    difference,
     difference_of_medians,
     levels_by_factor,
 )
-from merge_runner_analysis.stats.intervals import Difference
 from merge_runner_analysis.stats.measures import estimate, trials_of, undecided_note
+from merge_runner_analysis.stats.verdicts import Comparison, Known, compared, of_humans
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
+from merge_runner_analysis.verdict_words import (
+    HUMANS,
+    LANGUAGE_MODEL,
+    MEASURES,
+    MOCK,
+    PROGRAM,
+    TABLE,
+    sentences,
+)
 
+VERDICT_COLUMNS = (
+    Column("driver", "driver"),
+    Column("setting", "prompt"),
+    Column("kind", "kind", meaning="language model, program or mock model"),
+    Optional("measure", "measure"),
+    Optional("n", "n", "count", 0, "trials that the estimate rests on"),
+    Optional("k", "k", "count", 0, "trials that collided", "collided_boxes"),
+    Optional("undecided", "undecided", "count", 0, "ended by another rule"),
+    Column("estimate", "estimate", "number", 2, "in the unit of the measure"),
+    interval("ci", "of the same model"),
+    Optional("human", "humans", "number", 2, "in the same conditions"),
+    interval("human_ci", "of the humans"),
+    Optional("difference", "difference", "number", 2, "driver minus humans"),
+    interval("difference_ci", "of the difference"),
+    Optional("p", "p", "p", 3, "of no difference, by the same model"),
+    Optional("p_holm", "Holm", "p", 3, "corrected over the measures of the driver"),
+    Optional("detectable", "detectable", "number", 2, "smallest difference found with power .8"),
+    Optional("state", "verdict", meaning="what is shown"),
+    Optional("rule", "rule", meaning="how the verdict is set"),
+)
 WITHIN = (
     "compared within the {} that both have: rates by the weights of Mantel and Haenszel, with "
     "Newcombe's interval and Fisher's exact test; means by least squares, with its t test"
@@ -42,6 +77,93 @@ NO_INTERACTION = (
 )
 
 
+def verdicts(study: Study) -> Table:
+    """Every driver and prompt that is judged, and the humans first, by every measure."""
+    rows = [] if study.human not in study.groups else [*_human_rows(study)]
+    for group in study.models:
+        if not group.caution:
+            rows += [_compared(group, _kind(study, group), one) for one in compared(study, group)]
+    rows += [
+        Row(group.id, (group.id,), _driver(group, _kind(study, group)), group.unjudged)
+        for group in study.unjudged
+    ]
+    return Table(
+        TABLE,
+        VERDICT_COLUMNS,
+        rows,
+        (
+            *sentences(rows),
+            *(
+                f"{one.name}: {one.trait}, {one.unit}; verdict: {one.rule}"
+                for one in MEASURES.values()
+            ),
+            "shown: as in humans; weaker, stronger: shown, and the interval of the difference "
+            "leaves 0 out; unlike: not shown, and it leaves 0 out; inconclusive: neither",
+            "collisions: by the rule of the human experiment, outlines that overlap, looked for at "
+            "20 Hz; the humans' share weighs conditions as the driver's trials do",
+            f"intervals take trials as independent. The {HUMAN_TRIALS} human trials are of nine "
+            "pairs who differ, which only the mean gap and imported gaps allow for",
+            *(
+                f"{group.id}: {group.caution}: it is not judged, nor compared with the humans"
+                for group in study.baselines
+                if group.caution
+            ),
+        ),
+    )
+
+
+def _kind(study: Study, group: Group) -> str:
+    if group.scripted:
+        return MOCK
+    models = dict(zip(SIDES, (*group.models, *group.models), strict=False))
+    asked = language_models(models, study.specs.get(group.spec_hash or "", {}))
+    return LANGUAGE_MODEL if asked else PROGRAM
+
+
+def _driver(group: Group, kind: str) -> dict[str, Value]:
+    return {"driver": group.label, "setting": group.setting, "kind": kind}
+
+
+def _compared(group: Group, kind: str, found: Comparison) -> Row:
+    difference, measure = found.difference, found.measure
+    values: dict[str, Value] = _driver(group, kind) | {
+        "measure": measure.name,
+        **_known(found.own),
+        "human": found.human.estimate.value,
+        "human_ci": found.human.estimate.bounds(),
+        "state": found.state or None,
+        "rule": measure.rule,
+    }
+    if difference is not None:
+        values |= {
+            "difference": difference.value,
+            "difference_ci": difference.bounds(),
+            "p": difference.p,
+            "p_holm": found.p_holm,
+            "detectable": difference.detectable,
+        }
+    return Row(f"{group.id}/{measure.name}", (group.id,), values, found.note, measure.counts)
+
+
+def _human_rows(study: Study) -> Iterator[Row]:
+    for name, found in of_humans(study).items():
+        values = _driver(study.human, HUMANS) | {"measure": name, **_known(found)}
+        note = "; ".join(filter(None, (found.problem, found.remark)))
+        # What is published rests on no trials here.
+        counts = "" if found.remark or not study.human.measured else MEASURES[name].counts
+        yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, counts)
+
+
+def _known(found: Known) -> dict[str, Value]:
+    return {
+        "n": found.estimate.n,
+        "k": found.k,
+        "undecided": found.undecided or None,
+        "estimate": found.estimate.value,
+        "ci": found.estimate.bounds(),
+    }
+
+
 def contrasts(study: Study) -> Table:
     """Every prompt against its driver's reference."""
     # A family is one question asked of several variants. Correcting over all metrics at once would
@@ -50,10 +172,8 @@ def contrasts(study: Study) -> Table:
         row
         for driver in dict.fromkeys(group.driver for group in study.models)
         for metric in shown_in("tables")
-        if metric.estimator != "median"
         for row in _family(study, driver, metric)
     ]
-    judged = "judged " if study.unjudged else ""
     return Table(
         "contrasts",
         (
@@ -77,7 +197,7 @@ def contrasts(study: Study) -> Table:
             "of all these trials as if of one condition, in the direction in which less is enough, "
             "of means (t.975 + t.8) times the standard error",
             RULES_NOTE,
-            *([] if rows else [f"there is no pair of {judged}groups to compare"]),
+            *([] if rows else ["there is no pair of judged groups to compare"]),
         ),
     )
 
@@ -86,43 +206,42 @@ def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
     """One measure of a driver's prompts against its reference; p are corrected for their number."""
     groups = {group.setting: group for group in study.models if group.driver == driver}
     other = groups.pop(study.reference, None)
-    found = [
-        (group, other, difference)
+    found = {
+        group: difference
         for group in groups.values()
         if other and (difference := contrast(study, (group, other), metric))
-    ]
-    for pair, p in zip(found, corrected([difference.p for *_, difference in found]), strict=True):
-        yield _prompt_row(*pair, metric, p)
-
-
-def _prompt_row(group: Group, other: Group, found: Difference, metric: Metric, holm: float) -> Row:
-    first, second = (
-        trials_of(one, metric).dropna(subset=[metric.column])["condition"] for one in (group, other)
-    )
-    named = ", ".join(quoted(name) for name in sorted({*first} & {*second}))
-    factor, least = 100 if metric.rate else 1, found.detectable
-    return Row(
-        f"{group.id}/{other.setting}/{metric.name}",
-        (group.id, other.id),
-        {
+    }
+    holm = corrected([difference.p for difference in found.values()])
+    for (group, difference), p_holm in zip(found.items(), holm, strict=True):
+        assert other is not None
+        first, second = (
+            trials_of(one, metric).dropna(subset=[metric.column])["condition"]
+            for one in (group, other)
+        )
+        named = ", ".join(quoted(name) for name in sorted({*first} & {*second}))
+        factor, least = 100 if metric.rate else 1, difference.detectable
+        values: dict[str, Value] = {
             "driver": group.label,
             "setting": group.setting,
             "reference": other.setting,
             "measure": metric.heading,
-            "difference": factor * found.value,
-            "ci": found.bounds(factor),
-            "p": found.p,
-            "p_holm": holm,
+            "difference": factor * difference.value,
+            "ci": difference.bounds(factor),
+            "p": difference.p,
+            "p_holm": p_holm,
             "detectable": None if least is None else factor * least,
             "n": int(first.isin(second).sum()),
             "n_reference": int(second.isin(first).sum()),
-            "freedom": None if isinf(found.freedom) else found.freedom,
-        },
-        f"{metric.heading}: so few trials can show no difference, however large"
-        if least is None
-        else "",
-        f"{metric.counts} AND condition IN ({named})",
-    )
+            "freedom": None if isinf(difference.freedom) else difference.freedom,
+        }
+        few = f"{metric.heading}: so few trials can show no difference, however large"
+        yield Row(
+            f"{group.id}/{other.setting}/{metric.name}",
+            (group.id, other.id),
+            values,
+            few if least is None else "",
+            f"{metric.counts} AND condition IN ({named})",
+        )
 
 
 def factors(study: Study) -> Table:
@@ -142,7 +261,6 @@ def factors(study: Study) -> Table:
     rows += _interactions(study, found) if by else []
     p = {row.id: value for row in rows if isinstance(value := row.values.get("p"), float)}
     holm = dict(zip(p, corrected([*p.values()]), strict=True))
-    judged = "judged " if study.unjudged else ""
     return Table(
         "factors",
         (
@@ -162,8 +280,8 @@ def factors(study: Study) -> Table:
         ),
         [replace(row, values={**row.values, "p_holm": holm.get(row.id)}) for row in rows],
         (
-            *([] if found else [f"the trials of {judged}drivers differ in no factor"]),
-            f"intervals: {intervals_of(METRICS.values())}. {DIFFERENCES}",
+            *([] if found else ["the trials of judged drivers differ in no factor"]),
+            f"intervals: {INTERVALS}. {DIFFERENCES}",
             *([INTERACTIONS.format(by=by)] if by else []),
             *([f"Holm: corrected for all {len(p)} p of the table"] if p else []),
             *(f"{_name(levels[0])}: {balance(levels)}" for levels in found),
@@ -179,20 +297,13 @@ def _name(level: Level) -> str:
 def _level_row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
     found = estimate(level.pooled, metric)
     cells = _cells(level, metric) | {"n": found.n, "value": found.value, "ci": found.bounds()}
-    if level is not first:
-        if metric.estimator == "median":
-            cells |= {"difference": difference_of_medians(study, metric, level, first)}
-        else:
-            found_difference = difference(study, metric, level, first)
-            cells |= _difference(found_difference, metric, of=(level, first))
+    if level is not first and metric.estimator == "median":
+        cells |= {"difference": difference_of_medians(study, metric, level, first)}
+    elif level is not first:
+        cells |= _difference(study, metric, level, first)
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
-    return Row(
-        f"{level.id}/{metric.name}",
-        level.groups,
-        cells,
-        "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric)))),
-        counts=metric.counts,
-    )
+    note = "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric))))
+    return Row(f"{level.id}/{metric.name}", level.groups, cells, note, counts=metric.counts)
 
 
 def _cells(level: Level, metric: Metric) -> dict[str, Value]:
@@ -207,17 +318,16 @@ def _cells(level: Level, metric: Metric) -> dict[str, Value]:
     }
 
 
-def _difference(
-    found: Difference | None, metric: Metric, of: tuple[Level, ...]
-) -> dict[str, Value]:
+def _difference(study: Study, metric: Metric, *levels: Level) -> dict[str, Value]:
     """A difference of levels; no p where some of them lack cells that others have."""
+    found = contrast(study, [level.pooled for level in levels], metric, "cell")
     if found is None:
         return {}
-    unit = 100 if metric.rate else 1
+    unit, cells = 100 if metric.rate else 1, {frozenset(level.cells) for level in levels}
     return {
         "difference": unit * found.value,
         "difference_ci": found.bounds(unit),
-        "p": found.p if len({frozenset(level.cells) for level in of}) == 1 else None,
+        "p": found.p if len(cells) == 1 else None,
     }
 
 
@@ -227,30 +337,24 @@ def _interactions(study: Study, found: list[list[Level]]) -> Iterator[Row]:
     for levels in found:
         known.setdefault((levels[0].factor, levels[0].mark), []).append(levels)
     tested = [metric for metric in METRICS.values() if metric.estimator != "median"]
-    for (base, *more), metric in product(known.values(), tested):
-        twins = {level.name: level for level in base[1:]}
-        for first, *levels in more:
+    for ((base, *twins), *more), metric in product(known.values(), tested):
+        for (first, *levels), twin in product(more, twins):
             for level in levels:
-                if level.name in twins and first.name == base[0].name:
-                    others = twins[level.name], base[0]
-                    yield _interaction(study, (level, first), others, metric)
+                if level.name == twin.name and first.name == base.name:
+                    yield _interaction(study, level, first, twin, base, metric)
 
 
 def _interaction(
-    study: Study, pair: tuple[Level, Level], others: tuple[Level, Level], metric: Metric
+    study: Study, level: Level, first: Level, twin: Level, base: Level, metric: Metric
 ) -> Row:
-    level, base = pair[0], others[1]
     by, _, at = level.at.partition("=")
+    different = _difference(study, metric, level, first, twin, base)
     cells = _cells(level, metric) | {
         "at": f"{at} - {base.at.partition('=')[2]}",
         "factor": f"{level.factor} × {by}",
         "n": estimate(level.pooled, metric).n,
+        **different,
     }
-    found = difference(study, metric, *pair, *others)
-    return Row(
-        f"{level.id}/interaction/{metric.name}",
-        level.groups,
-        cells | _difference(found, metric, of=(*pair, *others)),
-        "" if found else f"{metric.heading}: {NO_INTERACTION}",
-        metric.counts,
-    )
+    note = "" if different else f"{metric.heading}: {NO_INTERACTION}"
+    row_id = f"{level.id}/interaction/{metric.name}"
+    return Row(row_id, level.groups, cells, note, metric.counts)

@@ -9,10 +9,9 @@ import io
 import json
 import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from functools import partial
 from itertools import accumulate, takewhile
 
-from merge_runner.errors import unknown_name
 from merge_runner.prompts.blocks import title_of
 from merge_runner.text_safety import csv_writer, in_spreadsheet
 from merge_runner_analysis.table_format import TableFormat
@@ -46,35 +45,22 @@ def render(tables: Sequence[Table], form: TableFormat, width: int | None = None)
     """All tables as one text that ends without a line break; ``width`` is that of a terminal."""
     if form is TableFormat.JSON:
         return json.dumps({"tables": [as_json(t) for t in tables]}, indent=2, ensure_ascii=False)
-    if form is TableFormat.TEXT:
-        return "\n\n".join(as_text(table, width) for table in tables)
-    write = {
+    writers: dict[TableFormat, Callable[[Table], str]] = {
+        TableFormat.TEXT: partial(as_text, width=width),
         TableFormat.CSV: as_csv,
         TableFormat.MD: as_markdown,
         TableFormat.LATEX: as_latex,
-    }[form]
+    }
     # Several CSV tables in one stream could not be told apart without their names.
     named = form is TableFormat.CSV and len(tables) > 1
-    return "\n\n".join(f"# {table.name}\n" * named + write(table) for table in tables)
+    return "\n\n".join(f"# {table.name}\n" * named + writers[form](table) for table in tables)
 
 
-def with_columns(tables: Sequence[Table], names: Sequence[str]) -> list[Table]:
-    """The tables with these columns, after those that name a row; raises UsageError."""
-    known = dict.fromkeys(column.name for table in tables for column in table.columns)
-    for name in names:
-        if name not in known:
-            raise unknown_name("column", name, known)
-    return [
-        replace(table, columns=[*first, *(c for c in rest if c.name in names)])
-        for table in tables
-        for first, rest in [_parted(table.columns)]
-    ]
-
-
-def _parted(columns: Sequence[Column]) -> tuple[Sequence[Column], Sequence[Column]]:
-    """The columns at the left, which name a row, and the others."""
-    names = sum(1 for _ in takewhile(lambda column: column.kind == "text", columns))
-    return columns[:names], columns[names:]
+def _grid(table: Table) -> tuple[list[Column], list[list[str]]]:
+    """The columns that are shown; their headings, and each row, as a reader sees them."""
+    shown = shown_columns(table)
+    rows = [[shown_value(c, row.values.get(c.name)) for c in shown] for row in table.rows]
+    return shown, [[column.heading for column in shown], *rows]
 
 
 def as_text(table: Table, width: int | None = None) -> str:
@@ -85,42 +71,29 @@ def as_text(table: Table, width: int | None = None) -> str:
     # Characters differ in width on a terminal, so len() would misalign the columns.
     from rich.cells import cell_len
 
-    columns, grid, notes = shown_columns(table), _grid(table), notes_of(table)
+    (columns, grid), notes = _grid(table), notes_of(table)
     widths = [max(map(cell_len, cells)) for cells in zip(*grid, strict=True)]
     if width is not None:
         ends = accumulate(one + len(BETWEEN) for one in widths)
         fitting = max(sum(end - len(BETWEEN) <= width for end in ends), 1)
-        if left_out := [column.name for column in columns[fitting:]]:
-            notes.insert(
-                0,
-                f"wider than the terminal, so without {', '.join(left_out)}: --columns NAME,NAME "
-                "chooses, --format csv has all",
-            )
-        columns, widths = columns[:fitting], widths[:fitting]
+        if left_out := ", ".join(column.name for column in columns[fitting:]):
+            notes.insert(0, f"wider than the terminal, so without {left_out}: --format csv has all")
+        columns = columns[:fitting]
     lines = []
     for cells in grid if columns else ():
-        blanks = (" " * (one - cell_len(cell)) for one, cell in zip(widths, cells, strict=False))
-        texts = (
-            cell + blank if column.kind == "text" else blank + cell
-            for column, cell, blank in zip(columns, cells, blanks, strict=False)
-        )
+        texts = []
+        for column, cell, of in zip(columns, cells, widths, strict=False):
+            blank = " " * (of - cell_len(cell))
+            texts.append(cell + blank if column.kind == "text" else blank + cell)
         lines.append(BETWEEN.join(texts))
     lines[1:1] = ["─" * max(map(cell_len, lines))] if lines else []
-    wrapped = (_wrapped(f"  {note}", width) for note in notes)
-    return "\n".join([_wrapped(table.heading, width), *(line.rstrip() for line in lines), *wrapped])
-
-
-def _grid(table: Table) -> list[list[str]]:
-    """The headings, then each row, of the columns that are shown, as a reader sees them."""
-    shown = shown_columns(table)
-    rows = [[shown_value(c, row.values.get(c.name)) for c in shown] for row in table.rows]
-    return [[column.heading for column in shown], *rows]
-
-
-def _wrapped(text: str, width: int | None) -> str:
-    if width is None:
-        return text
-    return textwrap.fill(text, width, subsequent_indent="    ", break_on_hyphens=False)
+    said = [table.heading, *(f"  {note}" for note in notes)]
+    if width is not None:
+        said = [
+            textwrap.fill(text, width, subsequent_indent="    ", break_on_hyphens=False)
+            for text in said
+        ]
+    return "\n".join([said[0], *(line.rstrip() for line in lines), *said[1:]])
 
 
 def as_csv(table: Table) -> str:
@@ -175,30 +148,29 @@ def value_rows(table: Table) -> list[dict[str, Value]]:
 
 def as_markdown(table: Table) -> str:
     """A table for a README or an issue."""
-    rules = [":--" if column.kind == "text" else "--:" for column in shown_columns(table)]
-    escaped = ([cell.replace("|", r"\|") for cell in cells] for cells in _grid(table))
+    columns, grid = _grid(table)
+    rules = "|".join(":--" if column.kind == "text" else "--:" for column in columns)
+    escaped = ([cell.replace("|", r"\|") for cell in cells] for cells in grid)
     head, *rows = (f"| {' | '.join(cells)} |" for cells in escaped)
     notes = (f"- {note}" for note in notes_of(table))
-    return "\n".join([f"**{table.heading}**", "", head, f"|{'|'.join(rules)}|", *rows, "", *notes])
+    return "\n".join([f"**{table.heading}**", "", head, f"|{rules}|", *rows, "", *notes])
 
 
 def as_latex(table: Table) -> str:
     r"""A table for the paper: needs the packages booktabs, amssymb and graphicx."""
-    columns = shown_columns(table)
+    columns, (head, *body) = _grid(table)
     form = "".join("l" if column.kind == "text" else "r" for column in columns)
-    head, *body = _grid(table)
     numeric = [column.kind in {"p", "number", "percent", "interval"} for column in columns]
-    rows = [
+    rows = "\n".join(
         " & ".join(
             f"${cell}$" if number and cell != MISSING else cell.translate(LATEX)
             for number, cell in zip(numeric, cells, strict=True)
         )
         + r" \\"
         for cells in body
-    ]
+    )
     headings = " & ".join(cell.translate(LATEX) for cell in head)
     notes = r"\\ ".join(note.translate(LATEX) for note in notes_of(table))
-    lines = "\n".join(rows)
     return rf"""\begin{{table*}}
 \centering
 \caption{{{table.title.translate(LATEX)}}}
@@ -208,7 +180,7 @@ def as_latex(table: Table) -> str:
 \toprule
 {headings} \\
 \midrule
-{lines}
+{rows}
 \bottomrule
 \end{{tabular}}}}
 \\[2pt]\parbox{{\linewidth}}{{\footnotesize {notes}}}
@@ -259,38 +231,32 @@ def table_view(table: Table, link: Callable[[Table, Row, Column], object]) -> di
     """A table as templates need it: headings, cells with what ``link`` returns, notes.
 
     The text cells before a row's first other cell are its headers: a screen reader announces them
-    with each of its cells.
+    with each of its cells. A value leads to trials unless it is published or a count of zero.
     """
     columns = shown_columns(table)
-    headers, _ = _parted(columns)
+    headers = [*takewhile(lambda column: column.kind == "text", columns)]
+    rows = []
+    for row in table.rows:
+        cells = []
+        for column in columns:
+            value, left = row.values.get(column.name), column.kind == "text"
+            linked = row.counts and not left and (value if column.counts else value is not None)
+            cells.append(
+                {
+                    "text": shown_value(column, value),
+                    "left": left,
+                    "header": column in headers,
+                    "link": link(table, row, column) if linked else None,
+                    "label": f"{column.heading} of {row.id}",
+                }
+            )
+        rows.append({"id": row.id, "cells": cells})
     return {
         "name": table.name,
         "heading": table.heading,
         "columns": [
             {"heading": c.heading, "meaning": c.meaning, "text": c.kind == "text"} for c in columns
         ],
-        "rows": [
-            {
-                "id": row.id,
-                "cells": [
-                    {
-                        "text": shown_value(column, row.values.get(column.name)),
-                        "left": column.kind == "text",
-                        "header": column in headers,
-                        "link": link(table, row, column) if _linked(row, column) else None,
-                        "label": f"{column.heading} of {row.id}",
-                    }
-                    for column in columns
-                ],
-            }
-            for row in table.rows
-        ],
+        "rows": rows,
         "notes": notes_of(table),
     }
-
-
-def _linked(row: Row, column: Column) -> bool:
-    """Whether a value leads to trials: a published one has none, nor has a count of zero."""
-    value = row.values.get(column.name)
-    nothing = value is None or (column.counts and not value)
-    return bool(row.counts) and column.kind != "text" and not nothing

@@ -12,11 +12,6 @@ from merge_runner_analysis.data.reference_data import HUMAN_DOI, HUMAN_TRIALS
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.tables.model import Table
 
-# Tables whose intervals and tests take imported human trials as independent.
-POOLING = {
-    "who-first", "gap", "indicators", "ablation-qualitative", "ablation-quantitative",
-}  # fmt: skip
-
 
 def footnoted(table: Table, study: Study) -> Table:
     """The table with notes on its trials, and ``*`` for what is said of drivers, told in a note."""
@@ -44,11 +39,16 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
         yield f"trials that did not finish: {'; '.join(left_out)}"
     if study.without_fallbacks:
         yield "trials in which a decision had a fallback are left out (--without-fallbacks)"
-    if pooled := _studies(study, [group for group in groups if group.setting]):
-        yield (
-            f"trials of several studies: {', '.join(pooled)}. No p is given for a difference "
-            "across studies; `--study FILE` keeps the trials of one"
-        )
+    driven = [group.trials for group in groups if group.setting]
+    if driven and not study.file:
+        known, trials = study.studies, pd.concat(driven)
+        sizes = {name: int(known.holds(name, trials).sum()) for name in known.orders}
+        pooled = [f"{name} ({n} trials)" for name, n in sizes.items() if n]
+        if len(pooled) > 1:
+            yield (
+                f"trials of several studies: {', '.join(pooled)}. No p is given for a difference "
+                "across studies; `--study FILE` keeps the trials of one"
+            )
     if study.human in groups:
         yield from _human_notes(study, table)
         for group in groups:
@@ -63,47 +63,35 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
             f"{', '.join(counts)} trials repeat an earlier one to the last state, of programs that "
             "declare no chance: they are left out, and n counts the others"
         )
-    if pairs := [f"{group.id}: {_seats(group)}" for group in groups if group.is_mixed]:
+    if pairs := [f"{group.id}: {_seats(group)}" for group in groups if len(group.models) > 1]:
         yield (
             "of two different drivers left stands for the one that is named first, wherever it "
             f"sat: odds that it goes first. {'; '.join(pairs)}"
         )
 
 
-def _studies(study: Study, groups: list[Group]) -> list[str]:
-    """Which studies the trials are of, where these are several."""
-    if study.file or len(study.studies.orders) < 2 or not groups:
-        return []
-    trials = pd.concat([group.trials for group in groups])
-    sizes = {name: int(study.studies.holds(name, trials).sum()) for name in study.studies.orders}
-    found = [f"{name} ({n} trials)" for name, n in sizes.items() if n]
-    return found if len(found) > 1 else []
-
-
 def _human_notes(study: Study, table: Table) -> Iterator[str]:
-    if study.imported is None:
+    if not study.human.measured:
         yield (
             f"human: the published outcomes of {HUMAN_TRIALS} trials; for the rest `merge-runner "
             f"human import PATH` reads the recordings (doi {HUMAN_DOI})"
         )
         return
-    yield from (f"human: {finding}" for finding in study.imported.findings())
-    if table.name in POOLING:
+    yield from (f"human: {finding}" for finding in study.findings)
+    if table.number:  # the paper's take imported human trials as independent
         yield (
             "human: intervals and tests take the trials as independent, but the imported ones come "
-            f"from {study.imported.pairs} pairs who differ: they are too narrow"
+            f"from {study.human.trials['pair'].nunique()} pairs who differ: they are too narrow"
         )
 
 
 def _seats(group: Group) -> str:
     """On which sides two different drivers sat."""
     left, right = group.seats
-    if group.one_sided:
-        return (
-            f"{group.models[0]} sat on the {'left' if left else 'right'} in all {left + right} "
-            "trials: what is its doing cannot be told from what is its side's; `mirror = true` in "
-            "the study, or --mirror, plays both ways round"
-        )
+    sat = f"{group.models[0]} sat on the left in {left} trials, and on the right in {right}"
+    if left and right:
+        return f"{sat}, mirrored"
     return (
-        f"{group.models[0]} sat on the left in {left} trials, and on the right in {right}, mirrored"
+        f"{sat}: what is its doing cannot be told from what is its side's; `mirror = true` in the "
+        "study, or --mirror, plays both ways round"
     )

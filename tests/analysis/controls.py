@@ -14,12 +14,12 @@ from scipy import stats
 from merge_runner_analysis.data.intermittency import (
     SAMPLE_S,
     at_5_hz,
-    clocked,
     gains,
     without_resistance,
 )
 
 SECONDS = 10
+CLOCK_SAMPLES = 5  # 1 s: the clock of the paper's drivers
 PROFILES = 200
 RATES_HZ = (5, 20)
 NOISES_MPS = (0.0, 0.02, 0.03)
@@ -36,6 +36,16 @@ def driven(accelerations: np.ndarray, step_s: float) -> np.ndarray:
     """Speeds from 10 m/s on, each acceleration (n, steps) held for a step."""
     start = np.zeros((len(accelerations), 1))
     return 10 + np.concatenate([start, np.cumsum(accelerations, axis=1) * step_s], axis=1)
+
+
+def clocked(velocity_mps: np.ndarray) -> np.ndarray:
+    """Speeds at 5 Hz, (vehicles, samples), with one acceleration from each full second to the next.
+
+    So drives whoever decides once a second and holds its acceleration, whatever it decides.
+    """
+    at = np.arange(velocity_mps.shape[1])
+    knots = np.union1d(at[::CLOCK_SAMPLES], at[-1:])
+    return np.stack([np.interp(at, knots, v[knots]) for v in velocity_mps])
 
 
 def sizes(rng, n: int, low: float, high: float) -> np.ndarray:

@@ -20,6 +20,7 @@ from merge_runner.results.database import open_database
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.reference_data import PAIRS, published
+from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explorer.export import export_folder
 from merge_runner_analysis.human.archive import open_files
 from merge_runner_analysis.human.load import import_trials, sort_files
@@ -234,7 +235,7 @@ def main() -> None:
     folder, *kinds = sys.argv[1:]
     for kind in kinds or KINDS:
         db = made(Path(folder), kind)
-        for _ in write_report(db, None, db.with_name("report.html"), db.with_name("files")):
+        for _ in write_report(Study(db), db.with_name("report.html"), db.with_name("files")):
             pass
         export_folder(db, db.with_name("pages"))
         sys.stdout.write(f"{db.parent}: {KINDS[kind].__doc__}\n")

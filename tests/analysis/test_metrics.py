@@ -6,15 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.text import Text
 from scipy import stats
 
 from merge_runner.errors import UsageError
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.data.metric_values import outcomes_with_metrics
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.figures.gallery import distributions
 from merge_runner_analysis.human.archive import open_files
 from merge_runner_analysis.human.load import import_trials, sort_files
 from merge_runner_analysis.metrics import (
@@ -24,7 +21,6 @@ from merge_runner_analysis.metrics import (
     JOINT,
     METRICS,
     RMSE,
-    HumanReference,
     Metric,
     register,
     shown_in,
@@ -32,7 +28,6 @@ from merge_runner_analysis.metrics import (
 from merge_runner_analysis.stats.measures import (
     counts,
     estimate,
-    human_reference,
     median,
     no_human_value,
     values,
@@ -90,13 +85,6 @@ def test_a_metric_whose_parts_do_not_fit_together_is_refused(added):
         added(name="a_m", value="collided", estimator="proportion")
 
 
-def test_a_metric_that_the_published_outcomes_cannot_tell_is_named(added):
-    added(name="fine", value="1.0", humans_from="outcomes")
-    added(name="odd_m", value="gap_m", humans_from="outcomes")
-    with pytest.raises(UsageError, match="the metric odd_m fails on the published human outcomes"):
-        outcomes_with_metrics()
-
-
 def test_the_trials_of_a_share_are_those_that_it_is_found_in(added, partly):
     added(name="driven_percent", estimator="proportion", trials="ended", value="end_time_s > 0")
     human = Study(partly).human
@@ -105,18 +93,9 @@ def test_the_trials_of_a_share_are_those_that_it_is_found_in(added, partly):
 
 
 def test_why_humans_have_no_value_is_told_of_collisions_alone_by_their_rule(added):
-    whole = added(name="a_mps", label="a", humans_from="all recordings")
+    whole = added(name="a_mps", label="a")
     assert no_human_value(COLLISIONS).endswith("published human collisions are boxes that overlap")
-    assert no_human_value(whole) == (
-        "a (m/s): no human value is published, and not all human recordings are imported"
-    )
-
-
-def test_a_metric_that_no_trial_has_is_not_said_to_lack_finished_trials(added, db):
-    added(name="none_m", value="NULL")
-    texts = [text.get_text() for text in distributions(Study(db)).findobj(Text)]
-    assert texts.count("no trial has it") == 2
-    assert "no finished trial" not in texts
+    assert no_human_value(whole) == "a (m/s): no human value is published, and none is imported"
 
 
 def test_trials_whose_value_is_missing_or_no_finite_number_do_not_count(added, db):
@@ -142,29 +121,12 @@ def test_a_proportion_of_all_ended_trials_counts_those_of_which_it_is_known(adde
 
 def test_a_rate_is_compared_and_a_median_is_not(added, db):
     rate = {"estimator": "proportion", "value": "joint"}
-    added(name="a_percent", label="a", human=HumanReference(40.0, "X (2026)", n=50), **rate)
+    added(name="a_percent", label="a", **rate)
     added(name="c_mps", label="c", estimator="median")
     (table,) = make_tables(Study(db), ["contrasts"])
     rows = {row.id for row in table.rows}
     assert "o3/A1/baseline/a_percent" in rows
     assert not any(name.endswith("c_mps") for name in rows)
-
-
-def test_a_published_human_value_stands_in_the_tables_with_its_interval_and_source(added, db):
-    known = HumanReference(0.5, "X (2026)", low=0.4, high=0.6)
-    added(name="a_mps", label="a", human=known)
-    quantitative, indicators = make_tables(Study(db), ["ablation-quantitative", "indicators"])
-    (human,) = (row for row in quantitative.rows if row.id == "human")
-    assert (human.values["a_mps"], human.values["a_mps_ci"]) == (0.5, (0.4, 0.6))
-    assert "a (m/s): published, no human traces are imported (X (2026))" in human.note
-    (human,) = (row for row in indicators.rows if row.id == "human/a_mps")
-    assert human.values["interval"] == (0.4, 0.6)
-
-
-def test_what_is_published_of_rates_is_of_the_trials_that_count():
-    assert human_reference(JOINT).n == 962
-    assert human_reference(BOXES).n == 990
-    assert human_reference(COLLISIONS) is None
 
 
 @pytest.mark.parametrize("n", [6, 7, 20, 101])

@@ -11,7 +11,7 @@ from merge_runner.run.stored_replay import audit_database
 from merge_runner_analysis.data.provenance import provenance
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explorer.pages.prompts import differences
-from merge_runner_analysis.report.alarms import alarms
+from merge_runner_analysis.report.page import alarms
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Said, changed, write_study, yielding
 
@@ -78,10 +78,10 @@ def test_report_and_audit_say_that_it_is_not_judged_and_conclude_nothing(mixed):
     study, origin = Study(mixed), provenance(mixed)
     (table,) = make_tables(study, ["verdicts"])
     assert "bad" not in table.notes[0]
-    (alarm,) = alarms(study, origin)
-    assert alarm.title == "Too few valid decisions"
+    ((title, text),) = alarms(study, origin).items()
+    assert title == "Too few valid decisions"
     for group in ("bad/baseline", "o3/A1"):
-        assert f"{group}: not judged: " in alarm.text
+        assert f"{group}: not judged: " in text
         assert any(text.startswith(f"{group}: Not judged: ") for text in table.notes)
         notes = [note for audit in audit_database(mixed) for note in audit.notes]
         assert any(note.startswith(f"{group}: not judged: ") for note in notes)

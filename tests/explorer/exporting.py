@@ -13,7 +13,7 @@ from merge_runner_analysis.tables import TABLES
 FEW_TABLES = {
     "merge_runner_analysis.explorer.pages.tables.TABLES": {"attempts": TABLES["attempts"]},
     "merge_runner_analysis.explorer.pages.tables.FIGURES": {
-        "ablation-matrix": FIGURES["ablation-matrix"]
+        "first-action": FIGURES["first-action"]
     },
 }
 

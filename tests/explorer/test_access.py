@@ -21,7 +21,7 @@ PAGES = (
     "/tables/attempts",
     "/tables/indicators",
     "/prompts",
-    "/figures/ablation-matrix",
+    "/figures/first-action",
     "/discordant?model=emulator&variant=A1",
     "/trials/o4/baseline/L_4_0/rep01?side=left&decision=2",
     "/trials/human/baseline/N_0_0/rep01",

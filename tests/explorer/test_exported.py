@@ -94,7 +94,7 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     page.get_by_role("link", name="Study").click()
     expect(page.locator("h1")).to_have_text("The baseline prompt in all 11 conditions")
     page.get_by_role("link", name="Tables and figures", exact=True).click()
-    page.get_by_role("link", name="ablation-matrix").click()
+    page.get_by_role("link", name="first-action").click()
     expect(page.locator("figure img")).to_be_visible()
 
 
@@ -104,7 +104,7 @@ def test_what_an_export_refers_to_lies_in_it_and_asks_no_server(exported):
     assert names > {
         *("index.html", "files/trials.html", "files/trials-emulator-baseline-N_0_0-rep01.html"),
         *("files/conditions-N_0_0.html", "files/tables-attempts.csv", "files/tables-attempts.tex"),
-        *("files/figures-ablation-matrix.svg", "files/sweeps.html"),
+        *("files/figures-first-action.svg", "files/sweeps.html"),
     }
     assert {str(page): found for page in pages if (found := broken(page))} == {}
     assert len(pages) > 30

@@ -236,16 +236,16 @@ def test_every_figure_is_offered_and_comes_as_svg(client, db):
     assert set(re.findall(r'href="/figures/([^"]+)\.svg"', client.get("/tables").text)) == set(
         MAKERS
     )
-    reply = client.get("/figures/ablation-matrix.svg")
+    reply = client.get("/figures/first-action.svg")
     assert reply.headers["content-type"].startswith("image/svg+xml")
     assert "</svg>" in reply.text
     policy = reply.headers["content-security-policy"]
     assert "style-src 'unsafe-inline'; img-src data:; sandbox" in policy
-    assert client.get("/figures/ablation-matrix.png").content.startswith(b"\x89PNG")
+    assert client.get("/figures/first-action.png").content.startswith(b"\x89PNG")
     assert client.get("/figures/nothing.svg").status_code == 404
-    page = client.get("/figures/ablation-matrix").text
+    page = client.get("/figures/first-action").text
     assert 'src="data:image/svg+xml;base64,' in page
-    assert 'href="/tables/ablation-qualitative.csv" download' in page
+    assert 'href="/tables/first-action.csv" download' in page
     assert f"<code>{results_digest(db)[0]}</code>" in page
     assert "arXiv:2604.09609" in page
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import re
 from collections import Counter
-from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from urllib.parse import parse_qs, urlsplit
@@ -84,6 +83,7 @@ def study(written, tmp_path):
 
 def browser(db):
     site = Site(db)
+    site.computing = Awaited(db, InProcess)
     return TestClient(explorer(site), base_url="http://127.0.0.1:1")
 
 
@@ -117,10 +117,7 @@ def test_runs_show_what_the_audit_finds_and_notes_and_keep_it(study):
         connection.execute("UPDATE sweeps SET ended_at = started_at, exit_code = 1")
         connection.execute("UPDATE trials SET end_time_s = 99 WHERE status = 'finished'")
     for address in (URL, "/sweeps"):
-        site = Site(study)
-        site.computing = Awaited(study, InProcess)
-        with closing(site):
-            text = text_of(TestClient(explorer(site), base_url="http://127.0.0.1:1"), address)
+        text = text_of(browser(study), address)
         assert "found: outcome: sweep-1" in text
     [run] = audit_database(study, "sweep-1")
     assert all(" ".join(note.split()) in text for note in run.notes)
@@ -261,7 +258,8 @@ def test_while_it_runs_its_totals_are_its_progress_file_s_and_the_cells_those_st
 )
 def test_the_verdict_says_how_it_ended_and_what_to_type(code, ended, failed, kind, words, goes_on):
     row = {"sweep_id": "s", "name": "baseline", "exit_code": code, "ended": ended,
-           "failed": failed, "others": 0, "ended_at": None if code is None else END}  # fmt: skip
+           "failed": failed, "others": 0, "ended_at": None if code is None else END,
+           "asked": 9, "invalid": 0}  # fmt: skip
     run = Run(row, CONFIG, None)
     verdict = assessment_of(run)
     assert verdict.kind == kind
@@ -277,9 +275,12 @@ def test_the_command_to_go_on_names_the_database(tmp_path):
     assert command == f"merge-runner sweep baseline --model o3 --db {tmp_path}/t.duckdb"
 
 
-def test_a_finished_sweep_that_another_model_answered_is_doubtful():
-    row = {"exit_code": 0, "ended": 0, "failed": 0, "others": 7, "ended_at": END}
-    assert assessment_of(Run(row, {}, None)).kind == "doubtful"
+@pytest.mark.parametrize("doubt", [{"others": 7}, {"invalid": 8}])
+def test_a_finished_sweep_of_another_model_or_without_valid_replies_is_doubtful(doubt):
+    row = {"exit_code": 0, "ended": 0, "failed": 0, "others": 0, "ended_at": END, "asked": 9}
+    verdict = assessment_of(Run(row | {"invalid": 0} | doubt, {}, None))
+    assert verdict.kind == "doubtful"
+    assert ("no problems" in verdict.text) == ("others" in doubt)
 
 
 def test_what_runs_and_trials_share_counts_once_over_all_runs(study):

@@ -212,6 +212,8 @@ def _undecided(trials: pd.DataFrame, column: str) -> int:
     """How many trials another collision rule ended, so that this one did not see what follows."""
     if column not in ("collided", "boxes"):
         return 0
+    if column == "collided" and (trials["source"] == "human").all():
+        return 0  # humans did not drive under the rule of the drivers
     return int((trials[column].isna() & (trials["status"] != "failed")).sum())
 
 
@@ -253,6 +255,7 @@ def _indicators(groups) -> dict[str, dict]:
         for name, column, kind, shown in METRICS:
             if shown and "gap" in trials:
                 value, low, high, n = _estimate(trials, column, kind)
+                n = None if (_id(key), column) == ("human", "collided") else n
                 row = {"value": value, "interval_low": low, "interval_high": high, "n": n}
                 rows[f"{_id(key)}/{name}"] = row
     return rows

@@ -10,6 +10,7 @@ import duckdb
 import pytest
 from aiohttp import web
 
+from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.report.page import write_report
 from tests.harness import FAST, watched
 
@@ -141,9 +142,8 @@ async def test_no_key_and_no_account_id_is_in_anything_that_a_sweep_leaves(
         runs.append(await merge_runner("recording", "info", "o3.parquet", **env))
     assert [run.code for run in runs] == [0] * len(runs), runs
     results = tmp_path / "results"
-    report = write_report(
-        results / "merge.duckdb", None, results / "report.html", tmp_path / "files"
-    )
+    study = Study(results / "merge.duckdb")
+    report = write_report(study, results / "report.html", tmp_path / "files")
     assert list(report)
     kept = everything_in(tmp_path) + str(runs)
     # The errors are kept, with the key taken out of them.

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from merge_runner_analysis.explorer.computing import Job
 from merge_runner_analysis.explorer.display_text import with_minus
-from merge_runner_analysis.explorer.pages.computed import Computed, computed_table
+from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.pages.home import (
     Driver,
     by_condition,
@@ -89,7 +90,7 @@ def _summary(own: Driver) -> str:
     )
 
 
-def _first(site: Site, driver: str, scope: Scope) -> tuple[Computed, str]:
+def _first(site: Site, driver: str, scope: Scope) -> tuple[Job, str]:
     """What a driver does first, by the table of first actions; empty until that is made."""
     found, table = computed_table(site, "first-action", scope.sweep, scope.condition)
     told = []

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from merge_runner_analysis.explorer.pages.computed import Computed, computed
+from merge_runner_analysis.explorer.computing import Job
+from merge_runner_analysis.explorer.pages.computed import computed
 from merge_runner_analysis.explorer.scope import carried, scope_of
 from merge_runner_analysis.explorer.site import NothingNew, NotThere, Site, news_of
 from merge_runner_analysis.explorer.sweeps import (
@@ -43,7 +44,8 @@ def sweeps_page(site: Site, asked: Mapping[str, str]) -> str:
 def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     """One run; raises NotThere, and NothingNew as ``seen``."""
     seen = asked.get("seen", "")
-    found = [(run, said) for run, said in list_runs(site.catalogue) if run.sweep_id == sweep_id]
+    runs = list_runs(site.catalogue)
+    found = [(run, said) for run, said in runs if run.sweep_id == sweep_id]
     if not found:
         raise NotThere(f"the database holds no sweep {sweep_id}")
     run, assessment = found[0]
@@ -67,7 +69,7 @@ def sweep_page(site: Site, sweep_id: str, asked: Mapping[str, str]) -> str:
     )
 
 
-def audit_of(site: Site, runs: Iterable[Run]) -> Computed | None:
+def audit_of(site: Site, runs: Iterable[Run]) -> Job | None:
     """What the audit notes of each run; None while one goes on, which ends with an audit."""
     if any(run.followed for run in runs):
         return None

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from merge_runner.records import SIDES
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.accounts.account import Account
+from merge_runner_analysis.accounts import Account
 from merge_runner_analysis.explorer import views
 from merge_runner_analysis.explorer.details import Trial, read_trial
 from merge_runner_analysis.explorer.display_text import clamped, shortened

@@ -5,7 +5,7 @@ from __future__ import annotations
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner_analysis.accounts.course import Course
+from merge_runner_analysis.accounts import Course
 from tests.analysis.studies import SCENARIO, Drive, Said, played
 
 NO_PLAN = Said(failure="no_array")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from merge_runner.records import SIDES
-from merge_runner_analysis.accounts.account import Mark, account
+from merge_runner_analysis.accounts import Mark, account
 from tests.analysis.accounts.crashes import EXAMPLES, course_of, crash, decided, drive
 from tests.analysis.studies import played
 
@@ -14,10 +14,10 @@ WORDS = {
     "last have avoided it, the left vehicle was 2.5 m/s faster and the right one 2.0 "
     "m/s faster than at the start; 0.5 m/s or more count as acting.",
     "no action": "Neither acted.",
-    "near miss": "It came close: the gap was 0.4 m when the first vehicle reached the merge point, "
-    "and afterwards the time to collision fell to 0.9 s.",
-    "long wait": "The first vehicle reached the merge point after 12.5 s; at the initial speeds it "
-    "would have been there after 4.6 s.",
+    "near miss": "It came close: the gap was 0.4 m at the first merge, then the time to collision "
+    "fell to 0.9 s.",
+    "long wait": "The first vehicle reached the merge point after 12.5 s: 2 times as long as at "
+    "the initial speeds, or longer.",
 }
 FACTS = {"gap_m": 0.42, "min_ttc_s": 0.9, "time_to_merge_s": 12.5}
 
@@ -38,11 +38,10 @@ def test_an_account_begins_with_what_the_trial_is_an_example_of(name):
     assert told(name).sentences[0].startswith(WORDS[name])
 
 
-def test_of_each_driver_it_says_what_would_have_helped_and_what_it_did_instead():
+def test_of_each_driver_it_says_what_would_have_helped():
     left, right = told("both insisted").sentences[1:]
     assert left == (
-        "The left driver could still have avoided it at 1.6 s, by braking at 2.0 m/s² from then "
-        "on. Instead it sped up by 1.2 m/s² on average."
+        "The left driver could still have avoided it at 1.6 s, by braking at 2.0 m/s² from then on."
     )
     assert right.startswith("The right driver could still have avoided it at 2.0 s")
 

@@ -11,8 +11,13 @@ from merge_runner.records import SIDES, other_side
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner_analysis.accounts.classes import COLLISIONS, collision_class, judged_at
-from merge_runner_analysis.accounts.course import BRAKING, SPEEDING_UP
+from merge_runner_analysis.accounts import (
+    BRAKING,
+    COLLISIONS,
+    SPEEDING_UP,
+    collision_class,
+    judged_at,
+)
 from merge_runner_analysis.data.reference_data import human_outcomes, published
 from tests.analysis.accounts.crashes import EXAMPLES, NO_PLAN, crash
 

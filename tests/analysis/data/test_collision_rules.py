@@ -9,11 +9,9 @@ import pandas as pd
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.records import StateRow, TrialRecord, TrialSpec
-from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.data.collision_rules import judged
 from merge_runner_analysis.data.load import load_trials
+from merge_runner_analysis.data.trials import judged
 from tests.analysis.studies import Drive, write_study
 
 
@@ -63,43 +61,3 @@ def test_what_is_seen_between_steps_is_what_a_finer_simulation_sees(tmp_path, ch
     fine = judged_by(tmp_path / "b", finer, **rule, step_s=0.05)
     assert coarse["collided_boxes"].equals(fine["collided"])
     assert 0 < fine["collided"].sum() < 100
-
-
-@pytest.fixture
-def humans(tmp_path):
-    """Stores human trials of N_0_0: (status, merged first, positions) each."""
-
-    def store(*trials):
-        records = []
-        for number, (status, first, pairs) in enumerate(trials):
-            spec = TrialSpec(
-                f"human/{number}", "h", "human", "human", "human", None, "N_0_0", number, 0, 0,
-                pair="pair1",
-            )  # fmt: skip
-            states = tuple(
-                StateRow(step, 0.05 * step, side, position, 10.0, 0.0)
-                for step, pair in enumerate(pairs)
-                for side, position in zip(("left", "right"), pair, strict=True)
-            )
-            end_s = 0.05 * (len(pairs) - 1)
-            records.append(TrialRecord(spec, status, first, end_s, None, states, ()))
-        path = tmp_path / "humans.duckdb"
-        Store(path).add_recorded(records, {})
-        return path
-
-    return store
-
-
-def test_humans_are_judged_by_the_drivers_rule_every_fifth_of_a_second(humans):
-    """Boxes are what was recorded; a disc is not looked for between the steps of the drivers."""
-    apart, close, end = (90.0, 80.0), (84.0, 84.0), (150.0, 140.0)
-    db = humans(
-        ("finished", "left", [apart] * 4 + [close, apart, end]),
-        ("finished", "left", [apart, close, close, close, apart, end]),
-        ("collided", None, [apart, close]),
-        ("collided", None, [close, apart]),
-    )
-    trials = judged(db, load_trials(db))
-    assert trials["collided_boxes"].tolist() == [False, False, True, True]
-    assert trials["collided"].drop(2).tolist() == [True, False, True]
-    assert trials["collided"].isna()[2]

@@ -108,8 +108,8 @@ def test_another_program_makes_tables_anew(db, made, monkeypatch):
         monkeypatch.setattr(
             "merge_runner_analysis.data.derived_cache.program", lambda name=name: name
         )
-        finished_tables(db, ["velocity-profiles"])
-    assert made == ["velocity-profiles"] * 2
+        finished_tables(db, ["criticality"])
+    assert made == ["criticality"] * 2
 
 
 def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, monkeypatch):
@@ -128,7 +128,7 @@ def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, 
 @pytest.mark.slow
 def test_what_is_kept_is_not_in_the_database(db):
     before = db.read_bytes()
-    finished_tables(db, ["velocity-profiles"])
+    finished_tables(db, ["criticality"])
     assert db.read_bytes() == before
 
 
@@ -162,8 +162,8 @@ def test_what_cannot_be_kept_is_made_and_said_once(db, made, caplog):
     before = db.read_bytes()
     db.with_name(f"{db.name}.derived").mkdir()
     for _ in range(2):
-        assert finished_tables(db, ["velocity-profiles"])
-    assert made == ["velocity-profiles"] * 2
+        assert finished_tables(db, ["criticality"])
+    assert made == ["criticality"] * 2
     assert caplog.text.count("is not kept for the next time") == 1
     assert db.read_bytes() == before
 
@@ -181,7 +181,7 @@ def test_a_figure_is_not_taken_for_the_table_of_its_name(db, monkeypatch):
 def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        "merge_runner_analysis.report.page.FIGURES", {"figure2": None, "distributions": None}
+        "merge_runner_analysis.report.page.FIGURES", {"figure2": None, "first-action": None}
     )
     monkeypatch.setattr(
         "merge_runner_analysis.report.page.rendered",
@@ -189,10 +189,10 @@ def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
     )
     first = finished_figures(Study(db))
     assert finished_figures(Study(db)) == first == dict.fromkeys(first, "PHN2Zy8+")
-    assert drawn == [("figure2", "svg"), ("distributions", "svg")]
+    assert drawn == [("figure2", "svg"), ("first-action", "svg")]
     change(db, CHANGES["an outcome"])
     finished_figures(Study(db))
-    assert drawn == [("figure2", "svg"), ("distributions", "svg")] * 2
+    assert drawn == [("figure2", "svg"), ("first-action", "svg")] * 2
 
 
 @pytest.mark.long

@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 
 from merge_runner.config import both_sides
-from merge_runner.errors import UsageError
 from merge_runner_analysis.data.driver_words import stand_in
 from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.provenance import provenance
@@ -17,7 +16,7 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.explorer.sweeps import list_runs
-from merge_runner_analysis.report.alarms import alarms
+from merge_runner_analysis.report.page import alarms
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import value_rows
 from tests.analysis.studies import changed, write_study, yielding
@@ -69,7 +68,7 @@ def test_who_was_asked_is_read_from_the_columns_and_not_from_a_trials_name(db):
 def test_a_bracket_in_a_drivers_name_is_no_mark(tmp_path):
     drives = [*yielding("o3", reps=1), *yielding("o3 [preview]", reps=1)]
     study = Study(write_study(tmp_path / "t.duckdb", drives))
-    titles = [alarm.title for alarm in alarms(study, provenance(study.db))]
+    titles = [*alarms(study, provenance(study.db))]
     assert "Several settings under one name" not in titles
 
 
@@ -90,7 +89,7 @@ def test_a_mock_model_is_a_stand_in_for_no_model(tmp_path, name):
     db = write_study(tmp_path / "t.duckdb", yielding(name, reps=1))
     (group,) = changed(db, "UPDATE trials SET scripted = true").models
     assert group.label == f"{name} (scripted stand-in, no language model)"
-    assert alarms(Study(db), provenance(db)) == [], "nobody takes it for a model"
+    assert alarms(Study(db), provenance(db)) == {}, "nobody takes it for a model"
 
 
 @pytest.mark.slow
@@ -98,9 +97,9 @@ def test_trials_of_a_stand_in_are_never_pooled_with_those_of_the_model(db):
     study = changed(db, "UPDATE trials SET scripted = true WHERE trial_id LIKE 'o3/%/rep01'")
     sizes = {group.driver: len(group.trials) for group in study.models}
     assert sizes == {"o3": 22, "other": 33, "o3 [scripted]": 11}
-    (alarm,) = alarms(study, provenance(db))
-    assert alarm.title == "A scripted stand-in answered"
-    assert "o3 [scripted]/baseline: scripted stand-in, not o3" in alarm.text
+    ((title, text),) = alarms(study, provenance(db)).items()
+    assert title == "A scripted stand-in answered"
+    assert "o3 [scripted]/baseline: scripted stand-in, not o3" in text
     (table,) = make_tables(study, ["ablation-quantitative"])
     for row, trials in (("o3/baseline", 22), ("o3 [scripted]/baseline", 11)):
         (source,) = explain(study, table, f"{row}:n").sources
@@ -142,7 +141,7 @@ def test_programs_that_declare_no_chance_count_each_trial_once(db):
     (source,) = explain(study, table, "o3/baseline:n").sources
     assert len(load(source.query, db)) == len(source.trials) == 11
     assert any(": 22 of 33 trials repeat an earlier one" in note for note in table.notes)
-    assert alarms(study, provenance(db)) == []
+    assert alarms(study, provenance(db)) == {}
     (accounts,) = make_tables(study, ["attempts"])
     assert accounts.rows[0].values["trials"] == 33, "nothing is dropped from accounts"
     (source,) = explain(study, accounts, "o3/baseline:trials").sources
@@ -160,7 +159,7 @@ def test_programs_that_declare_no_chance_count_each_trial_once(db):
 def test_equal_trials_count_where_a_driver_or_what_it_perceives_has_chance(db, chance, scenario):
     study = changed(db, *same_each_time(db), *as_programs(chance, **scenario))
     assert (len(study.models[0].trials), study.models[0].repeated) == (33, 0)
-    assert alarms(study, provenance(db)) == []
+    assert alarms(study, provenance(db)) == {}
 
 
 def test_what_is_perceived_late_and_not_far_is_perceived_without_chance(db):
@@ -180,10 +179,10 @@ def test_repetitions_that_differ_contradict_who_declares_no_chance_and_all_count
 def test_equal_trials_of_a_language_model_are_told_and_count(db, where, equal):
     study = changed(db, *same_each_time(db, f"trial_id LIKE '{where}'"))
     assert study.models[0].repeated == 0
-    (alarm,) = alarms(study, provenance(db))
-    assert alarm.title == "Trials or answers repeat earlier ones"
+    ((title, text),) = alarms(study, provenance(db)).items()
+    assert title == "Trials or answers repeat earlier ones"
     says = f"o3/baseline: {equal} of 33 trials are as an earlier one to the last state; each counts"
-    assert says in alarm.text
+    assert says in text
 
 
 def test_a_sweep_records_which_programs_have_chance(in_process, tmp_path):
@@ -241,34 +240,6 @@ def test_the_sides_are_those_of_the_scripted_calls(tmp_path):
         "UPDATE trials SET scripted = true",
     )
     assert study.models[0].label == "o3 (scripted stand-in on the left, not o3)"
-
-
-def test_answers_that_are_word_for_word_as_before_are_told_in_the_report(tmp_path):
-    db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
-    study = changed(
-        db,
-        "UPDATE decisions SET call_key = trial_id || side || decision, plan = [0.1], "
-        "rationale = 'as ever', prompt_hash = decision::VARCHAR",
-    )
-    titles = [alarm.title for alarm in alarms(study, provenance(db))]
-    assert "Trials or answers repeat earlier ones" in titles
-
-
-@pytest.mark.parametrize(
-    ("spec", "says"),
-    [
-        ("[]", "Input should be a valid dictionary"),
-        ('{"scenario": {"odd": 1}}', "scenario.odd: Extra inputs are not permitted"),
-        ('{"scenario": {"step_s": 0}}', "scenario.step_s: Input should be greater than 0"),
-        ('{"left": {"body": 3}}', "left.body: Input should be a valid dictionary"),
-    ],
-)
-def test_a_stored_spec_that_cannot_be_read_is_named_with_a_trial_in_one_line(db, spec, says):
-    with pytest.raises(UsageError) as refused:
-        changed(db, f"UPDATE specs SET spec = '{spec}' WHERE spec_hash = 'other-baseline'")
-    (line,) = str(refused.value).splitlines()
-    assert line.startswith("the spec other-baseline, of other/baseline/L_0_-8/rep01, cannot be ")
-    assert says in line
 
 
 def test_a_spec_of_no_trial_keeps_nothing_from_being_read(db):

@@ -11,11 +11,10 @@ from merge_runner.records import StateRow, TrialRecord, TrialSpec
 from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.imported_humans import (
-    RECORDINGS,
     by_condition,
     by_pair,
+    findings,
     human_trials,
-    imported,
 )
 from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.reference_data import PAIRS, human_outcomes
@@ -29,7 +28,7 @@ from merge_runner_analysis.tables import make_tables
 def published_trials() -> pd.DataFrame:
     """The 990 published outcomes as trials of nine pairs."""
     pairs = [list(PAIRS.values())[i % 9] for i in range(990)]
-    return human_outcomes().assign(pair=pairs, origin=RECORDINGS)
+    return human_outcomes().assign(pair=pairs, of_pages=False)
 
 
 def changed(trials: pd.DataFrame, condition: str, before: tuple, after: tuple, n: int = 1):
@@ -46,63 +45,38 @@ def changed(trials: pd.DataFrame, condition: str, before: tuple, after: tuple, n
 LEFT, RIGHT, CRASH = ("finished", "left"), ("finished", "right"), ("collided", None)
 
 
-def test_the_published_trials_are_complete_and_there_is_nothing_to_say_of_them():
-    found = imported(published_trials())
-    assert (found.trials, found.pairs, found.complete, found.label) == (990, 9, True, "human")
-    assert list(found.findings()) == []
+def test_there_is_nothing_to_say_of_the_published_trials():
+    assert list(findings(published_trials())) == []
 
 
 def test_a_part_is_named_so_and_keeps_the_published_outcomes():
-    found = imported(published_trials()[::8])
-    assert found.label == "humans (124 of 990 imported)"
-    assert (found.complete, found.contradicting) == (False, ())
-    (said,) = found.findings()
-    assert said.startswith("124 of 990 trials: who merged first and collisions stay the 990 ")
-
-
-def test_one_missing_trial_of_one_condition_leaves_the_whole_incomplete():
-    assert not imported(published_trials()[1:]).complete
+    (said,) = findings(published_trials()[::8])
+    assert said.startswith("124 of 990 trials are imported; who merged first and collisions are ")
 
 
 def test_more_of_an_outcome_than_is_published_is_another_data_set():
     more = changed(published_trials(), "N_0_0", LEFT, CRASH, 8)
-    found = imported(more[::2])
-    assert found.contradicting == ("N_0_0 collided 6 instead of 5",)
-    assert found.label == "humans (another data set, 495 trials)"
-    assert "another data set than the published one: N_0_0 collided 6" in next(found.findings())
-    assert "of 990 trials" not in " ".join(found.findings())
-
-
-def test_a_whole_condition_with_less_of_an_outcome_is_another_data_set():
-    timeout = changed(published_trials(), "N_0_0", LEFT, ("timeout", None))
-    assert imported(timeout).contradicting == ("N_0_0 left first 36 instead of 37",)
-    part = timeout[timeout["condition"] != "N_0_0"]
-    assert imported(part).contradicting == ()
+    (said,) = findings(more)
+    assert said == "another data set than the published one: more of an outcome in N_0_0"
 
 
 def test_a_swapped_outcome_is_found():
-    swapped = changed(published_trials(), "R_0_8", LEFT, RIGHT)
-    assert imported(swapped).contradicting == (
-        "R_0_8 left first 7 instead of 8",
-        "R_0_8 right first 79 instead of 78",
-    )
+    (said,) = findings(changed(published_trials(), "R_0_8", LEFT, RIGHT))
+    assert said.endswith("more of an outcome in R_0_8")
 
 
 def test_trials_of_other_pairs_are_counted_for_nothing():
     trials = published_trials()
     moved = trials.assign(pair=trials["pair"].mask(trials.index == 0, "experiment_7"))
-    found = imported(moved)
-    assert (found.trials, found.complete, found.left_out) == (989, False, {"experiment_7": 1})
-    assert "experiment_7: 1 trials, not of the nine published pairs: left out" in found.findings()
+    (said,) = findings(moved)
+    assert said.startswith("989 of 990 trials")
     assert by_condition(moved)["trials"].sum() == 989
     assert by_pair(moved)["trials"]["experiment_7"] == 1
 
 
 def test_trials_of_other_pairs_alone_are_another_data_set_however_many():
-    found = imported(published_trials().assign(pair="experiment_7"))
-    assert found.label == "humans (another data set, 990 trials)"
-    assert not found.complete
-    assert found.left_out == {}
+    (said,) = findings(published_trials().assign(pair="experiment_7"))
+    assert said == "another data set than the published one"
 
 
 @pytest.fixture
@@ -132,19 +106,18 @@ def stored(tmp_path):
 
 def test_the_trials_of_a_database_are_counted(stored):
     trials = human_trials(stored(published_trials()))
-    assert list(imported(trials).findings()) == []
+    assert list(findings(trials)) == []
     assert list(by_condition(trials).index) == list(CONDITIONS)
     assert (by_condition(trials)["trials"] == 90).all()
     assert dict(by_pair(trials)["trials"]) == dict.fromkeys(PAIRS.values(), 110)
     assert by_condition(trials)["collided"].sum() == 28
 
 
-def test_a_complete_import_takes_the_place_of_the_published_outcomes(stored):
-    human = Study(stored(published_trials())).human
-    assert human.published_outcomes is None
-    assert counts(human, BOXES) == (28, 990)
-    # Nothing came closer than a vehicle length in these traces, and collided ones stay open.
-    assert counts(human, COLLISIONS) == (0, 962)
+def test_a_complete_import_leads_to_the_trials_behind_the_published_outcomes(stored):
+    study = Study(stored(published_trials()))
+    assert (study.human.label, study.human.traced, study.complete) == ("human", True, True)
+    assert counts(study.human, BOXES) == (28, 990)
+    assert not known(study.human, COLLISIONS)
 
 
 def test_a_partial_import_has_both_numbers_of_trials_in_its_row(stored):
@@ -164,13 +137,11 @@ def test_a_partial_import_has_both_numbers_of_trials_in_its_row(stored):
 
 
 @pytest.mark.slow
-def test_another_data_set_is_named_in_every_table_with_humans(stored):
+def test_another_data_set_is_named_under_every_table_with_humans(stored):
     more = changed(published_trials(), "N_0_0", LEFT, CRASH, 8)
-    study = Study(stored(more[::2]))
+    study = Study(stored(more))
     for table in make_tables(study, ["who-first", "ablation-quantitative"]):
-        drivers = {row.values["driver"] for row in table.rows if row.groups == ("human",)}
-        assert all("another data set, 495 trials" in driver for driver in drivers), table.name
-        assert any("N_0_0 collided 6 instead of 5" in note for note in table.notes), table.name
+        assert any("more of an outcome in N_0_0" in note for note in table.notes), table.name
 
 
 def test_trials_of_other_pairs_are_in_no_row_and_in_no_query(stored):

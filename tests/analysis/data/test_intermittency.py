@@ -17,10 +17,8 @@ from merge_runner_analysis.data.intermittency import (
     LINE_SAMPLES,
     SAMPLE_S,
     at_5_hz,
-    clocked,
     gains,
     measure_profiles,
-    random_gain,
     residuals,
     without_resistance,
 )
@@ -61,7 +59,7 @@ def test_the_docs_print_what_the_controls_give():
     assert candidates_table() in text
     assert controls_table() in text
     assert clock_table() in text
-    at_random = f"by chance each second, held, have a mean gain of {random_gain():.2f} over 10 s"
+    at_random = "by chance each second, held, have a mean gain of 0.49 over 10 s"
     assert at_random in " ".join(text.split())
 
 
@@ -206,22 +204,10 @@ def test_a_vehicle_that_nothing_but_drag_slows_took_no_action():
     assert not measured(np.array(v), 0.05)["steady"]
 
 
-def test_a_clock_of_1_hz_makes_one_acceleration_of_each_second():
-    v = random_speeds(5, 33)
-    found = clocked(v)
-    assert (found[:, ::5] == v[:, ::5]).all()
-    assert (found[:, -1] == v[:, -1]).all()
-    bends = np.abs(np.diff(found, 2)) > 1e-9
-    assert not np.delete(bends, np.arange(4, 31, 5), axis=1).any()
-    held = controls.driven(np.repeat([[1.0, -0.5, 0.3]], 5, axis=1), SAMPLE_S)
-    assert clocked(held) == pytest.approx(held)
-    profile = measured(v[0])
-    assert profile["clocked_gain"] == pytest.approx(gains(found)[0])
-    assert profile["gain"] == pytest.approx(gains(v)[0])
-
-
 def test_whoever_draws_an_acceleration_each_second_and_holds_it_has_a_gain_above_0():
-    assert random_gain() == pytest.approx(0.49, abs=0.01)
+    drawn = np.random.default_rng(1).uniform(-2.5, 2.5, (1000, 10))
+    driven = controls.driven(np.repeat(drawn, 5, axis=1), SAMPLE_S)
+    assert gains(driven).mean() == pytest.approx(0.49, abs=0.03)
 
 
 def test_speeds_that_begin_later_are_measured_from_there():

@@ -16,9 +16,9 @@ from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.figures.drawing import PAGE_IN
 from merge_runner_analysis.figures.figure_2 import (
     HUMAN_VELOCITIES_MPS,
+    PAGE_IN,
     deviation,
     gap,
     left_first,
@@ -42,7 +42,7 @@ def written(small, tmp_path_factory):
 @pytest.mark.long
 def test_equal_results_give_equal_files(small, written):
     again = Study(small.db)
-    for name, form in (("figure2", "pdf"), ("distributions", "png")):
+    for name, form in (("figure2", "pdf"), ("first-action", "png")):
         assert rendered(again, name, form) == (written / f"{name}.{form}").read_bytes()
     assert rendered(again, "figure2", "svg") == rendered(small, "figure2", "svg")
 
@@ -68,9 +68,9 @@ def test_a_folder_that_cannot_be_made_is_said(small, tmp_path):
 def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(study):
     group = study.models[0]
     firsts = {
-        (velocity, point.x): point.estimate
+        (velocity, x): estimate
         for velocity in HUMAN_VELOCITIES_MPS
-        for point in points(group, velocity, left_first)
+        for x, estimate in points(group, velocity, left_first)
     }
     assert set(firsts) == {
         (c.relative_velocity_mps, c.projected_headway_m) for c in CONDITIONS.values()
@@ -80,15 +80,15 @@ def test_panels_show_each_condition_of_a_relative_velocity_once_with_its_trials(
         found = firsts[condition.relative_velocity_mps, condition.projected_headway_m]
         assert found == proportion(int((trials["merged_first"] == "left").sum()), len(trials))
         (mean_gap,) = [
-            point.estimate
-            for point in points(group, condition.relative_velocity_mps, gap)
-            if point.x == condition.projected_headway_m
+            estimate
+            for x, estimate in points(group, condition.relative_velocity_mps, gap)
+            if x == condition.projected_headway_m
         ]
         assert mean_gap == mean(trials["gap_m"])
         (both,) = [
-            point.estimate
-            for point in points(group, condition.relative_velocity_mps, deviation)
-            if point.x == condition.projected_headway_m
+            estimate
+            for x, estimate in points(group, condition.relative_velocity_mps, deviation)
+            if x == condition.projected_headway_m
         ]
         assert both.n == 2 * len(trials), "each trial gives two values"
         assert both.value == pytest.approx(trials["rmse_mps"].mean())
@@ -159,7 +159,7 @@ def test_no_two_relative_velocities_look_alike(tmp_path):
 
 def test_a_dollar_in_a_name_is_no_formula(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", yielding(r"a$\b$", reps=1)[:2]))
-    assert rendered(study, "distributions", "svg")
+    assert rendered(study, "figure2", "svg")
 
 
 BASELINES = {"figure2", "first-action"}
@@ -216,7 +216,6 @@ def test_every_figure_says_who_is_a_stand_in_and_names_its_variant(name, long_na
     if name not in BASELINES:
         assert any("A2" in text for text in marked)
         assert any("A1" in text for text in marked)
-    if name not in {*BASELINES, "factors"}:  # a level is of several drivers
         assert any("A7" in text and "o3" in text for text in shown)
 
 
@@ -232,8 +231,8 @@ def test_each_group_has_a_row_of_its_own_with_its_trials(study):
             for index, velocity in enumerate(HUMAN_VELOCITIES_MPS):
                 found = points(group, velocity, summary)
                 line = axis.containers[index].lines[0]
-                assert list(line.get_ydata()) == [p.estimate.value for p in found]
-                assert line.get_xdata() == pytest.approx([p.x + 0.3 * (index - 1) for p in found])
+                assert list(line.get_ydata()) == [estimate.value for _, estimate in found]
+                assert line.get_xdata() == pytest.approx([x + 0.3 * (index - 1) for x, _ in found])
 
 
 @pytest.mark.slow
@@ -261,10 +260,10 @@ def test_one_very_wide_interval_leaves_the_others_readable(tmp_path):
     study = Study(write_study(tmp_path / "t.duckdb", drives))
     low, high = drawn(study, "figure2-variants")[0][0][3].get_ylim()
     found = [
-        point.estimate
+        estimate
         for group in study.groups
         for velocity in HUMAN_VELOCITIES_MPS
-        for point in points(group, velocity, gap)
+        for _, estimate in points(group, velocity, gap)
     ]
     assert max(one.high - one.low for one in found) > 2 * (high - low)
     assert all(low < one.value < high for one in found)

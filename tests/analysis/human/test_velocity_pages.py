@@ -10,7 +10,7 @@ from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.human.archive import Unreadable
 from merge_runner_analysis.human.load import import_trials, sort_files
-from merge_runner_analysis.human.velocity_pages import condition_of, trace_of, trials_of
+from merge_runner_analysis.human.record import condition_of, trace_of, trials_of
 from tests.analysis.pages import packed, velocity_page
 from tests.analysis.recordings import drive, file, write_folder
 
@@ -105,24 +105,24 @@ def test_recordings_after_pages_leave_these_as_they_are(tmp_path):
     assert (report.added, report.there, report.differing) == (0, 3, [])
 
 
-def test_one_page_is_imported_by_its_name(human, tmp_path):
-    (tmp_path / "4_0.html").write_bytes(velocity_page(DRIVEN["L_4_0"]))
-    assert human("import", "4_0.html").out.startswith("3 trials added, 0 there already, 0 files")
+def test_one_page_in_a_folder_is_imported_by_its_name(human, tmp_path):
+    write_folder(tmp_path / "pages", {"4_0.html": velocity_page(DRIVEN["L_4_0"])})
+    assert human("import", "pages").out.startswith("3 trials added, 0 there already, 0 files")
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda traces: traces.pop("right"), "its right vehicle is not shown"),
-        (lambda traces: traces["left"]["x"].pop(), "samples of different times"),
-        (lambda traces: traces["left"]["x"].__setitem__(3, 0.3), "not equally far apart"),
-        (lambda traces: traces["left"]["x"].__setitem__(0, 0.05), "does not begin at 0 s"),
+        (lambda traces: traces.pop("right"), "it does not show both vehicles"),
+        (lambda traces: traces["left"]["x"].pop(), "it does not show both vehicles"),
+        (lambda traces: traces["left"]["x"].__setitem__(3, 0.3), "at equal steps from 0 s on"),
+        (lambda traces: traces["left"]["x"].__setitem__(0, 0.05), "at equal steps from 0 s on"),
         (
             lambda traces: (traces["left"]["line"].update(dash="dash"),
                             traces["right"]["line"].update(dash="solid")),
-            "its left vehicle went second, but is ahead at the end",
+            "its lines are dash and solid, but left is ahead at the end",
         ),
-        (lambda traces: traces["left"]["line"].update(dash="dot"), "who went first is open"),
+        (lambda traces: traces["left"]["line"].update(dash="dot"), "its lines are dot and dash"),
         (
             lambda traces: [each[axis].__delitem__(slice(120, None)) for each in traces.values()
                             for axis in "xy"],

@@ -24,8 +24,7 @@ from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.file import Effect
 from merge_runner_analysis.power import HUMANS, Case, chances, human, simulate
-from merge_runner_analysis.stats.group_scores import ceiling
-from merge_runner_analysis.stats.indicators import TESTED
+from merge_runner_analysis.stats.indicators import TESTED, ceiling
 from merge_runner_analysis.stats.regressions import gap_ols, who_first_firth, who_first_logit
 
 STUDIES = 20

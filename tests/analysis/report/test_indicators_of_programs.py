@@ -5,9 +5,7 @@ from __future__ import annotations
 import pytest
 
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.stats.group_scores import score
-from merge_runner_analysis.stats.indicators import Verdict
-from merge_runner_analysis.stats.likeness import gains
+from merge_runner_analysis.stats.indicators import Verdict, gains, score
 
 pytestmark = pytest.mark.slow
 PROGRAMS = ("constant", "idm", "projected-order")

@@ -17,8 +17,12 @@ from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import MAKERS, rendered
-from merge_runner_analysis.report.alarms import alarms
-from merge_runner_analysis.report.page import finished_figures, report_html, write_report
+from merge_runner_analysis.report.page import (
+    alarms,
+    finished_figures,
+    report_html,
+    write_report,
+)
 from merge_runner_analysis.tables import TABLES, make_tables
 from tests.analysis.studies import Said, write_study, yielding
 
@@ -49,7 +53,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module", autouse=True)
 def one_figure():
     """Drawing takes most of a report's time, and other tests look at the figures."""
-    name = "ablation-matrix"
+    name = "first-action"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("merge_runner_analysis.report.page.FIGURES", {name: FIGURES[name]})
         patch.setattr("merge_runner_analysis.figures.gallery.MAKERS", {name: MAKERS[name]})
@@ -96,8 +100,8 @@ def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_fac
     text = report_html(study, make_tables(study, ["factors", "gap"]), {})
     assert "<body>\n<h1>Who is &lt;first&gt;?</h1>" in text
     conditions = ", ".join(sorted(study.conditions))
-    parts = ['id="design"', conditions, "There is time.", "-There is time.\n+You", 'id="factors"',
-             'id="conclusions"', 'id="gap"']  # fmt: skip
+    parts = ['id="design"', conditions, "There is time.", "-There is time.\n+You",
+             'id="conclusions"', 'id="factors"', 'id="gap"']  # fmt: skip
     places = [text.index(part) for part in parts]
     assert places == sorted(places)
     assert text.count('id="factors"') == 1
@@ -107,7 +111,7 @@ def test_equal_results_give_equal_reports(small):
     again = Study(small.db)
     texts = {report_html(study, make_tables(study, ["gap"]), {}) for study in (small, again)}
     assert len(texts) == 1
-    assert len({rendered(study, "ablation-matrix", "svg") for study in (small, again)}) == 1
+    assert len({rendered(study, "first-action", "svg") for study in (small, again)}) == 1
 
 
 def test_an_empty_database_concludes_nothing(tmp_path):
@@ -125,7 +129,7 @@ def test_what_went_wrong_stands_at_the_top_before_any_number(page):
     warnings, _, _ = page.text.partition("What can be concluded")
     assert "Read this first" in warnings
     for said in (
-        "Another model answered. other was asked for, impostor answered: 3 answers, sweep sweep-1.",
+        "Another model answered. other was asked for, impostor answered: 3 answers, in sweep-1.",
         "Trials failed. 1 of 44 of other/baseline (no answer after 2 attempts).",
         "Many fallbacks. 55 of 906 decisions of o3/A2 (6.1 %).",
         "Attempts of unknown fate. 1 of 896 of o3/A1.",
@@ -135,7 +139,7 @@ def test_what_went_wrong_stands_at_the_top_before_any_number(page):
 
 def test_a_study_in_which_nothing_went_wrong_has_no_warning(tmp_path):
     study = asking(tmp_path, Said(), variant="A1")
-    assert alarms(study, provenance(study.db)) == []
+    assert alarms(study, provenance(study.db)) == {}
     assert "Read this first" not in Page(report_html(study, [], {})).text
 
 
@@ -158,7 +162,7 @@ def test_an_alias_that_the_sweep_declares_is_no_other_model(tmp_path):
         with duckdb.connect(str(db)) as connection:
             connection.execute("UPDATE sweeps SET config = ?", [json.dumps({"models": models})])
         study = Study(db)
-        assert [one.served for one in provenance(db).mismatches] == found
+        assert [*provenance(db).mismatches.served] == found
         assert tally(study, study.models[0])["other_model"] == 6 * len(found)
 
 
@@ -168,12 +172,12 @@ def test_the_fallbacks_of_a_group_are_unusual_above_one_in_twenty(tmp_path):
     found = tally(study, study.models[0])
     assert found["fallback"] == 6
     assert 0.05 < found["fallback"] / found["decisions"] < 0.07
-    (alarm,) = alarms(study, provenance(study.db))
-    assert alarm.title == "Many fallbacks"
-    assert "6 of" in alarm.text
+    ((title, text),) = alarms(study, provenance(study.db)).items()
+    assert title == "Many fallbacks"
+    assert "6 of" in text
     with duckdb.connect(str(study.db)) as connection:
         connection.execute("UPDATE decisions SET fallback = false WHERE trial_id LIKE '%R_-4_-8%'")
-    assert alarms(Study(study.db), provenance(study.db)) == []
+    assert alarms(Study(study.db), provenance(study.db)) == {}
 
 
 def test_a_driver_under_two_specs_is_named(small, tmp_path):
@@ -184,21 +188,18 @@ def test_a_driver_under_two_specs_is_named(small, tmp_path):
                 f"INSERT INTO {name} SELECT * REPLACE ('changed' AS spec_hash) FROM {name} "
                 "WHERE trial_id LIKE '%N_0_0%'"
             )
-    (alarm,) = alarms(Study(db), provenance(db))
-    assert alarm.title == "Several settings under one name"
-    assert alarm.text.startswith("o3, o3 [changed].")
+    ((title, text),) = alarms(Study(db), provenance(db)).items()
+    assert title == "Several settings under one name"
+    assert text.startswith("o3, o3 [changed].")
 
 
-def test_the_report_says_what_the_replies_cost_by_model_and_by_sweep(study, page):
+def test_the_report_says_what_the_replies_cost_by_model(study, page):
     origin = provenance(study.db)
     models = origin.model_costs.set_index("driver")
     # Every attempt cost a cent but the one of unknown fate.
     assert models["attempts"].to_dict() == {"o3": 3510, "other": 705}
     assert models["cost_usd"].to_dict() == pytest.approx({"o3": 35.09, "other": 7.05})
     assert models["attempts_of_unknown_cost"].to_dict() == {"o3": 1, "other": 0}
-    (sweep,) = origin.sweep_costs.itertuples()
-    assert (sweep.sweep_id, sweep.calls, sweep.attempts) == ("sweep-1", 4210, 4215)
-    assert sweep.cost_usd == pytest.approx(42.14)
     assert "35.09" in page.text
     assert "Attempts of unknown cost are not in the sums" in page.text
 
@@ -215,10 +216,10 @@ def test_a_call_that_several_trials_used_was_made_and_paid_once(tmp_path):
 @pytest.mark.slow
 def test_the_report_can_write_all_its_parts_as_files(small, tmp_path):
     db = Path(shutil.copy(small.db, tmp_path / "t.duckdb"))
-    paths = list(write_report(db, None, tmp_path / "r/report.html", tmp_path / "r/files"))
+    paths = list(write_report(Study(db), tmp_path / "r/report.html", tmp_path / "r/files"))
     assert (tmp_path / "r/report.html") in paths
     for name in TABLES:
         for suffix in ("txt", "csv", "json", "md", "tex"):
             assert (tmp_path / "r/files" / f"{name}.{suffix}").stat().st_size > 50
     with pytest.raises(UsageError, match="cannot be written"):
-        list(write_report(db, None, tmp_path, None))
+        list(write_report(Study(db), tmp_path, None))

@@ -10,7 +10,7 @@ from scipy import stats
 from benchmarks.ceiling import DATA_SETS, SIZES, data_sets, shares
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.reference_data import published
-from merge_runner_analysis.stats.group_scores import ceiling
+from merge_runner_analysis.stats.indicators import ceiling
 
 CELLS = [(c.projected_headway_m, c.relative_velocity_mps) for c in CONDITIONS.values()]
 NAMES = ["I1", "I2", "I3", "I4", "I1-I4"]

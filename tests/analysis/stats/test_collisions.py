@@ -85,7 +85,7 @@ def test_a_driver_is_compared_with_humans_by_the_rule_of_the_humans(study, tmp_p
     assert (found["k"], found["n"], found["undecided"]) == (2, 5, None)
     # In the conditions that it drove, as often as it drove them.
     rates = [human_counts()[name] for name in played.models[0].trials["condition"]]
-    assert found["human"] == pytest.approx(100 * sum(of.collided / of.trials for of in rates) / 5)
+    assert found["human"] == pytest.approx(100 * sum(of.collided / sum(of) for of in rates) / 5)
 
 
 @pytest.mark.parametrize("measure", [COLLISIONS, BOXES])

@@ -11,11 +11,11 @@ import pytest
 from scipy import stats
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.stats.group_scores import total
 from merge_runner_analysis.stats.indicators import (
     INDICATORS,
     NONE_APART,
     Verdict,
+    total,
     verdicts,
 )
 from merge_runner_analysis.stats.regressions import (

@@ -14,10 +14,14 @@ from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.data.intermittency import measure_profiles
 from merge_runner_analysis.data.load import SPEEDS, load
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.stats.group_scores import score
-from merge_runner_analysis.stats.indicators import Verdict
-from merge_runner_analysis.stats.likeness import compared, mean_gain, piecewise_constant
-from merge_runner_analysis.stats.likeness import gains as trial_gains
+from merge_runner_analysis.stats.indicators import (
+    Verdict,
+    compared,
+    mean_gain,
+    piecewise_constant,
+    score,
+)
+from merge_runner_analysis.stats.indicators import gains as trial_gains
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import SCENARIO, write_study, yielding
 
@@ -149,8 +153,7 @@ def test_a_trial_without_action_neither_passes_nor_fails_and_is_told(tmp_path):
     still = trial_gains(study, group).query("steady")
     assert list(still["condition"].sort_values()) == ["L_4_-8", "L_4_0", "L_4_8"]
     assert mean_gain(study, group).n == 8
-    profiles, indicators = make_tables(study, ["velocity-profiles", "indicators"])
-    assert profiles.rows[1].values["no_action"] == 3
+    (indicators,) = make_tables(study, ["indicators"])
     (row,) = [row for row in indicators.rows if row.id == "o3/baseline/I5"]
     assert "I5 without 3 of 11 trials: no control action" in row.note
     assert (row.values["paper"], row.values["robust"]) == (None, True)
@@ -163,9 +166,7 @@ def test_a_driver_that_never_acts_has_no_number_and_it_is_said_why(tmp_path):
     with duckdb.connect(str(study.db)) as connection:
         connection.execute("UPDATE states SET velocity_mps = 10")
     study = Study(study.db)
-    profiles, indicators = make_tables(study, ["velocity-profiles", "indicators"])
-    assert profiles.rows[1].values["gain"] is None
-    assert profiles.rows[1].note == "no finished trial with control action"
+    (indicators,) = make_tables(study, ["indicators"])
     (row,) = [row for row in indicators.rows if row.id == "o3/baseline/I5"]
     assert "no finished trial with control action" in row.note
 
@@ -192,16 +193,5 @@ def test_a_driver_is_judged_by_its_own_accelerations_before_an_import_too(study)
 )
 def test_i5_is_one_sided_the_mean_gain_is_above_0(monkeypatch, gain, passed):
     rows = gains([(f"t{i}", "N_0_0", None, value) for i, value in enumerate(gain)])
-    monkeypatch.setattr("merge_runner_analysis.stats.likeness.gains", lambda study, group: rows)
+    monkeypatch.setattr("merge_runner_analysis.stats.indicators.gains", lambda study, group: rows)
     assert piecewise_constant(None, None) == Verdict(passed)
-
-
-@pytest.mark.slow
-def test_beside_the_gain_stand_the_share_of_trials_and_what_a_clock_of_1_hz_makes(tmp_path):
-    """This driver holds for whole seconds: its clock makes all of its gain."""
-    study = driving(tmp_path)
-    (table,) = make_tables(study, ["velocity-profiles"])
-    values = {row.id: row.values for row in table.rows}["o3/baseline"]
-    assert values["held_percent"] == 100
-    assert values["clocked_gain"] == pytest.approx(values["gain"])
-    assert "difference_sd" not in values, "no humans are imported"

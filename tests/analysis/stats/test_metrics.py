@@ -15,7 +15,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.data.load import load, load_trials
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.tables.measures import criticality
+from merge_runner_analysis.tables.indicators import criticality
 from tests.analysis.studies import Drive, played, write_study
 
 SIZES = ((4.5, 1.8), (8.0, 2.5), (3.0, 1.2))

@@ -12,8 +12,8 @@ from scipy import optimize, stats
 
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.reference_data import human_outcomes
-from merge_runner_analysis.stats import firth
 from merge_runner_analysis.stats.regressions import (
+    Counts,
     gap_ols,
     who_first_firth,
     who_first_logit,
@@ -197,7 +197,7 @@ def test_the_penalised_fit_gives_the_published_endometrial_figures():
     assert len(patients) == 79
     design = np.column_stack([np.ones(79), patients[["NV", "PI", "EH"]]])
     left = patients["HG"].to_numpy(float)
-    fit = firth.Counts(design, np.ones(79), left).fit()
+    fit = Counts(design, np.ones(79), left).fit()
     assert fit.b == pytest.approx(ENDOMETRIAL["estimates"], abs=2e-6)
     assert [fit.p(term) for term in (1, 2, 3)] == pytest.approx(ENDOMETRIAL["p"], rel=2e-3)
 
@@ -243,7 +243,7 @@ def test_profile_intervals_are_those_of_firthmodels_and_agree_with_the_tests(tri
     expected = np.roll(model.conf_int(method="pl"), 1, axis=0)
     fit = who_first_firth(trials)
     for (name, term), bounds in zip(fit.terms.items(), expected, strict=True):
-        low, high = fit.interval(name)
+        low, high = fit.difference(name).bounds()
         assert (low, high) == pytest.approx(tuple(bounds), rel=1e-3, abs=1e-3)
         assert (low <= 0 <= high) == (term.p >= 0.05)
 
@@ -268,8 +268,8 @@ def test_small_and_separated_data_have_intervals_about_their_estimates_or_none()
         )
         for fit in (who_first_firth(few), who_first_firth(few, less=others)):
             for name, term in fit.terms.items():
-                bounds = fit.interval(name)
-                assert bounds is None or bounds[0] < term.b < bounds[1]
+                found = fit.difference(name)
+                assert found is None or found.low < term.b < found.high
 
 
 def test_the_penalised_fit_takes_the_iterations_that_separation_needs():
@@ -289,7 +289,7 @@ def test_separation_is_found_where_firthmodels_finds_it():
         trials = drawn(seed, 2, *np.random.default_rng(seed).normal(0, 2, 3))
         design, left = who_first_arrays(trials)
         expected = ~np.roll(detect_separation(design[:, 1:], left).is_finite, 1)
-        infinite = firth.Counts(design, np.ones(len(left)), left).infinite()
+        infinite = Counts(design, np.ones(len(left)), left).infinite()
         assert infinite.tolist() == expected.tolist()
         separated += infinite.any()
     assert 10 < separated < 50

@@ -1,0 +1,268 @@
+"""Why a trial went as it did: its class, what happened in words, and the moments to mark.
+
+What would have become of a collision had one driver done otherwise is moved and judged by the
+world's own rules; the other vehicle drives as it drove, and keeps its speed from where its samples
+end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil
+from typing import Any, Literal
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.records import SIDES, Side, other_side
+from merge_runner.scenarios.merge.collision import collided
+from merge_runner.scenarios.merge.geometry import Track
+from merge_runner.scenarios.merge.vehicle import advance, net_acceleration
+
+BRAKING, SPEEDING_UP = -1.0, 1.0
+"""The hardest actions, as a plan normalises them."""
+# Halved so often, the strongest action is known to 0.01 m/s^2.
+BISECTIONS = 8
+# Two clocks agree to this many seconds.
+TICK_S = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Both vehicles from the start of control on, in SI units, one value a sample.
+
+    Positions are travelled distances.
+    """
+
+    scenario: ScenarioConfig
+    track: Track
+    times_s: list[float]
+    positions_m: dict[Side, list[float]]
+    speeds_mps: dict[Side, list[float]]
+
+    @property
+    def last(self) -> int:
+        """The number of the last sample."""
+        return len(self.times_s) - 1
+
+    def change_mps(self, side: Side, sample: int) -> float:
+        """How much faster a vehicle is than it was at the start of control."""
+        return self.speeds_mps[side][sample] - self.speeds_mps[side][0]
+
+    def avoided(self, side: Side, action: float, since: int) -> bool:
+        """Whether there is no collision if a side drives one action from a sample on."""
+        scenario, commanded_mps2 = self.scenario, action * self.scenario.max_acceleration_mps2
+        own_m, speed = self.positions_m[side][since], self.speeds_mps[side][since]
+        for other_m in self._onward(other_side(side), since):
+            net_mps2 = net_acceleration(commanded_mps2, speed, scenario.resistance)
+            own_m, speed = advance(own_m, speed, net_mps2, scenario.step_s)
+            left_m, right_m = (own_m, other_m) if side == "left" else (other_m, own_m)
+            if collided(scenario, self.track, left_m, right_m):
+                return False
+            if max(left_m, right_m) >= self.track.end_m:
+                break
+        return True
+
+    def last_chance(self, side: Side, action: float, after: int = -1) -> int | None:
+        """The last sample from which the hardest action of a side still avoids the collision.
+
+        Of two moments the earlier one is always the better to begin at. None where no sample
+        ``after`` a given one will do.
+        """
+        exit_m = self.track.tunnel_exit_m - TICK_S  # from there on the driver has control
+        under_control = (i for i, at_m in enumerate(self.positions_m[side]) if at_m > exit_m)
+        low = max(after + 1, next(under_control, self.last))
+        if low >= self.last or not self.avoided(side, action, low):
+            return None
+        high = self.last  # where they have collided
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if self.avoided(side, action, middle) else (low, middle)
+        return low
+
+    def least_mps2(self, side: Side, action: float, since: int) -> float:
+        """The least strength that avoids the collision from a sample at which the hardest does."""
+        low, high = 0.0, 1.0
+        if self.avoided(side, low, since):
+            return low
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            enough = self.avoided(side, action * middle, since)
+            low, high = (low, middle) if enough else (middle, high)
+        return high * self.scenario.max_acceleration_mps2
+
+    def _onward(self, side: Side, since: int) -> Iterator[float]:
+        """The positions of a vehicle after a sample, until a trial would be timed out."""
+        positions, speed = self.positions_m[side], self.speeds_mps[side][-1]
+        yield from positions[since + 1 :]
+        position = positions[-1]
+        for _ in range(self.last, self.scenario.timeout_steps):
+            position, speed = advance(position, speed, 0.0, self.scenario.step_s)
+            yield position
+
+
+BOTH_INSISTED, BOTH_GAVE_WAY = "both insisted", "both gave way"
+ONE_TOO_LITTLE, NO_ACTION, INVALID_PLAN = "one too little", "no action", "invalid plan"
+COLLISIONS = (BOTH_INSISTED, BOTH_GAVE_WAY, ONE_TOO_LITTLE, NO_ACTION, INVALID_PLAN)
+NEAR_MISS, LONG_WAIT = "near miss", "long wait"
+
+ACTED_MPS = 0.5
+"""From this change of speed on a driver has acted: what makes a contribution in ``joint``, too."""
+NEAR_TTC_S = 1.5
+"""Below this time to collision an encounter is commonly called critical: A. R. A. van der Horst, A
+time-based analysis of road user behaviour in normal and critical encounters (TU Delft, 1990)."""
+NEAR_GAP_M = 1.0
+"""A gap that is as good as none: ours. The humans' mean is 3.85 m."""
+LONG_WAIT_TIMES = 2.0
+"""A wait is long where it takes so many times as long as at the initial speeds: ours."""
+
+# Of trials that did not collide, by their columns and ``alone_s``: when the first vehicle would
+# have been at the merge point if both had kept their initial speeds.
+OTHER_ACCOUNTS = f"""
+CASE WHEN status = 'finished' AND (gap_m < {NEAR_GAP_M} OR min_ttc_s < {NEAR_TTC_S})
+    THEN '{NEAR_MISS}'
+WHEN status IN ('finished', 'timeout')
+    AND coalesce(time_to_merge_s, end_time_s) >= {LONG_WAIT_TIMES} * alone_s THEN '{LONG_WAIT}' END
+"""
+ALONE = """
+SELECT trial_id, spec_hash,
+    min((merge_point_m() - position_m) / nullif(velocity_mps, 0)) AS alone_s
+FROM states WHERE step = 0 GROUP BY ALL
+"""
+
+Decided = Sequence[Mapping[str, Any]]
+"""Decisions in the order of their numbers: side, decision, time_s, valid, tactical, fallback."""
+
+
+def collision_class(course: Course, decisions: Decided) -> str:
+    """How a collision came about.
+
+    It is judged at the last sample from which one driver alone could still have avoided it, by
+    braking or speeding up as hard as the vehicle can. ``invalid plan``: a driver drove on an older
+    plan, or none, when its own braking could last have helped. Else by what the drivers had done
+    with their speeds until that sample, from ACTED_MPS on: both gained (``both insisted``), both
+    lost (``both gave way``), neither (``no action``), or not the same (``one too little``).
+    """
+    if any(_drove_no_plan_of_its_own(course, decisions, side) for side in SIDES):
+        return INVALID_PLAN
+    until = judged_at(course)
+    changes = [course.change_mps(side, until) for side in SIDES]
+    ways = {(change >= ACTED_MPS) - (change <= -ACTED_MPS) for change in changes}
+    if len(ways) > 1:
+        return ONE_TOO_LITTLE
+    return {-1: BOTH_GAVE_WAY, 0: NO_ACTION, 1: BOTH_INSISTED}[ways.pop()]
+
+
+def judged_at(course: Course) -> int:
+    """The last sample from which one driver alone avoids the collision; the end where none is."""
+    found = -1
+    for side in SIDES:
+        for action in (BRAKING, SPEEDING_UP):
+            later = course.last_chance(side, action, found)
+            found = found if later is None else later
+    return course.last if found < 0 else found
+
+
+def _drove_no_plan_of_its_own(course: Course, decisions: Decided, side: Side) -> bool:
+    own = [decision for decision in decisions if decision["side"] == side]
+    if not any(decision["fallback"] for decision in own):
+        return False
+    chance = course.last_chance(side, BRAKING)
+    until_s = -1.0 if chance is None else course.times_s[chance] + TICK_S
+    made = [decision["fallback"] for decision in own if decision["time_s"] <= until_s]
+    return bool(made and made[-1])
+
+
+SAYS = {"M": "merge", "Y": "yield"}
+HEADINGS = {NEAR_MISS: "Why it came close", LONG_WAIT: "Why it took so long"}
+MEANINGS = {
+    BOTH_INSISTED: "Both insisted: both had sped up",
+    BOTH_GAVE_WAY: "Both gave way: both had slowed down",
+    ONE_TOO_LITTLE: "One did too little: the two did different things, which was not enough",
+    NO_ACTION: "Neither acted",
+    INVALID_PLAN: "A driver drove without a valid plan when its braking could last have helped",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A moment of a trial: what happened, on which side, in a few words."""
+
+    time_s: float
+    side: Side
+    kind: Literal["choice", "invalid", "last chance"]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """What is to be said of a trial of a class."""
+
+    heading: str
+    sentences: list[str]
+    marks: list[Mark]
+
+
+def account(course: Course, decisions: Decided, trial: Mapping[str, Any]) -> Account:
+    """Return the account of a trial of any class: ``trial`` has it and its measures."""
+    name = trial["account"]
+    chances: dict[Side, int | None] = {}
+    if name == NEAR_MISS:
+        sentence = f"It came close: the gap was {trial['gap_m']:.1f} m at the first merge"
+        if trial["min_ttc_s"] is not None:
+            sentence += f", then the time to collision fell to {trial['min_ttc_s']:.1f} s"
+        sentences = [f"{sentence}."]
+    elif name == LONG_WAIT:
+        took_s = trial["time_to_merge_s"]
+        reached = "Nobody had reached the merge point at the end"
+        if took_s is not None:
+            reached = f"The first vehicle reached the merge point after {took_s:.1f} s"
+        times = f"{LONG_WAIT_TIMES:g} times as long as at the initial speeds, or longer"
+        sentences = [f"{reached}: {times}."]
+    else:
+        chances = {side: course.last_chance(side, BRAKING) for side in SIDES}
+        avoidable = (_avoidable(course, side, chance) for side, chance in chances.items())
+        sentences = [_collision(course, name), *avoidable]
+    marks = sorted(_marks(course, decisions, chances), key=lambda mark: mark.time_s)
+    return Account(HEADINGS.get(name, "Why it collided"), sentences, marks)
+
+
+def _collision(course: Course, name: str) -> str:
+    at = judged_at(course)
+    changes = (course.change_mps(side, at) for side in SIDES)
+    left, right = (f"{abs(mps):.1f} m/s {'faster' if mps >= 0 else 'slower'}" for mps in changes)
+    when = f"{course.times_s[at]:.1f} s, when one driver alone could last have avoided it"
+    if at == course.last:
+        when = "the end; nobody alone could have avoided it"
+    return (
+        f"{MEANINGS[name]}. At {when}, the left vehicle was {left} and the right one {right} than "
+        f"at the start; {ACTED_MPS:g} m/s or more count as acting."
+    )
+
+
+def _avoidable(course: Course, side: Side, chance: int | None) -> str:
+    """Until when a driver could have avoided the collision, and by how much, rounded up."""
+    if chance is None:
+        return f"By braking alone the {side} driver could never have avoided it."
+    mps2 = course.least_mps2(side, BRAKING, chance)
+    done = f"braking at {ceil(mps2 * 10 - TICK_S) / 10:.1f} m/s²" if mps2 else "not speeding up"
+    return (
+        f"The {side} driver could still have avoided it at {course.times_s[chance]:.1f} s, by "
+        f"{done} from then on."
+    )
+
+
+def _marks(
+    course: Course, decisions: Decided, chances: Mapping[Side, int | None]
+) -> Iterator[Mark]:
+    """Each choice that differs from the one before, each fallback, and each last chance."""
+    before: dict[Side, str] = {}
+    for decision in decisions:
+        at_s, side, word = decision["time_s"], decision["side"], decision["tactical"]
+        if word and word != before.get(side):
+            before[side] = word
+            yield Mark(at_s, side, "choice", f"chooses to {SAYS[word]}")
+        if decision["fallback"]:
+            yield Mark(at_s, side, "invalid", "no valid plan")
+    for side, chance in chances.items():
+        if chance is not None:
+            yield Mark(course.times_s[chance], side, "last chance", "last moment to brake")
