@@ -21,7 +21,7 @@ import httpx
 from merge_runner.errors import UsageError
 from merge_runner.paths import refuse_another_kind
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, Filter
+from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR
 from merge_runner_analysis.explorer.guard import LOOPBACK
 from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.offline import offline, page_of_trials
@@ -179,7 +179,7 @@ def _opened(db: Path, wanted: Sequence[str]) -> Iterator[tuple[Site, list[Row]]]
     site.is_still = True  # so that all pages are of the same trials
     rows = [
         row
-        for row in site.catalogue.every(Filter())
+        for row in site.catalogue.every({})
         if not wanted or any(fnmatchcase(row["trial_id"], pattern) for pattern in wanted)
     ]
     if not rows:

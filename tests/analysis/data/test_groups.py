@@ -13,9 +13,8 @@ from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.provenance import provenance
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.pages.sweep import list_runs
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.explorer.sweeps import list_runs
 from merge_runner_analysis.report.page import alarms
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import value_rows
@@ -226,10 +225,10 @@ def test_a_driver_of_a_study_is_a_program_also_where_the_study_is_not_at_hand(pr
     site = Site(db)
     site.catalogue.refresh()
     (group,) = Study(db).models
-    (trial,) = site.catalogue.every(Filter())
-    ((run, _),) = list_runs(site.catalogue)
+    (trial,) = site.catalogue.every({})
+    (run,) = list_runs(site.catalogue)
     said = "scripted stand-in, no language model"
-    assert (group.posing, trial["stand_in"], run.stand_in) == (said, said, said)
+    assert (group.posing, trial["stand_in"], run["stand_in"]) == (said, said, said)
 
 
 def test_the_sides_are_those_of_the_scripted_calls(tmp_path):
