@@ -170,7 +170,7 @@ async def _noted(site: Site, request: Request) -> Response:
         except (UsageError, ValueError) as exc:
             return PlainTextResponse(str(exc), 400)
         if "hx-request" in request.headers:
-            return HTMLResponse(site.render("_noted.html", row=row))
+            return HTMLResponse(site.render("_notes_of.html", row=row))
         return RedirectResponse(site.at.trial(row), 303)
 
     return await run_in_threadpool(write)

@@ -41,6 +41,8 @@ PAGES = {
     "Runs": "sweeps",
     "SQL": "sql",
 }
+# What all templates call, without a word of where it is.
+MACROS = ("words", "computed", "scope", "mark", "conditions", "trust", "notes")
 # The parts of a scope in an address; the list of trials filters by the same names.
 SCOPE = ("sweep", "model", "variant", "condition")
 # What hangs under these, each with one list of all.
@@ -97,6 +99,8 @@ class Site:
             autoescape=True,
             auto_reload=False,
             undefined=jinja2.StrictUndefined,
+            # Whatever a page says shows itself; what a form sends back is escaped before.
+            finalize=lambda value: visible(value) if type(value) is str else value,
             trim_blocks=True,
             lstrip_blocks=True,
         )
@@ -119,13 +123,15 @@ class Site:
             program=self.program,
             styles=STYLES,
             study=str(self.db),
-            visible=visible,
             carried={},
             scope_names=SCOPE,
             clock=clock,
             condition_text=condition_text,
             in_words=self.in_words,
         )
+        for name in MACROS:
+            macros = vars(self._environment.get_template(f"_{name}.html").module)
+            self._environment.globals |= {k: v for k, v in macros.items() if k[0] != "_"}
 
     def begin(self) -> None:
         """Read the trials and make the first page's table, before anything is asked."""

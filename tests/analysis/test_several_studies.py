@@ -94,7 +94,7 @@ def test_the_trials_behind_a_cell_are_those_of_the_study(db, folder):
     _, table = rows(study, "factors")
     (source,) = explain(study, table, "prompt=baseline/left_first_percent:trials").sources
     assert len(source.trials) == 8
-    assert design(study, {})[0] == ["Does the mood matter?"]
+    assert design(study)[0] == ["Does the mood matter?"]
     assert load(source.query, db)["trial_id"].tolist() == list(source.trials)
 
 

@@ -45,7 +45,7 @@ def test_more_than_a_fifth_is_too_much_and_a_fifth_is_not():
 @pytest.mark.slow
 def test_the_page_of_prompts_compares_it_with_nothing(mixed):
     (contrasts,) = make_tables(Study(mixed), ["contrasts"])
-    found = differences(contrasts, {"o3", "bad"})
+    found, _ = differences(contrasts, {"o3", "bad"})
     shown = {driver: list(prompts) for driver, prompts in found.items()}
     assert shown == {"o3": ["A2 against baseline"]}
 

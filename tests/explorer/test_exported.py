@@ -86,7 +86,7 @@ def test_a_folder_opens_from_the_disk_with_replay_and_decisions(page, exported):
     page.get_by_role("link", name="Trials", exact=True).click()
     expect(page.locator("h1")).to_have_text("Trials")
     page.wait_for_load_state()  # clicks are heard once the scripts have run
-    page.locator("[data-list] tbody a").first.click()
+    page.locator("#found tbody a").first.click()
     expect(page.locator("#next-trial")).to_be_visible()
     first = page.locator("h1").inner_text()
     page.keyboard.press("j")

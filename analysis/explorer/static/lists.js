@@ -7,9 +7,9 @@
     return [pathname, searchParams.get("trial"), searchParams.get("spec")].join();
   };
   document.addEventListener("click", ({ target }) => {
-    const row = target.closest("[data-list] tbody tr");
+    const row = target.closest("tbody tr");
     if (!row || target.closest("a") !== row.querySelector("a")) return;
-    const hrefs = [...document.querySelectorAll("[data-list] tbody tr")].map((one) => one.querySelector("a")?.href);
+    const hrefs = [...document.querySelectorAll("tbody tr")].map((one) => one.querySelector("a")?.href);
     // Where several rows are of one trial, as its decisions are, it counts once.
     const rows = [...new Map(hrefs.filter(Boolean).map((href) => [key(href), href])).values()];
     sessionStorage.setItem("list", JSON.stringify({ address: location.href, rows }));

@@ -179,7 +179,7 @@ def test_equal_trials_of_a_language_model_are_told_and_count(db, where, equal):
     study = changed(db, *same_each_time(db, f"trial_id LIKE '{where}'"))
     assert study.models[0].repeated == 0
     ((title, text),) = alarms(study, provenance(db)).items()
-    assert title == "Trials or answers repeat earlier ones"
+    assert title == "Trials repeat earlier ones"
     says = f"o3/baseline: {equal} of 33 trials are as an earlier one to the last state; each counts"
     assert says in text
 
