@@ -11,8 +11,6 @@ from merge_runner_analysis.explorer.scope import carried
 from merge_runner_analysis.explorer.search import (
     KINDS,
     LIMITS,
-    LONGEST,
-    MOST_TERMS,
     OWN_FACETS,
     Wanted,
     terms_of,
@@ -40,8 +38,6 @@ def words_page(site: Site, asked: Mapping[str, str]) -> str:
         headings=HEADINGS,
         carried=carried(asked),
         limits=LIMITS,
-        longest=LONGEST,
-        most_terms=MOST_TERMS,
         found=found,
         facets=found.facets,
         chosen=chosen,
