@@ -49,9 +49,13 @@ class Seat(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The group's label, or that of one of a mixed pair."""
-        one = f"{self.group.models[SIDES.index(self.side)]} of " if self.side else ""
-        return one + self.group.label
+        """The group's label, or that of one of a mixed pair: its program is no stand-in."""
+        group, side = self
+        if not side:
+            return group.label
+        said = group.said if group.trials[f"{side}_scripted"].any() else group.caution
+        one = f"{group.models[SIDES.index(side)]} of {group.driver}"
+        return f"{one} ({said})" if said else one
 
 
 def seats(group: Group) -> list[Seat]:

@@ -104,7 +104,8 @@ def test_a_page_says_when_nobody_answers_it_any_more(browser, study, address):
     context.close()
 
 
-def test_a_link_of_another_page_runs_no_query_and_a_typed_address_does(page, site, tmp_path):
+def test_a_link_of_another_page_runs_no_query_and_a_typed_address_does(browser, site, tmp_path):
+    page = browser.new_page()  # whose console says what was refused
     query = f"{site}/sql?q=select+count(*)+from+trials"
     (tmp_path / "other.html").write_text(f'<a href="{query}">here</a>')
     page.goto((tmp_path / "other.html").as_uri())
@@ -113,3 +114,4 @@ def test_a_link_of_another_page_runs_no_query_and_a_typed_address_does(page, sit
     page.goto("about:blank")
     page.goto(query)
     expect(page.locator("#result tbody tr")).to_have_count(1)
+    page.close()
