@@ -16,8 +16,8 @@ from merge_runner.served_model import others_among, sql_of
 from merge_runner_analysis.data.provenance import provenance, tally
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer.catalogue import Catalogue, Filter
-from merge_runner_analysis.explorer.sweeps import list_runs
+from merge_runner_analysis.explorer.catalogue import Catalogue
+from merge_runner_analysis.explorer.pages.sweep import list_runs
 from merge_runner_analysis.tables.attempts import attempts
 from tests.analysis.studies import Drive, Said, write_study
 
@@ -54,9 +54,9 @@ def test_all_that_tell_of_other_models_tell_the_same(db):
     ]
     assert sorted(text.split(": ")[0] for text in found) == [f"o3 -> {name}" for name in OTHERS]
     catalogue = Catalogue(db)
-    *_, (run, _) = list_runs(catalogue)
-    assert run.row["others"] == len(OTHERS)
-    causes = [cause for cause, _ in catalogue.facets(Filter())["cause"]]
+    *_, run = list_runs(catalogue)
+    assert run["row"]["others"] == len(OTHERS)
+    causes = [cause for cause, _ in catalogue.facets({})["cause"]]
     assert [c for c in causes if c.startswith("model: ")] == [f"model: o3 → {n}" for n in OTHERS]
 
 

@@ -35,7 +35,6 @@ from merge_runner.errors import MergeRunnerError, UsageError
 from merge_runner_analysis.explorer.glossary import sections
 from merge_runner_analysis.explorer.guard import LOOPBACK, Guard
 from merge_runner_analysis.explorer.pages import (
-    comparing,
     conditions,
     drivers,
     home,
@@ -147,7 +146,7 @@ PAGES: dict[str, Callable[..., str | Response]] = {
     "/trials/": lambda site, asked: RedirectResponse(site.at.to("trials", **asked)),
     "/trials.csv": _trials_csv,
     "/trials/{name:path}": trial.trial_page,
-    "/others/{name:path}": lambda *asked: JSONResponse(comparing.others(*asked)),
+    "/others/{name:path}": lambda *asked: JSONResponse(trial.others(*asked)),
     "/raw/{name:path}": _raw,
     "/glossary": lambda site, _: site.render("glossary.html", here="glossary", glossary=sections()),
     "/tables": tables.tables_page,

@@ -6,9 +6,9 @@ import io
 import json
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,19 +20,25 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.errors import MergeRunnerError, StoreLocked
 from merge_runner.records import SIDES
 from merge_runner.results.database import Instance, schema_sql
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.served_model import ALIASES, others_among
 from merge_runner.text_safety import csv_writer, quoted
 from merge_runner_analysis.accounts import ALONE, OTHER_ACCOUNTS, Course, collision_class
-from merge_runner_analysis.data.derived_cache import program
+from merge_runner_analysis.data.derived_cache import ROWS, program
 from merge_runner_analysis.data.driver_words import language_models, stand_in, unresponsive
-from merge_runner_analysis.explorer.details import scenario_of
 from merge_runner_analysis.explorer.display_text import csv_cell
 from merge_runner_analysis.explorer.reading import PATIENCE_S, Row, reading, records, stamp_of
+from merge_runner_analysis.explorer.views import condition_text, scenario_of
 
 PAGE = 100
-State = tuple[int, int]
-"""The number of trials and a sum over them: equal where the same trials are listed."""
+Wanted = Mapping[str, Any]
+"""Which trials are wanted, by facet or column; an empty value wants all, and of a list one must be.
+
+``who`` is ``drivers``, ``humans`` or ``stand-ins``, and ``q`` a part of a name. ``trials`` are
+(trial, spec), where those behind a cell of a table are wanted.
+"""
+Facets = dict[str, list[tuple[str, int]]]
 # Differs where what was stored of a trial does: another program may have played it anew.
 PRINTS = """
 SELECT trial_id, spec_hash,
@@ -46,44 +52,16 @@ FROM trials LEFT JOIN (
     FROM calls GROUP BY ALL
 ) USING (trial_id, spec_hash)
 """
-# Of each trial its attempts, counted where they are alike.
-TRIED = """
-SELECT trial_id, spec_hash, sum(times)::BIGINT AS attempts, sum(cost_usd) AS cost_usd,
-    list({requested: requested, served: served, answered: answered, outcome: outcome,
-        unpriced: unpriced, times: times}) AS tried
-FROM (
-    SELECT trial_id, spec_hash, model_requested AS requested, model_served AS served,
-        http_status = 200 AS answered, outcome, count(*) FILTER (cost_usd IS NULL) AS unpriced,
-        count(*) AS times, sum(cost_usd) AS cost_usd
-    FROM calls GROUP BY ALL
-) GROUP BY ALL
-"""
-# About 24 samples of each vehicle's speed, and the range of all samples.
-SPEEDS = """
-SELECT trial_id, spec_hash,
-    left_all[1:-1:1 + len(left_all) // 24] AS left_mps,
-    right_all[1:-1:1 + len(right_all) // 24] AS right_mps,
-    [list_min(left_all), list_max(left_all)] AS left_range_mps,
-    [list_min(right_all), list_max(right_all)] AS right_range_mps
-FROM (
-    SELECT trial_id, spec_hash,
-        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'left') AS left_all,
-        list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'right') AS right_all
-    FROM states WHERE time_s >= 0 GROUP BY ALL
-)
-"""
-# Of the levels of its study's factors a trial has a text each, but not of the prompt; a reply is
-# known by its call and attempt, since trials may share it. A fallback follows every invalid reply,
-# and nothing else: see the audit.
+# About 24 samples of each vehicle's speed, and the range of all. Of its study's factors
+# a trial has a text each, but not of the prompt; a reply is known by its call and attempt, since
+# trials may share it. A fallback follows every invalid reply, and nothing else: see the audit.
 LISTING = f"""
 SELECT nextval('numbers')::INTEGER AS number, trials.trial_id, trials.spec_hash, source,
     CASE WHEN source = 'human' THEN 'humans' WHEN scripted THEN 'stand-ins' ELSE 'drivers' END
         AS who,
-    model_left, model_right,
-    if(source = 'human', 'human', driver) AS model,
-    variant, condition, projected_headway_m, relative_velocity_mps, rep, pair, status,
-    merged_first, end_time_s, error, scripted,
-    stand_in, caution,
+    model_left, model_right, if(source = 'human', 'human', driver) AS model, variant, condition,
+    projected_headway_m, relative_velocity_mps, rep, pair, status, merged_first, end_time_s, error,
+    scripted, stand_in, caution,
     if(status = 'finished', coalesce(merged_first || ' first', 'nobody first'), status) AS outcome,
     CASE WHEN source = 'human' THEN 'human' WHEN decisions IS NULL THEN 'no decision'
         WHEN fallbacks > 0 OR invalid > 0 THEN 'fallbacks'
@@ -93,7 +71,7 @@ SELECT nextval('numbers')::INTEGER AS number, trials.trial_id, trials.spec_hash,
     coalesce(decisions, 0) AS decisions, coalesce(asked, 0) AS asked,
     coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
     coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps, left_range_mps,
-    right_range_mps, print, flaws, tried, replies, factors,
+    right_range_mps, print, flaws, tried, factors,
     [f.factor || '=' || f.level FOR f IN factors IF f.factor <> 'model'] AS levels
 FROM trials
 JOIN judged USING (trial_id, spec_hash)
@@ -106,9 +84,10 @@ LEFT JOIN (
         list(failure) FILTER (failure IS NOT NULL) AS flaws
     FROM decisions GROUP BY ALL
 ) USING (trial_id, spec_hash)
-LEFT JOIN ({TRIED}) USING (trial_id, spec_hash)
 LEFT JOIN (
-    SELECT trial_id, spec_hash, list({{reply: hash(call_key, attempt), usd: cost_usd}}) AS replies
+    SELECT trial_id, spec_hash, count(*) AS attempts, sum(cost_usd) AS cost_usd,
+        list({{requested: model_requested, served: model_served, answered: http_status = 200,
+            outcome: outcome, reply: hash(call_key, attempt), usd: cost_usd}}) AS tried
     FROM calls GROUP BY ALL
 ) USING (trial_id, spec_hash)
 LEFT JOIN ({ALONE}) USING (trial_id, spec_hash)
@@ -116,8 +95,22 @@ LEFT JOIN (
     SELECT trial_id, spec_hash, list({{factor: factor, level: value}} ORDER BY factor) AS factors
     FROM trial_levels WHERE factor <> 'prompt' GROUP BY ALL
 ) USING (trial_id, spec_hash)
-LEFT JOIN ({SPEEDS}) USING (trial_id, spec_hash)
+LEFT JOIN (
+    SELECT trial_id, spec_hash,
+        left_all[1:-1:1 + len(left_all) // 24] AS left_mps,
+        right_all[1:-1:1 + len(right_all) // 24] AS right_mps,
+        [list_min(left_all), list_max(left_all)] AS left_range_mps,
+        [list_min(right_all), list_max(right_all)] AS right_range_mps
+    FROM (
+        SELECT trial_id, spec_hash,
+            list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'left') AS left_all,
+            list(velocity_mps::FLOAT ORDER BY step) FILTER (side = 'right') AS right_all
+        FROM states WHERE time_s >= 0 GROUP BY ALL
+    )
+) USING (trial_id, spec_hash)
 """  # noqa: S608 # constants
+FACETS = ("sweep", "who", "model", "variant", "condition", "outcome", "account", "validity",
+          "cause", "tag")  # fmt: skip
 # Facets of which a trial may have several values, and the tables that hold these.
 SEVERAL = {"sweep": "members", "cause": "causes", "tag": "tagged"}
 # Before the name of a factor: its facet.
@@ -129,8 +122,8 @@ CREATE TABLE judged (trial_id VARCHAR, spec_hash VARCHAR, collision VARCHAR, sta
 CREATE TABLE listed AS {LISTING};
 CREATE TABLE noted (trial_id VARCHAR, spec_hash VARCHAR, tag VARCHAR);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
+CREATE TABLE shared (number INTEGER, of_several STRUCT(reply UBIGINT, usd DOUBLE)[]);
 CREATE VIEW tried AS SELECT number, unnest(tried, recursive := true) FROM listed;
-CREATE VIEW replies AS SELECT number, unnest(replies, recursive := true) FROM listed;
 CREATE VIEW levels AS SELECT number, unnest(factors, recursive := true) FROM listed;
 CREATE VIEW tagged AS SELECT number, tag FROM noted JOIN listed USING (trial_id, spec_hash);
 CREATE VIEW members AS SELECT DISTINCT sweep_id AS sweep, number
@@ -138,15 +131,22 @@ CREATE VIEW members AS SELECT DISTINCT sweep_id AS sweep, number
 CREATE VIEW causes AS
     SELECT number, 'plan: ' || flaw AS cause, count(*) AS times
     FROM (SELECT number, unnest(flaws) AS flaw FROM listed) GROUP BY ALL
-    UNION ALL SELECT number, 'attempt: ' || outcome, sum(times)::BIGINT
+    UNION ALL SELECT number, 'attempt: ' || outcome, count(*)
     FROM tried WHERE outcome <> 'ok' GROUP BY ALL
-    UNION ALL SELECT number, 'model: ' || requested || ' → ' || served, sum(times)::BIGINT
+    UNION ALL SELECT number, 'model: ' || requested || ' → ' || served, count(*)
     FROM tried SEMI JOIN others USING (requested, served) WHERE answered GROUP BY ALL;
 CREATE VIEW several AS
     SELECT number, '{FACTOR}' || factor AS facet, level AS value FROM levels
     UNION ALL SELECT number, 'sweep', sweep FROM members
     UNION ALL SELECT number, 'cause', cause FROM causes
     UNION ALL SELECT number, 'tag', tag FROM tagged;
+CREATE VIEW counted AS FROM listed LEFT JOIN shared USING (number) LEFT JOIN (
+    SELECT number, count(*) FILTER (outcome <> 'ok') AS faults,
+        count(*) FILTER (answered) AS answers, count(*) FILTER
+            (answered AND (requested, served) IN (FROM others)) AS others,
+        count(*) FILTER (usd IS NULL) AS unpriced
+    FROM tried GROUP BY ALL
+) USING (number);
 """  # noqa: S608 # constants
 # What is listed no longer as it is stored goes, and is taken again before anybody else can hold the
 # file. What was only asked is no trial to look at.
@@ -161,23 +161,17 @@ INSERT OR IGNORE INTO memory.specs FROM specs;
 """  # noqa: S608 # constants
 # Of the next 2,000 what is measured: the file is not held for longer than copying takes. Texts and
 # prompts stay in the database.
+COPIED = "trial_factors", "states", "decisions", "calls"
 TAKE = """
 INSERT INTO memory.trials BY NAME
     FROM trials ANTI JOIN memory.listed USING (trial_id, spec_hash) WHERE source <> 'seat'
     ORDER BY trial_id, spec_hash LIMIT 2000;
-INSERT INTO memory.trial_factors
-    FROM trial_factors SEMI JOIN memory.trials USING (trial_id, spec_hash);
-INSERT INTO memory.states BY NAME
-    FROM states SEMI JOIN memory.trials USING (trial_id, spec_hash);
-INSERT INTO memory.decisions BY NAME SELECT * EXCLUDE (prompt, rationale, plan)
-    FROM decisions SEMI JOIN memory.trials USING (trial_id, spec_hash);
-INSERT INTO memory.calls BY NAME SELECT * EXCLUDE (request, reply, error)
-    FROM calls SEMI JOIN memory.trials USING (trial_id, spec_hash);
-"""
-TAKEN = """
-TRUNCATE trials; TRUNCATE trial_factors; TRUNCATE states; TRUNCATE decisions; TRUNCATE calls;
-TRUNCATE judged;
-"""
+""" + "".join(
+    f"INSERT INTO memory.{name} BY NAME "
+    f"FROM {ROWS[name]} SEMI JOIN memory.trials USING (trial_id, spec_hash);"
+    for name in COPIED
+)
+TAKEN = "".join(f"TRUNCATE {name};" for name in ("trials", *COPIED, "judged"))
 # What was measured by the rules of this very program.
 RECALL = """
 INSERT INTO listed BY NAME
@@ -207,84 +201,64 @@ LEFT JOIN (
     WHERE time_s >= 0 GROUP BY ALL HAVING len(left_m) = len(right_m)
 ) USING (trial_id, spec_hash)
 """
-NOTE_JUDGED = f"INSERT INTO judged SELECT {', '.join(['unnest(?::VARCHAR[])'] * 5)}"
-SORTS = {
-    "trial": "trial_id",
-    "outcome": "outcome",
-    "end": "end_time_s",
-    "gap": "gap_m",
-    "rmse": "rmse_mps",
-    "invalid": "invalid",
-    "cost": "cost_usd",
-}
-COUNTS = """
+TEXTS = "unnest(?::VARCHAR[])"
+NOTED = f"TRUNCATE noted; INSERT INTO noted SELECT {TEXTS}, {TEXTS}, {TEXTS}"
+NOTE_JUDGED = f"INSERT INTO judged SELECT {TEXTS}, {TEXTS}, {TEXTS}, {TEXTS}, {TEXTS}"
+ANSWERED = "SELECT DISTINCT requested, served FROM tried WHERE answered"
+# Another model is one by the aliases of all sweeps, and a reply is shared by trials of any.
+COMPARED = """
+CREATE OR REPLACE TABLE shared AS
+    SELECT number, list({reply: reply, usd: usd}) AS of_several
+    FROM (FROM tried QUALIFY count(*) OVER (PARTITION BY reply) > 1) GROUP BY ALL;
+TRUNCATE others;
+INSERT INTO others SELECT unnest(?::VARCHAR[]), unnest(?::VARCHAR[]);
+"""
+SORTS = {"trial": "trial_id", "outcome": "outcome", "end": "end_time_s", "gap": "gap_m",
+         "rmse": "rmse_mps", "invalid": "invalid", "cost": "cost_usd"}  # fmt: skip
+SUMMED = ("decisions", "asked", "invalid", "fallbacks", "attempts", "faults", "answers", "others",
+          "unpriced")  # fmt: skip
+# A reply that several of the trials share counts and costs once. In their last digits sums differ
+# from time to time.
+COUNTS = f"""
 count(*) AS trials, count(*) FILTER (status <> 'failed') AS ended,
 count(*) FILTER (status = 'failed') AS failed, count(*) FILTER (status = 'collided') AS collided,
 count(*) FILTER (outcome = 'left first') AS left_first,
-count(*) FILTER (outcome = 'right first') AS right_first,
-coalesce(sum(decisions), 0)::BIGINT AS decisions, coalesce(sum(asked), 0)::BIGINT AS asked,
-coalesce(sum(invalid), 0)::BIGINT AS invalid,
-coalesce(sum(fallbacks), 0)::BIGINT AS fallbacks, coalesce(sum(cost_usd), 0) AS cost_usd,
-avg(gap_m) AS gap_m, avg(rmse_mps) AS rmse_mps, string_agg(DISTINCT stand_in, '; ') AS stand_in
+count(*) FILTER (outcome = 'right first') AS right_first, count(*) FILTER (scripted) AS scripted,
+{", ".join(f"coalesce(sum({name}), 0)::BIGINT AS {name}" for name in SUMMED)},
+round(avg(gap_m), 9) AS gap_m, round(avg(rmse_mps), 9) AS rmse_mps,
+string_agg(DISTINCT stand_in, '; ' ORDER BY stand_in) AS stand_in,
+flatten(list(of_several)) AS every, list_distinct(every) AS once,
+coalesce(len(once), 0) AS shared,
+coalesce(sum(attempts), 0)::BIGINT - coalesce(len(every), 0) + coalesce(len(once), 0) AS replies,
+round(coalesce(sum(cost_usd), 0) - coalesce(list_sum([reply.usd FOR reply IN every]), 0)
+    + coalesce(list_sum([reply.usd FOR reply IN once]), 0), 9) AS cost_usd
 """
-COUNTED = "print, flaws, tried, replies, factors"
-SHOWN = f"* EXCLUDE ({COUNTED})"
+SHOWN = "* EXCLUDE (print, flaws, tried, factors)"
 EXPORTED = (
-    f"* EXCLUDE ({COUNTED}, who, levels, number, asked, model_left, model_right, "
-    "left_mps, right_mps, left_range_mps, right_range_mps)"
+    "trial_id spec_hash source model variant condition projected_headway_m relative_velocity_mps "
+    "rep pair status merged_first end_time_s error scripted stand_in caution outcome validity "
+    "time_to_merge_s gap_m rmse_mps joint min_ttc_s account decisions invalid fallbacks attempts "
+    "cost_usd"
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Filter:
-    """Which trials are wanted; an empty text wants all. ``q`` is part of a name.
-
-    ``who`` is ``drivers``, ``humans`` or ``stand-ins``. ``levels`` are (factor, level). ``trials``
-    are (trial, spec), where those behind a cell of a table are wanted.
-    """
-
-    sweep: str = ""
-    who: str = ""
-    model: str = ""
-    variant: str = ""
-    condition: str = ""
-    outcome: str = ""
-    account: str = ""
-    validity: str = ""
-    cause: str = ""
-    tag: str = ""
-    q: str = ""
-    levels: tuple[tuple[str, str], ...] = ()
-    trials: tuple[tuple[str, str], ...] | None = None
-
-    def where(self, leave_out: str = "") -> tuple[str, list[Any]]:
-        """The filter as SQL with its values; without one facet, to count its alternatives."""
-        parts, values = ["true"], list[Any]()
-        for name, value in self.chosen.items():
-            if name == leave_out:
-                continue
-            if name == "q":
-                parts.append("contains(lower(trial_id), lower(?))")
-            elif name in FACETS and name not in SEVERAL:
-                parts.append(f"{name} = ?")
-            else:
-                parts.append("number IN (SELECT number FROM several WHERE facet = ? AND value = ?)")
-                values.append(name)
-            values.append(value)
-        if self.trials is not None:
-            parts.append("(trial_id, spec_hash) IN (SELECT (unnest(?::VARCHAR[]), "
-                         "unnest(?::VARCHAR[])))")  # fmt: skip
-            values += [[name for name, _ in self.trials], [spec for _, spec in self.trials]]
-        return " AND ".join(parts), values
-
-    @property
-    def chosen(self) -> dict[str, str]:
-        """What is asked for, by name."""
-        named = {name: value for name in (*FACETS, "q") if (value := getattr(self, name))}
-        return named | {f"{FACTOR}{factor}": level for factor, level in self.levels}
-
-
-FACETS = tuple(f.name for f in fields(Filter) if f.name not in {"q", "levels", "trials"})
+def where_of(wanted: Wanted, leave_out: str = "") -> tuple[str, list[Any]]:
+    """A filter as SQL with its values; without one facet, to count its alternatives."""
+    parts, values = ["true"], list[Any]()
+    for name, value in wanted.items():
+        if name == leave_out or value in ("", (), None):
+            continue
+        if name == "q":
+            parts.append("contains(lower(trial_id), lower(?))")
+        elif name == "trials":
+            parts.append("[trial_id, spec_hash] IN (SELECT unnest(?::VARCHAR[][]))")
+        elif name in SEVERAL or name.startswith(FACTOR):
+            parts.append("number IN (SELECT number FROM several WHERE facet = ? AND value = ?)")
+            values.append(name)
+        else:
+            parts.append(f"{name} = ?" if isinstance(value, str) else f"list_contains(?, {name})")
+        values.append(value)
+    return " AND ".join(parts), values
 
 
 @dataclass(slots=True)
@@ -298,12 +272,10 @@ class Catalogue:
 
     db: Path
     held: bool = False
-    _connection: duckdb.DuckDBPyConnection | None = None
+    _memory: duckdb.DuckDBPyConnection = field(init=False)
     _instance: Instance = field(default_factory=Instance)
-    _file: int | None = None
-    """The inode of the file that is listed: another file may take its name."""
-    _stamp: tuple[int, ...] | None = None
-    """The stamp of the database when it was last read to the end."""
+    _stamp: tuple[int, ...] = ()
+    """The stamp of the database when it was last read to the end; before that its inode alone."""
     _lock: threading.RLock = field(default_factory=threading.RLock)
     _tags: tuple[tuple[str, str, str], ...] = ()
 
@@ -318,117 +290,63 @@ class Catalogue:
             if stamp == self._stamp:
                 self.held = False
                 return False
-            if self._connection is None or stamp[0] != self._file:
-                self._begin(stamp[0])
+            if stamp[:1] != self._stamp[:1]:  # another file may have taken the name
+                self._begin(stamp[:1])
             try:
                 waiting = measured = self._reading(FORGET + TAKE)
                 while waiting:
                     # With the file closed: measuring takes longer than copying.
-                    judged = [_judged(row) for row in records(self._memory, JUDGED, ())]
-                    self._memory.execute(NOTE_JUDGED, [*map(list, zip(*judged, strict=True))])
+                    judged = zip(*map(_judged, self.ask(JUDGED)), strict=True)
+                    self.ask(NOTE_JUDGED, *map(list, judged))
                     self._memory.execute(f"INSERT INTO listed BY NAME {LISTING}; {TAKEN}")
                     waiting = self._reading(TAKE)
             except StoreLocked:
-                if self._stamp is None:
+                if self._stamp == stamp[:1]:
                     raise
                 self.held = True
             except MergeRunnerError:
-                self._file = self._stamp = None  # whatever is there next, begin anew
+                self._stamp = ()  # whatever is there next, begin anew
                 raise
             else:
                 self._stamp, self.held = stamp, False
                 if measured:
                     self._remember()
-            self._note_others()
+            answered, aliases = (
+                self._memory.execute(sql).fetchall() for sql in (ANSWERED, ALIASES)
+            )
+            others = others_among(answered, aliases)
+            self.ask(COMPARED, [asked for asked, _ in others], [served for _, served in others])
             return not self.held
 
-    def keep(self, numbers: Sequence[int]) -> None:
-        """List no trials but those with these numbers."""
-        with self._lock:
-            self._memory.execute(
-                "DELETE FROM listed WHERE number NOT IN (SELECT unnest(?))", [numbers]
-            )
+    def _begin(self, file: tuple[int, ...]) -> None:
+        """Forget everything but what was measured before."""
+        self._instance.drop()
+        self._memory = self._instance.cursor()
+        self._memory.execute(schema_sql() + BEGUN)
+        self._stamp, self._tags = file, ()
+        # Without the file, or where it is damaged, all is measured anew.
+        with suppress(duckdb.Error):
+            self.ask(RECALL, str(measured_beside(self.db)), program())
 
-    def facets(self, wanted: Filter) -> dict[str, list[tuple[str, int]]]:
-        """Each facet's values with how many trials they would leave, the other facets as wanted."""
-        found: dict[str, list[tuple[str, int]]] = {
-            name: [] for name in (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
-        }
-        counts, values = [], list[Any]()
-        for name in found:
-            where, wants = wanted.where(leave_out=name)
-            table, value = "listed", name
-            if name not in FACETS or name in SEVERAL:
-                table = "listed JOIN (FROM several WHERE facet = ?) USING (number)"
-                value, wants = "value", [name, *wants]
-            counts.append(
-                f"SELECT ? AS facet, {value} AS value, count(*) AS trials FROM {table} "  # noqa: S608 # constants
-                f"WHERE {where} AND {value} IS NOT NULL GROUP BY ALL"
-            )
-            values += [name, *wants]
-        for row in self.ask(f"{' UNION ALL '.join(counts)} ORDER BY ALL", *values):
-            found[row["facet"]].append((row["value"], row["trials"]))
-        return found
+    def _reading(self, sql: str) -> int:
+        """Run statements on the database and ours; returns how many trials wait to be listed."""
+        # A reader that found it held once does not wait again.
+        patience_s = 0.0 if self.held else PATIENCE_S
+        with reading(self.db, self._instance, patience_s) as connection:
+            connection.execute(sql)
+        return len(self.ask("FROM trials"))
 
-    def factors(self) -> list[str]:
-        """The factors of the listed studies, with ``model`` where there is any, but no prompt."""
-        rows = self.ask("SELECT DISTINCT factor FROM levels ORDER BY ALL")
-        names = [str(row["factor"]) for row in rows]
-        return names if names != ["model"] else []
-
-    def totals(self, wanted: Filter) -> dict[str, Row]:
-        """What a filter's trials come to: those of ``drivers``, ``humans`` and ``stand-ins``."""
-        return {row["who"]: row for row in self.counts(wanted, "who")}
-
-    def counts(self, wanted: Filter, *columns: str) -> list[Row]:
-        """What a filter's trials come to by columns: counts of all, means of those with a value."""
-        where, values = wanted.where()
-        named = ", ".join(columns)
-        return self.ask(
-            f"SELECT {named}, {COUNTS} FROM listed WHERE {where} GROUP BY {named} "  # noqa: S608 # constants
-            f"ORDER BY {named}",
-            *values,
-        )
-
-    def every(self, wanted: Filter, sort: str = "trial", limit: str = "") -> list[Row]:
-        """All trials of a filter; ``-gap`` sorts the largest gap first."""
-        where, values = wanted.where()
-        order = order_by(sort)
-        # Only the trials of a page are read with their speeds, which take the longest.
-        return self.ask(
-            f"SELECT {SHOWN} FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
-            f"ORDER BY {order} {limit}) USING (number) ORDER BY {order}",
-            *values,
-        )
-
-    def page(self, wanted: Filter, sort: str, number: int) -> list[Row]:
-        """The trials of one page, counted from 1."""
-        return self.every(wanted, sort, f"LIMIT {PAGE} OFFSET {PAGE * (number - 1)}")
-
-    def find(self, trial_id: str, spec_hash: str | None = None) -> Row | None:
-        """One trial; where its name stands for several, the one of that spec, or any."""
-        found = self.ask(
-            f"SELECT {SHOWN} FROM listed WHERE trial_id = ? AND spec_hash = coalesce(?, spec_hash) "  # noqa: S608 # constants
-            "ORDER BY spec_hash LIMIT 1",
-            trial_id,
-            spec_hash,
-        )
-        return found[0] if found else None
-
-    def state(self) -> State:
-        """What is listed now."""
-        ((trials, prints),) = map(
-            dict.values,
+    def _remember(self) -> None:
+        """Keep what was measured; where nothing can be written it is measured again next time."""
+        path = measured_beside(self.db)
+        made = path.with_name(f"{path.name}.{os.getpid()}")
+        with suppress(duckdb.Error, OSError):
             self.ask(
-                "SELECT count(*) AS trials, coalesce(bit_xor(print), 0) AS prints FROM listed"
-            ),
-        )
-        return int(trials), int(prints)
-
-    @property
-    def others(self) -> set[tuple[str, str]]:
-        """The models that were asked for, with the other ones that answered."""
-        return {(row["requested"], row["served"]) for row in self.ask("FROM others")}
+                f"COPY (SELECT * EXCLUDE number, ? AS rules FROM listed) TO {quoted(made)} "  # noqa: S608 # constants
+                "(FORMAT parquet)",
+                program(),
+            )
+            made.replace(path)
 
     def ask(self, sql: str, *values: object) -> list[Row]:
         """Rows of a query of ours on what is in memory."""
@@ -440,77 +358,111 @@ class Catalogue:
         with self._lock:
             return self._memory.cursor()
 
+    def keep(self, numbers: Sequence[int]) -> None:
+        """List no trials but those with these numbers."""
+        self.ask("DELETE FROM listed WHERE number NOT IN (SELECT unnest(?))", numbers)
+
     def tag(self, tags: tuple[tuple[str, str, str], ...]) -> None:
         """Know the tags that readers gave: (trial, spec, tag), each once."""
         with self._lock:
             if tags != self._tags:
-                self._memory.execute("TRUNCATE noted")
-                if tags:
-                    self._memory.executemany("INSERT INTO noted VALUES (?, ?, ?)", tags)
+                columns = [[tag[i] for tag in tags] for i in range(3)]
+                self.ask(NOTED, *columns)
                 self._tags = tags
 
-    def export(self, wanted: Filter, sort: str) -> str:
-        """All trials of a filter as CSV, with a column for each factor but the model."""
-        where, values = wanted.where()
-        factors = [name for name in self.factors() if name != "model"]
+    def factors(self) -> list[str]:
+        """The factors of the listed studies, with ``model`` where there is any, but no prompt."""
+        rows = self.ask("SELECT DISTINCT factor FROM levels ORDER BY ALL")
+        names = [str(row["factor"]) for row in rows]
+        return names if names != ["model"] else []
+
+    def facets(self, wanted: Wanted) -> Facets:
+        """Each facet's values with how many trials they would leave, the other facets as wanted."""
+        names = (*FACETS, *(f"{FACTOR}{name}" for name in self.factors()))
         with self._lock:
-            found = self._memory.execute(
-                f"SELECT {EXPORTED}, levels FROM listed WHERE {where} ORDER BY {order_by(sort)}",  # noqa: S608 # constants
-                values,
-            )
-            names, rows = [name for name, *_ in found.description[:-1]], found.fetchall()
-        lines = io.StringIO()
+            return facets_of(self._memory, "listed", names, wanted)
+
+    def counts(self, wanted: Wanted, *columns: str) -> list[Row]:
+        """What a filter's trials come to by columns: counts of all, means of those with a value.
+
+        Without columns it is one row. A trial counts in each ``sweep`` of which it is a member.
+        """
+        where, values = where_of(wanted)
+        table = "counted JOIN members USING (number)" if "sweep" in columns else "counted"
+        named = "".join(f"{name}, " for name in columns)
+        return self.ask(
+            f"SELECT * EXCLUDE (every, once) FROM (SELECT {named}{COUNTS} FROM {table} "  # noqa: S608 # constants
+            f"WHERE {where} GROUP BY ALL) ORDER BY ALL",
+            *values,
+        )
+
+    def every(self, wanted: Wanted, sort: str = "trial", page: int = 0) -> list[Row]:
+        """All trials of a filter, or those of a page from 1; ``-gap`` sorts the largest gap first.
+
+        What has no value comes last.
+        """
+        where, values = where_of(wanted)
+        direction = "DESC" if sort.startswith("-") else "ASC"
+        order = f"{SORTS[sort.removeprefix('-')]} {direction} NULLS LAST, trial_id, spec_hash"
+        limit = f"LIMIT {PAGE} OFFSET {PAGE * (page - 1)}" if page else ""
+        # Only the trials of a page are read with their speeds, which take the longest.
+        return self.ask(
+            f"SELECT {SHOWN} FROM listed SEMI JOIN (SELECT number FROM listed WHERE {where} "  # noqa: S608 # constants
+            f"ORDER BY {order} {limit}) USING (number) ORDER BY {order}",
+            *values,
+        )
+
+    def find(self, trial_id: str, spec_hash: str = "") -> Row | None:
+        """One trial; where its name stands for several, the one of that spec, or any."""
+        return next(iter(self.every({"trial_id": trial_id, "spec_hash": spec_hash})), None)
+
+    def condition_texts(self) -> dict[str, str]:
+        """In words: the conditions that humans drove, and those of all trials."""
+        numbers = "condition, projected_headway_m, relative_velocity_mps"
+        played = self.ask(f"SELECT DISTINCT {numbers} FROM listed")  # noqa: S608 # constants
+        return {
+            name: condition_text(one.projected_headway_m, one.relative_velocity_mps)
+            for name, one in HUMAN_CONDITIONS.items()
+        } | {name: condition_text(*of) for name, *of in map(dict.values, played)}
+
+    def state(self) -> Row:
+        """What differs where other ``trials`` are listed, or the same otherwise."""
+        return self.ask("SELECT count(*) AS trials, bit_xor(print) AS prints FROM listed")[0]
+
+    def export(self, wanted: Wanted, sort: str) -> str:
+        """All trials of a filter as CSV, with a column for each factor but the model."""
+        factors = [name for name in self.factors() if name != "model"]
+        names, lines = EXPORTED.split(), io.StringIO()
         writer = csv_writer(lines)
         writer.writerow(map(csv_cell, [*names, *(f"{FACTOR}{name}" for name in factors)]))
-        for *cells, levels in rows:
-            chosen = dict(level.split("=", 1) for level in levels or ())
-            writer.writerow(map(csv_cell, [*cells, *map(chosen.get, factors)]))
+        for row in self.every(wanted, sort):
+            levels = dict(level.split("=", 1) for level in row["levels"] or ())
+            writer.writerow(map(csv_cell, [*map(row.get, names), *map(levels.get, factors)]))
         return lines.getvalue()
 
-    def _begin(self, file: int) -> None:
-        """Forget everything but what was measured before."""
-        self._instance.drop()
-        self._connection = self._instance.cursor()
-        self._connection.execute(schema_sql() + BEGUN)
-        self._file, self._stamp, self._tags = file, None, ()
-        # Without the file, or where it is damaged, all is measured anew.
-        with suppress(duckdb.Error):
-            self._connection.execute(RECALL, [str(measured_beside(self.db)), program()])
 
-    def _remember(self) -> None:
-        """Keep what was measured; where nothing can be written it is measured again next time."""
-        path = measured_beside(self.db)
-        made = path.with_name(f"{path.name}.{os.getpid()}")
-        with suppress(duckdb.Error, OSError):
-            self._memory.execute(
-                f"COPY (SELECT * EXCLUDE number, ? AS rules FROM listed) TO {quoted(made)} "  # noqa: S608 # constants
-                "(FORMAT parquet)",
-                [program()],
-            )
-            made.replace(path)
-
-    def _reading(self, sql: str) -> int:
-        """Run statements on the database and ours; returns how many trials wait to be listed."""
-        # A reader that found it held once does not wait again.
-        patience_s = 0.0 if self.held else PATIENCE_S
-        with reading(self.db, self._instance, patience_s) as connection:
-            connection.execute(sql)
-            (waiting,) = connection.execute("SELECT count(*) FROM memory.trials").fetchall()
-        count: int = waiting[0]
-        return count
-
-    def _note_others(self) -> None:
-        """Find out where another model answered, by the aliases of all sweeps."""
-        answered = "SELECT DISTINCT requested, served FROM tried WHERE answered"
-        pairs, aliases = (self._memory.execute(sql).fetchall() for sql in (answered, ALIASES))
-        self._memory.execute("TRUNCATE others")
-        if others := others_among(pairs, aliases):
-            self._memory.executemany("INSERT INTO others VALUES (?, ?)", others)
-
-    @property
-    def _memory(self) -> duckdb.DuckDBPyConnection:
-        assert self._connection is not None, "it was never refreshed"
-        return self._connection
+def facets_of(
+    cursor: duckdb.DuckDBPyConnection, listed: str, names: Sequence[str], wanted: Wanted
+) -> Facets:
+    """The values of facets with how many rows of a table they would leave, the others as wanted."""
+    counts, values = [], list[Any]()
+    for name in names:
+        where, wants = where_of(wanted, leave_out=name)
+        table, value = listed, name
+        if name in SEVERAL or name.startswith(FACTOR):
+            table, value = f"{listed} JOIN (FROM several WHERE facet = ?) USING (number)", "value"
+            wants = [name, *wants]
+        counts.append(
+            f"SELECT ? AS facet, {value} AS value, count(*) AS times FROM {table} "  # noqa: S608 # constants
+            f"WHERE {where} AND {value} IS NOT NULL GROUP BY ALL"
+        )
+        values += [name, *wants]
+    found: Facets = {name: [] for name in names}
+    for facet, value, times in cursor.execute(
+        f"{' UNION ALL '.join(counts)} ORDER BY ALL", values
+    ).fetchall():
+        found[facet].append((value, times))
+    return found
 
 
 def _judged(trial: Row) -> tuple[str, str, str | None, str | None, str | None]:
@@ -544,10 +496,3 @@ def _task(source: str, spec: str) -> ScenarioConfig:
 def measured_beside(db: Path) -> Path:
     """The file that keeps what was measured of the trials of a database."""
     return db.with_name(f"{db.name}.trials.parquet")
-
-
-def order_by(sort: str) -> str:
-    """A sort as SQL: what has no value comes last, and equal ones by name."""
-    column = SORTS.get(sort.removeprefix("-"), "trial_id")
-    direction = "DESC" if sort.startswith("-") else "ASC"
-    return f"{column} {direction} NULLS LAST, trial_id, spec_hash"

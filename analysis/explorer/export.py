@@ -21,7 +21,7 @@ import httpx
 from merge_runner.errors import UsageError
 from merge_runner.paths import refuse_another_kind
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, Filter
+from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR
 from merge_runner_analysis.explorer.guard import LOOPBACK
 from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.offline import offline, page_of_trials
@@ -150,7 +150,8 @@ def _page_of(address: str, heads: tuple[str, ...]) -> tuple[str, str]:
         return "", ""
     known, asked = FOLLOWED[head], dict(parse_qsl(parts.query))
     moment = query_of({name: asked.pop(name) for name in MOMENT if name in asked})
-    kept = {name: asked[name] for name in asked if name in known or name.startswith(FACTOR)}
+    # In one order, whatever the page that links to it says first.
+    kept = {n: asked[n] for n in sorted(asked) if n in known or n.startswith(FACTOR)}
     if parts.path.endswith(".png") or asked.keys() - kept.keys() - {*SCOPE}:
         return "", ""
     return parts.path + query_of(kept), moment + (f"#{parts.fragment}" if parts.fragment else "")
@@ -178,7 +179,7 @@ def _opened(db: Path, wanted: Sequence[str]) -> Iterator[tuple[Site, list[Row]]]
     site.is_still = True  # so that all pages are of the same trials
     rows = [
         row
-        for row in site.catalogue.every(Filter())
+        for row in site.catalogue.every({})
         if not wanted or any(fnmatchcase(row["trial_id"], pattern) for pattern in wanted)
     ]
     if not rows:

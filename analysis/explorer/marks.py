@@ -21,9 +21,7 @@ from merge_runner_analysis.verdict_words import (
 )
 
 SHAPES = {SHOWN: "like", WEAKER: "weaker", STRONGER: "stronger", UNLIKE: "unlike", OPEN: "open"}
-# Decimals of a value in a cell, where they are not one: large shares have none.
-DECIMALS = {"gap-headway": 2}
-LARGE_PERCENT = 10.0
+LARGE_PERCENT = 10.0  # from here on a share of collisions has no decimals
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,28 +54,24 @@ def place(measure: Measure, value: float) -> float:
 
 def mark(measure: Measure, values: Values) -> Mark | None:
     """The mark of a verdict; None without a value or an interval."""
-    value, ci = values.get("estimate"), values.get("ci")
+    value, ci, (low, high) = values.get("estimate"), values.get("ci"), measure.ends
     ends = None if ci is None else (place(measure, ci[0]), place(measure, ci[1]))
     if value is None:
         return None if ends is None else Mark("", None, ends)
     shape = SHAPES.get(values.get("state") or "", "plain")
-    low, high = measure.ends
     if not low <= value <= high:
-        return Mark("beyond" if value > high else "below", place(measure, value), ends)
+        shape = "beyond" if value > high else "below"
     return Mark(shape, place(measure, value), ends)
 
 
 def band(measure: Measure, human: Values) -> dict[str, Any]:
     """The humans' interval and value on the axis, and 0 where the axis has it inside."""
-    value, ci = human.get("estimate"), human.get("ci")
-    if measure.margin is not None and ci is None and value is not None:
-        ci = value - measure.margin, value + measure.margin
-    low, high = measure.ends
-    return {
-        "at": None if value is None else place(measure, value),
-        "ends": None if ci is None else (place(measure, ci[0]), place(measure, ci[1])),
-        "zero": place(measure, 0.0) if low < 0 < high else None,
-    }
+    value, (low, high) = human.get("estimate"), measure.ends
+    if measure.margin is not None and human.get("ci") is None and value is not None:
+        human = {**human, "ci": (value - measure.margin, value + measure.margin)}
+    placed = mark(measure, human) or Mark("", None, None)
+    zero = place(measure, 0.0) if low < 0 < high else None
+    return {"at": placed.at, "ends": placed.ends, "zero": zero}
 
 
 def cells(verdicts: dict[str, Values]) -> dict[str, Cell]:
@@ -88,10 +82,9 @@ def cells(verdicts: dict[str, Values]) -> dict[str, Cell]:
 
 
 def _cell(measure: Measure, values: Values) -> Cell:
-    decimals = DECIMALS.get(measure.name, 1)
     value, ci = values.get("estimate"), values.get("ci")
-    if measure.name == "collisions" and (value or 0.0) >= LARGE_PERCENT:
-        decimals = 0
+    is_large = (value or 0.0) >= LARGE_PERCENT
+    decimals = {"gap-headway": 2, "collisions": 0 if is_large else 1}.get(measure.name, 1)
     text = "–" if value is None else number(value, decimals)
     if values.get("undecided"):
         text = share(values, 0)

@@ -5,22 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from starlette.datastructures import QueryParams
 
 from merge_runner.prompts.blocks import title_of
-from merge_runner_analysis.explorer.catalogue import Filter
-from merge_runner_analysis.explorer.conditions import ordered
 from merge_runner_analysis.explorer.site import SCOPE, NotThere, Site
+from merge_runner_analysis.explorer.views import ordered
 from merge_runner_analysis.names import BASELINE
 
-# The number of trials of each run, driver, prompt and condition; each once for its prompt.
-OFFERED = """
-SELECT DISTINCT model, variant, condition FROM listed WHERE who <> 'humans' ORDER BY ALL
-"""
 # What the analysis adds to the names of drivers that have several tasks, prompts or stand-ins.
 MARKS = re.compile(r"( \[([0-9a-f]{8}|scripted)\])+$")
-SWEEPS = "SELECT sweep_id, name, started_at FROM sweeps ORDER BY started_at DESC"
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,27 +27,15 @@ class Scope:
     prompt: str = BASELINE
     condition: str = ""
 
-    def filter(self, driver: str = "", prompt: str = "", outcome: str = "") -> Filter:
-        """Its trials of a driver and a prompt, or of all."""
-        return Filter(
-            sweep=self.sweep,
-            condition=self.condition,
-            model=unmarked(driver),
-            variant=prompt,
-            outcome=outcome,
-        )
+    @property
+    def wanted(self) -> dict[str, Any]:
+        """The trials of all its drivers, as a filter."""
+        return {**self.trials(prompt=self.prompt), "model": self.drivers}
 
-    def where(self) -> tuple[str, list[object]]:
-        """The trials of all its drivers as SQL over the list, with its values."""
-        where, values = self.filter(prompt=self.prompt).where()
-        if not self.drivers:
-            return where, values
-        return f"{where} AND model IN (SELECT unnest(?::VARCHAR[]))", [*values, list(self.drivers)]
-
-    def trials(self, driver: str, prompt: str) -> dict[str, str]:
-        """A driver's trials with a prompt, as the list of trials filters them."""
-        chosen = {"sweep": self.sweep, "condition": self.condition}
-        return {"model": unmarked(driver), "variant": prompt, **chosen}
+    def trials(self, driver: str = "", prompt: str = "") -> dict[str, Any]:
+        """Its trials of a driver and a prompt, or of all: a filter, and the address of a list."""
+        return {"model": unmarked(driver), "variant": prompt,
+                "sweep": self.sweep, "condition": self.condition}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,17 +60,19 @@ def scope_of(
 
     ``driver``: of this one alone. Unless it may be of ``any_prompt``, it has one.
     """
-    rows = site.catalogue.ask(OFFERED)
+    rows = site.catalogue.ask(
+        "SELECT DISTINCT model, variant, condition FROM listed WHERE who <> 'humans' ORDER BY ALL"
+    )
     drivers = list(dict.fromkeys(row["model"] for row in rows))
     own = [row for row in rows if not driver or row["model"] == unmarked(driver)]
     prompts = list(dict.fromkeys(row["variant"] for row in own))
     conditions = ordered({row["condition"] for row in own})
     sweeps = {
         row["sweep_id"]: f"{row['name']}, {row['started_at']:%Y-%m-%d %H:%M} UTC"
-        for row in site.catalogue.ask(SWEEPS)
+        for row in site.catalogue.ask("FROM sweeps ORDER BY started_at DESC")
     }
-    usual = BASELINE if BASELINE in prompts else next(iter(prompts), BASELINE)
-    usual = "" if any_prompt else usual
+    usual = "" if any_prompt else next(iter(prompts), BASELINE)
+    usual = BASELINE if usual and BASELINE in prompts else usual
     scope = Scope(
         _known("sweep", asked.get("sweep", ""), sweeps),
         tuple(_known("driver", name, drivers) for name in every(asked, "model")),

@@ -16,7 +16,6 @@ from merge_runner.errors import MergeRunnerError
 from merge_runner.paths import DEFAULT_DB
 from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.explorer.computing import Computing
-from merge_runner_analysis.explorer.conditions import condition_texts
 from merge_runner_analysis.explorer.database_copy import Copies
 from merge_runner_analysis.explorer.display_text import MINUS, shown_number, visible, with_minus
 from merge_runner_analysis.explorer.notes import LONGEST_TEXT, Notes
@@ -156,7 +155,7 @@ class Site:
     def in_words(self, condition: str) -> str:
         """What a condition's name says; empty where no human drove it and it has no trial."""
         if condition not in self._conditions:
-            self._conditions = condition_texts(self.catalogue)
+            self._conditions = self.catalogue.condition_texts()
         return self._conditions.get(condition, "")
 
     @property

@@ -1,27 +1,63 @@
-"""What the pages show of trials and decisions, as plain values for the templates."""
+"""Conditions, prompts and trials in words; one trial as it is read, and what its page draws."""
 
 from __future__ import annotations
 
+import json
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant
-from merge_runner.records import SIDES
+from merge_runner.drivers.pace import Pace, pace_of
+from merge_runner.prompts.blocks import BLOCKS, Variant, title_of
+from merge_runner.records import SIDES, Side
 from merge_runner.scenarios.merge.collision import collided
+from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.accounts import Account, Course, account
-from merge_runner_analysis.explorer.details import Trial
 from merge_runner_analysis.explorer.display_text import visible
-from merge_runner_analysis.explorer.reading import Row
+from merge_runner_analysis.explorer.reading import Row, reading, records
 
-# Vehicles touch up to some 13 m apart: halved so often, that is less than a millimetre.
-BISECTIONS = 14
-# What a picture shows of the plane around the track, in m.
-BEFORE_M, BEYOND_M, BESIDE_M = 3.0, 5.8, 4.5
 UNKNOWN = "no meaning is known here"
+# The part of the plane that a picture of the track shows: x, y, width, height in m.
+_HALF_M = TRACK.start_distance_m / 2 + 4.5
+VIEW_BOX = f"-3 {-_HALF_M:g} {TRACK.end_y_m + 8.8:.1f} {2 * _HALF_M:g}"
 DRAWN = {"t": "time_s", "x": "position_m", "v": "velocity_mps", "a": "acceleration_mps2"}
+ONE = "WHERE trial_id = $trial AND spec_hash = $spec"
+STATES = f"""
+SELECT side, list(time_s ORDER BY step) AS time_s,
+    list(position_m ORDER BY step) AS position_m, list(velocity_mps ORDER BY step) AS velocity_mps,
+    list(acceleration_mps2 ORDER BY step) AS acceleration_mps2
+FROM states {ONE} GROUP BY ALL ORDER BY side
+"""  # noqa: S608 # constants
+# Where a call got no answer the trial ended, and what the other driver decided is never driven.
+DECISIONS = f"""
+WITH made AS (
+    SELECT *, false AS lost FROM decisions {ONE}
+    UNION ALL BY NAME
+    SELECT DISTINCT decision, side, false AS valid, false AS fallback, true AS lost
+    FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) {ONE}
+)
+SELECT made.*, coalesce(attempts, []) AS attempts, reply, perceived
+FROM made LEFT JOIN (
+    SELECT side, decision, list(called ORDER BY attempt) AS attempts,
+        arg_max(reply, attempt) FILTER (reply IS NOT NULL) AS reply
+    FROM (SELECT * EXCLUDE request FROM calls {ONE}) AS called GROUP BY ALL
+) USING (side, decision) LEFT JOIN (
+    SELECT side, decision, any_value(seen) AS perceived
+    FROM (FROM perceptions {ONE}) AS seen GROUP BY ALL
+) USING (side, decision)
+ORDER BY decision, side
+"""  # noqa: S608 # constants
+TASKS = f"""
+SELECT source, spec
+FROM (FROM trials {ONE}) LEFT JOIN specs USING (spec_hash)
+"""  # noqa: S608 # constants
+# Recordings do not describe their task: collisions were judged by the outlines, at 20 Hz.
+HUMAN_TASK = {"collision_rule": "rectangle", "step_s": 0.05}
 
 
 def condition_text(headway: float, velocity: float) -> str:
@@ -37,15 +73,10 @@ def condition_text(headway: float, velocity: float) -> str:
     return f"{ahead}, and the left one is {abs(velocity):g} m/s {compared}"
 
 
-def prompt_text(variant: str | None) -> str:
-    """A prompt variant in words."""
-    if variant is None:
-        return ""
-    known = VARIANTS.get(variant)
-    if known is None:
-        return f"a prompt of which {UNKNOWN}"
-    changes = changes_text(known, str)
-    return f"the prompt {changes}" if changes else "the whole prompt"
+def ordered(names: Iterable[str]) -> list[str]:
+    """Conditions in their usual order, those that no human drove last."""
+    places = {name: place for place, name in enumerate(HUMAN_CONDITIONS)}
+    return sorted(names, key=lambda name: (places.get(name, len(places)), name))
 
 
 def changes_text(variant: Variant, shown: Callable[[str], str]) -> str:
@@ -68,106 +99,128 @@ def clock(time_s: float) -> str:
     return f"{time_s:.1f}" if abs(time_s - round(time_s, 1)) < 1e-6 else f"{time_s:.2f}"
 
 
-def outcome_text(row: Row, scenario: ScenarioConfig) -> str:
+def outcome_text(row: Row) -> str:
     """How a trial ended, in a sentence."""
     end = f"{row['end_time_s']:.1f} s"
-    if row["status"] == "collided":
-        return f"The vehicles collided after {end}: {collision_text(scenario)}."
-    if row["status"] == "failed":
-        return f"The trial failed after {end}: {row['error']}."
-    if row["status"] == "timeout":
-        return f"Nobody had left the track after {end}."
+    without_first = {
+        "collided": f"The vehicles collided after {end}.",
+        "failed": f"The trial failed after {end}: {row['error']}.",
+        "timeout": f"Nobody had left the track after {end}.",
+    }
     first = row["merged_first"]
     if first is None:
-        return f"The trial ended after {end}; no vehicle merged first."
+        merged = f"The trial ended after {end}; no vehicle merged first."
+        return without_first.get(row["status"], merged)
     other = "right" if first == "left" else "left"
     when = "" if row["time_to_merge_s"] is None else f", after {row['time_to_merge_s']:.1f} s"
     gap = "" if row["gap_m"] is None else f", with a gap of {row['gap_m']:.1f} m"
     return f"The {other} vehicle yielded: the {first} one reached the merge point first{when}{gap}."
 
 
-def collision_text(scenario: ScenarioConfig) -> str:
-    """What counts as a collision in the scenario."""
-    length = f"{scenario.vehicle_length_m:g} m"
-    return {
-        "euclid2d": f"their centres came closer than {length}, a vehicle's length",
-        "shared_lane": f"past the merge point one was less than {length} behind the other",
-        "rectangle": "their outlines overlapped",
-    }[scenario.collision_rule]
-
-
 def judged_text(scenario: ScenarioConfig) -> str:
     """What the picture draws of the rule by which the scenario judges a collision."""
     length = f"{scenario.vehicle_length_m:g} m"
-    return {
-        "euclid2d": f"circles of {length}, a vehicle's length, about the centres: "
-        "it is a collision where they overlap",
-        "shared_lane": f"bars of {length} along the road: it is a collision where they overlap, "
-        "once a vehicle is past the merge point",
-        "rectangle": f"outlines of {length} by {scenario.vehicle_width_m:g} m: "
-        "it is a collision where they overlap",
+    drawn = {
+        "euclid2d": f"circles of {length}, a vehicle's length, about the centres",
+        "shared_lane": f"bars of {length} along the road, once a vehicle is past the merge point",
+        "rectangle": f"outlines of {length} by {scenario.vehicle_width_m:g} m",
     }[scenario.collision_rule]
-
-
-def view_box() -> str:
-    """Return the part of the plane that a picture of the track shows: x, y, width, height in m."""
-    half = TRACK.start_distance_m / 2 + BESIDE_M
-    width = TRACK.end_y_m + BEFORE_M + BEYOND_M
-    return f"{-BEFORE_M:g} {-half:g} {width:.1f} {2 * half:g}"
+    return f"{drawn}: it is a collision where they overlap"
 
 
 def facts(row: Row) -> list[str]:
     """What a trial was about and what was measured, in short sentences."""
-    text = condition_text(row["projected_headway_m"], row["relative_velocity_mps"])
-    found = [f"{row['condition']}: {text}."]
-    if row["variant"] is not None:
-        programs = row["source"] == "driver"
-        said = "no prompt, since only programs drive" if programs else prompt_text(row["variant"])
-        found.append(f"{row['variant']}: {said}.")
-    if row["levels"]:
-        found.append(f"{', '.join(row['levels'])}.")
-    if row["rmse_mps"] is not None:
-        found.append(f"RMSE of the speed {row['rmse_mps']:.2f} m/s.")
-    if row["decisions"]:
-        found.append(f"{row['invalid']} of {row['decisions']} decisions invalid.")
-    if row["cost_usd"] is not None:
-        found.append(f"{row['cost_usd']:.3f} USD.")
-    if row["caution"]:
-        found.append(f"Note: {row['caution']}.")
-    return found
+    condition = condition_text(row["projected_headway_m"], row["relative_velocity_mps"])
+    programs = "no prompt, since only programs drive"
+    prompt = programs if row["source"] == "driver" else f"the prompt {title_of(row['variant'])}"
+    texts = (
+        f"{row['condition']}: {condition}",
+        row["variant"] and f"{row['variant']}: {prompt}",
+        ", ".join(row["levels"] or ()),
+        row["rmse_mps"] is not None and f"RMSE of the speed {row['rmse_mps']:.2f} m/s",
+        row["decisions"] and f"{row['invalid']} of {row['decisions']} decisions invalid",
+        row["cost_usd"] is not None and f"{row['cost_usd']:.3f} USD",
+        row["caution"] and f"Note: {row['caution']}",
+    )
+    return [f"{text}." for text in texts if text]
 
 
-def summary(row: Row, trial: Trial) -> list[str]:
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A trial's samples by side, its decisions, and the task it is of.
+
+    ``paces`` say when each driver decided. A decision is a row with the one ``before`` on its side,
+    its ``attempts`` and the last ``reply``, what was ``perceived`` where that was imperfect,
+    whether its call was ``lost`` and whether it was ``driven``.
+    """
+
+    scenario: ScenarioConfig
+    paces: dict[Side, Pace]
+    states: dict[Side, Row]
+    decisions: list[Row]
+
+    @property
+    def end_s(self) -> float:
+        """The time of the last sample."""
+        return max((samples["time_s"][-1] for samples in self.states.values()), default=0.0)
+
+    @property
+    def by_side(self) -> dict[Side, list[Row]]:
+        """The decisions of each side that has any."""
+        decisions = self.decisions
+        return {
+            side: mine for side in SIDES if (mine := [d for d in decisions if d["side"] == side])
+        }
+
+    def interval_s(self, side: Side) -> float:
+        """How long a decision of a side is driven."""
+        return self.paces[side].interval_steps * self.scenario.step_s
+
+
+def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
+    """Read a trial that is known to be there."""
+    key = {"trial": trial_id, "spec": spec_hash}
+    with reading(db) as connection:
+        states, decisions, (task,) = (
+            records(connection, sql, key) for sql in (STATES, DECISIONS, TASKS)
+        )
+    told = json.loads(task["spec"] or "{}")
+    scenario = scenario_of(task["source"], told.get("scenario"))
+    trial = Trial(
+        scenario,
+        {side: pace_of(scenario, told.get(side, {})) for side in SIDES},
+        {row["side"]: row for row in states},
+        decisions,
+    )
+    before: dict[str, Row] = {}
+    for row in decisions:
+        if row["lost"]:
+            row["time_s"] = trial.end_s
+        row |= {"driven": row["time_s"] < trial.end_s, "before": before.get(row["side"])}
+        before[row["side"]] = row
+    return trial
+
+
+def scenario_of(source: str, told: Mapping[str, Any] | None) -> ScenarioConfig:
+    """The task of a trial, as its spec tells it, or as it usually is."""
+    usual = HUMAN_TASK if source == "human" else {}
+    return ScenarioConfig.model_validate(usual if told is None else told)
+
+
+def summary(trial: Trial) -> list[str]:
     """What the charts of a trial show, in sentences."""
     lines = []
     for side, samples in trial.states.items():
         speeds = controlled(samples, "velocity_mps")
+        # A sample's acceleration is that of the step before it.
+        hardest = max(controlled(samples, "acceleration_mps2")[1:], key=abs, default=0.0)
         if speeds:
             lines.append(
                 f"The {side} vehicle began at {speeds[0]:.1f} m/s, drove between "
-                f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s"
-                f"{_hardest(samples)}."
+                f"{min(speeds):.1f} and {max(speeds):.1f} m/s, and ended at {speeds[-1]:.1f} m/s; "
+                f"its hardest acceleration was {hardest:+z.1f} m/s²."
             )
-    for side, mine in trial.by_side.items():
-        words = [d["tactical"] for d in mine]
-        letters = " ".join(word or "–" for word in words)
-        said = letters if any(words) else f"{len(words)}, none in words"
-        bad = [str(d["decision"]) for d in mine if not d["valid"] and not d["lost"]]
-        lost = [str(d["decision"]) for d in mine if not d["driven"]]
-        lines.append(
-            f"Decisions of the {side} driver: {said}"
-            + (f"; without a valid plan: {', '.join(bad)}" if bad else "")
-            + (f"; the trial ended before {', '.join(lost)} was driven." if lost else ".")
-        )
     return lines
-
-
-def _hardest(samples: Row) -> str:
-    """The hardest acceleration under control: a sample's is that of the step before it."""
-    accelerations = controlled(samples, "acceleration_mps2")[1:]
-    if not accelerations:
-        return ""
-    return f"; its hardest acceleration was {max(accelerations, key=abs):+z.1f} m/s²"
 
 
 def controlled(samples: Row, name: str) -> list[float]:
@@ -187,12 +240,18 @@ def account_of(row: Row, trial: Trial) -> Account | None:
     return account(course, trial.decisions, row)
 
 
-def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, Any]:
-    """What the replay draws: samples, the track, the bounds of a collision."""
+def replay_data(row: Row, trial: Trial, account: Account | None, page: str) -> dict[str, Any]:
+    """What the replay draws: samples, the track, the bounds of a collision; and the address."""
+    scenario = trial.scenario
     return {
+        "page": page,
         "spec": row["spec_hash"],
-        "outcome": visible(outcome_text(row, trial.scenario)),
-        "label": label(row),
+        "outcome": visible(outcome_text(row)),
+        "label": visible(
+            f"human {row['pair']}, {row['condition']}"
+            if row["source"] == "human"
+            else f"{row['model']}, {row['variant']}, {row['condition']}, rep {row['rep']}"
+        ),
         "status": row["status"],
         "end": trial.end_s,
         "every": {side: trial.interval_s(side) for side in SIDES},
@@ -208,30 +267,29 @@ def replay_data(row: Row, trial: Trial, account: Account | None) -> dict[str, An
             "end": TRACK.end_m,
             "lateral": TRACK.branch_sine,
             "forward": TRACK.branch_cosine,
-            "length": trial.scenario.vehicle_length_m,
-            "width": trial.scenario.vehicle_width_m,
-            "rule": trial.scenario.collision_rule,
-            "hardest": trial.scenario.max_acceleration_mps2,
+            "length": scenario.vehicle_length_m,
+            "width": scenario.vehicle_width_m,
+            "rule": scenario.collision_rule,
+            "hardest": scenario.max_acceleration_mps2,
         },
     }
 
 
 def marks(row: Row, trial: Trial, account: Account | None) -> list[dict[str, Any]]:
     """The moments that matter, in order: merges, a collision, and those of the account."""
-    found = [
-        {"t": round(reached_s, 3), "side": side, "kind": "merge", "text": f"{side} merges"}
+    found: list[tuple[float, str, str, str]] = [
+        (reached_s, side, "merge", f"{side} merges")
         for side, samples in trial.states.items()
         if (reached_s := reaches_s(samples, TRACK.merge_point_m)) is not None
     ]
     if row["status"] == "collided":
-        found.append({"t": round(trial.end_s, 3), "side": "", "kind": "collision",
-                      "text": "collision"})  # fmt: skip
+        found.append((trial.end_s, "", "collision", "collision"))
     if account:
-        found += [
-            {"t": round(mark.time_s, 3), "side": mark.side, "kind": mark.kind, "text": mark.text}
-            for mark in account.marks
-        ]
-    return sorted(found, key=lambda mark: mark["t"])
+        found += [(mark.time_s, mark.side, mark.kind, mark.text) for mark in account.marks]
+    return [
+        {"t": round(time_s, 3), "side": side, "kind": kind, "text": text}
+        for time_s, side, kind, text in sorted(found, key=lambda mark: mark[0])
+    ]
 
 
 def reaches_s(samples: Row, place_m: float) -> float | None:
@@ -244,45 +302,30 @@ def reaches_s(samples: Row, place_m: float) -> float | None:
     return float(times[i - 1] + part * (times[i] - times[i - 1]))
 
 
-def label(row: Row) -> str:
-    """A trial in a few words."""
-    if row["source"] == "human":
-        return visible(f"human {row['pair']}, {row['condition']}")
-    return visible(f"{row['model']}, {row['variant']}, {row['condition']}, rep {row['rep']}")
-
-
 def collision_bounds(trial: Trial) -> list[float | None]:
-    """The headway below which the vehicles collide, for each sample; None where they cannot."""
-    left, right = trial.states.get("left"), trial.states.get("right")
-    if left is None or right is None:
-        return []
-    scenario = trial.scenario
-    pairs = list(zip(left["position_m"], right["position_m"], strict=False))
-    if scenario.collision_rule == "shared_lane":
-        length_m = scenario.vehicle_length_m
-        return [length_m if max(pair) >= TRACK.merge_point_m else None for pair in pairs]
-    # From there on the road is straight, and the bound stays the same.
-    straight_m = TRACK.merge_point_m + scenario.vehicle_length_m + scenario.vehicle_width_m
-    means = [min((a + b) / 2, straight_m) for a, b in pairs]
-    bounds = {mean_m: _bound(scenario, mean_m) for mean_m in {*means}}
-    return [bounds[mean_m] for mean_m in means]
+    """The headway below which the vehicles collide, for each sample; None where they cannot.
 
-
-def _bound(scenario: ScenarioConfig, mean_m: float) -> float | None:
-    """At the vehicles' mean position; by bisection.
-
-    The further apart two vehicles are along the road, the less they overlap.
+    To a millimetre, at their mean position: the further apart they are along the road, the less
+    they overlap.
     """
-    if not collided(scenario, TRACK, mean_m, mean_m):
-        return None
-    low, high = 0.0, 2 * (scenario.vehicle_length_m + scenario.vehicle_width_m)
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        if collided(scenario, TRACK, mean_m + middle / 2, mean_m - middle / 2):
-            low = middle
-        else:
-            high = middle
-    return round(high, 3)
+    scenario, length_m = trial.scenario, trial.scenario.vehicle_length_m
+    places = [samples["position_m"] for samples in trial.states.values()]
+    pairs = list(zip(*places, strict=False)) if len(places) == len(SIDES) else []
+    if scenario.collision_rule == "shared_lane":
+        return [length_m if max(pair) >= TRACK.merge_point_m else None for pair in pairs]
+    most_m = length_m + scenario.vehicle_width_m
+
+    @cache
+    def bound_m(mean_m: float) -> float | None:
+        apart_mm = bisect_left(
+            range(round(2000 * most_m)),
+            True,
+            key=lambda mm: not collided(scenario, TRACK, mean_m + mm / 2000, mean_m - mm / 2000),
+        )
+        return apart_mm / 1000 or None
+
+    # Where the road is straight the bound stays the same.
+    return [bound_m(min(sum(pair) / 2, TRACK.merge_point_m + most_m)) for pair in pairs]
 
 
 def plan_chart(row: Row, trial: Trial) -> dict[str, Any] | None:
@@ -303,51 +346,3 @@ def plan_chart(row: Row, trial: Trial) -> dict[str, Any] | None:
         "most_mps2": trial.scenario.max_acceleration_mps2,
         "steps": pace.plan_actions,
     }
-
-
-def older_plan(trial: Trial, row: Row) -> str:
-    """On which plan a driver went on whose reply held none, and from which of its steps."""
-    side, number, scenario = row["side"], row["decision"], trial.scenario
-    pace = trial.paces[side]
-    old = row["before"]
-    while old and not old["plan"]:
-        old = old["before"]
-    if old is None:
-        return "it had no earlier plan, and kept its speed"
-    since = 0 if scenario.fallback == "restart" else number - old["decision"]
-    begun, steps = since * pace.executed_actions, len(old["plan"])
-    if begun >= steps:
-        return f"its last plan, of decision {old['decision']}, had ended, and it kept its speed"
-    last = min(begun + pace.executed_actions, steps)
-    ended = "" if last - begun == pace.executed_actions else ", and then kept its speed"
-    return (
-        f"it drove steps {begun + 1} to {last} of the {steps} that it had planned in decision "
-        f"{old['decision']}, starting {clock(begun * pace.action_steps * scenario.step_s)} s into "
-        f"that plan{ended}"
-    )
-
-
-def aftermath(trial: Trial, decision: Row) -> list[dict[str, Any]]:
-    """Both vehicles where a decision was made and where the next one was, or at the end."""
-    if decision["lost"]:
-        return []
-    start = decision["time_s"]
-    until = start + trial.interval_s(decision["side"])
-    found = []
-    for side, samples in trial.states.items():
-        times = samples["time_s"]
-        inside = [i for i, t in enumerate(times) if start - 1e-9 <= t <= until + 1e-9]
-        if len(inside) > 1:
-            first, last = inside[0], inside[-1]
-            found.append(
-                {
-                    "side": side,
-                    "own": side == decision["side"],
-                    "lasted_s": times[last] - times[first],
-                    "from_mps": samples["velocity_mps"][first],
-                    "to_mps": samples["velocity_mps"][last],
-                    "moved_m": samples["position_m"][last] - samples["position_m"][first],
-                    "to_merge_m": TRACK.merge_point_m - samples["position_m"][last],
-                }
-            )
-    return sorted(found, key=lambda vehicle: not vehicle["own"])

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import PurePath
-from typing import NamedTuple
 
 from merge_runner.records import TrialRecord
 from merge_runner.results.store import Store, query
@@ -26,15 +25,8 @@ CHUNK = 100
 # The recorder wrote a PKL of each trial, too; unpickling it would run code in the file.
 NAME = re.compile(r"experiment_([0-9]{1,6})_iter_([0-9]{1,6})\.csv", re.IGNORECASE)
 IMPORTED = "SELECT trial_id, spec_hash FROM trials WHERE source = 'human'"
-
-
-class Source(NamedTuple):
-    """A file with trials: the recording of one, or the velocity page of a ``condition``."""
-
-    condition: str
-    experiment: int
-    iteration: int
-    file: File
+# The condition of a velocity page, or experiment and iteration of a recording; and the file.
+Source = tuple[str, int, int, File]
 
 
 @dataclass(slots=True)
@@ -53,20 +45,20 @@ class Report:
 
 def sort_files(files: Iterable[File]) -> list[Source]:
     """The files with trials, recordings first; raises UsageError for a bomb."""
-    sources = []
+    sources: list[Source] = []
     for file in files:
         if name := NAME.fullmatch(PurePath(file.name).name):
-            sources.append(Source("", int(name[1]), int(name[2]), file))
+            sources.append(("", int(name[1]), int(name[2]), file))
         elif condition := condition_of(file.name):
-            sources.append(Source(condition, 0, 0, file))
-    refuse_bombs(source.file for source in sources)
+            sources.append((condition, 0, 0, file))
+    refuse_bombs(file for *_, file in sources)
     return sorted(sources, key=lambda source: source[:3])
 
 
 def import_trials(sources: Iterable[Source], store: Store) -> Report:
     """Store trials, some at a time; an error does not undo earlier ones. Raises StoreError."""
     report = Report()
-    records = (record for source in sources for record in _records(source, report))
+    records = (record for source in sources for record in _records(*source, report))
     while chunk := list(islice(records, CHUNK)):
         # A trial that was imported from the other kind of file is there.
         known = dict(query(store.path, IMPORTED)[1])
@@ -80,19 +72,19 @@ def import_trials(sources: Iterable[Source], store: Store) -> Report:
     return report
 
 
-def _records(source: Source, report: Report) -> Iterator[TrialRecord]:
+def _records(
+    condition: str, experiment: int, iteration: int, file: File, report: Report
+) -> Iterator[TrialRecord]:
     """The trials of a file; what cannot be read is reported."""
-    name, condition = source.file.name, source.condition
     try:
-        content = source.file.read()
         if not condition:
-            yield trial_record(parse_csv(content), source.experiment, source.iteration)
+            yield trial_record(parse_csv(file.read()), experiment, iteration)
             return
-        for experiment, iteration, lines in trials_of(content, condition):
+        for experiment, iteration, lines in trials_of(file.read(), condition):  # noqa: PLR1704 # of the page
             try:
                 yield trial_record(trace_of(lines, condition), experiment, iteration, condition)
             except Unreadable as exc:
-                trial = f"{name}: {PAIRS[experiment]}, trial {iteration}"
+                trial = f"{file.name}: {PAIRS[experiment]}, trial {iteration}"
                 report.unreadable.append((trial, str(exc)))
     except Unreadable as exc:
-        report.unreadable.append((name, str(exc)))
+        report.unreadable.append((file.name, str(exc)))

@@ -24,8 +24,7 @@ from merge_runner_analysis.data.study import Study, levels_of
 from merge_runner_analysis.explain import Source, sources_of, sql_command
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import rendered, write_figures
-from merge_runner_analysis.names import BASELINE, DESCRIPTIONS
-from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.names import BASELINE, DESCRIPTIONS, TableFormat
 from merge_runner_analysis.tables import finished_tables
 from merge_runner_analysis.tables.against import FILES, against
 from merge_runner_analysis.tables.differences import verdicts
@@ -51,7 +50,7 @@ MEANINGS = {
     "the paper's row of that model.",
     "Too few valid decisions": "What was driven is mostly not what the model decided: no value, "
     "test or conclusion rests on these trials.",
-    "Trials or answers repeat earlier ones": "Where a cache on the way answered, or the "
+    "Trials repeat earlier ones": "Where a cache on the way answered, or the "
     "temperature is 0, they are no samples, and intervals and tests claim too much.",
     "Trials failed": "They are in no measure; the same sweep again plays them anew.",
     "Many fallbacks": "There the older plan was driven, or none: tables --without-fallbacks shows "
@@ -219,7 +218,7 @@ def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
             yield "A scripted stand-in answered", f"{group.id}: {group.posing}"
         if group.equal:
             yield (
-                "Trials or answers repeat earlier ones",
+                "Trials repeat earlier ones",
                 f"{group.id}: {group.equal} of {trials} trials are as an earlier one to the last "
                 "state; each counts",
             )

@@ -49,8 +49,6 @@ def against(table: Table, study: Study) -> Table:
     groups = {group.id: group for group in (*study.groups, *study.unjudged)}
     rows = [_beside(row, groups[row.groups[0]], paper) for row in table.rows]
     notes = [*table.notes, *(f"paper: {citation(name)}" for name in FILES[table.name])]
-    if not any(name.endswith("_in_paper") for row in rows for name in row.values):
-        notes.append("the paper has none of these drivers and variants")
     return replace(table, columns=columns, rows=rows, notes=notes)
 
 

@@ -14,7 +14,7 @@ from itertools import accumulate, takewhile
 
 from merge_runner.prompts.blocks import title_of
 from merge_runner.text_safety import csv_writer, in_spreadsheet
-from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.tables.model import Column, Row, Table, Value
 
 MISSING = "–"

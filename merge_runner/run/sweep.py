@@ -250,7 +250,13 @@ class Sweep:
             "sweep_id": sweep_id,
             "name": self._plan.name,
             "started_at": started_at,
-            "config": canonical_json({**config, "max_cost_usd": self._options.max_cost_usd}),
+            "config": canonical_json(
+                {
+                    **config,
+                    "max_cost_usd": self._options.max_cost_usd,
+                    "cache": str(self._options.cache),
+                }
+            ),
             "git_commit": commit,
             "git_dirty": dirty,
             "versions": canonical_json(versions()),

@@ -15,7 +15,7 @@ from starlette.testclient import TestClient
 from merge_runner.results.store import Store
 from merge_runner_analysis.explorer import catalogue as catalogue_module
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.catalogue import Catalogue, Filter
+from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.explorer.site import Site
 from tests.analysis.accounts.crashes import CLOSING_IN, EXAMPLES, drive
 from tests.analysis.studies import as_humans, played, write_study
@@ -51,12 +51,12 @@ def address(account):
 
 
 def test_each_trial_is_listed_with_its_account(catalogue):
-    found = {row["rep"]: row["account"] for row in catalogue.every(Filter(model="o3"))}
+    found = {row["rep"]: row["account"] for row in catalogue.every({"model": "o3"})}
     assert found == {drive(account).rep: account for account in EXAMPLES}
 
 
 def test_a_follower_that_closes_in_is_a_near_miss_whatever_the_gap(catalogue):
-    (row,) = catalogue.every(Filter(model="o5"))
+    (row,) = catalogue.every({"model": "o5"})
     assert (row["gap_m"], row["min_ttc_s"]) == (pytest.approx(1.99, abs=0.01), pytest.approx(0.95))
     assert row["account"] == "near miss"
 
@@ -64,7 +64,7 @@ def test_a_follower_that_closes_in_is_a_near_miss_whatever_the_gap(catalogue):
 def test_accounts_are_counted_by_driver_and_variant_and_filtered(catalogue):
     counts = {
         (row["model"], row["variant"], row["account"]): row["trials"]
-        for row in catalogue.counts(Filter(), "model", "variant", "account")
+        for row in catalogue.counts({}, "model", "variant", "account")
         if row["account"]
     }
     o3 = {("o3", "baseline", account): 1 for account in EXAMPLES if account}
@@ -74,9 +74,9 @@ def test_accounts_are_counted_by_driver_and_variant_and_filtered(catalogue):
         ("o4", "baseline", "both insisted"): 1,
         ("human", None, "no action"): 1,
     }
-    (alone,) = catalogue.counts(Filter(model="human"), "account")
+    (alone,) = catalogue.counts({"model": "human"}, "account")
     assert alone["account"] == "no action"
-    assert ("both insisted", 2) in catalogue.facets(Filter())["account"]
+    assert ("both insisted", 2) in catalogue.facets({})["account"]
 
 
 def test_what_is_stored_later_has_its_account_too(db, tmp_path):
@@ -86,7 +86,7 @@ def test_what_is_stored_later_has_its_account_too(db, tmp_path):
     catalogue.refresh()
     Store(path).write("sweep-1", [played(drive("invalid plan"))], patience_s=5)
     catalogue.refresh()
-    assert [row["account"] for row in catalogue.counts(Filter(), "account")] == [
+    assert [row["account"] for row in catalogue.counts({}, "account")] == [
         "invalid plan",
         "no action",
     ]
@@ -106,7 +106,7 @@ def test_what_was_measured_once_is_measured_again_only_where_rows_or_rules_diffe
         measured.clear()
         catalogue = Catalogue(path)
         catalogue.refresh()
-        return catalogue.every(Filter()), len(measured)
+        return catalogue.every({}), len(measured)
 
     def without_numbers(rows):
         return [{**row, "number": 0} for row in rows]
@@ -141,7 +141,7 @@ def test_a_collision_that_cannot_be_judged_is_listed_without_an_account(tmp_path
         connection.execute(damage)
     catalogue = Site(path).catalogue
     catalogue.refresh()
-    (row,) = catalogue.every(Filter())
+    (row,) = catalogue.every({})
     assert (row["outcome"], row["account"]) == ("collided", None)
 
 

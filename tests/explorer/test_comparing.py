@@ -12,8 +12,6 @@ from playwright.sync_api import expect
 from starlette.testclient import TestClient
 
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.catalogue import Filter
-from merge_runner_analysis.explorer.pages.comparing import offered
 from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import Drive, as_humans, write_study
 
@@ -81,17 +79,6 @@ def test_the_next_repetition_goes_round(client):
     names = ["o3/baseline/N_0_0/rep01", "o3/baseline/N_0_0/rep02"]
     assert [ask(client, name, offer="next repetition") for name in names] == names[::-1]
     assert ask(client, "o3/A1/N_0_0/rep01", offer="next repetition") is None
-
-
-def test_what_is_offered_to_all_of_a_condition_is_what_is_offered_to_each(db, client):
-    site = Site(db)
-    site.catalogue.refresh()
-    rows = site.catalogue.every(Filter(condition="N_0_0"))
-    found = offered(site, "N_0_0", [(row["trial_id"], row["spec_hash"]) for row in rows])
-    assert len(found) == len(rows)
-    for (name, _), offers in found.items():
-        for kind, (other, _) in offers.items():
-            assert ask(client, name, offer=kind) == other
 
 
 def test_all_words_of_a_search_count_and_the_own_trial_is_not_found(client):

@@ -12,12 +12,11 @@ import pytest
 from starlette.testclient import TestClient
 
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.pages.home import home_page
+from merge_runner_analysis.explorer.pages.sweep import list_runs
 from merge_runner_analysis.explorer.pages.trial import trial_page
 from merge_runner_analysis.explorer.pages.trials import filter_of, trials_page
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.explorer.sweeps import list_runs
 from tests.harness import FAST
 
 SMALL = ("--reps", 1, "--conditions", "L_4_0,N_0_0", "--yes", *FAST)
@@ -55,7 +54,7 @@ def test_the_trials_of_two_endpoints_are_listed_apart(site, hosts):
         view = connection.execute(
             "SELECT driver, count(*) FROM trial_drivers GROUP BY 1"
         ).fetchall()
-    listed = site.catalogue.facets(Filter())["model"]
+    listed = site.catalogue.facets({})["model"]
     assert sorted(listed) == sorted(view)
     assert dict(view) == {
         f"o3 at {hosts[0]}": 2,
@@ -67,7 +66,7 @@ def test_the_trials_of_two_endpoints_are_listed_apart(site, hosts):
 def test_a_link_to_trials_of_a_driver_finds_them(site, hosts):
     client = browser(site)
     for driver in (f"o3 at {hosts[0]}", f"o3 at {hosts[1]}+constant/set1"):
-        row = site.catalogue.every(Filter(model=driver))[0]
+        row = site.catalogue.every({"model": driver})[0]
         page = client.get(f"/trials/{row['trial_id']}", params={"spec": row["spec_hash"]}).text
         links = map(html.unescape, re.findall('href="(/trials[?][^"]*)"', page))
         link = next(each for each in links if "model=" in each)
@@ -80,12 +79,12 @@ def test_a_link_to_trials_of_a_driver_finds_them(site, hosts):
 def test_a_sweep_is_named_by_its_driver_and_says_that_a_stand_in_answered(site, hosts):
     client = browser(site)
     names = [f"o3 at {hosts[1]}+constant", f"o3 at {hosts[1]}", f"o3 at {hosts[0]}"]
-    runs = [run for run, _ in list_runs(site.catalogue)]
-    assert [run.driver for run in runs] == names
+    runs = list_runs(site.catalogue)
+    assert [run["driver"] for run in runs] == names
     shown = client.get("/sweeps").text
     for entry, name in zip(runs, names, strict=True):
         assert f"{name} (scripted stand-in, not o3)" in shown
-        page = client.get(f"/sweeps/{entry.sweep_id}").text
+        page = client.get(f"/sweeps/{entry['sweep_id']}").text
         assert f"{name} drives" in page
         assert "<strong>scripted stand-in, not o3.</strong>" in page
 
@@ -100,12 +99,12 @@ def computed(page, site):
 def test_every_page_says_who_is_a_stand_in_and_for_whom(site):
     words = "scripted stand-in, not o3"
     site.catalogue.refresh()
-    trials = site.catalogue.every(Filter())
+    trials = site.catalogue.every({})
     assert [row["stand_in"] for row in trials] == [words] * len(trials)
     pages = {
         "trials": trials_page(site, {}),
         "trial": trial_page(site, trials[0]["trial_id"], {}),
         "study": computed(home_page, site),
-        "csv": site.catalogue.export(Filter(), "trial"),
+        "csv": site.catalogue.export({}, "trial"),
     }
     assert [name for name, page in pages.items() if words not in page] == []

@@ -93,10 +93,7 @@ def test_an_invalid_reply_stands_open_and_the_plan_that_went_on_is_named(page):
     page.goto(f"{LONG}?side=left&decision=1")
     panel = page.locator(".decision-panel")
     expect(panel.locator(".verdict")).to_have_text(
-        re.compile(
-            "no valid plan: no_array: it drove steps 6 to 10 of the 20 that it had planned in "
-            r"decision 0, starting 1\.0 s into that plan"
-        )
+        re.compile("no valid plan: no_array: it drove on with an older plan, or kept its speed")
     )
     expect(panel.locator("details", has_text="The whole reply")).to_have_attribute("open", "")
 

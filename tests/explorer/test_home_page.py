@@ -20,7 +20,7 @@ from merge_runner_analysis.explorer.computing import Computing
 from merge_runner_analysis.explorer.site import STATIC, STYLES, Site
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import MAKERS
-from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import render
 from merge_runner_analysis.verdict_words import (

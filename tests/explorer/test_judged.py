@@ -14,9 +14,8 @@ from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.details import read_trial
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.explorer.views import collision_bounds
+from merge_runner_analysis.explorer.views import collision_bounds, read_trial
 from merge_runner_analysis.human.archive import open_files
 from merge_runner_analysis.human.load import import_trials, sort_files
 from tests.analysis.recordings import drive, write_folder

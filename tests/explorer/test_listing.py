@@ -10,7 +10,6 @@ import pytest
 from starlette.testclient import TestClient
 
 from merge_runner_analysis.explorer.app import explorer
-from merge_runner_analysis.explorer.catalogue import Filter
 from merge_runner_analysis.explorer.pictures import sparkline, speed_range
 from merge_runner_analysis.explorer.site import Site
 from tests.analysis.studies import Drive, as_humans, write_study, yielding
@@ -79,7 +78,7 @@ def test_humans_and_drivers_are_summed_up_apart(client, db):
 def test_a_sparkline_cuts_nothing_and_the_page_says_its_scale(client, db):
     site = Site(db)
     site.catalogue.refresh()
-    rows = site.catalogue.page(Filter(), "trial", 1)
+    rows = site.catalogue.every({}, page=1)
     with duckdb.connect(str(db), read_only=True) as connection:
         ((slowest, fastest),) = connection.execute(
             "SELECT min(velocity_mps), max(velocity_mps) FROM states"

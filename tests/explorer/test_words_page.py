@@ -43,10 +43,6 @@ def db(tmp_path_factory):
             "WHERE trial_id LIKE 'o3/%' AND side = 'left' AND decision = ?",
             [(tactical, text, number) for number, (tactical, text) in SAID.items()],
         )
-        connection.execute(
-            """UPDATE calls SET reply = '{"text": "a whole reply, collision"}' """
-            "WHERE trial_id LIKE 'o4/%1' AND side = 'right' AND decision = 1"
-        )
     return path
 
 
@@ -91,24 +87,6 @@ def test_matches_are_marked_and_what_a_model_wrote_stays_text(client):
     assert "&amp; I &lt;b&gt;<mark>brake</mark>&lt;/b&gt; hard" in text
     assert "[U+202E]" in "".join(Texts(text).said)
     assert "\u202e" not in text
-
-
-def test_whole_replies_are_another_search(client):
-    assert found(client, q="collision") == [("o3", "left", 2)]
-    assert found(client, **{"q": "collision", "in": "replies"}) == [("o4", "right", 1)]
-
-
-def test_long_replies_that_are_much_alike_are_searched_in_little_memory(db, tmp_path):
-    path = tmp_path / "t.duckdb"
-    path.write_bytes(db.read_bytes())
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(
-            "UPDATE calls SET reply = to_json(repeat('No, I wait. ', 250000) || attempt)"
-        )
-        ((texts,),) = connection.execute("SELECT sum(length(reply)) FROM calls").fetchall()
-    assert texts > 40 * path.stat().st_size
-    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
-        assert len(found(client, **{"q": "i wait", "in": "replies"})) == PAGE
 
 
 def test_facets_choose_among_what_is_found_and_count_it(client):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from math import ceil, floor
 from pathlib import Path
 from typing import Any
 
-from merge_runner_analysis.explorer.catalogue import COUNTS, Filter
 from merge_runner_analysis.explorer.pictures import Scale
 from merge_runner_analysis.explorer.reading import Row, reading, records
 from merge_runner_analysis.explorer.scope import carried, scope_of
@@ -17,8 +15,6 @@ from merge_runner_analysis.explorer.site import NotThere, Site, news_of
 
 # So many trials are drawn: a browser can still show them, and more would be one dark spot.
 MOST = 500
-# A trace has about so many points, and always the last one.
-POINTS = 40
 # Sizes in the picture, in its units.
 WIDTH, LEFT, RIGHT, PANEL, BETWEEN, TOP, FOOT = 1000, 42, 8, 170, 34, 24, 42
 CROSS = "m-5-5 10 10m0-10-10 10"
@@ -28,8 +24,9 @@ PANELS = {
     "second_mps": "Speed of the second one (m/s)",
     "headway_m": "Headway: how far the first is ahead (m)",
 }
-# Both vehicles at each sample under control, of the trials $1 with the specs $2. Where nobody
-# merged first, the first is who was ahead at the end.
+# Both vehicles of the trials $1 with the specs $2 at the sample under control that is nearest to
+# every 0.2 s, which is the step of most drivers, and at the last one. Where nobody merged first,
+# the first is who was ahead at the end.
 SAMPLED = """
 WITH wanted AS (
     SELECT unnest($1::VARCHAR[]) AS trial_id, unnest($2::VARCHAR[]) AS spec_hash
@@ -47,6 +44,11 @@ WITH wanted AS (
             - any_value(position_m) FILTER ((side = 'left') = turned) AS headway_m
     FROM states JOIN ordered USING (trial_id, spec_hash)
     WHERE time_s >= 0 GROUP BY ALL HAVING headway_m IS NOT NULL
+), nearest AS (
+    SELECT *, round(5 * time_s)::INTEGER AS place, 1 = row_number() OVER (
+        PARTITION BY trial_id, spec_hash, place ORDER BY abs(5 * time_s - place), step) AS is_near
+    FROM sampled
+    QUALIFY is_near OR step = max(step) OVER (PARTITION BY trial_id, spec_hash)
 )
 """
 TRACES = f"""
@@ -54,27 +56,17 @@ TRACES = f"""
 SELECT trial_id, spec_hash, list(time_s ORDER BY step) AS time_s, {
     ", ".join(f"list({name} ORDER BY step) AS {name}" for name in PANELS)
 }
-FROM sampled JOIN (
-    SELECT trial_id, spec_hash, min(step) AS first, max(step) AS last,
-        1 + (max(step) - min(step)) // {POINTS} AS every FROM sampled GROUP BY ALL
-) USING (trial_id, spec_hash)
-WHERE (step - first) % every = 0 OR step = last GROUP BY ALL
+FROM nearest GROUP BY ALL
 """  # noqa: S608 # constants
-# Of each trial the sample that is nearest to every 0.2 s, which is the step of the other drivers:
-# the 10th, 50th and 90th percentile. Where fewer than half of the trials go on, the rest are no
+# The 10th, 50th and 90th percentile. Where fewer than half of the trials go on, the rest are no
 # picture of all.
 BAND = f"""
-{SAMPLED}, placed AS (
-    SELECT *, round(5 * time_s)::INTEGER AS place FROM sampled
-), nearest AS (
-    FROM placed QUALIFY 1 = row_number() OVER (
-        PARTITION BY trial_id, spec_hash, place ORDER BY abs(5 * time_s - place), step)
-)
+{SAMPLED}
 SELECT place / 5 AS time_s, {
     ", ".join(f"quantile_cont({name}, [0.1, 0.5, 0.9]) AS {name}" for name in PANELS)
 }
-FROM nearest GROUP BY place
-HAVING 2 * count(*) >= (SELECT count(*) FROM nearest WHERE place = 0) ORDER BY place
+FROM nearest WHERE is_near GROUP BY place
+HAVING 2 * count(*) >= (SELECT count(*) FROM nearest WHERE is_near AND place = 0) ORDER BY place
 """  # noqa: S608 # constants
 
 
@@ -87,21 +79,14 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     if not site.in_words(name):
         raise NotThere(f"there is no condition {name!r} here")
     bar = scope_of(site, asked, any_prompt=True)
-    where, values = replace(bar.scope, condition=name).where()
-    rows = site.catalogue.ask(
-        "SELECT trial_id, spec_hash, outcome, end_time_s FROM listed "  # noqa: S608 # constants
-        f"WHERE {where} AND who <> 'humans' ORDER BY ALL",
-        *values,
-    )
-    groups = site.catalogue.ask(
-        f"SELECT model, variant, {COUNTS} FROM listed "  # noqa: S608 # constants
-        f"WHERE {where} AND who <> 'humans' GROUP BY ALL ORDER BY model, variant",
-        *values,
-    )
-    humans = site.catalogue.every(Filter(condition=name, who="humans"))
+    wanted = {**bar.scope.wanted, "condition": name, "who": ["drivers", "stand-ins"]}
+    rows = site.catalogue.every(wanted)
+    humans = site.catalogue.every({"condition": name, "who": "humans"})
     chosen = [rows[i * len(rows) // MOST] for i in range(MOST)] if len(rows) > MOST else rows
-    traces = {_key(trace): trace for trace in _read(site.db, TRACES, chosen)}
-    drawn = [row | traces[_key(row)] for row in chosen if _key(row) in traces]
+    traces = {(row["trial_id"], row["spec_hash"]): row for row in _read(site.db, TRACES, chosen)}
+    drawn = [
+        row | trace for row in chosen if (trace := traces.get((row["trial_id"], row["spec_hash"])))
+    ]
     band = _read(site.db, BAND, humans)
     return site.render(
         "condition.html",
@@ -111,7 +96,7 @@ def condition_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         carried={key: kept for key, kept in carried(asked).items() if key != "condition"},
         sweep=bar.scope.sweep,
         state=state,
-        groups=groups,
+        groups=site.catalogue.counts(wanted, "model", "variant"),
         trials=len(rows),
         drawn=len(drawn),
         sampled=len(rows) > MOST,
@@ -178,14 +163,8 @@ def _path(row: Row, time: Scale, scales: Mapping[str, Scale]) -> str:
     return "".join(parts)
 
 
-def _read(db: Path, sql: str, trials: Collection[Row]) -> list[Row]:
+def _read(db: Path, sql: str, trials: Sequence[Row]) -> list[Row]:
     """What a query finds of trials."""
-    names: Any = [row["trial_id"] for row in trials], [row["spec_hash"] for row in trials]
-    if not trials:
-        return []
+    keys = [[row[name] for row in trials] for name in ("trial_id", "spec_hash")]
     with reading(db) as connection:
-        return records(connection, sql, names)
-
-
-def _key(row: Row) -> tuple[str, str]:
-    return row["trial_id"], row["spec_hash"]
+        return records(connection, sql, keys)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 from merge_runner_analysis.explorer.computing import Job
 from merge_runner_analysis.explorer.display_text import with_minus
@@ -17,7 +16,6 @@ from merge_runner_analysis.explorer.pages.home import (
     noted,
 )
 from merge_runner_analysis.explorer.scope import Scope, scope_of, unmarked
-from merge_runner_analysis.explorer.search import Wanted
 from merge_runner_analysis.explorer.site import NotThere, Site
 from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.tables.formats import printed
@@ -25,7 +23,7 @@ from merge_runner_analysis.verdict_words import DIFFERS, OPEN, SHOWN, UNLIKE
 
 # How attempts of a driver's trials with a prompt ended, and which model answered.
 ATTEMPTS = """
-SELECT served, outcome, sum(times)::BIGINT AS times
+SELECT served, outcome, count(*) AS times
 FROM tried SEMI JOIN (FROM listed WHERE model = ? AND variant = ?) USING (number)
 GROUP BY ALL ORDER BY ALL
 """
@@ -52,7 +50,7 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
             f"no driver {name!r} was played with this prompt; there are: "
             f"{', '.join(by_name) or 'none'}"
         )
-    trials = scope.filter(name, scope.prompt)
+    trials = scope.trials(name, scope.prompt)
     was_asked = own and own.facts and own.facts["asked"]
     awaited, first = _first(site, name, scope) if was_asked else (None, "")
     return site.render(
@@ -65,13 +63,13 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
         **values | {"human": humans_of(values["table"], own)},
         awaited=awaited,
         first=first,
-        found=site.words.search(Wanted("rationales", (), trials, {}), 1) if was_asked else None,
-        kept=scope.trials(name, scope.prompt),
+        found=site.words.search(trials) if was_asked else None,
+        kept=trials,
         summary=_summary(own) if own and own.cells else "",
         attempts=site.catalogue.ask(ATTEMPTS, unmarked(name), scope.prompt),
         accounts=[
             row
-            for row in site.catalogue.counts(replace(trials, outcome="collided"), "account")
+            for row in site.catalogue.counts({**trials, "outcome": "collided"}, "account")
             if row["account"]
         ],
         conditions=by_condition(site, scope, [own] if own else []),

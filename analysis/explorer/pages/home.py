@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from merge_runner_analysis.data.reference_data import human_counts
-from merge_runner_analysis.explorer.catalogue import Filter
-from merge_runner_analysis.explorer.conditions import ordered
 from merge_runner_analysis.explorer.marks import Cell, band, cells
 from merge_runner_analysis.explorer.pages.computed import computed_table
+from merge_runner_analysis.explorer.pages.sweep import standing_of
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.scope import Bar, Scope, carried, scope_of, unmarked
 from merge_runner_analysis.explorer.site import Site, news_of
-from merge_runner_analysis.explorer.sweeps import standing_of
+from merge_runner_analysis.explorer.views import ordered
 from merge_runner_analysis.names import DESCRIPTIONS, HUMAN
 from merge_runner_analysis.tables.model import Table
 from merge_runner_analysis.verdict_words import (
@@ -91,7 +90,7 @@ def home_page(site: Site, asked: Mapping[str, str]) -> str:
         other_prompts=[name for name, _ in bar.prompts if name != scope.prompt],
         notes=noted(shown),
         conditions=by_condition(site, scope, shown),
-        imported=bool(site.catalogue.counts(Filter(who="humans"), "who")),
+        imported=bool(site.catalogue.counts({"who": "humans"}, "who")),
     )
 
 
@@ -127,7 +126,7 @@ def humans_of(table: Table | None, own: Driver | None = None) -> dict[str, Any]:
 
 def drivers_of(site: Site, table: Table | None, scope: Scope) -> list[Driver]:
     """Every driver and prompt with trials in a scope; without a table their facts alone."""
-    counts = site.catalogue.counts(scope.filter(), "model", "variant", "who")
+    counts = site.catalogue.counts(scope.trials(), "model", "variant", "who")
     facts = {(row["model"], row["variant"]): row for row in counts if row["who"] != "humans"}
     specs = {(row["model"], row["variant"]): row for row in site.catalogue.ask(ASKED)}
     groups = by_group(table.rows) if table else {"/".join(key): {} for key in facts}
@@ -184,7 +183,7 @@ def by_condition(site: Site, scope: Scope, drivers: Sequence[Driver]) -> dict[st
 
     None stands for a condition that somebody did not drive; without a driver they are the humans'.
     """
-    rows = site.catalogue.counts(scope.filter(), "model", "variant", "condition")
+    rows = site.catalogue.counts(scope.trials(), "model", "variant", "condition")
     counted = {(row["model"], row["variant"], row["condition"]): _merged(row) for row in rows}
     of = [(one, (unmarked(one.name), one.prompt)) for one in drivers]
     known = {name: _merged(counts._asdict()) for name, counts in human_counts().items()}

@@ -12,7 +12,7 @@ from merge_runner_analysis.explorer.pages.computed import awaited, computed, com
 from merge_runner_analysis.explorer.scope import every
 from merge_runner_analysis.explorer.site import NotThere, Site, download
 from merge_runner_analysis.figures import FIGURES
-from merge_runner_analysis.table_format import TableFormat
+from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.tables import TABLES
 from merge_runner_analysis.tables.formats import render, shown_columns, table_view
 from merge_runner_analysis.tables.model import from_text

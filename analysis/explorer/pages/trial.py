@@ -1,22 +1,19 @@
-"""One trial, and one decision of it."""
+"""One trial, one decision of it, and the trials to lay beside it: found by words, or offered."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 from markupsafe import Markup
 
-from merge_runner.records import SIDES
 from merge_runner.text_safety import quoted
-from merge_runner_analysis.accounts import Account
 from merge_runner_analysis.explorer import views
-from merge_runner_analysis.explorer.details import Trial, read_trial
-from merge_runner_analysis.explorer.display_text import clamped, shortened
+from merge_runner_analysis.explorer.display_text import clamped, shortened, visible
 from merge_runner_analysis.explorer.pictures import step_points
 from merge_runner_analysis.explorer.prompts import parts_of
-from merge_runner_analysis.explorer.reading import Row
+from merge_runner_analysis.explorer.reading import Row, reading
 from merge_runner_analysis.explorer.site import REPLAY, NotThere, Site
 from merge_runner_analysis.explorer.urls import whole
 
@@ -27,14 +24,38 @@ OFFERS = {
     "stays closest to this one's until its first vehicle has merged (root mean square)",
     REPETITION: "the next repetition with the same driver, prompt and condition",
 }
-
 SAMPLES = "from states where trial_id = {} and spec_hash = {} order by step, side"
+FOUND = 12
+# An address calls a trial by its name, and by its spec where that name has several.
+NAMED = """
+SELECT trial_id || if(count(*) OVER (PARTITION BY trial_id) = 1, '', '@' || spec_hash) AS key,
+    outcome, coalesce(stand_in, '') AS note, condition, trial_id, spec_hash,
+    lower(concat_ws(' ', trial_id, model, variant, outcome)) AS words
+FROM listed
+"""
+# Times are compared in ms: drivers and recordings have steps of their own. A human trial counts
+# that is as fast on average, and lasts as long as what it is compared with.
+NEAREST = """
+WITH near AS (
+    SELECT trial_id, spec_hash, (trial_id, spec_hash) = ($trial, $spec) AS own,
+        coalesce((spec->>'$.mean_speed_mps')::DOUBLE, mean_speed_mps()) AS mean_mps
+    FROM trials LEFT JOIN specs USING (spec_hash)
+    WHERE condition = $condition AND (source = 'human' OR own)
+), told AS (
+    SELECT trial_id, spec_hash, own, mean_mps, round(1000 * time_s)::INTEGER AS ms,
+        sum(if(side = 'left', position_m, -position_m)) AS headway_m, max(position_m) AS first_m
+    FROM states JOIN near USING (trial_id, spec_hash)
+    WHERE time_s >= 0 GROUP BY ALL HAVING count(*) = 2
+), mine AS (FROM told WHERE own AND first_m < merge_point_m())
+SELECT told.trial_id, told.spec_hash FROM told JOIN mine USING (mean_mps, ms) WHERE NOT told.own
+GROUP BY ALL HAVING max(ms) = (SELECT max(ms) FROM mine)
+ORDER BY avg((told.headway_m - mine.headway_m) ** 2), told.trial_id, told.spec_hash LIMIT 1
+"""
 
 
 def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     """Return a trial with all of its decisions."""
-    row = find(site, trial_id, asked)
-    trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
+    row, trial = found(site, trial_id, asked)
     account = views.account_of(row, trial)
     return site.render(
         "trial.html",
@@ -42,14 +63,14 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
         scripts=REPLAY,
         panels=panels(site, row, trial),
         row=row,
-        outcome=views.outcome_text(row, trial.scenario),
+        outcome=views.outcome_text(row),
         facts=views.facts(row),
         judged=views.judged_text(trial.scenario),
-        view_box=views.view_box(),
-        data=embedded(replayed(site, row, trial, account)) if trial.states else None,
+        view_box=views.VIEW_BOX,
+        data=views.replay_data(row, trial, account, site.at.trial(row)) if trial.states else None,
         account=account,
         samples=SAMPLES.format(quoted(row["trial_id"]), quoted(row["spec_hash"])),
-        lines=views.summary(row, trial),
+        lines=views.summary(trial),
         trial_decisions=trial.by_side,
         offers=OFFERS,
         clamped=clamped,
@@ -61,82 +82,123 @@ def trial_page(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     )
 
 
-def panels(site: Site, row: Row, trial: Trial) -> list[Markup]:
+def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
+    """The trial that an address names; raises NotThere."""
+    row = site.catalogue.find(trial_id, asked.get("spec", ""))
+    if row is None:
+        raise NotThere(f"the database holds no trial {trial_id}")
+    return row
+
+
+def found(site: Site, trial_id: str, asked: Mapping[str, str]) -> tuple[Row, views.Trial]:
+    """The trial that an address names, with what was stored of it; raises NotThere."""
+    row = find(site, trial_id, asked)
+    return row, views.read_trial(site.db, row["trial_id"], row["spec_hash"])
+
+
+def panels(site: Site, row: Row, trial: views.Trial) -> list[Markup]:
     """Return the panels of all decisions of a trial, in the order of its ribbons."""
-    others = site.catalogue.others
+    others = site.catalogue.ask("FROM others")
     decisions = (d for mine in trial.by_side.values() for d in mine)
     return [decision_panel(site, row, trial, d, others) for d in decisions]
 
 
-def replayed(site: Site, row: Row, trial: Trial, account: Account | None) -> dict[str, Any]:
-    """What a replay draws of a trial, with the address of its page."""
-    return {**views.replay_data(row, trial, account), "page": site.at.trial(row)}
-
-
-def decision_at(trial: Trial, asked: Mapping[str, str]) -> Row:
+def decision_at(trial: views.Trial, asked: Mapping[str, str]) -> Row:
     """The decision that an address names; raises NotThere."""
-    side, number = asked.get("side", ""), whole(asked.get("decision", ""))
-    if side not in SIDES or number is None:
-        raise NotThere("a decision is named by side=left or side=right, and decision=NUMBER")
-    found = [d for d in trial.decisions if (d["side"], d["decision"]) == (side, number)]
-    if not found:
-        raise NotThere(f"the trial has no decision {number} of the {side} driver")
-    return found[0]
+    side, number = asked.get("side", ""), asked.get("decision", "")
+    for decision in trial.decisions:
+        if (decision["side"], decision["decision"]) == (side, whole(number)):
+            return decision
+    raise NotThere(f"the trial has no decision {number} of the {side} driver")
 
 
 def decision_panel(
-    site: Site, row: Row, trial: Trial, decision: Row, others: Collection[tuple[str, str]]
+    site: Site, row: Row, trial: views.Trial, decision: Row, others: Sequence[Row]
 ) -> Markup:
     """What a driver was told, said, planned and did; ``others`` are answers of another model."""
-    body, before = _reply(decision), decision["before"]
-    text, more = shortened(body or "")
     named = {"side": decision["side"], "decision": decision["decision"]}
+    before = decision["before"]
     panel = site.render(
         "_decision.html",
         d=decision,
         driver=row[f"model_{decision['side']}"],
         page=site.at.trial(row, **named),
         clamped=clamped,
-        went_on=views.older_plan(trial, decision) if decision["fallback"] else "",
         before=before,
         parts=parts_of(decision["prompt"] or "", before["prompt"] if before else None),
         meaning=views.block_meaning,
         others=others,
-        reply=None if body is None else {"text": text, "more": more},
+        reply=shortened(decision["reply"]) if decision["reply"] else None,
         raw=site.at.raw(row, **named),
         chart=views.plan_chart(decision, trial),
         points=step_points,
-        aftermath=views.aftermath(trial, decision),
     )
     return Markup(panel)  # noqa: S704 # rendered by a template of ours, which escapes
 
 
 def raw_reply(site: Site, trial_id: str, asked: Mapping[str, str]) -> str:
     """The body of the last reply to a call, whole; raises NotThere."""
-    row = find(site, trial_id, asked)
-    trial = read_trial(site.db, row["trial_id"], row["spec_hash"])
-    body = _reply(decision_at(trial, asked))
-    if body is None:
+    _, trial = found(site, trial_id, asked)
+    reply: str | None = decision_at(trial, asked)["reply"]
+    if reply is None:
         raise NotThere(f"{trial_id} has no reply to this decision")
-    return body
+    return reply
 
 
-def _reply(decision: Row) -> str | None:
-    bodies: list[str] = [a["reply"] for a in decision["attempts"] if a["reply"]]
-    return bodies[-1] if bodies else None
+def others(site: Site, trial_id: str, asked: Mapping[str, str]) -> dict[str, Any] | str | None:
+    """What a trial's page asks about others: one to lay beside it, one that is offered, or several.
+
+    ``compare=KEY`` gives what a replay draws of it, ``offer=KIND`` a key; None where there is none.
+    ``q=WORDS`` gives the first trials that have the words, those of the same condition before
+    others. Raises NotThere.
+    """
+    row = find(site, trial_id, asked)
+    if "compare" in asked:
+        other = named(site, asked["compare"])
+        return None if other is None else _laid(site, other)
+    if "offer" in asked:
+        offers = {HUMAN: _nearest_human, REPETITION: _next_repetition}
+        if asked["offer"] not in offers:
+            raise NotThere(f"there are no other offers than {', '.join(OFFERS)}")
+        offered = offers[asked["offer"]](site, row)
+        sql = f"SELECT key FROM ({NAMED}) WHERE trial_id = ? AND spec_hash = ?"  # noqa: S608 # constants
+        return site.catalogue.ask(sql, *offered)[0]["key"] if offered else None
+    words = asked.get("q", "").lower().split()
+    fits = " AND contains(words, ?)" * len(words)
+    rows = site.catalogue.ask(
+        f"SELECT key, outcome, note FROM ({NAMED}) WHERE (trial_id, spec_hash) <> (?, ?){fits} "  # noqa: S608 # constants
+        f"ORDER BY condition <> ?, trial_id, spec_hash LIMIT {FOUND}",
+        *(row["trial_id"], row["spec_hash"], *words, row["condition"]),
+    )
+    return {"found": [other | {"note": visible(other["note"])} for other in rows]}
 
 
-def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
-    """The trial that an address names; raises NotThere."""
-    row = site.catalogue.find(trial_id, asked.get("spec") or None)
-    if row is None:
-        raise NotThere(f"the database holds no trial {trial_id}")
-    return row
+def named(site: Site, key: str) -> Row | None:
+    """The trial that a key stands for; a name with several specs stands for the first of them."""
+    name, _, spec = key.rpartition("@")
+    return site.catalogue.find(key) or (site.catalogue.find(name, spec) if name else None)
 
 
-def embedded(data: dict[str, Any] | str) -> Markup:
-    """Data for a script, as JSON that no HTML can end."""
-    text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
-    for character in "<>&":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return Markup(text)  # noqa: S704 # it holds no character of HTML
+def _laid(site: Site, row: Row) -> dict[str, Any] | None:
+    trial = views.read_trial(site.db, row["trial_id"], row["spec_hash"])
+    if not trial.states:
+        return None
+    return {
+        **views.replay_data(row, trial, views.account_of(row, trial), site.at.trial(row)),
+        "ribbons": site.render("_ribbons.html", row=row, trial_decisions=trial.by_side),
+        "panels": "".join(panels(site, row, trial)),
+    }
+
+
+def _nearest_human(site: Site, row: Row) -> tuple[str, str] | None:
+    given = {"trial": row["trial_id"], "spec": row["spec_hash"], "condition": row["condition"]}
+    with reading(site.db) as connection:
+        return connection.execute(NEAREST, given).fetchone()
+
+
+def _next_repetition(site: Site, row: Row) -> tuple[str, str] | None:
+    same = {name: row[name] for name in ("condition", "model", "variant", "pair", "spec_hash")}
+    rows = sorted(site.catalogue.every(same), key=itemgetter("rep", "trial_id"))
+    alike = [(other["trial_id"], other["spec_hash"]) for other in rows]
+    place = alike.index((row["trial_id"], row["spec_hash"]))
+    return (alike * 2)[place + 1] if len(alike) > 1 else None

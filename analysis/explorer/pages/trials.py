@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
 
-from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Filter
+from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS, Wanted
 from merge_runner_analysis.explorer.pages.computed import awaited, computed
 from merge_runner_analysis.explorer.pictures import sparkline, speed_range
 from merge_runner_analysis.explorer.scope import carried
@@ -22,30 +20,30 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
     """One page of the trials that an address asks for; raises NothingNew as it was ``seen``."""
     state = site.catalogue.state()
     seen = news_of(state, asked.get("seen", ""))
+    news = site.at.to("trials", **{**asked, "seen": seen})
     if "seen" in asked:  # that the trials are no longer those that were seen
-        here, news = (at_of(site, asked, seen=text) for text in ("", seen))
-        return site.render("_news.html", trials=state[0], here=here, news=news)
-    wanted, sort = filter_of(asked), sort_of(asked)
-    cell, named = asked.get("cell", ""), None
+        here = site.at.to("trials", **{**asked, "seen": ""})
+        return site.render("_news.html", trials=state["trials"], here=here, news=news)
+    chosen, sort, cell = filter_of(asked), sort_of(asked), asked.get("cell", "")
+    wanted, named = chosen, None
     if cell:
         named = computed(site, cell_request(cell))
         if named.content is None:
             return site.render("behind.html", here="trials", cell=cell, computed=named)
-        wanted = replace(wanted, trials=tuple(named.content["trials"]))
-    totals = site.catalogue.totals(wanted)
+        wanted = {**chosen, "trials": named.content["trials"]}
+    totals = {row["who"]: row for row in site.catalogue.counts(wanted, "who")}
     trials = sum(part["trials"] for part in totals.values())
     last = max(1, -(-trials // PAGE))
-    number = min(page_of(asked), last)
-    rows = site.catalogue.page(wanted, sort, number)
-    facets = site.catalogue.facets(wanted)
+    page = min(whole(asked.get("page", "")) or 1, last)
+    rows = site.catalogue.every(wanted, sort, page)
     return site.render(
         "trials.html",
         here="trials",
-        facets=facets,
-        chosen=wanted.chosen,
+        facets=site.catalogue.facets(wanted),
+        chosen=chosen,
         headings=HEADINGS,
         carried=carried(asked),
-        kept={**wanted.chosen, "cell": cell},
+        kept={**chosen, "cell": cell},
         cell=cell,
         computed=named,
         sort=sort,
@@ -55,25 +53,17 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         rows=rows,
         leveled=any(row["levels"] for row in rows),
         scale=speed_range(rows),
-        news=at_of(site, asked, seen=seen),
-        page=number,
+        news=news,
+        page=page,
         last_page=last,
         sparkline=sparkline,
     )
 
 
-def at_of(site: Site, asked: Mapping[str, str], **state: str) -> str:
-    """The address of a list, with more of a state."""
-    return site.at.to("trials", **{**asked, **state})
-
-
-def export_filter(site: Site, asked: Mapping[str, str]) -> Filter:
+def export_filter(site: Site, asked: Mapping[str, str]) -> Wanted:
     """The filter in an address, whose cell may have to be computed; raises NotThere, StoreError."""
     wanted, cell = filter_of(asked), asked.get("cell", "")
-    if not cell:
-        return wanted
-    found = awaited(site, cell_request(cell))
-    return replace(wanted, trials=tuple(found["trials"]))
+    return {**wanted, "trials": awaited(site, cell_request(cell))["trials"]} if cell else wanted
 
 
 def cell_request(cell: str) -> tuple[str, str, str, str]:
@@ -85,23 +75,16 @@ def cell_request(cell: str) -> tuple[str, str, str, str]:
     return "cell", table, row, column
 
 
-def filter_of(asked: Mapping[str, str]) -> Filter:
+def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
     """The filter in an address."""
-    given: dict[str, Any] = {name: asked[name] for name in (*FACETS, "q") if name in asked}
-    levels = [
-        (name.removeprefix(FACTOR), level)
-        for name, level in asked.items()
-        if name.startswith(FACTOR) and level
-    ]
-    return replace(Filter(), **given, levels=tuple(levels))
+    return {
+        name: value
+        for name, value in asked.items()
+        if value and (name in {*FACETS, "q"} or name.startswith(FACTOR))
+    }
 
 
 def sort_of(asked: Mapping[str, str]) -> str:
     """The order in an address; one that is unknown is that of the names."""
     sort = asked.get("sort", "trial")
     return sort if sort.removeprefix("-") in SORTS else "trial"
-
-
-def page_of(asked: Mapping[str, str]) -> int:
-    """The page in an address, from 1."""
-    return whole(asked.get("page", "")) or 1

@@ -19,8 +19,8 @@ from merge_runner_analysis.data.derived_cache import (
     present_state,
 )
 from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.report.page import finished_figures
-from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, finished_tables, make_tables
 from merge_runner_analysis.tables.formats import render
 from merge_runner_analysis.tables.model import from_text, to_text

@@ -13,9 +13,8 @@ from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.provenance import provenance
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer.catalogue import Filter
+from merge_runner_analysis.explorer.pages.sweep import list_runs
 from merge_runner_analysis.explorer.site import Site
-from merge_runner_analysis.explorer.sweeps import list_runs
 from merge_runner_analysis.report.page import alarms
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import value_rows
@@ -180,7 +179,7 @@ def test_equal_trials_of_a_language_model_are_told_and_count(db, where, equal):
     study = changed(db, *same_each_time(db, f"trial_id LIKE '{where}'"))
     assert study.models[0].repeated == 0
     ((title, text),) = alarms(study, provenance(db)).items()
-    assert title == "Trials or answers repeat earlier ones"
+    assert title == "Trials repeat earlier ones"
     says = f"o3/baseline: {equal} of 33 trials are as an earlier one to the last state; each counts"
     assert says in text
 
@@ -226,10 +225,10 @@ def test_a_driver_of_a_study_is_a_program_also_where_the_study_is_not_at_hand(pr
     site = Site(db)
     site.catalogue.refresh()
     (group,) = Study(db).models
-    (trial,) = site.catalogue.every(Filter())
-    ((run, _),) = list_runs(site.catalogue)
+    (trial,) = site.catalogue.every({})
+    (run,) = list_runs(site.catalogue)
     said = "scripted stand-in, no language model"
-    assert (group.posing, trial["stand_in"], run.stand_in) == (said, said, said)
+    assert (group.posing, trial["stand_in"], run["stand_in"]) == (said, said, said)
 
 
 def test_the_sides_are_those_of_the_scripted_calls(tmp_path):

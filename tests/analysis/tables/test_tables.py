@@ -20,9 +20,9 @@ from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.metrics import METRICS
+from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.stats.indicators import score
 from merge_runner_analysis.stats.intervals import proportion
-from merge_runner_analysis.table_format import TableFormat
 from merge_runner_analysis.tables import TABLES, make_tables
 from merge_runner_analysis.tables.against import against
 from merge_runner_analysis.tables.formats import as_text, render
