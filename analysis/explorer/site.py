@@ -42,7 +42,7 @@ PAGES = {
     "SQL": "sql",
 }
 # What all templates call, without a word of where it is.
-MACROS = ("words", "computed", "scope", "mark", "conditions", "trust", "notes")
+MACROS = ("scope", "words", "computed", "mark", "conditions", "trust", "notes")
 # The parts of a scope in an address; the list of trials filters by the same names.
 SCOPE = ("sweep", "model", "variant", "condition")
 # What hangs under these, each with one list of all.

@@ -10,8 +10,6 @@ from merge_runner_analysis.explorer.scope import carried
 from merge_runner_analysis.explorer.search import (
     FACETS,
     LIMITS,
-    LONGEST,
-    MOST_TERMS,
     terms_of,
 )
 from merge_runner_analysis.explorer.site import Site
@@ -41,8 +39,6 @@ def words_page(site: Site, asked: Mapping[str, str]) -> str:
         headings=HEADINGS,
         carried=carried(asked),
         limits=LIMITS,
-        longest=LONGEST,
-        most_terms=MOST_TERMS,
         found=found,
         facets=found["facets"],
         chosen=chosen,
