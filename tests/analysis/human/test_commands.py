@@ -29,7 +29,9 @@ def test_a_zip_is_imported_once_and_the_status_counts_it(human, tmp_path):
     assert run.code == 0
     assert run.out == ("2 trials added, 0 there already, 0 files could not be read\n")
     (few,) = run.err.splitlines()
-    assert few.startswith("note: 2 of 990 trials: who merged first and collisions stay the 990 ")
+    assert few.startswith(
+        "note: 2 of 990 trials are imported; who merged first and collisions are "
+    )
     again = human("import", path)
     assert (again.code, again.out[:33]) == (0, "0 trials added, 2 there already, ")
     late = {"experiment_4_iter_1.csv": drive("L_4_0", late=True).csv()}
@@ -43,7 +45,7 @@ def test_a_zip_is_imported_once_and_the_status_counts_it(human, tmp_path):
     assert ["pair3", "1", "0", "0", "1"] in lines
     assert ["L_4_0", "1", "1", "0", "0", "88", "0", "2"] in lines
     assert ["N_0_0", "1", "0", "0", "1", "37", "48", "5"] in lines
-    assert lines[-1][:4] == ["2", "of", "990", "trials:"]
+    assert lines[-1][:4] == ["2", "of", "990", "trials"]
 
 
 def test_what_cannot_be_read_is_listed_and_the_rest_is_imported(human, tmp_path):
