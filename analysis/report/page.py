@@ -188,7 +188,9 @@ def _plain(rows: pd.DataFrame) -> Markup:
     )
     with pd.option_context("display.max_colwidth", None):
         return Markup(  # noqa: S704 # pandas escapes it
-            named.to_html(index=False, na_rep="", classes="plain", float_format="{:.6g}".format)
+            named.to_html(
+                border=0, index=False, na_rep="", classes="plain", float_format="{:.6g}".format
+            )
         )
 
 
