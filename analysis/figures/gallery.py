@@ -15,6 +15,8 @@ from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.figures.figure_2 import (
     COLUMN_IN,
+    LINE_IN,
+    PAGE_IN,
     Points,
     Style,
     draw_points,
@@ -52,13 +54,17 @@ def figure_of_first_actions(study: Study) -> Figure:
     drawn = [(Style("#000000", "o"), "humans", _human_first_actions(study))]
     for number, seat in enumerate(seat for group in groups for seat in seats(group)):
         drawn.append((style(number), seat.name, _first_actions(study, seat)))
-    figure = Figure(figsize=(COLUMN_IN, 2.7), layout="constrained")
+    labels = [wrapped(name, PAGE_IN - COLUMN_IN - 0.6) for _, name, _ in drawn]
+    legend_in = LINE_IN * sum(label.count("\n") + 1.5 for label in labels)
+    figure = Figure(figsize=(PAGE_IN, max(2.7, legend_in)), layout="constrained")
     axis = figure.subplots()
+    # Beside each other, and far from the next velocity.
+    apart_mps = min(0.04, 0.4 / len(drawn))
     for place, (look, _, means) in enumerate(drawn):
-        draw_points(axis, means, 0.04 * place, look)
+        draw_points(axis, means, apart_mps * place, look)
     axis.set(xlabel="own relative velocity (m/s)", ylabel="first action (m/s²)")
-    handles = [key(look, wrapped(name, COLUMN_IN / 2 - 0.4)) for look, name, _ in drawn]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False)
+    handles = [key(look, label) for (look, _, _), label in zip(drawn, labels, strict=True)]
+    figure.legend(handles=handles, loc="outside right center", frameon=False)
     return figure
 
 
