@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from merge_runner_analysis.data.study import Study
 
 REMEMBERED = 100
-# While a run goes on the database changes all the time: an answer stands for a minute.
-STANDS_S = 60.0
+# While a run goes on the database changes all the time: an answer stands for some seconds.
+STANDS_S = 20.0
 BROKEN = (
     "the computation ended without an answer; what it said stands where `merge-runner view` was "
     "started"

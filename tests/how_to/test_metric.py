@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-from base64 import b64decode
 from html import unescape
 
 import duckdb
@@ -15,7 +13,7 @@ from tests.harness import FAST, how_to, plugin
 NAME, HEADING = "mean_abs_acceleration_mps2", "mean |a| (m/s²)"
 TABLES = ("indicators", "contrasts")
 FORMATS = {"text": HEADING, "csv": NAME, "md": r"mean \|a\|", "latex": "$|$a$|$"}
-NOTHING = f"{HEADING}: no human value is published, and no human traces are imported"
+NOTHING = f"{HEADING}: no human value is published, and none is imported"
 EXPECTED = (
     "SELECT avg(a) FROM (SELECT avg(abs(acceleration_mps2)) AS a FROM states "
     "JOIN trials USING (trial_id, spec_hash) WHERE time_s > 0 AND status = 'finished' "
@@ -76,8 +74,6 @@ def test_the_report_shows_it(report):
     text = unescape(report)
     assert HEADING in text
     assert NOTHING in text
-    drawn = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)', report)
-    assert any(f"<!-- {HEADING} -->" in b64decode(figure).decode() for figure in drawn)
 
 
 @pytest.mark.long

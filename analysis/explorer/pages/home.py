@@ -64,10 +64,11 @@ class Driver:
 def home_page(site: Site, asked: Mapping[str, str]) -> str:
     """The study; raises NotThere, and NothingNew where nothing is new since it was ``seen``."""
     standing = standing_of(site.catalogue)
-    seen = news_of((standing, site.catalogue.state(), site.catalogue.held), asked.get("seen", ""))
     bar = scope_of(site, asked)
     scope = bar.scope
     drivers, values = judged(site, bar, asked)
+    now = standing, site.catalogue.state(), site.catalogue.held, values["computed"].begun
+    seen = news_of(now, asked.get("seen", ""))
     shown = [
         one
         for one in drivers

@@ -160,7 +160,8 @@ def command_of(name: str, config: Row, db: Path) -> str:
             options.append(("--variants", ",".join(played)))
         if usual and any(by_prompt.get(prompt) != times for prompt, times in played.items()):
             options.append(("--reps", str(max(played.values()))))
-        if conditions != [*told.get("conditions", HUMAN_CONDITIONS)]:
+        named = told.get("conditions", HUMAN_CONDITIONS)
+        if conditions != [one["name"] if isinstance(one, dict) else one for one in named]:
             options.append(("--conditions", ",".join(conditions)))
     options += [
         ("--sample-set", str(config.get("sample_set") or "")),
