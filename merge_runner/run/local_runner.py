@@ -62,7 +62,7 @@ EVERY_S, POLL_S = 1.0, 0.05
 # storing fails, as when another program holds the file.
 BATCH = 256
 MOST_PENDING = 2 * BATCH
-BATCH_BYTES, MOST_PENDING_BYTES = 2**24, 2**26
+BATCH_BYTES, MOST_PENDING_BYTES = 2**24, 2**25
 DECISION_BYTES = 2_000  # with its share of the states
 LOCK_PATIENCE_S = 2.0
 AGAIN = (

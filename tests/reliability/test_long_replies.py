@@ -181,7 +181,7 @@ def test_memory_is_little_where_texts_are_short_and_calls_not_many(
     )
     limit_memory(connection, longest)
     limits = "SELECT current_setting('memory_limit'), current_setting('threads')"
-    expected = ("133.5 MiB", 1) if is_little else ("953.6 MiB", 2)
+    expected = ("104.9 MiB", 1) if is_little else ("953.6 MiB", 2)
     assert connection.execute(limits).fetchone() == expected
 
 
