@@ -270,7 +270,7 @@ def test_the_numbers_of_a_table_look_like_links(browser, db):
     with served(db) as address:
         page = browser.new_page(viewport={"width": 1024, "height": 800})
         page.goto(f"{address}/tables/attempts")
-        number = page.locator("table.of-report td a").first
+        number = page.locator("#content td a").first
         looks = "e => [getComputedStyle(e).color, getComputedStyle(e).textDecorationStyle]"
         assert number.evaluate(looks) == page.locator("main p a").first.evaluate(looks)
         assert number.evaluate(looks)[1] == "solid"

@@ -70,17 +70,17 @@ def test_a_newcomer_finds_why_it_collides_most_and_a_colleague_sees_the_same(pag
     expect(page.locator("#ghost-key")).to_contain_text("human P1, N_0_0")
     expect(page.locator("#ghost-key")).to_contain_text("reached the merge point first")
 
-    # A tag, from the keyboard.
-    page.keyboard.press("t")
-    page.keyboard.type("speeds up when level")
+    # A note with a tag, from the keyboard.
+    page.keyboard.press("n")
+    page.keyboard.type("speeds up when #level")
     page.keyboard.press("Enter")
-    expect(page.locator("#noted")).to_contain_text("speeds up when level")
+    expect(page.locator("#noted")).to_contain_text("speeds up when #level")
 
     # A colleague opens the folder.
     export_with_a_table(db, tmp_path / "pages")
     page.goto((tmp_path / "pages/index.html").as_uri())
     watch_the_worst(page)
     expect(page.locator("details", has_text="Why it collided")).to_be_visible()
-    expect(page.locator("#noted")).to_contain_text("speeds up when level")
+    expect(page.locator("#noted")).to_contain_text("speeds up when #level")
     page.locator("#moments").get_by_role("button", name="last moment to brake").first.click()
     expect(page.locator("#panel blockquote").first).to_contain_text(WRONG)
