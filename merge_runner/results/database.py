@@ -121,7 +121,11 @@ def open_database(
     # A name such as md:x or :memory: names a file, too.
     _attach(connection, f"{quoted(path.absolute())} AS {name} ({mode})", path, patience_s, instance)
     try:
-        connection.execute(f"USE {name}")
+        # Whoever used the instance before may have limited it; see limit_memory.
+        connection.execute(
+            f"USE {name}; SET memory_limit = '{SETTINGS['memory_limit']}'; "
+            f"SET threads = {SETTINGS['threads']}"
+        )
         yield connection
     except BaseException:
         instance.drop()
@@ -177,8 +181,9 @@ def _holder(exc: duckdb.Error) -> str:
 def limit_memory(connection: duckdb.DuckDBPyConnection, longest: int = 0) -> None:
     """Let DuckDB use little memory, and one thread, where texts are short and calls not many.
 
-    ``longest`` is the length of the longest text that will be stored. A row group of such calls
-    takes 64 MB, an audit of 200,000 of them 110 MB; more would only cache the file.
+    That holds until the instance opens a database again. ``longest`` is the length of the longest
+    text that will be stored. A row group of such calls takes 64 MB, an audit of 200,000 of them
+    110 MB; more would only cache the file.
     """
     [(stored, calls)] = connection.execute(SIZES).fetchall()
     is_little = bool(max(stored, longest) < 8_192 and calls < 210_000)

@@ -26,9 +26,11 @@ from merge_runner.results.database import (
     limit_memory,
     merge_small_groups,
     open_database,
+    read_database,
     schema_sql,
 )
 from merge_runner.results.recording import export_recording, read_recording
+from merge_runner.results.store import Store
 from tests.harness import RECORDING, watched
 
 SIZE, REPS = 20_480, 5
@@ -183,6 +185,14 @@ def test_memory_is_little_where_texts_are_short_and_calls_not_many(
     limits = "SELECT current_setting('memory_limit'), current_setting('threads')"
     expected = ("104.9 MiB", 1) if is_little else ("953.6 MiB", 2)
     assert connection.execute(limits).fetchone() == expected
+
+
+def test_what_limits_one_database_does_not_limit_the_next(tmp_path):
+    Store(tmp_path / "one.duckdb").write(None, [])
+    Store(tmp_path / "two.duckdb")
+    with read_database(tmp_path / "two.duckdb") as connection:
+        (limit,) = connection.execute("SELECT current_setting('memory_limit')").fetchone()
+    assert limit == "953.6 MiB"
 
 
 @pytest.mark.long
