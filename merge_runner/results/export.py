@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -129,8 +129,8 @@ def wide_trials(factors: Iterable[tuple[str, str]], sweep_id: str | None = None)
     return WIDE.format(levels=levels, only=only(sweep_id))
 
 
-def export_tables(db: Path, folder: Path, also: Sequence[tuple[SchemaTable, Path]] = ()) -> None:
-    """Write the folder, with tables ``also`` that are CSV files.
+def export_tables(db: Path, folder: Path) -> None:
+    """Write the folder.
 
     Its dictionary says what each column means and, in a row without a column, each table. Raises
     UsageError where the folder is neither empty nor an earlier export's.
@@ -144,19 +144,19 @@ def export_tables(db: Path, folder: Path, also: Sequence[tuple[SchemaTable, Path
             factors = connection.execute(FACTORS.format(only="")).fetchall()
             connection.execute(f"CREATE OR REPLACE TEMP VIEW {NAME} AS {wide_trials(factors)}")
             connection.execute(f"COMMENT ON VIEW {NAME} IS {quoted(COMMENT)}")
-            queries = [(table, f"FROM {table.name}") for table in described(connection)]
-            queries += [(table, f"FROM read_csv({quoted(file.resolve())})") for table, file in also]
+            tables = described(connection)
             folder.mkdir(parents=True, exist_ok=True)
             meanings = [
                 (table.name, *column)
-                for table, _ in queries
+                for table in tables
                 for column in [
                     ("", "", table.comment),
                     *((c.name, c.kind, c.comment or OF_A_FACTOR) for c in table.columns),
                 ]
             ]
             _write_csv(dictionary, HEADINGS, meanings)
-            for table, query in queries:
+            for table in tables:
+                query = f"FROM {table.name}"
                 parquet = quoted((folder / f"{table.name}.parquet").resolve())
                 options = "FORMAT parquet, COMPRESSION zstd"
                 connection.execute(f"COPY ({query}) TO {parquet} ({options})")
