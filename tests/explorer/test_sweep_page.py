@@ -13,6 +13,7 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
+from merge_runner.results.database import write_database
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.progress import remove_standing, write_standing
 from merge_runner.run.stored_replay import audit_database
@@ -105,14 +106,15 @@ def running(db, **changes):
 
 
 def test_a_run_says_how_long_it_lasted(study):
-    with duckdb.connect(str(study)) as connection:
+    # Waits for the audit that a page has asked for, which reads the file in another process.
+    with write_database(study) as connection:
         connection.execute("UPDATE sweeps SET ended_at = started_at + INTERVAL 2 HOURS")
     assert ">2.0 h<" in browser(study).get("/sweeps").text
     assert "lasted 2.0 h" in text_of(browser(study))
 
 
 def test_runs_show_what_the_audit_finds_and_notes_and_keep_it(study):
-    with duckdb.connect(str(study)) as connection:
+    with write_database(study) as connection:
         connection.execute("UPDATE sweeps SET ended_at = started_at, exit_code = 1")
         connection.execute("UPDATE trials SET end_time_s = 99 WHERE status = 'finished'")
     for address in (URL, "/sweeps"):
@@ -197,7 +199,7 @@ def test_an_alias_is_nothing_that_went_wrong(study):
     for alias in ("o3-alias", "o3"):
         assert site.catalogue.every(filter_of({"cause": f"model: o3 → {alias}"})) == []
     assert len(site.catalogue.every(filter_of({"cause": "model: o3 → another"}))) == 1
-    with duckdb.connect(str(study)) as connection:
+    with write_database(study) as connection:
         connection.execute("UPDATE calls SET outcome = 'ok', model_served = 'o3'")
         connection.execute("UPDATE decisions SET failure = NULL, valid = true, fallback = false")
         connection.execute("UPDATE trials SET status = 'finished' WHERE status = 'failed'")
@@ -205,7 +207,7 @@ def test_an_alias_is_nothing_that_went_wrong(study):
 
 
 def test_two_other_models_have_a_line_and_a_list_each(study):
-    with duckdb.connect(str(study)) as connection:
+    with write_database(study) as connection:
         connection.execute("UPDATE calls SET model_served = 'third' WHERE trial_id LIKE '%N_0_0%'")
     site = Site(study)
     shown = html.unescape(page_of(site))
@@ -221,7 +223,7 @@ def page_of(site):
 
 def test_what_a_server_wrote_is_shown_as_text(study):
     hostile = "<script>alert(1)</script>\u202e<img src=x>"
-    with duckdb.connect(str(study)) as connection:
+    with write_database(study) as connection:
         connection.execute("UPDATE trials SET error = ? WHERE status = 'failed'", [hostile])
         connection.execute("UPDATE calls SET model_served = ? WHERE model_served = 'another'",
                            [hostile])  # fmt: skip
@@ -283,7 +285,7 @@ def test_a_finished_sweep_of_another_model_or_without_valid_replies_is_doubtful(
 
 
 def test_what_runs_and_trials_share_counts_once_over_all_runs(study):
-    with duckdb.connect(str(study)) as connection:
+    with write_database(study) as connection:
         connection.execute(
             "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id) FROM sweeps;"
             "INSERT INTO sweep_trials SELECT 'newer', trial_id, spec_hash FROM sweep_trials;"
@@ -349,7 +351,7 @@ def test_a_sweep_is_not_said_to_be_lost_while_its_end_cannot_be_read(study):
 
 def test_the_newest_sweep_is_the_first_of_the_list(study):
     client = browser(study)
-    with duckdb.connect(str(study)) as connection:
+    with write_database(study) as connection:
         connection.execute(
             "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id, "
             "started_at + INTERVAL 1 DAY AS started_at) FROM sweeps"
@@ -368,7 +370,7 @@ def test_a_page_that_looks_for_news_gets_them_once(study):
     assert {page: client.get(look).status_code for page, look in looks.items()} == dict.fromkeys(
         looks, 204
     )
-    with duckdb.connect(str(study)) as connection:
+    with write_database(study) as connection:
         connection.execute(
             "INSERT INTO sweeps BY NAME SELECT * REPLACE ('newer' AS sweep_id, "
             "started_at + INTERVAL 1 DAY AS started_at) FROM sweeps"
