@@ -110,10 +110,9 @@ class Trace:
 def parse_csv(content: bytes) -> Trace:
     """Read a trial's CSV file; raises Unreadable."""
     try:
-        table = pd.read_csv(
-            io.BytesIO(content), usecols=NEEDED.__contains__, dtype=dict.fromkeys(SERIES, float),
-            float_precision="round_trip",  # or the last bit may be missed
-        )  # fmt: skip
+        # Python's own float, since pandas before 3 may miss the last bit.
+        exact = dict.fromkeys(SERIES, lambda text: float(text or "nan"))
+        table = pd.read_csv(io.BytesIO(content), usecols=NEEDED.__contains__, converters=exact)
     except (ValueError, MemoryError) as exc:  # pandas' own errors are ValueErrors
         raise Unreadable(f"it is not the CSV table of a trial: {one_line(str(exc))}") from exc
     if missing := sorted(set(NEEDED) - set(table)):
