@@ -263,7 +263,7 @@ def trace_of(trial: Lines, condition: str) -> Trace:
     if not equal or not np.isfinite(velocities).all(axis=None):
         raise Unreadable("its samples are no finite numbers at equal steps from 0 s on")
     steps = (velocities + velocities.shift()).fillna(0.0) / 2 * step_s
-    positions = steps.cumsum() + HUMAN_CONDITIONS[condition].starts_m(TRACK)
+    positions = steps.cumsum() + list(HUMAN_CONDITIONS[condition].starts_m(TRACK))
     return Trace(
         step_s=step_s,
         end_state=_end_state(trial, dict(positions.iloc[-1]), times_s[-1, 0]),
