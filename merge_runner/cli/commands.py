@@ -107,7 +107,7 @@ def sweep(
     if recordings and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
     known = {each.name for each in fields(Options)} & given.keys() - {"dry_run"}
-    options = Options(**{name: given[name] for name in known})
+    options = Options(**{name: given[name] for name in known}, typed=sys.argv[1:])
     wanted = {name: given[name] for name in signature(make_plan).parameters if name in given}
     wanted |= {"conditions": cli.listed(conditions), "variants": cli.listed(variants)}
     wanted["only"] = cli.levels(only or (), "--only")

@@ -80,7 +80,7 @@ class Options:
     those of other sweeps. ``dask`` names the cluster that plays the trials; None: this process. A
     ``dry_run`` sends nothing, a ``quiet`` run shows no progress, and one that is to ``keep_going``
     asks a model on that gives no valid decision. In a ``batch`` run all trials ask together, at a
-    lower price.
+    lower price. ``typed`` are the command's words after the program's name, with which it goes on.
     """
 
     db: Path
@@ -98,6 +98,7 @@ class Options:
     dask: str | None = None
     dry_run: bool = False
     batch: bool = False
+    typed: Sequence[str] = ()
 
     @property
     def connections(self) -> int:

@@ -245,16 +245,15 @@ class Sweep:
         started_at = datetime.now(UTC).replace(tzinfo=None)
         commit, dirty = await asyncio.to_thread(git_state)
         sweep_id = f"{self._plan.name}-{self._plan.model}-{started_at:%Y%m%dT%H%M%S%f}"
-        config = self._plan.model_dump(mode="json")
         row = {
             "sweep_id": sweep_id,
             "name": self._plan.name,
             "started_at": started_at,
             "config": canonical_json(
                 {
-                    **config,
+                    **self._plan.model_dump(mode="json"),
                     "max_cost_usd": self._options.max_cost_usd,
-                    "cache": str(self._options.cache),
+                    "typed": self._options.typed,
                 }
             ),
             "git_commit": commit,

@@ -54,7 +54,8 @@ def db(tmp_path_factory):
         said = {1: Said(("timeout",), lost=True)} if drive.condition == "R_0_8" else {}
         straight = {"left": (0.0,), "right": (0.0,)} if crash else {}
         drives.append(replace(drive, said=said if drive.rep == 2 else {}, **straight))
-    return write_study(tmp_path_factory.mktemp("home") / "study.duckdb", drives)
+    config = {"typed": ["sweep", "test"]}
+    return write_study(tmp_path_factory.mktemp("home") / "study.duckdb", drives, config=config)
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +201,7 @@ def test_the_strip_says_what_to_type_and_nothing_twice(db, tmp_path):
     client = client_of(site)
     text = client.get("/").text
     assert "Stopped: the account" in text
-    assert "<code>/opt/bin/merge-runner sweep test --model" in text
+    assert "<code>/opt/bin/merge-runner sweep test</code>" in text
     (again,) = re.findall(r'hx-get="(/\?seen=[^"]+)"', text)
     assert client.get(again).status_code == 204
     with duckdb.connect(copy) as connection:

@@ -46,7 +46,9 @@ CONFIG = {
     ],
     "conditions": list(CONDITIONS),
     "max_cost_usd": 9.0,
+    "typed": ["sweep", "baseline", "--model", "o3", "--db", "my results.duckdb", "--max-cost", "9"],
 }
+TYPED = "merge-runner sweep baseline --model o3 --db 'my results.duckdb' --max-cost 9"
 TROUBLE = (
     Said(("refusal",), "refusal"),
     Said(failure="no_array"),
@@ -262,19 +264,9 @@ def test_the_verdict_says_how_it_ended_and_what_to_type(code, ended, failed, kin
     run = run_of(row, CONFIG, None)
     assert run["kind"] == kind
     assert words in run["text"]
-    assert run["command"] == ("merge-runner sweep baseline --model o3" if goes_on else "")
+    assert run["command"] == (TYPED if goes_on else "")
+    assert run_of(row, CONFIG | {"typed": []}, None)["command"] == ""
     assert run_of(row, CONFIG, None, later="later")["command"] == ""
-
-
-def test_the_command_to_go_on_names_what_the_run_was_begun_with(tmp_path):
-    study = {"text": "repetitions = 10", "plugins": {}}
-    config = {**CONFIG, "study": study, "repetitions": {"baseline": 3}, "conditions": ["N_0_0"],
-              "cache": "elsewhere"}  # fmt: skip
-    command = run_of({**ROW, "exit_code": 130}, config, None, tmp_path / "t.duckdb")["command"]
-    assert command == (
-        "merge-runner sweep baseline --model o3 --reps 3 --conditions N_0_0 "
-        f"--db {tmp_path}/t.duckdb --cache elsewhere"
-    )
 
 
 @pytest.mark.parametrize("doubt", [{"others": 7}, {"invalid": 8}])

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import json
 import shlex
-import tomllib
 from collections.abc import Mapping, Sequence
 from datetime import UTC
-from pathlib import Path
 from typing import Any
 
 from merge_runner.audit.checks import not_judged
 from merge_runner.config import both_sides, pair_name
-from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.run.progress import Standing, read_standing
-from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner.study.file import study_files
 from merge_runner_analysis.explorer.catalogue import Catalogue, Wanted
 from merge_runner_analysis.explorer.computing import Job
 from merge_runner_analysis.explorer.pages.computed import computed
@@ -75,7 +70,7 @@ def list_runs(catalogue: Catalogue) -> list[Row]:
             # The newest run of the same trials went on with those before it.
             same = row["name"], config.get("model"), config.get("sample_set")
             later = newest.setdefault(same, sweep_id).replace(sweep_id, "")
-            runs.append(run_of(row | counted[sweep_id], config, standing, catalogue.db, later))
+            runs.append(run_of(row | counted[sweep_id], config, standing, later))
         if all(run["state"] != "lost" for run in runs):
             break
     return runs
@@ -102,15 +97,14 @@ def standing_of(catalogue: Catalogue) -> list[Row]:
     return [run for run in runs if run["state"] != "finished" and not run["later"]] or runs[:1]
 
 
-def run_of(
-    row: Row, config: Row, standing: Standing | None, db: Path = DEFAULT_DB, later: str = ""
-) -> Row:
-    """A run of a sweep into ``db``: how far it is, and in a ``text`` whether it can be trusted.
+def run_of(row: Row, config: Row, standing: Standing | None, later: str = "") -> Row:
+    """A run of a sweep: how far it is, and in a ``text`` whether it can be trusted.
 
     ``row`` has what is stored of it and what its trials come to, ``config`` what it planned, and
     ``standing`` what its process says, None: no file does. It is ``running``, ``checking`` what is
-    stored, ``lost``, ``finished`` or ``stopped``. ``command`` goes on with it, unless a ``later``
-    run already did. One that is ``followed`` may have news: it may have slept, and go on.
+    stored, ``lost``, ``finished`` or ``stopped``. ``command``, as it was typed, goes on with it,
+    unless a ``later`` run already did. One that is ``followed`` may have news: it may have slept,
+    and go on.
     """
     state, last_word = "stopped" if row["exit_code"] else "finished", row["ended_at"]
     if last_word is None:
@@ -144,33 +138,9 @@ def run_of(
     kind, text = assessment_of(run)
     code = row["exit_code"]
     goes_on = state in {"lost", "stopped"} and code != 4 and run["ended"] != run["planned"]
-    command = command_of(row["name"], config, db) if goes_on and not later else ""
+    typed = config.get("typed") if goes_on and not later else None  # a notebook types none
+    command = shlex.join(["merge-runner", *typed]) if typed else ""
     return {**run, "kind": kind, "text": text, "command": command}
-
-
-def command_of(name: str, config: Row, db: Path) -> str:
-    """What to type to go on with a run: what it was begun with, but for parts of factors."""
-    cache, study = config.get("cache", str(DEFAULT_CACHE)), config.get("study")
-    options = [("--model", driver or "?") for driver in config.get("model", "").split(",")]
-    if study:
-        told, played = tomllib.loads(study["text"]), config["repetitions"]
-        usual, conditions = told.get("repetitions"), config["conditions"]
-        by_prompt = usual if isinstance(usual, dict) else dict.fromkeys(played, usual)
-        if by_prompt.keys() != played.keys():
-            options.append(("--variants", ",".join(played)))
-        if usual and any(by_prompt.get(prompt) != times for prompt, times in played.items()):
-            options.append(("--reps", str(max(played.values()))))
-        named = told.get("conditions", HUMAN_CONDITIONS)
-        if conditions != [one["name"] if isinstance(one, dict) else one for one in named]:
-            options.append(("--conditions", ",".join(conditions)))
-    options += [
-        ("--sample-set", str(config.get("sample_set") or "")),
-        ("--db", "" if db == DEFAULT_DB else str(db)),
-        ("--cache", "" if cache == str(DEFAULT_CACHE) else cache),
-    ]
-    given = [word for option in options if option[1] for word in option]
-    file = name if name in study_files() or not study else f"{name}.toml"
-    return shlex.join(["merge-runner", "sweep", file, *given])
 
 
 def assessment_of(run: Row) -> tuple[str, str]:
