@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import UTC
 from typing import Any
@@ -76,16 +77,14 @@ def list_runs(catalogue: Catalogue) -> list[Row]:
     return runs
 
 
-def numbers_of(catalogue: Catalogue, wanted: Wanted) -> dict[str, Row]:
+def numbers_of(catalogue: Catalogue, wanted: Wanted) -> Mapping[str, Row]:
     """What the wanted trials of each run come to, and, without an id, those of all together.
 
-    Whatever several runs or trials share counts once.
+    Whatever several runs or trials share counts once. A run may have begun since: it has none.
     """
     (total,) = catalogue.counts({**wanted, "who": ["drivers", "stand-ins"]})
-    nothing = dict.fromkeys(total, 0)
     counted = {row["sweep"]: row for row in catalogue.counts(wanted, "sweep")}
-    ids = [row["sweep_id"] for row in catalogue.ask("SELECT sweep_id FROM sweeps")]
-    return {"": total, **{sweep_id: counted.get(sweep_id, nothing) for sweep_id in ids}}
+    return defaultdict(lambda: dict.fromkeys(total, 0), {"": total} | counted)
 
 
 def standing_of(catalogue: Catalogue) -> list[Row]:

@@ -42,8 +42,9 @@ replay.comparison = (scene, changed) => {
   const known = () => [...list.options].some(({ value }) => value === field.value);
   const suggest = async () => {
     if (known()) return form.requestSubmit();
-    const answer = await ask({ q: field.value });
-    if (!answer) return;
+    const text = field.value;
+    const answer = await ask({ q: text });
+    if (!answer || field.value !== text) return; // the answer to later words may have come before
     list.replaceChildren(
       ...answer.found.map(({ key, outcome, note }) => new Option([outcome, note].filter(Boolean).join(", "), key)),
     );
