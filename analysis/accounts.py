@@ -231,6 +231,7 @@ def _collision(course: Course, name: str) -> str:
     changes = (course.change_mps(side, at) for side in SIDES)
     left, right = (f"{abs(mps):.1f} m/s {'faster' if mps >= 0 else 'slower'}" for mps in changes)
     when = f"{course.times_s[at]:.1f} s, when one driver alone could last have avoided it"
+    when += ", by braking or speeding up"
     if at == course.last:
         when = "the end; nobody alone could have avoided it"
     return (

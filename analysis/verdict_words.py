@@ -102,7 +102,7 @@ MEASURES = {
         Measure(
             "gap",
             "Gap at the merge point",
-            "gap",
+            "mean gap",
             "m",
             WITH_GAP,
             "the difference excludes 0",
@@ -119,6 +119,11 @@ MEASURES = {
             "HC3 errors: above 0 at 5 %",
             "leaves {of} m more per m of headway, humans {humans} m",
             (-0.6, 1.0),
+            {
+                WEAKER: "leaves less gap per headway than humans",
+                STRONGER: "leaves more gap per headway than humans",
+                UNLIKE: "leaves no more gap with more headway",
+            },
             decimals=2,
         ),
         Measure(
@@ -127,7 +132,8 @@ MEASURES = {
             "gap by relative velocity",
             "m at 0.8 m/s",
             WITH_GAP,
-            "HC3 errors: within 1 m in two one-sided tests; unlike where the interval is beyond it",
+            "HC3 errors: conditions that differ in it alone within 1 m, two one-sided tests; "
+            "unlike where the interval is beyond 1 m",
             "changes its gap by {of} m at 0.8 m/s of relative velocity, humans by {humans} m",
             (-3.0, 2.0),
             margin=1.0,
@@ -190,7 +196,7 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
         if state.get(name) == OPEN
     ]
     if unclear:
-        parts["unclear"] = f"{joined(unclear)}: no difference shown"
+        parts["unclear"] = f"{joined(unclear)}: {OPEN}"
     text = ". ".join(capital(part) for part in parts.values() if part)
     return f"{text or 'Nothing can be compared with humans'}."
 
@@ -247,13 +253,13 @@ def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
 
 
 def told(values: Values) -> str:
-    """The sentence of one difference: ``collides in 68 % [47, 84] of trials, humans in ...``."""
+    """The sentence of one difference: ``collides in 68 % [47, 84] of trials, ... (n = 22)``."""
     measure = MEASURES[str(values["measure"])]
     of = with_interval(values["estimate"], values["ci"], measure.decimals)
     if values.get("undecided"):
         of = share(values)
     humans = with_interval(values["human"], values["human_ci"], measure.decimals)
-    return measure.told.format(of=of, humans=humans)
+    return f"{measure.told.format(of=of, humans=humans)} (n = {values['n']})"
 
 
 def with_interval(value: float | None, ci: Sequence[float] | None, decimals: int) -> str:
@@ -275,9 +281,7 @@ def verdict_word(values: Values) -> str:
     state, name = values.get("state"), str(values["measure"])
     if not state:
         return "not judged"
-    if name in {"collisions", "gap"}:
-        if state == OPEN:
-            return "no difference shown"
+    if name in {"collisions", "gap"} and state != OPEN:
         more = "more" if (values["difference"] or 0.0) > 0 else "less"
         return f"{'fewer' if (more, name) == ('less', 'collisions') else more} than humans"
     return {SHOWN: "as in humans", UNLIKE: "unlike humans"}.get(str(state), str(state))

@@ -35,7 +35,7 @@ PAGE = 100
 Wanted = Mapping[str, Any]
 """Which trials are wanted, by facet or column; an empty value wants all, and of a list one must be.
 
-``who`` is ``drivers``, ``humans`` or ``stand-ins``, and ``q`` a part of a name. ``trials`` are
+``who`` is ``drivers``, ``humans`` or ``stand-ins``, and ``q`` are parts of a name. ``trials`` are
 (trial, spec), where those behind a cell of a table are wanted.
 """
 Facets = dict[str, list[tuple[str, int]]]
@@ -249,8 +249,11 @@ def where_of(wanted: Wanted, leave_out: str = "") -> tuple[str, list[Any]]:
         if name == leave_out or value in ("", (), None):
             continue
         if name == "q":
-            parts.append("contains(lower(trial_id), lower(?))")
-        elif name == "trials":
+            words = value.lower().split()
+            parts += ["contains(lower(trial_id), ?)"] * len(words)
+            values += words
+            continue
+        if name == "trials":
             parts.append("[trial_id, spec_hash] IN (SELECT unnest(?::VARCHAR[][]))")
         elif name in SEVERAL or name.startswith(FACTOR):
             parts.append("number IN (SELECT number FROM several WHERE facet = ? AND value = ?)")

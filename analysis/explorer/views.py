@@ -138,7 +138,7 @@ def facts(row: Row) -> list[str]:
         row["variant"] and f"{row['variant']}: {prompt}",
         ", ".join(row["levels"] or ()),
         row["rmse_mps"] is not None and f"RMSE of the speed {row['rmse_mps']:.2f} m/s",
-        row["decisions"] and f"{row['invalid']} of {row['decisions']} decisions invalid",
+        row["asked"] and f"{row['invalid']} of {row['asked']} decisions asked invalid",
         row["cost_usd"] is not None and f"{row['cost_usd']:.3f} USD",
         row["caution"] and f"Note: {row['caution']}",
     )

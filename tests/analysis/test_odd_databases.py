@@ -15,7 +15,7 @@ from tests.analysis.odd_databases import KINDS, made
 
 # What the report of a kind says, and what it must not say.
 SAID = {
-    "two_trials": (["o3/baseline: Collisions: no difference shown."], ["o3 does not drive"]),
+    "two_trials": (["o3/baseline: Collisions: inconclusive."], ["o3 does not drive"]),
     "stand_in_behind_o3": (
         [
             "A scripted stand-in answered",
@@ -26,7 +26,7 @@ SAID = {
     ),
     "another_endpoint": (["o3 at localhost:8080"], [">o3</td>"]),
     "partial_import": (["humans (129 of 990 imported)", "5 pairs"], ["are not imported"]),
-    "complete_import": (["Collisions and gap: no difference shown."], ["are not imported"]),
+    "complete_import": (["Collisions and mean gap: inconclusive."], ["are not imported"]),
     "other_vehicle_length": (["vehicle_length_m = 8.0"], []),
     "temperature": (["temperature = 0.2"], ["no temperature", "default sampling temperature"]),
     "programs": (
@@ -41,7 +41,7 @@ SAID = {
         ["No language model can be compared with humans yet.", "Trials failed"],
         ["o3 does not drive"],
     ),
-    "killed": (["o3/baseline: Collisions: no difference shown."], ["o3 does not drive"]),
+    "killed": (["o3/baseline: Collisions: inconclusive."], ["o3 does not drive"]),
     "word_for_word": (
         ["o3/baseline: 22 of 33 trials are as an earlier one to the last state; each counts"],
         ["declare no chance"],

@@ -60,7 +60,7 @@ TROUBLE = (
 )
 END = datetime(2026, 11, 21, 1)  # noqa: DTZ001 # as the database keeps times
 ROW = {"sweep_id": "s", "name": "baseline", "exit_code": 0, "trials": 1, "ended": 1, "failed": 0,
-       "others": 0, "asked": 9, "invalid": 0, "scripted": 0, "started_at": END,
+       "others": 0, "asked": 9, "invalid": 0, "faults": 0, "scripted": 0, "started_at": END,
        "ended_at": END}  # fmt: skip
 
 
@@ -267,6 +267,13 @@ def test_the_verdict_says_how_it_ended_and_what_to_type(code, ended, failed, kin
     assert run["command"] == (TYPED if goes_on else "")
     assert run_of(row, CONFIG | {"typed": []}, None)["command"] == ""
     assert run_of(row, CONFIG, None, later="later")["command"] == ""
+
+
+def test_a_finished_sweep_says_what_went_wrong_on_the_way():
+    run = run_of(ROW | {"faults": 5, "invalid": 1, "ended": 33}, CONFIG, None)
+    met = "failed attempts 5, invalid replies 1"
+    assert run["text"] == f"Finished: all 33 trials ended; on the way: {met}."
+    assert run["kind"] == "finished"
 
 
 @pytest.mark.parametrize("doubt", [{"others": 7}, {"invalid": 8}])

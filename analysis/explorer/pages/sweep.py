@@ -165,7 +165,11 @@ def assessment_of(run: Row) -> tuple[str, str]:
         row, text = run["row"], f"Finished: all {ended} trials ended"
         if why := not_judged(run["driver"], row["invalid"], row["asked"]):
             return "doubtful", f"{text}; {why}."
-        text += ", and no problems were found"
+        troubles = {"failed attempts": row["faults"], "invalid replies": row["invalid"]}
+        if met := ", ".join(f"{name} {times:,}" for name, times in troubles.items() if times):
+            text += f"; on the way: {met}"
+        else:
+            text += ", and no problems were found"
         if others := row["others"]:
             return "doubtful", f"{text}; but another model gave {others} answers."
         return "finished", f"{text}."
