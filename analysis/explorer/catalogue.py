@@ -417,7 +417,12 @@ class Catalogue:
 
     def find(self, trial_id: str, spec_hash: str = "") -> Row | None:
         """One trial; where its name stands for several, the one of that spec, or any."""
-        return next(iter(self.every({"trial_id": trial_id, "spec_hash": spec_hash})), None)
+        found = self.ask(
+            f"SELECT {SHOWN} FROM listed WHERE trial_id = ? AND spec_hash LIKE ? "  # noqa: S608 # constants
+            "ORDER BY spec_hash LIMIT 1",
+            *(trial_id, spec_hash or "%"),
+        )
+        return next(iter(found), None)
 
     def condition_texts(self) -> dict[str, str]:
         """In words: the conditions that humans drove, and those of all trials."""

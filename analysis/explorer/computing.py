@@ -184,17 +184,22 @@ def _end_with_parent() -> None:
     os._exit(0)
 
 
+def processes(number: int) -> ProcessPoolExecutor:
+    """So many processes, with the same study's plug-ins as this one."""
+    return ProcessPoolExecutor(
+        max_workers=number,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_begin,
+        initargs=(in_use().text, dict(in_use().plugins)),
+    )
+
+
 class Worker:
-    """A process that computes, with the same study's plug-ins as this one."""
+    """A process that computes."""
 
     def __init__(self, db: Path) -> None:
         self._db = db
-        self._pool = ProcessPoolExecutor(
-            max_workers=1,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_begin,
-            initargs=(in_use().text, dict(in_use().plugins)),
-        )
+        self._pool = processes(1)
         self._pid = self._pool.submit(os.getpid)
 
     def submit(self, request: Request) -> Future[dict[str, Any]]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 import shutil
 import tempfile
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from html import unescape
 from itertools import chain, count
 from pathlib import Path, PurePosixPath
@@ -20,11 +22,14 @@ import httpx
 
 from merge_runner.errors import UsageError
 from merge_runner.paths import refuse_another_kind
+from merge_runner.results.database import read_database
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR
+from merge_runner_analysis.explorer.computing import processes
 from merge_runner_analysis.explorer.guard import LOOPBACK
 from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.offline import offline, page_of_trials
+from merge_runner_analysis.explorer.pages.trial import trial_page
 from merge_runner_analysis.explorer.reading import Row
 from merge_runner_analysis.explorer.site import SCOPE, STATIC, Site
 from merge_runner_analysis.explorer.urls import query_of
@@ -41,6 +46,7 @@ FOLLOWED: dict[str, Collection[str]] = {
     "discordant": ("model", "variant"),
 }
 OF_TRIALS = ("trials", "glossary")
+OF_A_TRIAL, MOST_HELPERS = "/trials/", 4
 MOMENT = ("side", "decision")  # the script of a trial's page reads these
 POLICY = (
     "default-src 'none'; script-src 'self' file:; style-src 'self' file:; "
@@ -98,6 +104,9 @@ async def _crawl(
 ) -> None:
     """Save the pages to which links lead, as they are served, with links from file to file."""
     files, waiting = {begin: INDEX}, deque([begin])
+    # Most pages are of trials, and most of the time they are what is waited for.
+    rendering: dict[str, Future[str]] = {}
+    helpers = processes(min(os.cpu_count() or 1, MOST_HELPERS))
 
     def leads(root: str, address: str) -> str:
         """The way to the file of an address; empty where there is none."""
@@ -105,26 +114,30 @@ async def _crawl(
         if page and page not in files:
             files[page] = _file_of(page, files.values())
             waiting.append(page)
+            if page.startswith(OF_A_TRIAL):
+                rendering[page] = helpers.submit(_trial_page, site.db, page)
         return f"{root}{files[page]}{moment}" if files.get(page) else ""
 
     transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
     plain = {"accept-encoding": "identity"}
-    async with httpx.AsyncClient(
-        transport=transport, base_url=f"http://{LOOPBACK}", headers=plain
-    ) as client:
+    client = httpx.AsyncClient(transport=transport, base_url=f"http://{LOOPBACK}", headers=plain)
+    with helpers:
         while waiting:
             address = waiting.popleft()
-            reply = await client.get(address)
-            text = reply.text
-            if BUSY in text:
-                waiting.append(address)
-                await asyncio.sleep(POLL_S)
-                continue
-            if reply.is_error and reply.status_code != httpx.codes.NOT_FOUND:
-                raise UsageError(
-                    f"nothing was written: {address} answers {reply.status_code}; "
-                    "`merge-runner view` shows why"
-                )
+            if address in rendering:
+                text = await asyncio.wrap_future(rendering.pop(address))
+            else:
+                reply = await client.get(address)
+                text = reply.text
+                if BUSY in text:
+                    waiting.append(address)
+                    await asyncio.sleep(POLL_S)
+                    continue
+                if reply.is_error and reply.status_code != httpx.codes.NOT_FOUND:
+                    raise UsageError(
+                        f"nothing was written: {address} answers {reply.status_code}; "
+                        "`merge-runner view` shows why"
+                    )
             # Files come before the pages that link to them: a figure that cannot be drawn has none.
             for link in {unescape(href) for href in _FILE_LINKS.findall(text)} - files.keys():
                 if page := _page_of(link, heads)[0]:
@@ -139,6 +152,23 @@ async def _crawl(
             refuse_leaks(site.db, files[address], text)
             (stage / files[address]).write_text(text, encoding="utf-8")
             told(len(files) - len(waiting))
+
+
+@lru_cache(1)
+def _still(db: Path) -> tuple[Site, ExitStack]:
+    """The site of a process that helps, and what keeps its database open."""
+    site, kept = Site(db, is_still=True), ExitStack()
+    site.catalogue.refresh()
+    site.open = kept.enter_context(read_database(db))
+    site.open.execute("SET threads = 1")  # there are several of these
+    return site, kept
+
+
+def _trial_page(db: Path, page: str) -> str:
+    """The page of a trial, as it is served."""
+    parts = urlsplit(page)
+    name = unquote(parts.path.removeprefix(OF_A_TRIAL))
+    return trial_page(_still(db)[0], name, dict(parse_qsl(parts.query)))
 
 
 @cache  # pages link to each other

@@ -33,7 +33,7 @@ def refuse_leaks(db: Path, where: str, text: str) -> None:
         if name.endswith(_SECRET_NAMES) and len(value) >= SHORTEST_SECRET and value in text:
             raise UsageError(f"nothing was written: {where} holds the value of {name}")
     for begin, rest in _KEYS.items():
-        if begin in text and (key := re.search(rf"\b{begin}{rest}", text)):
+        if begin in text and (key := re.search(rf"{begin}(?<!\w{begin}){rest}", text)):
             raise UsageError(
                 f"nothing was written: {where} holds what looks like a key: {key[0][:6]}..."
             )

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import jinja2
+from duckdb import DuckDBPyConnection
 from starlette.responses import Response
 
 from merge_runner.errors import MergeRunnerError
@@ -84,6 +85,8 @@ class Site:
     """Who writes notes."""
     is_still: bool = False
     """Whether no news is taken in."""
+    open: DuckDBPyConnection | None = None
+    """The database, where a process does nothing but to read its trials."""
 
     def __post_init__(self) -> None:
         self._first_reading: threading.Thread | None = None

@@ -7,19 +7,21 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
+
+from duckdb import DuckDBPyConnection
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.pace import Pace, pace_of
 from merge_runner.prompts.blocks import BLOCKS, Variant, title_of
 from merge_runner.records import SIDES, Side
+from merge_runner.results.database import by_name, names_of
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.accounts import Account, Course, account
 from merge_runner_analysis.explorer.display_text import visible
-from merge_runner_analysis.explorer.reading import Row, reading, records
+from merge_runner_analysis.explorer.reading import Row, records
 
 UNKNOWN = "no meaning is known here"
 # The part of the plane that a picture of the track shows: x, y, width, height in m.
@@ -33,25 +35,9 @@ SELECT side, list(time_s ORDER BY step) AS time_s,
     list(acceleration_mps2 ORDER BY step) AS acceleration_mps2
 FROM states {ONE} GROUP BY ALL ORDER BY side
 """  # noqa: S608 # constants
-# Where a call got no answer the trial ended, and what the other driver decided is never driven.
-DECISIONS = f"""
-WITH made AS (
-    SELECT *, false AS lost FROM decisions {ONE}
-    UNION ALL BY NAME
-    SELECT DISTINCT decision, side, false AS valid, false AS fallback, true AS lost
-    FROM calls ANTI JOIN decisions USING (trial_id, spec_hash, side, decision) {ONE}
-)
-SELECT made.*, coalesce(attempts, []) AS attempts, reply, perceived
-FROM made LEFT JOIN (
-    SELECT side, decision, list(called ORDER BY attempt) AS attempts,
-        arg_max(reply, attempt) FILTER (reply IS NOT NULL) AS reply
-    FROM (SELECT * EXCLUDE request FROM calls {ONE}) AS called GROUP BY ALL
-) USING (side, decision) LEFT JOIN (
-    SELECT side, decision, any_value(seen) AS perceived
-    FROM (FROM perceptions {ONE}) AS seen GROUP BY ALL
-) USING (side, decision)
-ORDER BY decision, side
-"""  # noqa: S608 # constants
+DECISIONS = f"SELECT *, false AS lost FROM decisions {ONE}"  # noqa: S608 # constants
+CALLS = f"SELECT * EXCLUDE request FROM calls {ONE} ORDER BY attempt"  # noqa: S608 # constants
+PERCEIVED = f"FROM perceptions {ONE}"
 TASKS = f"""
 SELECT source, spec
 FROM (FROM trials {ONE}) LEFT JOIN specs USING (spec_hash)
@@ -138,7 +124,7 @@ def facts(row: Row) -> list[str]:
         row["variant"] and f"{row['variant']}: {prompt}",
         ", ".join(row["levels"] or ()),
         row["rmse_mps"] is not None and f"RMSE of the speed {row['rmse_mps']:.2f} m/s",
-        row["asked"] and f"{row['invalid']} of {row['asked']} decisions asked invalid",
+        row["asked"] and f"{row['invalid']} of {row['asked']} decisions invalid",
         row["cost_usd"] is not None and f"{row['cost_usd']:.3f} USD",
         row["caution"] and f"Note: {row['caution']}",
     )
@@ -177,13 +163,24 @@ class Trial:
         return self.paces[side].interval_steps * self.scenario.step_s
 
 
-def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
+def read_trial(connection: DuckDBPyConnection, trial_id: str, spec_hash: str) -> Trial:
     """Read a trial that is known to be there."""
     key = {"trial": trial_id, "spec": spec_hash}
-    with reading(db) as connection:
-        states, decisions, (task,) = (
-            records(connection, sql, key) for sql in (STATES, DECISIONS, TASKS)
-        )
+    states, calls, (task,) = (records(connection, sql, key) for sql in (STATES, CALLS, TASKS))
+    result = connection.execute(DECISIONS, key)
+    lost = dict.fromkeys(names_of(result)) | {"valid": False, "fallback": False, "lost": True}
+    made = {(row["decision"], row["side"]): row for row in by_name(result)}
+    for call in calls:
+        place = call["decision"], call["side"]
+        # Where it got no answer the trial ended, and what the other driver decided is never driven.
+        row = made.setdefault(place, lost | dict(zip(("decision", "side"), place, strict=True)))
+        row.setdefault("attempts", []).append(call)
+    decisions = [made[place] for place in sorted(made)]
+    is_told = any(row["other_seen"] is not None for row in decisions)
+    perceived = {
+        (row["decision"], row["side"]): row
+        for row in (records(connection, PERCEIVED, key) if is_told else ())
+    }
     told = json.loads(task["spec"] or "{}")
     scenario = scenario_of(task["source"], told.get("scenario"))
     trial = Trial(
@@ -194,6 +191,10 @@ def read_trial(db: Path, trial_id: str, spec_hash: str) -> Trial:
     )
     before: dict[str, Row] = {}
     for row in decisions:
+        row.setdefault("attempts", [])
+        replies = [call["reply"] for call in row["attempts"] if call["reply"] is not None]
+        row["reply"] = replies[-1] if replies else None
+        row["perceived"] = perceived.get((row["decision"], row["side"]))
         if row["lost"]:
             row["time_s"] = trial.end_s
         row |= {"driven": row["time_s"] < trial.end_s, "before": before.get(row["side"])}

@@ -14,6 +14,7 @@ from merge_runner.results.store import Store
 from merge_runner.scenarios.merge.collision import collided
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.reading import reading
 from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.explorer.views import collision_bounds, read_trial
 from merge_runner_analysis.human.archive import open_files
@@ -76,7 +77,8 @@ def page_of(db, number=0):
 @pytest.mark.parametrize("rule", RULES)
 def test_the_band_of_the_chart_holds_the_headways_that_collide(study_of, rule):
     db = study_of(rule)
-    trial = read_trial(db, *a_trial(db, 1))
+    with reading(db) as connection:
+        trial = read_trial(connection, *a_trial(db, 1))
     bounds = collision_bounds(trial)
     places = zip(*(samples["position_m"] for samples in trial.states.values()), strict=True)
     for bound, (left, right) in zip(bounds, places, strict=True):
@@ -153,7 +155,8 @@ def test_no_sign_stands_under_a_car_and_every_car_stands_within_the_picture(page
 
 
 def test_the_hardest_acceleration_counts_from_control_on(humans):
-    trial = read_trial(humans, *a_trial(humans))
+    with reading(humans) as connection:
+        trial = read_trial(connection, *a_trial(humans))
     samples = trial.states["left"]
     times, accelerations = samples["time_s"], samples["acceleration_mps2"]
     assert min(accelerations) == pytest.approx(-20, abs=0.1)

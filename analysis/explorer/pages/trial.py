@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from operator import itemgetter
 from typing import Any
 
@@ -94,7 +95,8 @@ def find(site: Site, trial_id: str, asked: Mapping[str, str]) -> Row:
 def found(site: Site, trial_id: str, asked: Mapping[str, str]) -> tuple[Row, views.Trial]:
     """The trial that an address names, with what was stored of it; raises NotThere."""
     row = find(site, trial_id, asked)
-    return row, views.read_trial(site.db, row["trial_id"], row["spec_hash"])
+    with nullcontext(site.open) if site.open else reading(site.db) as connection:
+        return row, views.read_trial(connection, row["trial_id"], row["spec_hash"])
 
 
 def panels(site: Site, row: Row, trial: views.Trial) -> list[Markup]:
@@ -163,7 +165,8 @@ def named(site: Site, key: str) -> Row | None:
 
 
 def _laid(site: Site, row: Row) -> dict[str, Any] | None:
-    trial = views.read_trial(site.db, row["trial_id"], row["spec_hash"])
+    with reading(site.db) as connection:
+        trial = views.read_trial(connection, row["trial_id"], row["spec_hash"])
     if not trial.states:
         return None
     return {
