@@ -11,8 +11,8 @@ from tests.analysis.studies import played
 
 WORDS = {
     "both insisted": "Both insisted: both had sped up. At 2.0 s, when one driver alone could "
-    "last have avoided it, the left vehicle was 2.5 m/s faster and the right one 2.0 "
-    "m/s faster than at the start; 0.5 m/s or more count as acting.",
+    "last have avoided it, by braking or speeding up, the left vehicle was 2.5 m/s faster and the "
+    "right one 2.0 m/s faster than at the start; 0.5 m/s or more count as acting.",
     "no action": "Neither acted.",
     "near miss": "It came close: the gap was 0.4 m at the first merge, then the time to collision "
     "fell to 0.9 s.",
