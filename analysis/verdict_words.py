@@ -122,7 +122,7 @@ MEASURES = {
             {
                 WEAKER: "leaves less gap per headway than humans",
                 STRONGER: "leaves more gap per headway than humans",
-                UNLIKE: "leaves no more gap with more headway",
+                UNLIKE: "leaves less gap per headway than humans",
             },
             decimals=2,
         ),

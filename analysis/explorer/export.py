@@ -10,7 +10,8 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import ExitStack, contextmanager
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager, suppress
 from fnmatch import fnmatchcase
 from functools import cache, lru_cache, partial
 from html import unescape
@@ -31,7 +32,7 @@ from merge_runner_analysis.explorer.leaks import refuse_leaks
 from merge_runner_analysis.explorer.offline import offline, page_of_trials
 from merge_runner_analysis.explorer.pages.trial import trial_page
 from merge_runner_analysis.explorer.reading import Row
-from merge_runner_analysis.explorer.site import SCOPE, STATIC, Site
+from merge_runner_analysis.explorer.site import SCOPE, STATIC, NotThere, Site
 from merge_runner_analysis.explorer.urls import query_of
 
 MOST = 1_000  # trials of drivers; of humans there are at most 990
@@ -86,7 +87,10 @@ def export_folder(
         if wanted:
             site.catalogue.keep([row["number"] for row in rows])
         (stage / FILES).mkdir()
-        asyncio.run(_crawl(site, begin, heads, stage, told))
+        try:
+            asyncio.run(_crawl(site, begin, heads, stage, told))
+        except BrokenProcessPool:
+            raise UsageError("nothing was written: a process that helped was ended") from None
         shutil.copytree(STATIC, stage / FILES / "static", ignore=shutil.ignore_patterns(*SERVED))
     return index
 
@@ -121,12 +125,13 @@ async def _crawl(
     transport = httpx.ASGITransport(explorer(site), raise_app_exceptions=False)
     plain = {"accept-encoding": "identity"}
     client = httpx.AsyncClient(transport=transport, base_url=f"http://{LOOPBACK}", headers=plain)
-    with helpers:
+    with ExitStack() as ends:
+        ends.callback(helpers.shutdown, cancel_futures=True)
         while waiting:
-            address = waiting.popleft()
+            address, text = waiting.popleft(), ""
             if address in rendering:
                 text = await asyncio.wrap_future(rendering.pop(address))
-            else:
+            if not text:
                 reply = await client.get(address)
                 text = reply.text
                 if BUSY in text:
@@ -165,10 +170,12 @@ def _still(db: Path) -> tuple[Site, ExitStack]:
 
 
 def _trial_page(db: Path, page: str) -> str:
-    """The page of a trial, as it is served."""
+    """The page of a trial, as it is served; empty where it is not there."""
     parts = urlsplit(page)
     name = unquote(parts.path.removeprefix(OF_A_TRIAL))
-    return trial_page(_still(db)[0], name, dict(parse_qsl(parts.query)))
+    with suppress(NotThere):
+        return trial_page(_still(db)[0], name, dict(parse_qsl(parts.query)))
+    return ""
 
 
 @cache  # pages link to each other
