@@ -128,23 +128,16 @@ async def _crawl(
     with ExitStack() as ends:
         ends.callback(helpers.shutdown, cancel_futures=True)
         while waiting:
-            address, text = waiting.popleft(), ""
-            if address in rendering:
-                text = await asyncio.wrap_future(rendering.pop(address))
-            if not text:
-                reply = await client.get(address)
-                text = reply.text
-                if BUSY in text:
-                    waiting.append(address)
-                    await asyncio.sleep(POLL_S)
-                    continue
-                if reply.is_error and reply.status_code != httpx.codes.NOT_FOUND:
-                    raise UsageError(
-                        f"nothing was written: {address} answers {reply.status_code}; "
-                        "`merge-runner view` shows why"
-                    )
+            address = waiting.popleft()
+            text = await asyncio.wrap_future(rendering.pop(address)) if address in rendering else ""
+            text = text or await _served(client, address)
+            if BUSY in text:
+                waiting.append(address)
+                await asyncio.sleep(POLL_S)
+                continue
             # Files come before the pages that link to them: a figure that cannot be drawn has none.
-            for link in {unescape(href) for href in _FILE_LINKS.findall(text)} - files.keys():
+            links = {unescape(href) for href in _FILE_LINKS.findall(text)}
+            for link in sorted(links - files.keys()):
                 if page := _page_of(link, heads)[0]:
                     file = await client.get(page)
                     files[page] = "" if file.is_error else _file_of(page, files.values())
@@ -157,6 +150,17 @@ async def _crawl(
             refuse_leaks(site.db, files[address], text)
             (stage / files[address]).write_text(text, encoding="utf-8")
             told(len(files) - len(waiting))
+
+
+async def _served(client: httpx.AsyncClient, address: str) -> str:
+    """A page as it is served, also one that says what is not there; raises UsageError."""
+    reply = await client.get(address)
+    if reply.is_error and reply.status_code != httpx.codes.NOT_FOUND:
+        raise UsageError(
+            f"nothing was written: {address} answers {reply.status_code}; `merge-runner view` "
+            "shows why"
+        )
+    return reply.text
 
 
 @lru_cache(1)

@@ -140,6 +140,27 @@ def test_the_other_is_found_by_keyboard_alone(page):
 
 
 @pytest.mark.long
+def test_an_answer_that_comes_late_does_not_replace_that_to_newer_words(page):
+    late = []
+
+    def answered(route):
+        if "q=l_4_0" in route.request.url and not late:
+            late.append(route)
+        else:
+            route.continue_()
+
+    page.goto(f"/trials/{TRIAL}")
+    page.route("**/others/**", answered)
+    page.locator("#compare").fill("l_4_0")
+    page.locator("#compare").fill("l_4_0 rep02")
+    expect(page.locator("#others option")).to_have_count(1)
+    with page.expect_response("**/others/**"):
+        late[0].continue_()
+    page.wait_for_function("() => new Promise((done) => setTimeout(() => done(true)))")
+    expect(page.locator("#others option")).to_have_count(1)
+
+
+@pytest.mark.long
 def test_offers_are_a_click_away(page):
     page.goto(f"/trials/{TRIAL}")
     page.get_by_role("button", name="next repetition").click()

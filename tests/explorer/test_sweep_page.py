@@ -304,6 +304,14 @@ def test_what_runs_and_trials_share_counts_once_over_all_runs(study):
     assert shared > 0
 
 
+def test_a_run_that_begins_while_its_page_is_made_has_counted_nothing_yet(study):
+    catalogue = Site(study).catalogue
+    catalogue.refresh()
+    counted = numbers_of(catalogue, {})
+    assert set(counted["begun since"].values()) == {0}
+    assert counted["begun since"].keys() == counted[""].keys()
+
+
 def test_a_scope_changes_what_is_counted_and_no_sentence(study):
     client = browser(study)
     whole, part = (text_of(client, f"/sweeps{scope}") for scope in ("", "?condition=N_0_0"))
