@@ -26,11 +26,12 @@ LARGE_PERCENT = 10.0  # from here on a share of collisions has no decimals
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Where a value and its interval lie; ``shape`` is one of SHAPES, ``beyond`` or ``below``."""
+    """Where a value and its interval lie, and a shape; one outside the axis is an arrow."""
 
     shape: str
     at: float | None
     ends: tuple[float, float] | None
+    arrow: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +60,8 @@ def mark(measure: Measure, values: Values) -> Mark | None:
     if value is None:
         return None if ends is None else Mark("", None, ends)
     shape = SHAPES.get(values.get("state") or "", "plain")
-    if not low <= value <= high:
-        shape = "beyond" if value > high else "below"
-    return Mark(shape, place(measure, value), ends)
+    arrow = "beyond" if value > high else "below" if value < low else ""
+    return Mark(shape, place(measure, value), ends, arrow)
 
 
 def band(measure: Measure, human: Values) -> dict[str, Any]:

@@ -174,7 +174,10 @@ def test_a_driver_stands_beside_another(tmp_path):
     site.computing = Awaited(db, InProcess)
     text = client_of(site).get("/drivers/o3?with=o4").text
     assert "<option selected>o4</option>" in text
-    assert text.count('class="o" href="#other"') >= 4
+    drawn = re.findall(r'class="o" href="#(\w+)" x="([\d.]+)%"', text)
+    assert {shape for shape, _ in drawn} == {"other", "beyond"}
+    assert ("beyond", "100.0") in drawn  # outside its axis it is an arrow, and no value at the end
+    assert ("other", "100.0") not in drawn
     assert client_of(site).get("/drivers").text.count('href="/trials?') == 2
     site.computing.close()
 
