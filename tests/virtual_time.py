@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import types
+from unittest import mock
+
+from asyncio_throttle import throttler
 
 # Loopback delivers at once, but maybe by another thread of the kernel.
 PATIENCE_S = 0.002
@@ -55,7 +59,9 @@ def in_virtual_time(test):
 
     @functools.wraps(test)
     def run(*args, **kwargs):
-        with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
+        # The throttle reads the system's clock, which the clock of a plain loop is, too.
+        clock = mock.patch.object(throttler, "time", types.SimpleNamespace(monotonic=now_s))
+        with clock, asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
             runner.run(limited(*args, **kwargs))
 
     return run

@@ -1,10 +1,7 @@
 import asyncio
-import functools
 import random
-import types
 
 import pytest
-from asyncio_throttle import throttler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,21 +10,6 @@ from merge_runner.llm.limiter import Limiter, Pause
 from tests.virtual_time import in_virtual_time, now_s
 
 MINUTE = 60.0
-
-
-def on_a_clock(test):
-    """Run a test in virtual time, which the throttle reads too."""
-
-    @functools.wraps(test)
-    def run(*args, **kwargs):
-        real = throttler.time
-        throttler.time = types.SimpleNamespace(monotonic=now_s)
-        try:
-            in_virtual_time(test)(*args, **kwargs)
-        finally:
-            throttler.time = real
-
-    return run
 
 
 class Queue:
@@ -73,7 +55,7 @@ def fullest_window(times, weights, length=MINUTE):
     return largest
 
 
-@on_a_clock
+@in_virtual_time
 async def test_no_limits_pass_everybody_at_once():
     queue = Queue(Limiter())
     for number in range(50):
@@ -84,7 +66,7 @@ async def test_no_limits_pass_everybody_at_once():
 
 
 @pytest.mark.parametrize("limits", [{}, {"rpm": 600}, {"tpm": 100}], ids=str)
-@on_a_clock
+@in_virtual_time
 async def test_the_lowest_order_goes_first_and_within_it_the_first_come(limits):
     limiter = Limiter(**limits)
     limiter.pause(1)
@@ -97,7 +79,7 @@ async def test_the_lowest_order_goes_first_and_within_it_the_first_come(limits):
     assert queue.names == sorted(queue.names)
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_late_arrival_of_an_older_trial_goes_first():
     queue = Queue(Limiter(rpm=1))
     for name in ("first", "second", "third"):
@@ -109,7 +91,7 @@ async def test_a_late_arrival_of_an_older_trial_goes_first():
 
 
 @pytest.mark.parametrize("rpm", [1, 7, 50, 245, 500])
-@on_a_clock
+@in_virtual_time
 async def test_no_window_holds_more_requests_than_the_limit(rpm):
     queue = Queue(Limiter(rpm=rpm))
     for number in range(int(rpm * 1.1) + 2):
@@ -119,7 +101,7 @@ async def test_no_window_holds_more_requests_than_the_limit(rpm):
 
 
 @pytest.mark.parametrize("rpm", [60, 500])
-@on_a_clock
+@in_virtual_time
 async def test_requests_flow_evenly_and_not_a_window_at_once(rpm):
     queue = Queue(Limiter(rpm=rpm))
     for number in range(rpm // 3):
@@ -128,7 +110,7 @@ async def test_requests_flow_evenly_and_not_a_window_at_once(rpm):
     assert fullest_window(queue.times, [1] * len(queue.times), length=1.0) <= 2 * rpm / 60
 
 
-@on_a_clock
+@in_virtual_time
 async def test_an_idle_limiter_saves_up_no_requests():
     queue = Queue(Limiter(rpm=10))
     queue.ask()
@@ -140,7 +122,7 @@ async def test_an_idle_limiter_saves_up_no_requests():
     assert fullest_window(queue.times, [1] * 31) <= 10
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_turn_that_a_pause_holds_up_is_not_one_too_many_after_it():
     limiter = Limiter(rpm=4)
     queue = Queue(limiter)
@@ -154,7 +136,7 @@ async def test_a_turn_that_a_pause_holds_up_is_not_one_too_many_after_it():
     assert fullest_window(queue.times, [1] * 9) <= 4
 
 
-@on_a_clock
+@in_virtual_time
 async def test_short_windows_work_alike():
     queue = Queue(Limiter(rpm=20, tpm=100, window_s=0.3))
     for _ in range(50):
@@ -166,7 +148,7 @@ async def test_short_windows_work_alike():
 
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 100), st.integers(0, 3), st.integers(0, 30)), max_size=30))
-@on_a_clock
+@in_virtual_time
 async def test_no_window_holds_more_tokens_than_the_limit(asked):
     queue = Queue(Limiter(tpm=100))
     for number, (tokens, order, pause) in enumerate(asked):
@@ -177,7 +159,7 @@ async def test_no_window_holds_more_tokens_than_the_limit(asked):
     assert fullest_window(queue.times, queue.tokens) <= 100
 
 
-@on_a_clock
+@in_virtual_time
 async def test_tokens_come_back_after_a_window():
     queue = Queue(Limiter(tpm=100))
     for _ in range(4):
@@ -186,7 +168,7 @@ async def test_tokens_come_back_after_a_window():
     assert queue.times == [0, 0, MINUTE, MINUTE]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_heavy_request_at_the_head_is_not_overtaken():
     queue = Queue(Limiter(tpm=100))
     for name, tokens in [("filling", 60), ("heavy", 100), ("light", 1), ("lighter", 0)]:
@@ -197,7 +179,7 @@ async def test_a_heavy_request_at_the_head_is_not_overtaken():
     assert queue.names == ["filling", "heavy", "light", "lighter"]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_settling_lower_frees_tokens_for_those_who_wait():
     queue = Queue(Limiter(tpm=100))
     settle = await queue.ask("first", 90)
@@ -209,7 +191,7 @@ async def test_settling_lower_frees_tokens_for_those_who_wait():
     assert queue.times == [0, 0]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_settling_higher_holds_others_back():
     queue = Queue(Limiter(tpm=100))
     settle = await queue.ask("first", 10)
@@ -219,7 +201,7 @@ async def test_settling_higher_holds_others_back():
     assert queue.times == [0, MINUTE]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_settling_after_the_window_changes_nothing():
     queue = Queue(Limiter(tpm=100))
     settle = await queue.ask("first", 50)
@@ -237,7 +219,7 @@ async def test_settling_after_the_window_changes_nothing():
 @given(
     st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100), st.integers(0, 90)), max_size=20)
 )
-@on_a_clock
+@in_virtual_time
 async def test_settled_tokens_are_what_counts(asked):
     """With every request settled at once, the actual tokens alone fill the window."""
     queue = Queue(Limiter(tpm=100))
@@ -252,7 +234,7 @@ async def test_settled_tokens_are_what_counts(asked):
     assert fullest_window(times, actual) <= 100
 
 
-@on_a_clock
+@in_virtual_time
 async def test_who_has_given_up_is_skipped_and_takes_no_place():
     queue = Queue(Limiter(rpm=1))
     tasks = [queue.ask(number) for number in range(5)]
@@ -264,7 +246,7 @@ async def test_who_has_given_up_is_skipped_and_takes_no_place():
     assert queue.times[-1] < 2.1 * MINUTE
 
 
-@on_a_clock
+@in_virtual_time
 async def test_who_has_given_up_holds_back_nobody_with_its_tokens():
     queue = Queue(Limiter(tpm=100))
     queue.ask("first", 90)
@@ -276,7 +258,7 @@ async def test_who_has_given_up_holds_back_nobody_with_its_tokens():
     assert queue.times == [0, 1]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_pause_holds_everybody():
     limiter = Limiter()
     queue = Queue(limiter)
@@ -288,7 +270,7 @@ async def test_a_pause_holds_everybody():
     assert queue.times == [30, 30]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_shorter_pause_does_not_end_a_longer_one():
     limiter = Limiter()
     limiter.pause(30)
@@ -301,7 +283,7 @@ async def test_a_shorter_pause_does_not_end_a_longer_one():
     assert queue.times == [40]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_pause_is_shared_by_all_limiters_of_one_key():
     shared = Pause()
     one, other, stranger = (
@@ -318,7 +300,7 @@ async def test_a_pause_is_shared_by_all_limiters_of_one_key():
     assert [queue.times for queue in (one, other, stranger)] == [[30], [30], [0]]
 
 
-@on_a_clock
+@in_virtual_time
 async def test_a_request_above_the_token_limit_is_refused_with_advice():
     limiter = Limiter(tpm=100)
     with pytest.raises(UsageError, match=r"101 tokens.*100 tokens.*--tpm"):
