@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
+from merge_runner_analysis.stats.intervals import wilson
 from merge_runner_analysis.verdict_words import (
     MEASURES,
     OPEN,
@@ -26,12 +26,13 @@ LARGE_PERCENT = 10.0  # from here on a share of collisions has no decimals
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Where a value and its interval lie, and a shape; one outside the axis is an arrow."""
+    """Where a value, its interval and 0 lie, and a shape; one outside the axis is an arrow."""
 
     shape: str
     at: float | None
     ends: tuple[float, float] | None
     arrow: str = ""
+    zero: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +65,22 @@ def mark(measure: Measure, values: Values) -> Mark | None:
     return Mark(shape, place(measure, value), ends, arrow)
 
 
-def band(measure: Measure, human: Values) -> dict[str, Any]:
+def rate(count: int, of: int) -> Mark:
+    """The mark of a share on an axis from 0 to 100 %, with its score interval; empty of none."""
+    if not of:
+        return Mark("", None, None)
+    low, high = wilson(count / of, of)
+    return Mark("plain", round(100 * count / of, 2), (round(100 * low, 2), round(100 * high, 2)))
+
+
+def band(measure: Measure, human: Values) -> Mark:
     """The humans' interval and value on the axis, and 0 where the axis has it inside."""
     value, (low, high) = human.get("estimate"), measure.ends
     if measure.margin is not None and human.get("ci") is None and value is not None:
         human = {**human, "ci": (value - measure.margin, value + measure.margin)}
     placed = mark(measure, human) or Mark("", None, None)
     zero = place(measure, 0.0) if low < 0 < high else None
-    return {"at": placed.at, "ends": placed.ends, "zero": zero}
+    return replace(placed, zero=zero)
 
 
 def cells(verdicts: dict[str, Values]) -> dict[str, Cell]:

@@ -174,10 +174,20 @@ def test_a_driver_stands_beside_another(tmp_path):
     site.computing = Awaited(db, InProcess)
     text = client_of(site).get("/drivers/o3?with=o4").text
     assert "<option selected>o4</option>" in text
-    drawn = re.findall(r'class="o" href="#(\w+)" x="([\d.]+)%"', text)
+    verdicts, _, by_condition = text.partition("In the conditions")
+    drawn = re.findall(r'class="o" href="#(\w+)" x="([\d.]+)%"', verdicts)
     assert {shape for shape, _ in drawn} == {"other", "beyond"}
     assert ("beyond", "100.0") in drawn  # outside its axis it is an arrow, and no value at the end
     assert ("other", "100.0") not in drawn
+    left_first = re.search(r"Left goes first <small>.*?</tr>", by_condition, re.DOTALL)[0]
+    with duckdb.connect(str(db), read_only=True) as connection:
+        shares = connection.execute(
+            "SELECT round(100 * avg((merged_first = 'left')::INT), 2) FROM trials "
+            "WHERE model_left = 'o3' AND merged_first IS NOT NULL GROUP BY condition"
+        ).fetchall()
+    marks = re.findall(r'class="d" href="#plain" x="([\d.]+)%"', left_first)
+    assert sorted(map(float, marks)) == sorted(share for (share,) in shares)
+    assert left_first.count('class="band"') == len(marks) == left_first.count('href="#other"')
     assert client_of(site).get("/drivers").text.count('href="/trials?') == 2
     site.computing.close()
 

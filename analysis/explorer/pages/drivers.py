@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from merge_runner_analysis.explorer.computing import Job
 from merge_runner_analysis.explorer.display_text import with_minus
+from merge_runner_analysis.explorer.marks import rate
 from merge_runner_analysis.explorer.pages.computed import computed_table
 from merge_runner_analysis.explorer.pages.home import (
     Driver,
@@ -53,12 +54,19 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
     trials = scope.trials(name, scope.prompt)
     was_asked = own and own.facts and own.facts["asked"]
     awaited, first = _first(site, name, scope) if was_asked else (None, "")
+    beside = by_name.get(asked.get("with", ""))
+    conditions = by_condition(site, scope, [one for one in (own, beside) if one])
+    # Of each condition, the humans' and the drivers' share of trials in which left goes first.
+    shares = (
+        [rate(cell["left_first"], cell["merged"]) if cell else rate(0, 0) for cell in cells]
+        for cells in (conditions["humans"], *(cells for _, cells in conditions["rows"]))
+    )
     return site.render(
         "driver.html",
         here="drivers",
         name=name,
         own=own,
-        beside=by_name.get(asked.get("with", "")),
+        beside=beside,
         others=[one for one in by_name.values() if one is not own],
         **values | {"human": humans_of(values["table"], own)},
         awaited=awaited,
@@ -72,7 +80,8 @@ def driver_page(site: Site, name: str, asked: Mapping[str, str]) -> str:
             for row in site.catalogue.counts({**trials, "outcome": "collided"}, "account")
             if row["account"]
         ],
-        conditions=by_condition(site, scope, [own] if own else []),
+        conditions=conditions,
+        rates=zip(*shares, strict=True),
         notes=noted([own] if own else []),
     )
 
