@@ -207,10 +207,11 @@ class Worker:
         return self._pool.submit(answer, self._db, request)
 
     def close(self) -> None:
-        """End it, whatever is under way."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        """End it, whatever is under way, and the thread that serves it."""
         with suppress(BrokenProcessPool, ProcessLookupError):
             os.kill(self._pid.result(), signal.SIGKILL)
+        # A thread that still ended while the program exits could make it fail.
+        self._pool.shutdown(cancel_futures=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import socket
+import threading
 from contextlib import closing
 
 import duckdb
@@ -123,6 +124,13 @@ def test_a_file_of_the_users_own_is_not_taken_for_ours(study, tmp_path, monkeypa
     with closing(Worker(study)) as worker:
         found = worker.submit(("table", "attempts")).result(timeout=60)
     assert found["counted"] > 0
+
+
+def test_a_worker_that_is_closed_leaves_no_thread_that_a_program_could_stumble_over(study):
+    before = set(threading.enumerate())
+    with closing(Worker(study)) as worker:
+        worker.submit(("table", "attempts"))
+    assert set(threading.enumerate()) <= before
 
 
 def test_a_fault_in_a_computation_does_not_stay(study):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import optimize, stats
-from scipy.special import expit
+from scipy.special import expit, log_expit
 
 from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.data.study import Study
@@ -60,9 +60,10 @@ def penalised(design, left, column, value):
 
     def loss(free):
         b = np.insert(free, column, value)
-        p = expit(design @ b)
+        log_odds = design @ b
+        p = expit(log_odds)
         information = design.T @ (design * (p * (1 - p))[:, None])
-        fit = left * np.log(p) + (1 - left) * np.log1p(-p)
+        fit = np.where(left, log_expit(log_odds), log_expit(-log_odds))
         return -(fit.sum() + np.linalg.slogdet(information)[1] / 2)
 
     how = {"method": "Nelder-Mead", "options": {"xatol": 1e-8, "fatol": 1e-11, "maxiter": 5000}}
