@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Mapping, Sequence
 
 from starlette.responses import Response
@@ -15,6 +16,8 @@ from merge_runner_analysis.explorer.queries import DOWNLOADED_ROWS, LONGEST
 from merge_runner_analysis.explorer.scope import carried, scope_of
 from merge_runner_analysis.explorer.site import Site, download
 
+# Whoever asks while the schema is listed for the first time waits for it.
+LISTING = threading.Lock()
 # Types of which values stand to the right.
 NUMBER = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE|BIGNUM|DECIMAL\(.*\)")
 
@@ -59,6 +62,8 @@ def sql_page(site: Site, asked: Mapping[str, str]) -> str:
         except MergeRunnerError as exc:
             problem = visible(str(exc))
     names = [name for name, _ in result.columns] if result else []
+    with LISTING:
+        schema = tables()
     return site.render(
         "sql.html",
         here="sql",
@@ -68,7 +73,7 @@ def sql_page(site: Site, asked: Mapping[str, str]) -> str:
         asked=is_asked,
         longest=LONGEST,
         examples=EXAMPLES,
-        tables=tables(),
+        tables=schema,
         units=units(),
         problem=problem,
         result=result,
