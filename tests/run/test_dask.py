@@ -36,6 +36,8 @@ from tests.zygote import Zygote
 SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
 # Six trials of 19 calls each.
 SIX = ("sweep", "baseline", "--reps", 2, "--conditions", "L_4_0,N_0_0,R_-4_8", "--json")
+# Fewer than the calls of two trials: no worker can end two before another one has begun.
+PASSING = 30
 ON_TWO = (*SIX, "--in-flight", 4, "--dask", "local:2")
 PAID = ("--model", "o3", "--yes", *FAST)
 
@@ -289,7 +291,7 @@ async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, sche
 async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
     merge_runner, started, tmp_path
 ):
-    gate = Gate(40, tmp_path)
+    gate = Gate(PASSING, tmp_path)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)
@@ -332,7 +334,7 @@ def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
 async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
     merge_runner, started, tmp_path
 ):
-    gate = Gate(40, tmp_path)
+    gate = Gate(PASSING, tmp_path)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*SIX, "--in-flight", 3, "--dask", "local:3", **env)
@@ -384,7 +386,7 @@ def kept_calls(folder) -> int:
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, number, tmp_path):
-    gate = Gate(40, tmp_path)
+    gate = Gate(PASSING, tmp_path)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)
