@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from merge_runner_analysis.stats.intervals import wilson
 from merge_runner_analysis.verdict_words import (
     MEASURES,
     OPEN,
@@ -67,6 +66,9 @@ def mark(measure: Measure, values: Values) -> Mark | None:
 
 def rate(count: int, of: int) -> Mark:
     """The mark of a share on an axis from 0 to 100 %, with its score interval; empty of none."""
+    # Imported here: scipy takes a second, and only a driver's page has rates.
+    from merge_runner_analysis.stats.intervals import wilson
+
     if not of:
         return Mark("", None, None)
     low, high = wilson(count / of, of)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from html import unescape
 
@@ -166,6 +168,12 @@ def test_a_drivers_page_has_its_verdicts_with_the_trials_behind_them(client, ver
         assert listed(client.get(link).text) == int(count), link
     assert client.get("/drivers/nobody").status_code == 404
     assert "990 trials" in client.get("/drivers/human").text
+
+
+def test_the_explorer_begins_without_the_libraries_of_the_statistics():
+    """They would hold up the first page by a second; the worker imports them beside it."""
+    code = "import sys, merge_runner_analysis.explorer.app; sys.exit('scipy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_a_driver_stands_beside_another(tmp_path):
