@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from functools import cache
 from typing import NamedTuple
 
 import duckdb
@@ -13,6 +12,7 @@ from merge_runner.registry import require
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.data.load import KEYS
 from merge_runner_analysis.data.reference_data import citation
+from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.names import HUMAN
 from merge_runner_analysis.tables.formats import shown_value
@@ -106,7 +106,7 @@ def sources_of(
     )
 
 
-@cache
+@remembered
 def _source(study: Study, group: Group, predicate: str, condition: str) -> Source:
     rows = _trials(study, group).sql(
         f"SELECT trial_id, {condition or 'NULL'} FROM trials WHERE {predicate} ORDER BY trial_id"  # noqa: S608 # ours
@@ -148,7 +148,7 @@ def _query(study: Study, group: Group, predicate: str, trials: tuple[str, ...]) 
     )
 
 
-@cache
+@remembered
 def _trials(study: Study, group: Group) -> duckdb.DuckDBPyConnection:
     """A connection in which ``trials`` are those of a group, with what became of their calls."""
     connection = duckdb.connect()

@@ -48,6 +48,7 @@ from merge_runner_analysis.data.load import (
     study_name,
 )
 from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
+from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.trials import judged, outcomes_with_metrics, trials_with_metrics
 from merge_runner_analysis.names import BASELINE, HUMAN
 
@@ -406,7 +407,7 @@ def _place(level: str, listed: Sequence[str]) -> tuple[int, bool, float, str]:
     return place, level not in USUAL, number, level
 
 
-@cache
+@remembered
 def in_one_study(study: Study, *groups: Group) -> bool:
     """Whether one study was played with all trials of these groups of drivers."""
     known = study.studies

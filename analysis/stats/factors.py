@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from math import isnan
 
 import pandas as pd
 
+from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study, levels_of
 from merge_runner_analysis.metrics import Metric
 from merge_runner_analysis.stats.contrasts import trials_by_cell
@@ -41,7 +41,7 @@ class Level:
         return {*self.pooled.ended["cell"]}
 
 
-@cache
+@remembered
 def levels_by_factor(study: Study, by: str = "", at: str = "") -> list[list[Level]]:
     """The levels of each factor in which the trials of drivers differ, the reference first.
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from merge_runner.records import SIDES
 from merge_runner_analysis.data.driver_words import has_chance
 from merge_runner_analysis.data.reference_data import human_outcomes
+from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study, of_trials
 from merge_runner_analysis.stats.intervals import Estimate, estimate
 from merge_runner_analysis.stats.regressions import Array, unfit_for_logit, who_first_data
@@ -63,7 +64,7 @@ def seats(group: Group) -> list[Seat]:
     return [Seat(group)] if len(group.models) == 1 else [Seat(group, side) for side in SIDES]
 
 
-@cache
+@remembered
 def first_actions(study: Study, seat: Seat) -> pd.DataFrame:
     """Return a driver's first actions in trials that ended, one row each.
 
@@ -96,7 +97,7 @@ def repeats_itself(study: Study, seat: Seat) -> bool:
     return bool((ways.size() > 1).any() and (ways.max() - ways.min() < SAME_MPS2).all())
 
 
-@cache
+@remembered
 def _stored(study: Study, seat: Seat) -> pd.DataFrame:
     columns = ["trial_id", "spec_hash", "condition", "projected_headway_m", "relative_velocity_mps",
                "pair", "ego"]  # fmt: skip

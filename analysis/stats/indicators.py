@@ -24,13 +24,13 @@ conditions, as another mix of conditions is none.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.stats.intervals import Estimate, difference, mean
 from merge_runner_analysis.stats.regressions import (
@@ -95,7 +95,7 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Verdict:
     return Verdict(fit.equivalence_p < ALPHA)
 
 
-@cache
+@remembered
 def gains(study: Study, group: Group) -> pd.DataFrame:
     """One row a finished trial: condition, pair, ``steady`` (nobody acted), and ``gain`` or NaN."""
     trials = group.finished[["trial_id", "condition", "pair"]]
@@ -167,7 +167,7 @@ class Fits(NamedTuple):
     hc3: Regression
 
 
-@cache
+@remembered
 def fits(group: Group) -> Fits:
     """Fit a group's trials; without gaps the linear fits say so."""
     logit, firth = who_first_logit(group.outcomes), who_first_firth(group.outcomes)
@@ -217,7 +217,7 @@ def total(judged: dict[str, Verdict]) -> str | None:
     return f"{sum(known)} of {len(known)}" if known else None
 
 
-@cache
+@remembered
 def score(study: Study, group: Group) -> Score:
     """Judge a group's indicators."""
     fit = fits(group)

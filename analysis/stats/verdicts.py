@@ -15,10 +15,10 @@ leaves 0 out.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.reference_data import PAIRS, published
+from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import BOXES, GAP
 from merge_runner_analysis.stats import intervals
@@ -96,7 +96,7 @@ class Comparison:
     p_holm: float | None = None
 
 
-@cache
+@remembered
 def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     """Compare a driver with the humans by every measure."""
     # Conditions that no human drove would pass for another behaviour.
@@ -112,7 +112,7 @@ def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     return tuple(replace(one, p_holm=next(holm) if one.difference else None) for one in found)
 
 
-@cache
+@remembered
 def of_humans(study: Study) -> dict[str, Known]:
     """The humans by measure, over all conditions."""
     return {name: _human(study, study.human, name) for name in MEASURES}
@@ -221,7 +221,7 @@ def _gap(group: Group, like: Group) -> Known:
     return Known(found, problem if found.se is None else "")
 
 
-@cache
+@remembered
 def _slope(group: Group, name: str) -> Known:
     """A slope of who goes first by Firth's fit."""
     fit = fits(group).firth

@@ -15,7 +15,7 @@ from merge_runner_analysis.data.derived_cache import (
     options_text,
     present_state,
 )
-from merge_runner_analysis.tables.formats import value_rows
+from merge_runner_analysis.tables.formats import names_of, value_rows
 from merge_runner_analysis.tables.model import Row, Table, from_text, to_text
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def table(study: Study | Path | str, name: str) -> pd.DataFrame:
 
     read = study if isinstance(study, Study) else Study(study)
     (made,) = make_tables(read, [name])
-    frame = pd.DataFrame(value_rows(made)).set_index("row")
+    frame = pd.DataFrame(value_rows(made), columns=names_of(made)).set_index("row")
     # Of a column without a value pandas cannot tell the type.
     missing = [name for name in frame if frame[name].isna().all()]
     return frame.astype(dict.fromkeys(missing, "float64"))

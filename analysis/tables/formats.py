@@ -100,8 +100,7 @@ def as_csv(table: Table) -> str:
     """A table's values at full precision; an interval takes two columns."""
     out = io.StringIO()
     writer = csv_writer(out)
-    names = [name for column in table.columns for name in value_names(column)]
-    writer.writerow(["row", *names, "note"])
+    writer.writerow(names_of(table))
     for row in value_rows(table):
         # repr is the shortest text that reads back as the same float; float() strips NumPy's type.
         writer.writerow(
@@ -124,6 +123,11 @@ def as_json(table: Table) -> dict[str, object]:
         "rows": value_rows(table),
         "notes": list(table.notes),
     }
+
+
+def names_of(table: Table) -> list[str]:
+    """The names of what ``value_rows`` gives of each row."""
+    return ["row", *(name for column in table.columns for name in value_names(column)), "note"]
 
 
 def value_names(column: Column) -> tuple[str, ...]:

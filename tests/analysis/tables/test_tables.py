@@ -24,8 +24,9 @@ from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.stats.indicators import score
 from merge_runner_analysis.stats.intervals import proportion
 from merge_runner_analysis.tables import TABLES, make_tables
+from merge_runner_analysis.tables import table as table_of
 from merge_runner_analysis.tables.against import against
-from merge_runner_analysis.tables.formats import as_text, render
+from merge_runner_analysis.tables.formats import as_csv, as_text, render
 from merge_runner_analysis.tables.model import Column, Row, Table
 from tests.analysis.studies import Drive, changed, write_study, yielding
 from tests.harness import PROJECT
@@ -145,6 +146,12 @@ def test_every_form_holds_the_same_values(tables):
         assert latex.count("{") == latex.count("}")
         assert len(text) >= len(table.rows) + 3
         assert "nan" not in "\n".join(text).lower()
+
+
+def test_a_table_without_rows_is_a_frame_with_its_columns(small):
+    frame = table_of(small, "factors")
+    assert frame.empty
+    assert [frame.index.name, *frame] == as_csv(make_tables(small, ["factors"])[0]).split(",")
 
 
 def test_several_csv_tables_carry_their_names(study):
