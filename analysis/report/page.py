@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator
+from datetime import datetime
 from difflib import unified_diff
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 import jinja2
 import pandas as pd
-from markupsafe import Markup
+from pandas.api.types import is_string_dtype
 
 from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
@@ -135,7 +137,7 @@ def report_html(study: Study, tables: list[Table], figures: dict[str, str]) -> s
         command=sql_command(study),
         libraries=", ".join(f"{name} {version(name)}" for name in LIBRARIES),
         origin=origin,
-        plain=_plain,
+        shown_plainly=_plain,
         readings=published("readings"),
         cited=published("sources"),
         program=program(),
@@ -181,17 +183,33 @@ def _changes(baseline: str, prompt: str) -> str:
     return "\n".join(line for line in lines if not line.startswith(("---", "+++", "@@")))
 
 
-def _plain(rows: pd.DataFrame) -> Markup:
-    """Rows of the database as HTML, under the names of their columns."""
-    named = rows.convert_dtypes().rename(
-        columns=lambda name: name.replace("_usd", " (USD)").replace("_", " ")
-    )
-    with pd.option_context("display.max_colwidth", None):
-        return Markup(  # noqa: S704 # pandas escapes it
-            named.to_html(
-                border=0, index=False, na_rep="", classes="plain", float_format="{:.6g}".format
-            )
+class PlainColumn(NamedTuple):
+    """A column of rows of the database as a reader sees it; only ``text`` may be wrapped."""
+
+    name: str
+    text: bool
+    cells: list[str]
+
+
+def _plain(rows: pd.DataFrame) -> list[PlainColumn]:
+    found = rows.convert_dtypes()
+    return [
+        PlainColumn(
+            str(name).replace("_usd", " (USD)").replace("_", " "),
+            is_string_dtype(found[name]),
+            ["" if pd.isna(value) else _shown(value) for value in found[name]],
         )
+        for name in found
+    ]
+
+
+def _shown(value: object) -> str:
+    match value:
+        case float():
+            return f"{value:.6g}"
+        case datetime():
+            return f"{value:%Y-%m-%d %H:%M:%S}"
+    return str(value)
 
 
 def alarms(study: Study, origin: Provenance) -> dict[str, str]:

@@ -56,7 +56,7 @@ VERDICT_COLUMNS = (
     Optional("p_holm", "Holm", "p", 3, "corrected over the measures of the driver"),
     Optional("detectable", "detectable", "number", 2, "smallest difference found with power .8"),
     Optional("state", "verdict", meaning="what is shown"),
-    Optional("rule", "rule", meaning="how the verdict is set"),
+    Optional("rule", "rule", meaning="how the verdict is set", noted=True),
 )
 WITHIN = (
     "compared within the {} that both have: rates by the weights of Mantel and Haenszel, with "

@@ -197,8 +197,12 @@ def printed(table: Table, row: Row) -> dict[str, str]:
 
 
 def shown_columns(table: Table) -> list[Column]:
-    """The columns with at least one value."""
-    return [c for c in table.columns if any(r.values.get(c.name) is not None for r in table.rows)]
+    """The columns with at least one value that the notes do not say."""
+    return [
+        column
+        for column in table.columns
+        if not column.noted and any(row.values.get(column.name) is not None for row in table.rows)
+    ]
 
 
 def notes_of(table: Table) -> list[str]:

@@ -29,7 +29,7 @@ class Column:
 
     ``meaning`` describes its values in words. ``counts`` is the SQL condition, beside the row's, of
     the trials that a share or a count counts. If ``optional``, a value may be missing without a
-    note.
+    note. One that is ``noted`` stands in the values alone: the notes say it to a reader.
     """
 
     name: str
@@ -39,6 +39,7 @@ class Column:
     meaning: str = ""
     counts: str = ""
     optional: bool = False
+    noted: bool = False
 
 
 Optional = partial(Column, optional=True)
