@@ -6,7 +6,7 @@ What a driver is told of that state may be late, with errors, missing now and th
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from itertools import takewhile
@@ -46,7 +46,7 @@ async def play_trial(
     """Play a trial to its end, or until a call fails.
 
     Drivers are asked at once, or ``in_turn`` where their answers are there already. Raises
-    UsageError for a decision that cannot be driven.
+    UsageError for a decision that cannot be driven, and what a driver raises but CallFailed.
     """
     # Each side starts as its own driver says, or else as the other's does.
     given = {side: d.starts for side, d in drivers.items() if hasattr(d, "starts")}
@@ -61,7 +61,7 @@ async def play_trial(
         if in_turn or len(due) < 2:  # both
             answers = [await seat.ask() for seat in due]
         else:
-            answers = await asyncio.gather(*(seat.ask() for seat in due))
+            answers = await _ask_at_once(due)
         for seat, answer in zip(due, answers, strict=True):
             number, side = world.step // seat.interval, seat.side
             if isinstance(answer, CallFailed):
@@ -84,6 +84,18 @@ async def play_trial(
         decisions=tuple(decisions),
         failed_calls=tuple(failed_calls),
     )
+
+
+async def _ask_at_once(seats: Sequence[_Seated]) -> list[Decision | CallFailed]:
+    """Ask drivers side by side; where one raises, no other goes on when this returns."""
+    asking = [asyncio.create_task(seat.ask()) for seat in seats]
+    try:
+        return await asyncio.gather(*asking)
+    finally:
+        if left := [task for task in asking if not task.done()]:
+            for task in left:
+                task.cancel()
+            await asyncio.gather(*left, return_exceptions=True)
 
 
 class _Seated:

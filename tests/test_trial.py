@@ -9,7 +9,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import model_pace, program_pace
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import CallFailed, UsageError
+from merge_runner.errors import CallFailed, SweepStopped, TrialSuspended, UsageError
 from merge_runner.records import SIDES, Attempt, ChatRequest, Decision, Slot, TrialSpec
 from merge_runner.trial import play_trial
 
@@ -85,6 +85,20 @@ class Meeting(Holding):
         await asyncio.sleep(0)  # lets every other task begin, and none that nobody has made
         self.met.append(self.other.asked == self.asked)
         return await super().decide(observation, number)
+
+
+class Waiting(Holding):
+    """Waits for ever, and notes when it is given up."""
+
+    given_up = False
+
+    async def decide(self, observation, number):
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            await asyncio.sleep(0)
+            self.given_up = True
+            raise
 
 
 class Failing(Holding):
@@ -364,3 +378,26 @@ class Short:
 async def test_a_decision_that_cannot_be_driven_is_refused_in_one_line():
     with pytest.raises(UsageError, match=r"the left driver decided on \(0.5,\), and is to drive 5"):
         await play(Short(), Short())
+
+
+@pytest.mark.parametrize("kind", [TrialSuspended, SweepStopped, UsageError, KeyError])
+@pytest.mark.parametrize("first", SIDES)
+async def test_a_trial_that_is_left_takes_its_other_driver_with_it(kind, first):
+    error, waiting = kind("no more"), Waiting(0.0)
+    drivers = {first: Failing(0.0, at=0, error=error)}
+    drivers = {side: drivers.get(side, waiting) for side in SIDES}
+    with pytest.raises(kind) as told:
+        await play(**drivers)
+    assert told.value is error
+    assert waiting.given_up
+
+
+async def test_a_trial_that_is_cancelled_takes_both_drivers_with_it():
+    drivers = Waiting(0.0), Waiting(0.0)
+    trial = asyncio.create_task(play(*drivers))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    trial.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await trial
+    assert [driver.given_up for driver in drivers] == [True, True]

@@ -72,12 +72,13 @@ class Wait:
     """What a call waits for, and until when (UTC); None: until it happens.
 
     It is ``idle`` where what it waits for does not happen by itself: an answer that makes room, or
-    that is somebody else's.
+    that is somebody else's. It is ``paid`` where the answer may be charged already.
     """
 
     what: str
     until: datetime | None = None
     idle: bool = False
+    paid: bool = False
 
 
 @dataclass(slots=True, eq=False)
@@ -160,8 +161,8 @@ class LlmClient:
     ``batch_price`` as a share of the plain one, or its calls may wait already.
 
     ``under_way`` are the calls of all clients of a run by key. A call is shared by all who ask for
-    its key, and goes on when they are cancelled, so that what is paid for is kept; ``drain`` waits
-    for it.
+    its key. Where they are all cancelled, one that may be paid for goes on, so that its answer is
+    kept, and ``drain`` waits for it; one that still waits for its turn is given up.
     """
 
     name: str
@@ -219,14 +220,18 @@ class LlmClient:
             raise ReplayMiss("no recorded reply", request)
         if reply is None:
             # The attempts are counted once, for whoever asked first.
-            shared = request.key in self.under_way
-            call = self.under_way[request.key] if shared else self._start(request, order)
+            call = self.under_way.get(request.key)
+            shared = call is not None and not call.task.cancelling()
+            if call is None or not shared:
+                call = self._start(request, order)
             call.asking += 1
             try:
                 # Shielded: the call may be paid for already when its trial is cancelled.
                 reply = await asyncio.shield(call.task)
             finally:
                 call.asking -= 1
+                if not call.asking and call.wait is not None and not call.wait.paid:
+                    call.task.cancel()  # or it would take money for a trial that is left
             if shared:
                 reply = replace(reply, earlier=len(reply.attempts))
         self._count(reply)
@@ -270,12 +275,20 @@ class LlmClient:
 
     @contextmanager
     def _waiting(
-        self, call: Call, what: str, until: datetime | None = None, *, idle: bool = False
+        self,
+        call: Call,
+        what: str,
+        until: datetime | None = None,
+        *,
+        idle: bool = False,
+        paid: bool = False,
     ) -> Iterator[None]:
         """Mark a call as waiting, so that it can be given up: nothing of it is in flight."""
         if self._stopping:
             raise CallFailed("the sweep was stopped", call.request)
-        call.wait = Wait(what, until, idle)
+        if not (call.asking or paid):
+            raise CallFailed("its trial was left", call.request)
+        call.wait = Wait(what, until, idle, paid)
         try:
             yield
         finally:
@@ -318,7 +331,8 @@ class LlmClient:
         self.under_way[request.key] = call
 
         def forget(done: asyncio.Task[ChatReply]) -> None:
-            del self.under_way[request.key]
+            if self.under_way[request.key] is call:  # it is not asked anew meanwhile
+                del self.under_way[request.key]
             if not done.cancelled():
                 done.exception()  # retrieved, since all who asked may be gone by now
 
@@ -437,7 +451,7 @@ class LlmClient:
             if rounds is None or singly:
                 outcome, record = await self._send(call, paid)
                 return await self._concluded(call, paid, outcome, record)
-            with self._waiting(call, f"for batches of {self.model}", idle=True):
+            with self._waiting(call, f"for batches of {self.model}", idle=True, paid=True):
                 outcome, batch = await rounds.ask(call, paid, self.model)
             call.open, call.singly = None, True
             record, raw = self._record(call, outcome, batch.note.submitted_at), outcome.raw

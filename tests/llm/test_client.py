@@ -409,6 +409,54 @@ async def test_one_of_two_who_gives_up_does_not_take_the_answer_from_the_other(m
 
 
 @in_virtual_time
+async def test_a_call_that_nobody_waits_for_any_more_takes_neither_a_turn_nor_money(make, cache):
+    limiter = Limiter()
+    client = make(answer(), limiter=limiter, cap=1.0, price=PRICE)
+    limiter.pause(300)
+    asked = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    asked.cancel()
+    await ticks()
+    assert (client.waits, client.money.queued_usd) == ([], 0)
+    again = asyncio.create_task(client.ask("prompt", slot()))
+    assert (await again).text == "M", "it can be asked anew"
+    assert (now_s(), len(client.transport.sent)) == (300, 1)
+
+
+@in_virtual_time
+async def test_who_asks_anew_for_a_call_that_is_just_given_up_gets_an_answer(make):
+    limiter = Limiter()
+    client = make(answer(), limiter=limiter)
+    limiter.pause(300)
+    asked = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    (call,) = client.under_way.values()
+    asked.cancel()
+    for _ in range(20):
+        if not call.task.cancelling():
+            await asyncio.sleep(0)
+    assert not call.task.done()
+    assert (await client.ask("prompt", slot())).text == "M"
+    assert client.under_way == {}
+
+
+@in_virtual_time
+async def test_a_call_in_flight_that_nobody_waits_for_any_more_is_not_tried_again(make, cache):
+    client = make(error(503), answer())
+    client.transport.open.clear()
+    asked = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    (call,) = client.under_way.values()
+    asked.cancel()
+    await ticks()
+    client.transport.open.set()
+    await asyncio.wait([call.task])
+    assert len(client.transport.sent) == 1
+    (attempts,) = cache.all_unanswered().values()
+    assert outcomes(attempts) == ["overloaded"]
+
+
+@in_virtual_time
 async def test_drain_gives_up_calls_that_wait_for_their_turn(make, cache):
     limiter = Limiter()
     client = make(answer(), limiter=limiter)
