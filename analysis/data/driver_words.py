@@ -18,6 +18,11 @@ def language_models(names: Mapping[Side, str], spec: Mapping[str, Any]) -> dict[
     return {side: name for side, name in names.items() if "program" not in (spec.get(side) or {})}
 
 
+def programs_alone(spec: Mapping[str, Any]) -> bool:
+    """Return whether programs drive on both sides, so that no language model samples."""
+    return all("program" in (spec.get(side) or {}) for side in SIDES)
+
+
 def has_chance(spec: Mapping[str, Any], sides: Collection[Side] = SIDES) -> bool:
     """Return whether drivers of a spec, or what they perceive, are drawn by chance.
 

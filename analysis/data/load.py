@@ -70,14 +70,17 @@ ORDER BY trial_id, spec_hash
 TRIALS = _TRIALS.format(which="source <> 'seat'")
 # First situations that were only asked: equal columns, of trials that end before a second decision.
 ASKED_TRIALS = _TRIALS.format(which="source = 'seat'")
-# Of each driven trial that ended a hash of its states, as its ego sees them: equal ones went the
-# same way.
+# Of each driven trial that ended a hash of its states, as its ego sees them, and of what its
+# outcome and its gap depend on beside these: equal ones went the same way.
 TRACES = """
-SELECT trial_id, spec_hash, sum(hash(step, if(side = ego, 'left', 'right'), position_m,
-    velocity_mps))::VARCHAR AS trace
-FROM states JOIN trial_drivers USING (trial_id, spec_hash)
-SEMI JOIN (FROM trials WHERE source <> 'human' AND status <> 'failed')
-USING (trial_id, spec_hash) GROUP BY ALL
+SELECT trial_id, spec_hash, concat_ws(' ', trace, status, spec->>'$.scenario.vehicle_length_m',
+    spec->>'$.scenario.vehicle_width_m') AS trace
+FROM (
+    SELECT trial_id, spec_hash, sum(hash(step, if(side = ego, 'left', 'right'), position_m,
+        velocity_mps)) AS trace
+    FROM states JOIN trial_drivers USING (trial_id, spec_hash) GROUP BY ALL
+) JOIN trials USING (trial_id, spec_hash) LEFT JOIN specs USING (spec_hash)
+WHERE source <> 'human' AND status <> 'failed'
 """
 # One row a vehicle: its speeds under control, and whether the simulator slowed it by itself. It
 # cruises until its first decision; those of humans are not on record.

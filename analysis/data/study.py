@@ -27,6 +27,7 @@ from merge_runner_analysis.data.derived_cache import options_text, present_state
 from merge_runner_analysis.data.driver_words import (
     has_chance,
     language_models,
+    programs_alone,
     stand_in,
     unresponsive,
 )
@@ -82,9 +83,9 @@ class Group:
     name the driver, ``models`` are the names that were asked for, the ego's first, an equal one
     once, ``seats`` are how many of the trials have the ego on the left and on the right, ``posing``
     is what is said of a scripted stand-in, and ``caution`` of a human who is replayed: such trials
-    are not judged. The ``trials`` of a deterministic driver are distinct, and ``whole`` is the
-    group with their repetitions; ``equal`` counts the trials of a language model that went as an
-    earlier one.
+    are not judged. The ``trials`` of programs are distinct, and ``whole`` is the group with their
+    copies; ``equal`` counts the trials of a language model that went as an earlier one. The column
+    ``way`` is equal in copies: trials of programs that are equal state by state.
     ``unjudged`` says why nothing is concluded from them, and is empty where something is.
     ``published_outcomes`` are those of humans, which imported trials do not replace.
     """
@@ -124,7 +125,7 @@ class Group:
 
     @property
     def repeated(self) -> int:
-        """How many trials of a deterministic driver are left out as repetitions."""
+        """How many trials of programs are left out as copies of an earlier one."""
         return len(self.stored.trials) - len(self.trials)
 
     @property
@@ -507,8 +508,12 @@ def _model_groups(
         reasons = (not_judged(row.Index, row.invalid, row.asked) for row in counts.itertuples())
         group = _model_group(trials.loc[rows.index], rows.iloc[0])
         group = replace(group, unjudged="; ".join(filter(None, reasons)))
-        chance = any(has_chance(specs.get(name, {})) for name in rows["spec_hash"].unique())
-        groups.append(_distinct(group, chance=chance))
+        own = [specs.get(name, {}) for name in rows["spec_hash"].unique()]
+        # Of a first decision that was only asked, what follows is not known: draws that differ
+        # later may be equal until then.
+        only_asked = rows["source"].iloc[0] == "seat" and any(map(has_chance, own))
+        programs = all(map(programs_alone, own)) and not only_asked
+        groups.append(_distinct(group, programs=programs))
     return sorted(groups, key=lambda g: (g.scripted, g.driver, g.setting != BASELINE, g.setting))
 
 
@@ -535,19 +540,17 @@ def _model_group(rows: pd.DataFrame, first: pd.Series) -> Group:
     return replace(group, label=f"{driver} ({group.said})") if group.said else group
 
 
-def _distinct(group: Group, *, chance: bool) -> Group:
-    """The group with its equal trials counted, or left out where its drivers have no chance.
-
-    They declare it, and their repetitions do not contradict it.
-    """
+def _distinct(group: Group, *, programs: bool) -> Group:
+    """The group without copies, if only programs drive; of a language model they are counted."""
     rows = group.trials
     ended = rows[rows["trace"].notna()].sort_values(["rep", "ego"], kind="stable")
     again = ended.index[ended.duplicated(["condition", "trace"])]
-    ways = rows.groupby(["condition", "ego"])["trace"].nunique()
-    if again.empty or chance or (ways > 1).any():
-        program = rows["source"].iloc[0] == "driver"
-        return replace(group, equal=0 if program else len(again))
-    return replace(group, trials=rows.drop(index=again), whole=group)
+    each = rows["trial_id"] + " " + rows["spec_hash"]
+    rows = rows.assign(way=rows["trace"].fillna(each) if programs else each)
+    if not programs:
+        return replace(group, trials=rows, equal=len(again))
+    whole = replace(group, trials=rows)
+    return replace(whole, trials=rows.drop(index=again), whole=whole) if len(again) else whole
 
 
 def _marks(keyed: pd.DataFrame, within: list[str], what: str) -> pd.Series:

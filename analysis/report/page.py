@@ -52,8 +52,9 @@ MEANINGS = {
     "the paper's row of that model.",
     "Too few valid decisions": "What was driven is mostly not what the model decided: no value, "
     "test or conclusion rests on these trials.",
-    "Trials repeat earlier ones": "Where a cache on the way answered, or the "
-    "temperature is 0, they are no samples, and intervals and tests claim too much.",
+    "Trials repeat earlier ones": "Copies of programs add nothing to any n, interval or test. "
+    "Where a cache answered a language model on the way, or its temperature is 0, equal trials are "
+    "no samples, and intervals and tests claim too much.",
     "Trials failed": "They are in no measure; the same sweep again plays them anew.",
     "Many fallbacks": "There the older plan was driven, or none: tables --without-fallbacks shows "
     "whether that changes the results.",
@@ -222,6 +223,32 @@ def alarms(study: Study, origin: Provenance) -> dict[str, str]:
     }
 
 
+def _repeats(study: Study) -> Iterator[str]:
+    """Which drivers have equal trials, at one level of their factors or at several."""
+    by_name: dict[str, list[pd.DataFrame]] = {}
+    for group in study.played:
+        by_name.setdefault(group.name, []).append(group.trials)
+        if group.repeated:
+            yield (
+                f"{group.id}: {group.repeated} of {len(group.stored.trials)} trials of programs "
+                "are as an earlier one to the last state; they are left out"
+            )
+        if group.equal:
+            yield (
+                f"{group.id}: {group.equal} of {len(group.trials)} trials are as an earlier one to "
+                "the last state; each counts"
+            )
+    for name, parts in by_name.items():
+        every = pd.concat(parts)
+        distinct = len(every.drop_duplicates(["condition", "way"]))
+        if distinct < len(every):
+            yield (
+                f"{name}: {distinct} of {len(every)} trials of programs at different levels of "
+                "factors are distinct; each counts once where levels are pooled, and copies are "
+                "not compared"
+            )
+
+
 def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
     for one in origin.mismatches.itertuples():
         answers = f"{one.answers} answer{'s' * (one.answers != 1)}"
@@ -236,12 +263,6 @@ def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
         # A mock model's own name is honest.
         if group.scripted and MOCKS.isdisjoint(group.models):
             yield "A scripted stand-in answered", f"{group.id}: {group.posing}"
-        if group.equal:
-            yield (
-                "Trials repeat earlier ones",
-                f"{group.id}: {group.equal} of {trials} trials are as an earlier one to the last "
-                "state; each counts",
-            )
         if failed := counts["failed"]:
             reasons = group.trials["error"].dropna()
             why = reasons.mode().get(0, "no reason is stored")
@@ -255,6 +276,7 @@ def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
         if counts["unknown"]:
             said = f"{counts['unknown']} of {counts['attempts']} of {group.id}"
             yield "Attempts of unknown fate", said
+    yield from (("Trials repeat earlier ones", text) for text in _repeats(study))
     for marked in names.values():
         if len(marked) > 1:
             yield "Several settings under one name", ", ".join(marked)

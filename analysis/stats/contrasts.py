@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import permutations
 
 import numpy as np
 import pandas as pd
@@ -156,8 +157,8 @@ def contrast(
     """The first of two groups minus the second, within the cells that both have.
 
     Of four groups it is how far the difference of the first two differs from that of the others, in
-    the cells that all have. None where these are of several studies, share no cell or have
-    undecided trials; and for medians, which have no test.
+    the cells that all have. None where these are of several studies, share no cell or none but
+    copied ones, or have undecided trials; and for medians, which have no test.
     """
     frames = trials_by_cell(study, groups, metric, cell, shared=len(groups) > 2)
     if metric.estimator == "median" or not frames:
@@ -181,14 +182,36 @@ def trials_by_cell(
 ) -> list[pd.DataFrame]:
     """The trials of each group with a measure, their cell as ``condition``, perhaps as all have.
 
-    Nothing where the groups are of several studies or have undecided trials.
+    Copied cells are left out. Nothing where the groups are of several studies or have undecided
+    trials.
     """
     if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
         return []
     every = [trials_of(group, metric).dropna(subset=[metric.column]) for group in groups]
     every = [frame.assign(condition=frame[cell]) for frame in every]
     kept = (set.intersection if shared else set.union)(*(set(one["condition"]) for one in every))
+    kept -= copied_cells(every)
     return [frame[frame["condition"].isin(kept)] for frame in every]
+
+
+def copied_cells(frames: Sequence[pd.DataFrame]) -> set[object]:
+    """The cells in which all trials of one group are copies of another's: programs play them.
+
+    They differ by nothing, by construction, so that nothing can be tested there.
+    """
+    ways = [frame.groupby("condition")["way"].agg(set) for frame in frames]
+    return {
+        cell
+        for one, other in permutations(ways, 2)
+        for cell in one.index.intersection(other.index)
+        if one[cell] <= other[cell]
+    }
+
+
+def same_trials(frames: Sequence[pd.DataFrame]) -> bool:
+    """Whether groups share cells, and all of these are copied ones."""
+    shared = set.intersection(*({*frame["condition"]} for frame in frames))
+    return bool(shared) and shared <= copied_cells(frames)
 
 
 def corrected(p: list[float]) -> list[float]:

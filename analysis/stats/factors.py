@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import isnan
 
 import pandas as pd
 
+from merge_runner.text_safety import quoted
 from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study, levels_of
 from merge_runner_analysis.metrics import Metric
-from merge_runner_analysis.stats.contrasts import trials_by_cell
+from merge_runner_analysis.stats.contrasts import same_trials, trials_by_cell
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A level of a factor: the ids of its groups, and their trials as one group.
+    """A level of a factor: the ids of its groups, and their trials as one group without copies.
 
-    The trials have a column ``cell``: their condition and the levels of all other factors.
+    The trials have a column ``cell``: their condition and the levels of all other factors. Cells
+    in which programs play the same trials are one cell. ``pooled.whole`` has the copies, too.
     ``posing`` is what is said of scripted stand-ins; the ``mark`` tells their level from others'.
     ``at`` is the level of another factor that all of its trials have, if it is shown by that one.
     """
@@ -40,6 +43,17 @@ class Level:
         """The cells of its trials that ended."""
         return {*self.pooled.ended["cell"]}
 
+    @property
+    def predicate(self) -> str:
+        """SQL that is true of the trials of its groups but for copies; empty where none is one."""
+        whole = self.pooled.stored.trials
+        copies = whole.drop(index=self.pooled.trials.index)
+        named = [
+            f"({quoted(row.trial_id)}, {quoted(row.spec_hash)})"
+            for row in copies[copies["group"].isin(self.groups)].itertuples()
+        ]
+        return f"(trial_id, spec_hash) NOT IN ({', '.join(named)})" if named else ""
+
 
 @remembered
 def levels_by_factor(study: Study, by: str = "", at: str = "") -> list[list[Level]]:
@@ -52,7 +66,7 @@ def levels_by_factor(study: Study, by: str = "", at: str = "") -> list[list[Leve
     kinds = [[g for g in chosen if g.scripted == scripted] for scripted in (False, True)]
     apart = any(g.scripted for g in study.models) and not all(g.scripted for g in study.models)
     return [
-        [_level(groups, factor, name, by, apart=apart) for name in levels]
+        _distinct([_level(groups, factor, name, by, apart=apart) for name in levels])
         for groups in kinds
         for factor, levels in levels_of(groups, study.order).items()
         if len(levels) > 1
@@ -66,13 +80,50 @@ def _level(every: list[Group], factor: str, name: str, by: str, *, apart: bool) 
         others = [f"{n}={level}" for n, level in group.levels.items() if n not in (factor, by)]
         others += [group.mark.strip()] * bool(group.mark)  # another setting of the task
         cells = [(condition, *others) for condition in group.trials["condition"]]
-        parts.append(group.trials.assign(cell=pd.Series(cells, group.trials.index, dtype=object)))
+        cells_of = pd.Series(cells, group.trials.index, dtype=object)
+        parts.append(group.trials.assign(cell=cells_of, group=group.id))
     pooled = replace(groups[0], trials=pd.concat(parts, ignore_index=True))
     said = {group.posing for group in groups}
     posing = said.pop() if len(said) == 1 else "scripted stand-ins"
     mark = " [scripted]" if apart and posing else ""
     at = f"{by}={groups[0].levels[by]}" if by else ""
     return Level(factor, name, tuple(group.id for group in groups), pooled, posing, mark, at)
+
+
+def _distinct(levels: list[Level]) -> list[Level]:
+    """The levels, each without copies of trials, and with the cells that share these as one."""
+    names: dict[tuple[str, ...], tuple[str, ...]] = {}
+
+    def first(cell: tuple[str, ...]) -> tuple[str, ...]:
+        while (before := names.get(cell, cell)) != cell:
+            cell = before
+        return cell
+
+    for level in levels:
+        for _, cells in level.pooled.trials.groupby(["condition", "way"])["cell"]:
+            same = sorted({first(cell) for cell in cells})
+            names |= dict.fromkeys(same[1:], same[0])
+    return [_without_copies(level, first) for level in levels]
+
+
+def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Level:
+    every = level.pooled.trials
+    every = every.assign(cell=pd.Series([first(cell) for cell in every["cell"]], dtype=object))
+    kept = every.drop_duplicates(["condition", "way"])
+    pooled = replace(level.pooled, trials=kept, whole=replace(level.pooled, trials=every))
+    return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)
+
+
+def copied(levels: Sequence[Level], metric: Metric) -> bool:
+    """Whether levels hold the same trials of programs in all cells that they share."""
+    return same_trials(
+        [
+            level.pooled.trials.dropna(subset=[metric.column]).assign(
+                condition=lambda rows: rows["cell"]
+            )
+            for level in levels
+        ]
+    )
 
 
 def difference_of_medians(study: Study, metric: Metric, level: Level, first: Level) -> float | None:

@@ -18,10 +18,11 @@ from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
 from merge_runner_analysis.data.study import Group, Study, levels_of
 from merge_runner_analysis.metrics import INTERVALS, METRICS, RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.names import HUMAN
-from merge_runner_analysis.stats.contrasts import contrast, corrected
+from merge_runner_analysis.stats.contrasts import contrast, corrected, same_trials
 from merge_runner_analysis.stats.factors import (
     Level,
     balance,
+    copied,
     difference_of_medians,
     levels_by_factor,
 )
@@ -73,7 +74,11 @@ INTERACTIONS = (
     "they exclude 0; of means by Welch's t test"
 )
 NO_INTERACTION = (
-    "no interaction without cells that all four have, spread within cells, or with undecided trials"
+    "no interaction without cells that all four have, spread within cells, or with undecided "
+    "trials or the same ones at two levels"
+)
+SAME_TRIALS = (
+    "programs play the same trials at both levels: the difference is 0 by construction, no test"
 )
 
 
@@ -197,9 +202,26 @@ def contrasts(study: Study) -> Table:
             "of all these trials as if of one condition, in the direction in which less is enough, "
             "of means (t.975 + t.8) times the standard error",
             RULES_NOTE,
+            *_same_as_reference(study),
             *([] if rows else ["there is no pair of judged groups to compare"]),
         ),
     )
+
+
+def _same_as_reference(study: Study) -> Iterator[str]:
+    """Which prompts have no row, since programs do not read them."""
+    own = {g.driver: g for g in study.models if g.setting == study.reference}
+    same = [
+        group.id
+        for group in study.models
+        if (other := own.get(group.driver)) not in (None, group)
+        and same_trials([group.trials, other.trials])
+    ]
+    if same:
+        yield (
+            f"{', '.join(same)}: programs play the same trials as with the prompt "
+            f"{study.reference}: the difference is 0 by construction, no test"
+        )
 
 
 def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
@@ -284,10 +306,26 @@ def factors(study: Study) -> Table:
             f"intervals: {INTERVALS}. {DIFFERENCES}",
             *([INTERACTIONS.format(by=by)] if by else []),
             *([f"Holm: corrected for all {len(p)} p of the table"] if p else []),
+            *_copies(found),
             *(f"{_name(levels[0])}: {balance(levels)}" for levels in found),
             RULES_NOTE,
         ),
     )
+
+
+def _copies(found: list[list[Level]]) -> Iterator[str]:
+    """Which levels have copies of trials from levels of other factors."""
+    counts = [
+        f"{level.id}: {level.pooled.repeated} of {len(level.pooled.stored.trials)}"
+        for levels in found
+        for level in levels
+        if level.pooled.repeated
+    ]
+    if counts:
+        yield (
+            f"{', '.join(counts)} trials of programs are equal to others of the level to the last "
+            "state, at another level of another factor: each counts once, in one cell"
+        )
 
 
 def _name(level: Level) -> str:
@@ -302,8 +340,13 @@ def _level_row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
     elif level is not first:
         cells |= _difference(study, metric, level, first)
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
-    note = "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric))))
-    return Row(f"{level.id}/{metric.name}", level.groups, cells, note, counts=metric.counts)
+    same = SAME_TRIALS if level is not first and copied([level, first], metric) else ""
+    note = "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric), same)))
+    return Row(f"{level.id}/{metric.name}", level.groups, cells, note, _counts(level, metric))
+
+
+def _counts(level: Level, metric: Metric) -> str:
+    return " AND ".join(filter(None, (metric.counts, level.predicate)))
 
 
 def _cells(level: Level, metric: Metric) -> dict[str, Value]:
@@ -357,4 +400,4 @@ def _interaction(
     }
     note = "" if different else f"{metric.heading}: {NO_INTERACTION}"
     row_id = f"{level.id}/interaction/{metric.name}"
-    return Row(row_id, level.groups, cells, note, metric.counts)
+    return Row(row_id, level.groups, cells, note, _counts(level, metric))

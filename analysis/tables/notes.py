@@ -60,8 +60,13 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
                 )
     if counts := [f"{g.id}: {g.repeated} of {len(g.stored.trials)}" for g in groups if g.repeated]:
         yield (
-            f"{', '.join(counts)} trials repeat an earlier one to the last state, of programs that "
-            "declare no chance: they are left out, and n counts the others"
+            f"{', '.join(counts)} trials of programs repeat an earlier one to the last state: they "
+            "are left out, and n counts the others"
+        )
+    if counts := [f"{g.id}: {g.equal} of {len(g.trials)}" for g in groups if g.equal]:
+        yield (
+            f"{', '.join(counts)} trials of language models are as an earlier one to the last "
+            "state: each is a sample, and counts"
         )
     if pairs := [f"{group.id}: {_seats(group)}" for group in groups if len(group.models) > 1]:
         yield (

@@ -38,7 +38,7 @@ class Program:
     object with their hash as ``digest``, whose ``read`` takes those of an open database (None:
     there is none yet), and whose ``check`` raises UsageError where a program has too few trials of
     a condition for a scenario and so many repetitions. ``chance`` declares that it draws by the
-    seed of its seat: the analysis counts equal trials of drivers that do not once. ``based_on``
+    seed of its seat: the analysis counts equal first decisions of others once. ``based_on``
     names the program that a study has given other parameters or another clock.
     """
 

@@ -31,7 +31,7 @@ SAID = {
     "temperature": (["temperature = 0.2"], ["no temperature", "default sampling temperature"]),
     "programs": (
         [
-            "projected-order/baseline: 11 of 22 trials repeat an earlier one",
+            "projected-order/baseline: 11 of 22 trials of programs repeat an earlier one",
             "* emulator+constant: scripted stand-in, no language model",
             "No language model is judged here.",
         ],
@@ -44,7 +44,7 @@ SAID = {
     "killed": (["o3/baseline: Collisions: inconclusive."], ["o3 does not drive"]),
     "word_for_word": (
         ["o3/baseline: 22 of 33 trials are as an earlier one to the last state; each counts"],
-        ["declare no chance"],
+        ["they are left out"],
     ),
     "two_studies": (
         [

@@ -130,7 +130,7 @@ def as_programs(chance, **scenario):
     ]
 
 
-def test_programs_that_declare_no_chance_count_each_trial_once(db):
+def test_equal_trials_of_programs_count_once(db):
     study = changed(db, *same_each_time(db), *as_programs({}))
     o3, other = study.models
     assert (len(o3.trials), o3.repeated, len(other.trials), other.repeated) == (11, 22, 33, 0)
@@ -139,8 +139,12 @@ def test_programs_that_declare_no_chance_count_each_trial_once(db):
     assert row.values["n"] == 11
     (source,) = explain(study, table, "o3/baseline:n").sources
     assert len(load(source.query, db)) == len(source.trials) == 11
-    assert any(": 22 of 33 trials repeat an earlier one" in note for note in table.notes)
-    assert alarms(study, provenance(db)) == {}
+    assert any(
+        ": 22 of 33 trials of programs repeat an earlier one" in note for note in table.notes
+    )
+    ((title, text),) = alarms(study, provenance(db)).items()
+    assert title == "Trials repeat earlier ones"
+    assert "o3/baseline: 22 of 33 trials of programs are as an earlier one to the last" in text
     (accounts,) = make_tables(study, ["attempts"])
     assert accounts.rows[0].values["trials"] == 33, "nothing is dropped from accounts"
     (source,) = explain(study, accounts, "o3/baseline:trials").sources
@@ -153,24 +157,19 @@ def test_programs_that_declare_no_chance_count_each_trial_once(db):
         ({"chance": True}, {}),
         ({}, {"perception_right": {"speed_sd_mps": 0.5}}),
         ({}, {"perception_left": {"dropout": 0.1}}),
+        ({}, {"perception_left": {"delay_s": 0.2, "range_m": 30}}),
     ],
 )
-def test_equal_trials_count_where_a_driver_or_what_it_perceives_has_chance(db, chance, scenario):
+def test_equal_trials_of_programs_count_once_whatever_is_declared(db, chance, scenario):
     study = changed(db, *same_each_time(db), *as_programs(chance, **scenario))
-    assert (len(study.models[0].trials), study.models[0].repeated) == (33, 0)
-    assert alarms(study, provenance(db)) == {}
+    assert (len(study.models[0].trials), study.models[0].repeated) == (11, 22)
+    assert {*alarms(study, provenance(db))} == {"Trials repeat earlier ones"}
 
 
-def test_what_is_perceived_late_and_not_far_is_perceived_without_chance(db):
-    late = {"perception_left": {"delay_s": 0.2, "range_m": 30}}
-    study = changed(db, *same_each_time(db), *as_programs({}, **late))
-    assert study.models[0].repeated == 22
-
-
-def test_repetitions_that_differ_contradict_who_declares_no_chance_and_all_count(db):
+def test_only_the_trials_that_are_equal_are_left_out(db):
     alike = "trial_id LIKE 'o3/%' AND trial_id NOT LIKE 'o3/baseline/N_0_0/%'"
-    study = changed(db, *same_each_time(db, alike), *as_programs({}))
-    assert study.models[0].repeated == 0
+    study = changed(db, *same_each_time(db, alike), *as_programs({"chance": True}))
+    assert (len(study.models[0].trials), study.models[0].repeated) == (13, 20)
 
 
 @pytest.mark.slow
@@ -184,13 +183,13 @@ def test_equal_trials_of_a_language_model_are_told_and_count(db, where, equal):
     assert says in text
 
 
-def test_a_sweep_records_which_programs_have_chance(in_process, tmp_path):
+def test_trials_that_a_program_draws_otherwise_count_beside_its_copies(in_process, tmp_path):
     db = tmp_path / "t.duckdb"
     for pair in ("human-odds+constant", "projected-order+constant"):
         sweep = ("sweep", "baseline", "--model", pair, "--mirror", "--reps", 3)
         assert in_process(*sweep, "--conditions", "L_4_0,R_-4_0", "--db", db) == 0
     assert {group.driver: (len(group.trials), group.repeated) for group in Study(db).models} == {
-        "constant+human-odds": (12, 0),
+        "constant+human-odds": (7, 5),  # one way where it goes first, and any other gap
         "constant+projected-order": (2, 10),
     }
 

@@ -1,0 +1,110 @@
+"""Programs read no prompt: their trials with each are copies, which count once in every table."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from merge_runner_analysis.data.provenance import provenance
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.report.page import alarms
+from merge_runner_analysis.tables import make_tables
+from tests.analysis.studies import changed, write_study, yielding
+
+SAME = "programs play the same trials at both levels"
+PROGRAM = json.dumps({side: {"program": "own", "chance": True} for side in ("left", "right")})
+
+
+def braking(drives, share):
+    """The same drives with another strength."""
+    return [
+        replace(
+            drive,
+            left=tuple(share * action for action in drive.left),
+            right=tuple(share * action for action in drive.right),
+        )
+        for drive in drives
+    ]
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    """Two programs and a language model, each with two prompts; the model alone heeds them."""
+    drives = [
+        *yielding("one", reps=4), *yielding("one", "A1", 4),
+        *braking(yielding("two", reps=4), 0.9), *braking(yielding("two", "A1", 4), 0.9),
+        *yielding("o3", reps=4), *braking(yielding("o3", "A1", 4), 0.8),
+    ]  # fmt: skip
+    path = write_study(tmp_path_factory.mktemp("copies") / "t.duckdb", drives)
+    changed(
+        path,
+        f"UPDATE specs SET spec = '{PROGRAM}' WHERE spec_hash NOT LIKE 'o3%'",
+        "UPDATE trials SET source = 'driver' WHERE trial_id NOT LIKE 'o3/%'",
+    )
+    return path
+
+
+def made(name, *args, **options):
+    (table,) = make_tables(Study(*args, **options), [name])
+    return table, {row.id: row for row in table.rows}
+
+
+def test_a_level_counts_each_trial_of_a_program_once(db):
+    table, rows = made("factors", db)
+    for model, n in (("one", 44), ("two", 44), ("o3", 88)):
+        row = rows[f"model={model}/left_first_percent"]
+        assert (row.values["trials"], row.values["n"]) == (n, n)
+        # Each prompt is a cell of its own only to the model, but where all are compared.
+        cell = f"model={model}/left_first_percent:n"
+        assert sum(len(source.trials) for source in explain(Study(db), table, cell).sources) == n
+    (note,) = [note for note in table.notes if "trials of programs are equal to others" in note]
+    assert "model=one: 44 of 88, model=two: 44 of 88" in note
+    (note,) = [note for note in table.notes if note.startswith("model: ")]
+    assert note == "model: every level has the same 11 cells"
+
+
+def test_two_programs_are_compared_by_distinct_trials(db):
+    both, once = (
+        made("factors", db, ["one", "two"], where=where)[1]
+        for where in (None, {"prompt": ["baseline"]})
+    )
+    for measure in ("left_first_percent", "gap_m"):
+        shown, alone = (rows[f"model=two/{measure}"].values for rows in (both, once))
+        for column in ("n", "value", "ci", "difference", "difference_ci", "p"):
+            assert shown[column] == pytest.approx(alone[column]), (measure, column)
+
+
+def test_no_test_is_made_of_copies_and_the_rows_say_so(db):
+    _, rows = made("factors", db, ["one", "two"])
+    for measure in ("left_first_percent", "gap_m", "conflict_resolution_s"):
+        row = rows[f"prompt=A1/{measure}"]
+        assert {row.values.get(name) for name in ("difference", "difference_ci", "p")} == {None}
+        assert SAME in row.note
+    table, rows = made("contrasts", db)
+    assert {row.partition("/")[0] for row in rows} == {"o3"}
+    (note,) = [note for note in table.notes if "programs play the same trials" in note]
+    assert note.startswith("one/A1, two/A1: ")
+
+
+def test_what_a_prompt_changes_rests_on_who_reads_it(db):
+    _, every = made("factors", db)
+    _, model = made("factors", db, ["o3"])
+    row, alone = (rows["prompt=A1/gap_m"].values for rows in (every, model))
+    for column in ("difference", "difference_ci", "p"):
+        assert row[column] == pytest.approx(alone[column])
+
+
+def test_no_interaction_is_made_of_copies(db):
+    _, rows = made("factors", db, ["one", "two"], by="prompt")
+    row = rows["prompt=A1/model=two/interaction/gap_m"]
+    assert row.values.get("p") is None
+    assert "the same ones at two levels" in row.note
+
+
+def test_the_report_says_which_trials_of_programs_are_copies(db):
+    found = alarms(Study(db), provenance(db))["Trials repeat earlier ones"]
+    assert "one: 44 of 88 trials of programs at different levels of factors are distinct" in found
+    assert "o3" not in found
