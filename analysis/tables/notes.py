@@ -61,7 +61,7 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
     if counts := [f"{g.id}: {g.repeated} of {len(g.stored.trials)}" for g in groups if g.repeated]:
         yield (
             f"{', '.join(counts)} trials of programs repeat an earlier one to the last state: they "
-            "are left out, and n counts the others"
+            "are left out, and n, shares and means are of the others, not of all draws"
         )
     if counts := [f"{g.id}: {g.equal} of {len(g.trials)}" for g in groups if g.equal]:
         yield (

@@ -55,7 +55,7 @@ SAID = {
         [],
     ),
     "mirrored_chance": (
-        ["95 of 220 trials are undecided, since another collision rule ended them"],
+        ["13 of 119 trials are undecided, since another collision rule ended them"],
         ["declare no chance"],
     ),
     "no_valid_reply": (
