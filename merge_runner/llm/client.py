@@ -27,7 +27,7 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.formats import FORMATS, WireFormat
+from merge_runner.llm.formats import FORMATS, WireFormat, read_reply
 from merge_runner.llm.http_outcome import (
     AttemptOutcome,
     TransportFailure,
@@ -205,16 +205,7 @@ class LlmClient:
 
         Raises CallFailed, TrialSuspended or SweepStopped.
         """
-        wire = self._wire.request(self.entry, prompt)
-        request = make_request(
-            provider=self.entry.provider,
-            endpoint=self.endpoint,
-            model=self.entry.id,
-            path=wire.path,
-            headers=wire.headers,
-            body=wire.body,
-            slot=slot,
-        )
+        request = self._request(prompt, slot)
         reply = self._known(request)
         if reply is None and self.sealed:
             raise ReplayMiss("no recorded reply", request)
@@ -242,6 +233,25 @@ class LlmClient:
                 "leave --strict-model out, or name it in `aliases` in experiments/models.toml"
             )
         return reply
+
+    def has_asked(self, prompt: str, slot: Slot) -> bool:
+        """Return whether a call is recorded, be it damaged or without an answer."""
+        try:
+            return self.cache.get(self._request(prompt, slot).key) is not None
+        except (RecordingError, CallFailed):
+            return True
+
+    def _request(self, prompt: str, slot: Slot) -> ChatRequest:
+        wire = self._wire.request(self.entry, prompt)
+        return make_request(
+            provider=self.entry.provider,
+            endpoint=self.endpoint,
+            model=self.entry.id,
+            path=wire.path,
+            headers=wire.headers,
+            body=wire.body,
+            slot=slot,
+        )
 
     async def drain(self) -> None:
         """Let attempts in flight end and be saved, and give up calls that wait for one."""
@@ -317,7 +327,7 @@ class LlmClient:
     def _read(self, recorded: CachedCall, earlier: int) -> ChatReply:
         last = recorded.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
-        text = self._wire.read(payload).text
+        text = read_reply(self._wire, payload).text
         return ChatReply(text, last.outcome, recorded.request, recorded.attempts, earlier)
 
     def _start(self, request: ChatRequest, order: int) -> Call:

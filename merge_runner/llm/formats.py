@@ -8,12 +8,13 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 from pydantic import JsonValue
 
 from merge_runner.config import ModelEntry
+from merge_runner.llm.reasoning import split_reasoning
 from merge_runner.records import Usage
 from merge_runner.registry import Registry
 
@@ -32,6 +33,16 @@ REFUSALS = (
     *("SAFETY", "RECITATION", "LANGUAGE", "OTHER", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII"),
     "MODEL_ARMOR",
 )
+# What ends a reply of a chat server that passes on another API's word: Gemini's in capitals,
+# Anthropic's, Mistral's (model_length), Zhipu's (sensitive).
+CHAT_TRUNCATED = {
+    *("length", "MAX_TOKENS", "max_tokens", "max_output_tokens", "model_length"),
+    "model_context_window_exceeded",
+}
+CHAT_REFUSED = {*REFUSALS, "content_filter", "refusal", "sensitive"}
+# The server broke the reply off, and what came of it is no answer of the model: vLLM and SGLang
+# (abort), Zhipu (network_error), DeepSeek, and routers (error).
+BROKEN_OFF = {"abort", "error", "network_error", "insufficient_system_resource"}
 # A protobuf Duration as JSON.
 DURATION = re.compile(r"(\d+(?:\.\d+)?)s")
 
@@ -50,7 +61,8 @@ class Reading:
     """What a JSON body of status 200 says.
 
     ``outcome`` is ``ok``, ``refusal``, ``truncated``, ``empty``, or ``error`` where the body
-    reports a failure after all. ``finish_reason`` is the provider's own word.
+    reports a failure after all. ``finish_reason`` is the provider's own word. ``reasoning`` is
+    what stands apart from the text of the answer.
     """
 
     outcome: str
@@ -58,6 +70,7 @@ class Reading:
     finish_reason: str | None = None
     model_served: str | None = None
     usage: Usage = field(default_factory=Usage)
+    reasoning: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +111,10 @@ class WireFormat(ABC):
 
     @abstractmethod
     def read(self, payload: dict[str, Any]) -> Reading:
-        """Read a body of status 200; unknown keys and missing ones are normal."""
+        """Read a body of status 200; unknown keys and missing ones are normal.
+
+        Reasoning that stands within the text stays there: see ``read_reply``.
+        """
 
     def meaning(self, error: ServerError) -> str | None:
         """Return the meaning of an error whose status does not tell it.
@@ -112,6 +128,28 @@ class WireFormat(ABC):
     def delay_s(self, error: ServerError) -> float | None:
         """Return the delay in s in a member of the error; its words are read for every format."""
         return None
+
+
+def read_reply(wire: WireFormat, payload: dict[str, Any]) -> Reading:
+    """Read a body of status 200; of its text the answer is kept apart from the reasoning."""
+    reading = wire.read(payload)
+    if reading.outcome not in {"ok", "truncated", "empty"}:
+        return reading
+    thoughts, answer, cut = split_reasoning(reading.text)
+    if not thoughts and answer == reading.text:
+        return reading
+    return replace(
+        reading,
+        outcome=outcome_of(answer, truncated=cut or reading.outcome == "truncated"),
+        text=answer,
+        reasoning=reading.reasoning + thoughts,
+    )
+
+
+def reasoning_of(payload: dict[str, Any]) -> str:
+    """Return the reasoning in a body of any format that is known."""
+    readings = (read_reply(w, payload) for w in FORMATS.values() if w.members & payload.keys())
+    return next((reading.reasoning for reading in readings if reading.reasoning), "")
 
 
 def outcome_of(
@@ -163,6 +201,11 @@ def as_count(value: object) -> int | None:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     return value if type(value) is int and 0 <= value <= MOST_TOKENS else None
+
+
+def is_error(value: object) -> bool:
+    """Return whether a member reports an error; some services add an empty one to good answers."""
+    return any(value.values()) if isinstance(value, dict) else bool(value)
 
 
 def joined(parts: Iterable[dict[str, Any]], member: str = "text") -> str:
@@ -258,13 +301,21 @@ class OpenAIChat(WireFormat):
         choice = at(payload, "choices.0")
         content = at(choice, "message.content")  # a list of parts at some servers
         text = content if isinstance(content, str) else joined(as_dicts(content))
+        thoughts = [at(choice, f"message.{name}") for name in ("reasoning_content", "reasoning")]
+        # Mistral's parts hold parts; OpenRouter and vLLM send the same words in both members.
+        thinking = [part.get("thinking") for part in as_dicts(content)]
+        thoughts += [joined(as_dicts(each)) for each in thinking]
         refusal = as_text(at(choice, "message.refusal"))
         finish = as_text(at(choice, "finish_reason"))
         # Routers answer 200 and put the failure of a generation into the body.
-        failed = payload.get("error") or at(choice, "error") or finish == "error"
-        refused = finish == "content_filter" or bool(refusal)
+        failed = is_error(payload.get("error")) or is_error(at(choice, "error"))
         return Reading(
-            outcome_of(text, failed=failed, truncated=finish == "length", refused=refused),
+            outcome_of(
+                text,
+                failed=failed or finish in BROKEN_OFF,
+                truncated=finish in CHAT_TRUNCATED,
+                refused=finish in CHAT_REFUSED or bool(refusal),
+            ),
             text or refusal or "",
             finish,
             as_text(payload.get("model")),
@@ -275,6 +326,7 @@ class OpenAIChat(WireFormat):
                 output_tokens="completion_tokens",
                 reasoning_tokens="completion_tokens_details.reasoning_tokens",
             ),
+            reasoning="".join(dict.fromkeys(as_text(each) or "" for each in thoughts)),
         )
 
 
@@ -302,18 +354,26 @@ class OpenAIResponses(WireFormat):
         )
 
     def read(self, payload: dict[str, Any]) -> Reading:
-        """Join the text parts of all messages; a failed response arrives with status 200."""
+        """Join the text parts of all messages; a failed response arrives with status 200.
+
+        A commentary beside the final message is reasoning.
+        """
         items = as_dicts(payload.get("output"))
-        messages = [item.get("content") for item in items if item.get("type") == "message"]
-        parts = [part for content in messages for part in as_dicts(content)]
+        messages = [item for item in items if item.get("type") == "message"]
+        final = [item for item in messages if item.get("phase") != "commentary"]
+        beside = [item for item in messages if item.get("phase") == "commentary"] if final else []
+        parts = [part for item in final or messages for part in as_dicts(item.get("content"))]
         text = joined(part for part in parts if part.get("type") == "output_text")
+        reasoned = [item for item in items if item.get("type") == "reasoning"] + beside
+        members = (item.get(name) for item in reasoned for name in ("summary", "content"))
+        thoughts = [joined(as_dicts(member)) for member in members]
         refusal = joined((part for part in parts if part.get("type") == "refusal"), "refusal")
         status = as_text(payload.get("status"))
         reason = as_text(at(payload, "incomplete_details.reason"))
         return Reading(
             outcome_of(
                 text,
-                failed=status == "failed" or payload.get("error"),
+                failed=status == "failed" or is_error(payload.get("error")),
                 truncated=status == "incomplete" or reason == "max_output_tokens",
                 refused=reason == "content_filter" or bool(refusal),
             ),
@@ -327,6 +387,7 @@ class OpenAIResponses(WireFormat):
                 output_tokens="output_tokens",
                 reasoning_tokens="output_tokens_details.reasoning_tokens",
             ),
+            reasoning="\n\n".join(filter(None, thoughts)),
         )
 
 
@@ -367,7 +428,7 @@ class GeminiGenerateContent(WireFormat):
         return Reading(
             outcome_of(
                 text,
-                failed=payload.get("error"),
+                failed=is_error(payload.get("error")),
                 truncated=finish == "MAX_TOKENS",
                 refused=bool(blocked) or finish in REFUSALS,
             ),
@@ -381,6 +442,7 @@ class GeminiGenerateContent(WireFormat):
                 output_tokens="candidatesTokenCount thoughtsTokenCount",
                 reasoning_tokens="thoughtsTokenCount",
             ),
+            reasoning=joined(part for part in parts if part.get("thought")),
         )
 
 
@@ -409,7 +471,7 @@ class AnthropicMessages(WireFormat):
         )
 
     def read(self, payload: dict[str, Any]) -> Reading:
-        """Join the text blocks; thinking blocks are left out."""
+        """Join the text blocks; thinking blocks are the reasoning."""
         blocks = as_dicts(payload.get("content"))
         text = joined(block for block in blocks if block.get("type") == "text")
         finish = as_text(payload.get("stop_reason"))
@@ -432,6 +494,7 @@ class AnthropicMessages(WireFormat):
                 output_tokens="output_tokens",
                 reasoning_tokens="output_tokens_details.thinking_tokens",
             ),
+            reasoning=joined(blocks, "thinking"),
         )
 
 

@@ -21,13 +21,17 @@ from urllib.parse import urlsplit
 from merge_runner.config import PROVIDERS, ModelEntry
 from merge_runner.errors import MergeRunnerError
 from merge_runner.llm.formats import (
+    BROKEN_OFF,
     Reading,
     ServerError,
     WireFormat,
     as_dict,
+    at,
+    is_error,
     known_delay_s,
     known_meaning,
     read_error,
+    read_reply,
 )
 
 if TYPE_CHECKING:
@@ -165,10 +169,14 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if raw.status == 200 and not isinstance(raw.payload, dict):
         return AttemptOutcome("retry", "bad_body", "the body is not a JSON object", raw=raw)
     body = as_dict(raw.payload)
-    reading = wire.read(body)
+    reading = read_reply(wire, body)
     if raw.status != 200:
         reading = Reading("error", usage=reading.usage)  # which is billed
         return replace(judge_error(raw.error, wire), reading=reading, raw=raw)
+    told = is_error(body.get("error")) or is_error(at(body, "choices.0.error"))
+    if reading.outcome == "error" and not told and reading.finish_reason in BROKEN_OFF:
+        why = f"the server broke its answer off (finish reason {reading.finish_reason})"
+        return AttemptOutcome("retry", "server_error", why, reading, raw=raw)
     if reading.outcome == "error":
         error = replace(raw.error, status=status_within(raw.error))
         return replace(judge_error(error, wire), reading=reading, raw=raw)

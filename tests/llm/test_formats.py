@@ -303,7 +303,27 @@ ANSWERS = [
     ("openai-chat", chat("TEXT", "eos"), "ok", "TEXT"),
     ("openai-chat", chat("TEXT", reasoning_content="HMM", reasoning="HMM"), "ok", "TEXT"),
     ("openai-chat", chat([{"type": "text", "text": "TE"}, {"text": "XT"}]), "ok", "TEXT"),
-    ("openai-chat", chat("TEX", "error"), "error", "TEX"),
+    # The finish words of the APIs behind a gateway.
+    *(
+        ("openai-chat", chat("TEX", word), "truncated", "TEX")
+        for word in ("MAX_TOKENS", "max_tokens", "model_length", "model_context_window_exceeded")
+    ),
+    *(
+        ("openai-chat", chat("TEX", word), "refusal", "TEX")
+        for word in ("SAFETY", "RECITATION", "PROHIBITED_CONTENT", "refusal", "sensitive")
+    ),
+    *(
+        ("openai-chat", chat("TEX", word), "error", "TEX")
+        for word in ("error", "abort", "network_error", "insufficient_system_resource")
+    ),
+    # Some services add an error without content to each good answer.
+    *(
+        (wire, {**sample, "error": error}, "ok", "TEXT")
+        for wire, sample in (("openai-chat", CHAT), ("openai-responses", RESPONSES))
+        for error in ({}, {"message": "", "type": "", "param": None, "code": None}, "", [])
+    ),
+    ("openai-chat", changed(CHAT, ("choices", 0, "error"), {"message": ""}), "ok", "TEXT"),
+    ("gemini", {**GEMINI, "error": {}}, "ok", "TEXT"),
     ("openai-chat", {**CHAT, "error": {"code": 502}}, "error", "TEXT"),
     ("openai-chat", changed(CHAT, ("choices", 0, "error"), {"code": 502}), "error", "TEXT"),
     ("openai-responses", response(REFUSED), "refusal", REFUSAL),

@@ -439,9 +439,22 @@ SUCCESSES = [
         "server_error",
     ),
     ("openai-chat", {**choice("", "error"), "usage": None}, "retry", "server_error"),
+    # The server broke its answer off, whatever else it sent.
+    ("openai-chat", choice("M\nI am", "abort"), "retry", "server_error"),
+    ("openai-chat", {**choice("M\nI am", "network_error"), "code": 0}, "retry", "server_error"),
+    ("openai-chat", choice("M", "insufficient_system_resource"), "retry", "server_error"),
+    ("openai-chat", {**choice("M", "error"), "status": "ok"}, "retry", "server_error"),
+    ("openai-chat", {**choice("M", "abort"), "error": {"code": 503}}, "retry", "overloaded"),
     ("openai-chat", {"error": "m"}, "retry", "server_error"),
     ("openai-chat", openai("m", "insufficient_quota"), "quota", "quota_exhausted"),
 ]
+
+
+@pytest.mark.parametrize("word", ["abort", "network_error", "insufficient_system_resource"])
+def test_a_finish_reason_that_says_so_names_the_server_that_broke_off(word):
+    found = judged("openai-chat", 200, choice("M\nI am", word))
+    assert found.message == f"the server broke its answer off (finish reason {word})"
+    assert (found.reading.finish_reason, found.delay_s) == (word, None)
 
 
 @pytest.mark.parametrize(("wire", "body", "action", "outcome"), SUCCESSES)

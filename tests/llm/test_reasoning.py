@@ -1,0 +1,252 @@
+"""Reasoning within a reply's text: kept apart from the answer, and never read as one."""
+
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.llm.formats import FORMATS, reasoning_of
+from merge_runner.llm.http_outcome import RawReply, judge
+from merge_runner.llm.reasoning import split_reasoning
+from merge_runner.prompts.parse import parse_reply
+
+law = settings(deadline=None, derandomize=True)  # the gate must not depend on luck or load
+
+ANSWER = f"M\nI am ahead.\n```python\n{[0.1] * 20}\n```"
+OTHER = f"Brake? ```python\n{[-0.9] * 20}\n``` No."
+TAGS = [
+    *((f"<{name}>", f"</{name}>") for name in ("think", "thinking", "thought", "reasoning")),
+    ("[THINK]", "[/THINK]"),
+    ("\u25c1think\u25b7", "\u25c1/think\u25b7"),
+    ("<THINK>", "</THINK>"),
+]
+HARMONY = (
+    "<|channel|>analysis<|message|>",
+    "<|end|><|start|>assistant<|channel|>final<|message|>",
+)
+
+
+def body(wire, text, finish=None):
+    """A whole answer in a wire format."""
+    message = {"type": "message", "content": [{"type": "output_text", "text": text}]}
+    parts = {"parts": [{"text": text}]}
+    return {
+        "openai-chat": {
+            "choices": [{"message": {"content": text}, "finish_reason": finish or "stop"}]
+        },
+        "openai-responses": {"status": "completed", "output": [message]},
+        "gemini": {"candidates": [{"content": parts, "finishReason": "STOP"}]},
+        "anthropic": {"content": [{"type": "text", "text": text}], "stop_reason": "end_turn"},
+    }[wire]
+
+
+def judged(wire, payload):
+    outcome = judge(RawReply(200, {}, json.dumps(payload)), FORMATS[wire])
+    return outcome.name, outcome.reading.text, outcome.reading.reasoning
+
+
+@pytest.mark.parametrize("wire", FORMATS)
+@pytest.mark.parametrize(("opening", "closing"), [*TAGS, HARMONY])
+@pytest.mark.parametrize("gap", ["", "\n\n"])
+def test_in_every_format_what_stands_before_the_answer_is_no_part_of_it(
+    wire, opening, closing, gap
+):
+    name, text, reasoning = judged(wire, body(wire, f"{opening}{OTHER}{closing}{gap}{ANSWER}"))
+    assert (name, text.strip(), OTHER in reasoning) == ("ok", ANSWER, True)
+    assert parse_reply(text, 20).plan == (0.1,) * 20
+    assert reasoning_of(body(wire, f"{opening}{OTHER}{closing}{ANSWER}")) == reasoning
+
+
+@pytest.mark.parametrize("wire", FORMATS)
+@pytest.mark.parametrize(("opening", "closing"), [*TAGS, HARMONY])
+def test_a_reply_that_ends_within_its_reasoning_is_truncated(wire, opening, closing):
+    """Whatever word for the end the server has."""
+    assert judged(wire, body(wire, f"\n{opening}{OTHER}")) == ("truncated", "", OTHER)
+    assert judged(wire, body(wire, opening))[:2] == ("truncated", "")
+    again = f"{opening}{OTHER}{closing}{opening}{OTHER}"
+    assert judged(wire, body(wire, again))[:2] == ("truncated", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "answer"),
+    [
+        # Chat templates write the opening tag themselves.
+        (f"{OTHER}\n</think>\n\n{ANSWER}", ANSWER),
+        (f"{OTHER}</think>{ANSWER}", ANSWER),
+        (f"{OTHER} </think>\n{ANSWER}", ANSWER),
+        (f"{OTHER}\n</think> {ANSWER}", ANSWER),
+        (f"{OTHER}<|end|><|start|>assistant<|channel|>final<|message|>{ANSWER}", ANSWER),
+        # The last one counts.
+        (f"<think>a</think>\nb\n</think>\n{ANSWER}", ANSWER),
+        (f"<think>a</think><reasoning>{OTHER}</reasoning>{ANSWER}", ANSWER),
+        # In quotes it is a mention, on both sides of the answer's begin.
+        (f"<think>I close with `</think>`. {OTHER}</think>{ANSWER}", ANSWER),
+        (f"<think>{OTHER}</think>{ANSWER}\nI left '</think>' out.", f"{ANSWER}\nI left '</think>'"),
+        # A fence is no quotation mark.
+        (f"<think>```\n{[-0.9] * 20}\n```</think>```python\n{[0.1] * 20}\n```", "```python"),
+        # Harmony: other channels, constraints, marks of the end, and none of them at all.
+        (f"<|start|>assistant{HARMONY[0]}a{HARMONY[1]}{ANSWER}<|return|>", ANSWER),
+        (f"<|channel|>commentary<|message|>{OTHER}{HARMONY[1]}{ANSWER}<|end|>", ANSWER),
+        (f"<|channel|>final <|constrain|>json<|message|>{ANSWER}", ANSWER),
+        (f"<|channel|>final<|message|>{ANSWER}<|end|><|start|>assistant{HARMONY[0]}a", ANSWER),
+        (f"analysis{OTHER}assistantfinal{ANSWER}", ANSWER),
+        # A stray tag at the end of an answer closes nothing.
+        (f"<think>{OTHER}</think>{ANSWER}\n</think>\n", ANSWER),
+    ],
+)
+def test_the_answer_is_what_follows_the_last_closing_tag(text, answer):
+    parts = split_reasoning(text)
+    assert parts.answer.strip().startswith(answer)
+    assert (parts.cut, parse_reply(parts.answer, 20).plan) == (False, (0.1,) * 20)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ANSWER,
+        f"{ANSWER}\n</think>\n",
+        f"M\nI never write `</think>` or <think>.\n{ANSWER[2:]}",
+        f"M\nI never write </think> in my replies.\n{ANSWER[2:]}",
+        f"M\nI think (</think>) that I go.\n{ANSWER[2:]}",
+        f"M\nA reply has a <|channel|> and [THINK].\n{ANSWER[2:]}",
+        f"M\n<think> is where others begin.\n{ANSWER[2:]}",
+        f"analysis: I go first.\n{ANSWER}",
+    ],
+)
+def test_a_tag_that_is_only_mentioned_eats_no_answer(text):
+    assert split_reasoning(text) == ("", text, False)
+
+
+@law
+@given(st.text() | st.text("<>/|[]\u25c1\u25b7 \nthink"))
+def test_a_reply_without_a_closing_tag_and_no_opening_one_at_its_head_is_an_answer(text):
+    if not text.strip().lower().startswith(("<", "[think]", "\u25c1think\u25b7")):
+        text = text.replace("/", "-")
+        assert split_reasoning(text) == ("", text, False)
+
+
+PLAIN = st.text(st.characters(blacklist_characters="<[\u25c1`\"'(\u201c\u2018"))
+
+
+@settings(law, max_examples=30)
+@given(PLAIN, PLAIN.filter(str.strip), st.sampled_from([*TAGS, HARMONY]))
+def test_thoughts_and_answer_are_told_apart_whatever_they_are(thoughts, answer, tags):
+    opening, closing = tags
+    assert split_reasoning(f"{opening}{thoughts}{closing}{answer}") == (thoughts, answer, False)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "</think>" * 60_000,
+        "x </think> x" * 40_000,
+        "`</think>`" * 50_000,
+        "<think>" * 140_000,
+        "<think></think>" * 60_000,
+        " " * 1_000_000 + "x",
+        "<|channel|>" * 90_000,
+        "<|channel|>" + " " * 1_000_000,
+        "analysis" * 120_000,
+    ],
+    ids=lambda text: repr(text[:12]),
+)
+def test_a_megabyte_of_tags_is_read_in_no_time(text):
+    parts = split_reasoning(text)
+    assert len(parts.reasoning) + len(parts.answer) <= len(text)
+
+
+THOUGHTS = [
+    ("openai-chat", {"choices": [{"message": {"content": "A", "reasoning_content": "T"}}]}),
+    ("openai-chat", {"choices": [{"message": {"content": "A", "reasoning": "T"}}]}),
+    (
+        "openai-chat",
+        {"choices": [{"message": {"content": "A", "reasoning": "T", "reasoning_content": "T"}}]},
+    ),
+    (
+        "openai-chat",
+        {
+            "choices": [
+                {
+                    "message": {
+                        "content": [
+                            {"type": "thinking", "thinking": [{"type": "text", "text": "T"}]},
+                            {"type": "text", "text": "A"},
+                        ]
+                    }
+                }
+            ]
+        },
+    ),
+    (
+        "openai-responses",
+        {
+            "status": "completed",
+            "output": [
+                {"type": "reasoning", "summary": [{"type": "summary_text", "text": "T"}]},
+                {"type": "message", "content": [{"type": "output_text", "text": "A"}]},
+            ],
+        },
+    ),
+    (
+        "anthropic",
+        {
+            "stop_reason": "end_turn",
+            "content": [{"type": "thinking", "thinking": "T"}, {"type": "text", "text": "A"}],
+        },
+    ),
+    (
+        "gemini",
+        {"candidates": [{"content": {"parts": [{"text": "T", "thought": True}, {"text": "A"}]}}]},
+    ),
+]
+
+
+@pytest.mark.parametrize(("wire", "payload"), THOUGHTS)
+def test_thoughts_that_a_provider_keeps_apart_are_reasoning_too(wire, payload):
+    assert judged(wire, payload) == ("ok", "A", "T")
+    assert reasoning_of(payload) == "T"
+
+
+@pytest.mark.parametrize("payload", [{}, {"choices": None}, {"error": "no"}, {"a": [1]}])
+def test_a_body_without_thoughts_has_none(payload):
+    assert reasoning_of(payload) == ""
+
+
+def test_thoughts_of_several_kinds_are_all_kept():
+    payload = body("openai-chat", "<think>B</think>A")
+    payload["choices"][0]["message"]["reasoning"] = "A"
+    assert judged("openai-chat", payload) == ("ok", "A", "AB")
+
+
+def test_an_answer_that_is_cut_off_after_the_reasoning_is_truncated_and_keeps_its_text():
+    payload = body("openai-chat", "<think>T</think>M\nI", finish="length")
+    assert judged("openai-chat", payload) == ("truncated", "M\nI", "T")
+
+
+def commented(*phases):
+    return {
+        "status": "completed",
+        "output": [
+            {
+                "type": "message",
+                "phase": phase,
+                "content": [{"type": "output_text", "text": f"{phase}!"}],
+            }
+            for phase in phases
+        ],
+    }
+
+
+@pytest.mark.parametrize(
+    ("phases", "text", "reasoning"),
+    [
+        (("commentary", "final_answer"), "final_answer!", "commentary!"),
+        (("commentary", "commentary", None), "None!", "commentary!\n\ncommentary!"),
+        (("final_answer",), "final_answer!", ""),
+        (("commentary",), "commentary!", ""),
+        ((None, None), "None!None!", ""),
+    ],
+)
+def test_a_commentary_beside_the_final_message_is_reasoning(phases, text, reasoning):
+    assert judged("openai-responses", commented(*phases)) == ("ok", text, reasoning)
