@@ -37,6 +37,8 @@ Status = Literal["finished", "collided", "timeout", "failed"]
 
 # The outcomes of an attempt that are answers.
 ANSWERS = ("ok", "refusal", "truncated", "empty")
+# The ``failure`` of a decision with a valid plan and without the tactical decision asked for.
+NO_DECISION = "no_decision"
 SIDES: tuple[Side, Side] = ("left", "right")
 
 # Headers that tell the slot and the attempt to our own emulator, and to nobody else.
@@ -194,7 +196,7 @@ class Decision:
     ``plan`` holds the normalised accelerations of a valid decision over the whole horizon, None
     where it was invalid; ``applied`` the ones to execute now. ``fallback`` says that ``applied``
     comes from an older plan, or is 0 because there is none. ``failure`` names why a decision is
-    invalid.
+    invalid; ``no_decision`` says that a valid one lacks the tactical decision asked for.
     """
 
     plan: tuple[float, ...] | None

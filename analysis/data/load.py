@@ -99,8 +99,8 @@ WHERE time_s >= greatest(0, coalesce(first_s, 0)) GROUP BY ALL ORDER BY ALL
 """
 # Fates of the attempts that were answered, also without a plan.
 ANSWERED = ("driven", "fallback")
-# One row a trial: what became of its calls and decisions. ``failures`` has the reason of each
-# answer without a valid plan, in lines; a retried attempt has no share in that of the answer.
+# One row a trial: what became of its calls and decisions. ``failures`` has in lines what each
+# answer lacks, a valid plan or the decision asked for; a retried attempt has no share in it.
 CALLS = """
 SELECT trial_id, spec_hash, attempts, calls, retried, lost, unknown, other_model, failures,
     decisions, fallback

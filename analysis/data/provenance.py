@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.records import SIDES
+from merge_runner.records import NO_DECISION, SIDES
 from merge_runner.results import frames
 from merge_runner.results.database import read_database
 from merge_runner.served_model import other_models, sql_of
@@ -109,8 +109,9 @@ def tally(study: Study, group: Group) -> Counter[str]:
 
     A call is asked at one decision, in one or more attempts. ``retried`` attempts were followed by
     another, ``lost`` calls ended without an answer; of the ``answers``, ``invalid`` ones have no
-    valid plan, for a reason that has a count of its own, too. ``fallback`` counts the ``decisions``
-    that were driven from an older plan, or none.
+    valid plan, for a reason that has a count of its own, too; ``no_decision`` ones have one, and
+    lack the tactical decision asked for. ``fallback`` counts the ``decisions`` that were driven
+    from an older plan, or none.
     """
     trials = of_trials(study.calls, group.trials)
     counts = {name: int(trials[name].sum()) for name in trials.select_dtypes("number")}
@@ -119,7 +120,7 @@ def tally(study: Study, group: Group) -> Counter[str]:
         "trials": len(group.trials),
         "failed": len(group.trials) - len(group.ended),
         "answers": counts["calls"] - counts["lost"],
-        "invalid": found.total(),
+        "invalid": found.total() - found[NO_DECISION],
     }
     return Counter({**found, **counts})
 

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import MergeRunnerError, StoreLocked
-from merge_runner.records import SIDES
+from merge_runner.records import NO_DECISION, SIDES
 from merge_runner.results.database import Instance, schema_sql
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -70,6 +70,7 @@ SELECT nextval('numbers')::INTEGER AS number, trials.trial_id, trials.spec_hash,
     coalesce(collision, {OTHER_ACCOUNTS}) AS account,
     coalesce(decisions, 0) AS decisions, coalesce(asked, 0) AS asked,
     coalesce(invalid, 0) AS invalid, coalesce(fallbacks, 0) AS fallbacks,
+    coalesce(no_decision, 0) AS no_decision,
     coalesce(attempts, 0) AS attempts, cost_usd, left_mps, right_mps, left_range_mps,
     right_range_mps, print, flaws, tried, factors,
     [f.factor || '=' || f.level FOR f IN factors IF f.factor <> 'model'] AS levels
@@ -81,6 +82,7 @@ JOIN trial_drivers USING (trial_id, spec_hash)
 LEFT JOIN (
     SELECT trial_id, spec_hash, count(*) AS decisions, count(call_key) AS asked,
         count(*) FILTER (NOT valid) AS invalid, count(*) FILTER (fallback) AS fallbacks,
+        count(*) FILTER (failure = '{NO_DECISION}') AS no_decision,
         list(failure) FILTER (failure IS NOT NULL) AS flaws
     FROM decisions GROUP BY ALL
 ) USING (trial_id, spec_hash)
@@ -111,6 +113,7 @@ LEFT JOIN (
 """  # noqa: S608 # constants
 FACETS = ("sweep", "who", "model", "variant", "condition", "outcome", "account", "validity",
           "cause", "tag")  # fmt: skip
+MISSING = "decision: missing"
 # Facets of which a trial may have several values, and the tables that hold these.
 SEVERAL = {"sweep": "members", "cause": "causes", "tag": "tagged"}
 # Before the name of a factor: its facet.
@@ -129,7 +132,8 @@ CREATE VIEW tagged AS SELECT number, tag FROM noted JOIN listed USING (trial_id,
 CREATE VIEW members AS SELECT DISTINCT sweep_id AS sweep, number
     FROM sweep_trials JOIN listed USING (trial_id, spec_hash);
 CREATE VIEW causes AS
-    SELECT number, 'plan: ' || flaw AS cause, count(*) AS times
+    SELECT number, if(flaw = '{NO_DECISION}', '{MISSING}', 'plan: ' || flaw) AS cause,
+        count(*) AS times
     FROM (SELECT number, unnest(flaws) AS flaw FROM listed) GROUP BY ALL
     UNION ALL SELECT number, 'attempt: ' || outcome, count(*)
     FROM tried WHERE outcome <> 'ok' GROUP BY ALL
@@ -215,8 +219,8 @@ INSERT INTO others SELECT unnest(?::VARCHAR[]), unnest(?::VARCHAR[]);
 """
 SORTS = {"trial": "trial_id", "outcome": "outcome", "end": "end_time_s", "gap": "gap_m",
          "rmse": "rmse_mps", "invalid": "invalid", "cost": "cost_usd"}  # fmt: skip
-SUMMED = ("decisions", "asked", "invalid", "fallbacks", "attempts", "faults", "answers", "others",
-          "unpriced")  # fmt: skip
+SUMMED = ("decisions", "asked", "invalid", "fallbacks", "no_decision", "attempts", "faults",
+          "answers", "others", "unpriced")  # fmt: skip
 # A reply that several of the trials share counts and costs once. In their last digits sums differ
 # from time to time.
 COUNTS = f"""

@@ -17,6 +17,7 @@ from pandas.api.types import is_string_dtype
 from merge_runner.drivers.registry import MOCKS
 from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import title_of
+from merge_runner.records import NO_DECISION
 from merge_runner.results.provenance import program
 from merge_runner_analysis.data.derived_cache import finished, keep_finished
 from merge_runner_analysis.data.load import load_each
@@ -58,6 +59,8 @@ MEANINGS = {
     "Trials failed": "They are in no measure; the same sweep again plays them anew.",
     "Many fallbacks": "There the older plan was driven, or none: tables --without-fallbacks shows "
     "whether that changes the results.",
+    "Decisions are missing": "The plans of these replies were driven, but the tactical decision "
+    "that was asked for is not in them: they are in no table of what drivers say.",
     "Attempts of unknown fate": "A run was killed before their reply was seen: they may have been "
     "paid for.",
     "Several settings under one name": "They are never pooled: all but the most frequent carry a "
@@ -273,6 +276,8 @@ def _found(study: Study, origin: Provenance) -> Iterator[tuple[str, str]]:
             share = f"{100 * fallbacks / decisions:.1f} %"
             said = f"{fallbacks} of {decisions} decisions of {group.id} ({share})"
             yield "Many fallbacks", said
+        if missing := counts[NO_DECISION]:
+            yield "Decisions are missing", f"{missing} of {decisions} decisions of {group.id}"
         if counts["unknown"]:
             said = f"{counts['unknown']} of {counts['attempts']} of {group.id}"
             yield "Attempts of unknown fate", said

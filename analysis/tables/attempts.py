@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from merge_runner.records import NO_DECISION
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.data.provenance import tally
 from merge_runner_analysis.data.study import Study
@@ -25,11 +26,12 @@ MEANINGS = {
     "lost": "calls that ended without an answer",
     **{name: f"answers that are {name}, without a plan" for name in FAILURES},
     "invalid": "answers without a valid plan, for any reason",
+    NO_DECISION: "answers with a valid plan, and without the tactical decision asked for",
     "fallback": "decisions driven from an older plan, or from none",
     "unknown": "attempts of unknown fate",
     "other_model": "answers of another model",
 }
-SHARES = {"retried", "lost", *FAILURES, "invalid", "fallback"}
+SHARES = {"retried", "lost", *FAILURES, "invalid", NO_DECISION, "fallback"}
 
 
 def attempts(study: Study) -> Table:
@@ -37,7 +39,9 @@ def attempts(study: Study) -> Table:
     found = {group: tally(study, group.stored) for group in study.played}
     known = {"answers", "decisions", *MEANINGS, *FAILURES.values()}
     reasons = dict.fromkeys(name for one in found.values() for name in sorted({*one} - known))
-    names = [*MEANINGS]
+    names = [
+        name for name in MEANINGS if name != NO_DECISION or any(one[name] for one in found.values())
+    ]
     names[names.index("invalid") : names.index("invalid")] = reasons
     columns = [column for name in names for column in _columns(name)]
     return Table(
@@ -65,10 +69,11 @@ def _columns(name: str) -> list[Column]:
 
 def _condition(name: str) -> str:
     """Which trials have what a column counts, by the columns of ``Study.calls``."""
-    if name in FAILURES or name not in MEANINGS:
+    if name in {*FAILURES, NO_DECISION} or name not in MEANINGS:
         failure = quoted(FAILURES.get(name, name))
         return f"list_contains(string_split(failures, chr(10)), {failure})"
-    own = {"trials": "", "failed": "status = 'failed'", "invalid": "failures IS NOT NULL"}
+    invalid = f"NOT list_has_all([{quoted(NO_DECISION)}], string_split(failures, chr(10)))"
+    own = {"trials": "", "failed": "status = 'failed'", "invalid": invalid}
     return own.get(name, f"{name} > 0")
 
 

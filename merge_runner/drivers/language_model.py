@@ -4,16 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from functools import partial
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import model_pace
-from merge_runner.prompts.blocks import render_prompt
+from merge_runner.prompts.blocks import asks_tactical, render_prompt
 from merge_runner.prompts.parse import ParsedReply, parse_reply
-from merge_runner.records import ChatReply, Decision, Observation, Side, Slot, TrialSpec
+from merge_runner.records import (
+    NO_DECISION,
+    ChatReply,
+    Decision,
+    Observation,
+    Side,
+    Slot,
+    TrialSpec,
+)
 
 Ask = Callable[[str, Slot, TrialSpec], Awaitable[ChatReply]]
 """Asks the model with a prompt, for a slot of a trial; raises CallFailed."""
+Known = Callable[[str, Slot], bool]
+"""Whether the model has been asked with a prompt for a slot already."""
 Decided = Callable[[Decision], None]
 """Gets each decision before it is driven; raises SweepStopped."""
 
@@ -24,11 +35,12 @@ class LanguageModel:
 
     ask: Ask
     decided: Decided | None = None
+    known: Known | None = None
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> LlmDriver:
         """See MakeDriver."""
         seat = take_seat(scenario, spec, side, model_pace(scenario))
-        return LlmDriver(self.ask, spec, seat, self.decided)
+        return LlmDriver(self.ask, spec, seat, self.decided, self.known)
 
 
 @dataclass(slots=True)
@@ -39,6 +51,7 @@ class LlmDriver:
     spec: TrialSpec
     seat: Seat
     decided: Decided | None = None
+    known: Known | None = None
     _plan: tuple[float, ...] | None = None
     _executed: int = 0
 
@@ -49,9 +62,8 @@ class LlmDriver:
         """
         scenario, spec = self.seat.scenario, self.spec
         assert spec.variant is not None, "only human trials have no prompt variant"
-        rest = None if self._plan is None else self._plan[self._executed :]
-        prompt = render_prompt(observation, rest, variant=spec.variant, scenario=scenario)
         slot = Slot(spec.condition, spec.repetition, self.seat.side, number, spec.sample_set)
+        prompt = self._prompt(observation, slot)
         reply = await self.ask(prompt, slot, spec)
         # A refusal or a truncated answer is an outcome of its own; it is not searched for a plan.
         parsed = (
@@ -66,12 +78,16 @@ class LlmDriver:
         wanted = self.seat.pace.executed_actions
         actions = (self._plan or ())[self._executed :][:wanted]
         self._executed += wanted
+        failure = parsed.failure
+        if failure is None and parsed.tactical is None:
+            asked = asks_tactical(spec.variant, observation.road)
+            failure = NO_DECISION if asked else None
         decision = Decision(
             plan=parsed.plan,
             applied=actions + (0.0,) * (wanted - len(actions)),
             tactical=parsed.tactical,
             rationale=parsed.rationale,
-            failure=parsed.failure,
+            failure=failure,
             fallback=parsed.plan is None,
             prompt=prompt,
             reply=reply,
@@ -79,3 +95,25 @@ class LlmDriver:
         if self.decided is not None:
             self.decided(decision)
         return decision
+
+    def _prompt(self, observation: Observation, slot: Slot) -> str:
+        """The prompt for a slot.
+
+        Earlier versions told a driver without a valid plan at each decision that it was its first
+        one. Where such a prompt has been asked it stays, so that recordings replay.
+        """
+        spec = self.spec
+        assert spec.variant is not None, "only human trials have no prompt variant"
+        render = partial(
+            render_prompt,
+            observation,
+            None if self._plan is None else self._plan[self._executed :],
+            variant=spec.variant,
+            scenario=self.seat.scenario,
+        )
+        prompt = render(first=slot.decision == 0)
+        if self._plan is not None or slot.decision == 0 or self.known is None:
+            return prompt
+        older = render(first=True)
+        is_older = self.known(older, slot) and not self.known(prompt, slot)
+        return older if is_older else prompt

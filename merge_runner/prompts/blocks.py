@@ -25,7 +25,7 @@ from merge_runner.prompts.state_lines import LINES, NOT_SEEN
 from merge_runner.records import Observation, Road
 from merge_runner.registry import Catalogue, Registry, require
 
-OUTPUT_FORMAT = "C5"
+TACTICAL, OUTPUT_FORMAT = "C4", "C5"
 LAST = "the end"
 _UNIT_OF_NOTHING = re.compile(rf"({NOT_SEEN}) (?:m/s\^2|m/s|km/h|mph|m|s)(?![\w/^])")
 KMH_OF_MPS = 3.6
@@ -34,11 +34,15 @@ MPH_OF_MPS = 3600 / 1609.344  # the international mile of 1959
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What a prompt is about; ``plan`` is the rest of the last valid one, None before the first."""
+    """What a prompt is about; ``plan`` is the rest of the last valid one, None before the first.
+
+    ``first`` says that the driver has not decided before.
+    """
 
     seen: Observation
     task: ScenarioConfig
     plan: Sequence[float] | None
+    first: bool
 
     def of_other(self, value: float) -> str:
         """A number about the other car, which may be out of sight."""
@@ -62,7 +66,7 @@ def _other_speeds(now: Situation) -> str:
 
 def _remaining_plan(now: Situation) -> str:
     if now.plan is None:
-        return "none, this is your first decision"
+        return "none, this is your first decision" if now.first else "none"
     return f"{listing(now.plan)}, one value every {now.task.action_s:g} s, next first"
 
 
@@ -247,7 +251,7 @@ _PAPER = (
     ("C3.human", "drive like a human", _HUMAN),
     ("C3.distance", "keep a distance", _DISTANCE),
     ("C3.reassess", "reassess", _REASSESS),
-    ("C4", "tactical decision", _TACTICAL, None),
+    (TACTICAL, "tactical decision", _TACTICAL, None),
     (OUTPUT_FORMAT, "output format", _SCHEMA),
 )
 _READY = (
@@ -340,16 +344,24 @@ def render_prompt(
     *,
     variant: str,
     scenario: ScenarioConfig,
+    first: bool = True,
 ) -> str:
     """The prompt of a variant.
 
     ``remaining_plan`` is the unexecuted rest of the last valid plan (normalised accelerations),
-    None before the first.
+    None before the first. ``first`` says that the driver has not decided before; it makes a
+    difference only where there is no plan.
     """
     template, names = _template(variant, observation.road, Registry.catalogue)
-    now = Situation(observation, scenario, remaining_plan)
+    now = Situation(observation, scenario, remaining_plan, first)
     prompt = template.format_map({name: FIELDS[name](now) for name in names})
     return prompt if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", prompt)
+
+
+def asks_tactical(variant: str, road: Road) -> bool:
+    """Whether the prompt of a variant asks for a tactical decision on a road."""
+    block = blocks_of(variant).get(TACTICAL)
+    return block is not None and (block.merge if road == "merge" else block.straight) is not None
 
 
 @lru_cache

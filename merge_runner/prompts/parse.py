@@ -8,6 +8,10 @@ The reasons: ``no_array``, ``several_arrays`` (different valid ones) or, where n
 is wrong with the array that comes nearest to a plan, one of the wanted length before any other:
 ``out_of_range``, ``wrong_length``, ``not_finite`` and ``not_a_number`` (an entry is no number
 literal).
+
+The tactical decision is read at the head of the reply, as a letter or in words (Merge first,
+Yield), perhaps after a label (Decision:). Where there is none, it is read from the lines that have
+such a label and nothing else, or from members of a JSON object of that name; these must agree.
 """
 
 from __future__ import annotations
@@ -39,9 +43,33 @@ _TOKEN_LINE = re.compile(
     r"(?:merge first|merge|yield)?[\W_]*",
     re.IGNORECASE,
 )
+_LABEL = r"(?:(?:my )?(?:tactical|decision|choice)[\W_]++(?:is[\W_]++)?(?:to[\W_]++)?)"
+_CHOICE = (
+    r"(?:(?P<letter>[MY])(?![^\W_])(?:[\W_]++(?:merge first|merge|yield)(?![^\W_]))?"
+    r"|(?:(?P<merge>merge first|go first|merge)|yield(?: to the other (?:car|driver|vehicle))?)"
+    r"(?![^\W_])(?:[\W_]++(?P<same>[MY])(?![^\W_]))?)"
+)
+# Some replies number their parts as the output format does; a brace begins a JSON object.
+_HEAD = r"(?:[^\w{]|_)*+(?:1[\W_]++)?"
+_CHOICE_LINE = re.compile(rf"{_HEAD}(?P<label>{_LABEL}*+){_CHOICE}[\W_]*+", re.IGNORECASE)
+_CHOICE_WITH_REASON = re.compile(
+    rf"{_HEAD}{_LABEL}++{_CHOICE}[*_`\"')\]]*+ ?(?:[.,:;(\u2013\u2014-]|(?=because|since)) ?",
+    re.IGNORECASE,
+)
+_HEADING = re.compile(rf"{_HEAD}{_LABEL}++", re.IGNORECASE)
+_MEMBER = re.compile(
+    r"""[{,]\s*+["'](?:tactical|decision|tactical[ _]decision|choice)["']\s*+:\s*+"""
+    rf"""["']{_CHOICE}["']""",
+    re.IGNORECASE,
+)
+# A line with a choice is short; the limit also bounds the time that a hostile line can take.
+_LONGEST_LINE = 80
 _LEADING_TOKEN = re.compile(r"[*_`#>\s\"'(\[]{0,20}([MY])(?=[\s*_`\"'):.,;\]\u2013\u2014-]|$)")
 # Models write these for the ASCII minus sign.
-_MINUSES = str.maketrans(dict.fromkeys("\u2212\u2012\u2013\ufe63\uff0d", "-"))
+_MINUSES = dict.fromkeys("\u2010\u2011\u2012\u2013\u2014\u2212\ufe63\uff0d", "-")
+# Some put these between characters, where nobody sees them.
+_INVISIBLE = dict.fromkeys("\u200b\u200c\u200d\u2060\ufeff", "")
+_AS_ASCII = str.maketrans(_MINUSES | _INVISIBLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +89,8 @@ def parse_reply(text: str, plan_actions: int) -> ParsedReply:
     prose, places = _split(text)
     plan, failure = _plan(places, plan_actions)
     tactical, rationale = _tactical(prose.strip())
+    if tactical is None:
+        tactical, rationale = _in_words(prose.strip(), text)
     return ParsedReply(plan, tactical, rationale, failure)
 
 
@@ -112,7 +142,7 @@ def _is_action(entry: float | str) -> bool:
 def _entries(inside: str) -> tuple[float | str, ...]:
     """The entries of an array: numbers, and as it is spelled what is not a number."""
     if not inside.isascii():
-        inside = inside.translate(_MINUSES)
+        inside = inside.translate(_AS_ASCII)
     if _NUMBERS.fullmatch(inside):
         return tuple(map(float, inside.rstrip().removesuffix(",").split(",")))
     entries = [_SIGN_APART.sub(r"\1", entry.strip()) for entry in inside.split(",")]
@@ -124,8 +154,7 @@ def _entries(inside: str) -> tuple[float | str, ...]:
 def _tactical(prose: str) -> tuple[Tactical | None, str]:
     """The M/Y token at the head of the reply, and the prose without it."""
     first_line, _, rest = prose.partition("\n")
-    # A token line is short; the limit also bounds the time that a hostile line can take.
-    whole = _TOKEN_LINE.fullmatch(first_line) if len(first_line) <= 80 else None
+    whole = _TOKEN_LINE.fullmatch(first_line) if len(first_line) <= _LONGEST_LINE else None
     if whole:
         return _token(whole), rest.strip()
     leading = _LEADING_TOKEN.match(first_line)
@@ -134,6 +163,33 @@ def _tactical(prose: str) -> tuple[Tactical | None, str]:
             "*_`\"'):.,;] \n\u2013\u2014-"
         ).strip()
     return None, prose
+
+
+def _in_words(prose: str, text: str) -> tuple[Tactical | None, str]:
+    """The decision where no letter is at the head of the reply, and the prose without it."""
+    lines = [line for line in prose.split("\n") if line.strip()]
+    short = [line for line in lines if len(line) <= _LONGEST_LINE]
+    heads = [line for line in lines[:2] if len(line) <= _LONGEST_LINE]
+    # A label may be a heading, above the choice.
+    count = 2 if len(heads) == 2 and _HEADING.fullmatch(f"{heads[0]} ") else 1
+    whole = _CHOICE_LINE.fullmatch(" ".join(heads[:count]))
+    if whole and (choice := _choice(whole)):
+        return choice, "\n".join(lines[count:]).strip()
+    begin = _CHOICE_WITH_REASON.match(prose[: 2 * _LONGEST_LINE])
+    if begin and (choice := _choice(begin)):
+        return choice, prose[begin.end() :].strip()
+    labelled = [found for line in short if (found := _CHOICE_LINE.fullmatch(line))]
+    choices = {*map(_choice, [found for found in labelled if found["label"]])}
+    choices = choices or {*map(_choice, _MEMBER.finditer(text))}
+    return (choices.pop() if len(choices) == 1 else None), prose
+
+
+def _choice(match: re.Match[str]) -> Tactical | None:
+    """The choice of a match; None where its words and its letter disagree."""
+    if match["letter"]:
+        return "M" if match["letter"].upper() == "M" else "Y"
+    choice: Tactical = "M" if match["merge"] else "Y"
+    return choice if (match["same"] or choice).upper() == choice else None
 
 
 def _token(match: re.Match[str]) -> Tactical:

@@ -46,7 +46,8 @@ GROUP BY driver, model, provider HAVING bool_or(tried.scripted) ORDER BY ALL;
 
 CREATE OR REPLACE TEMP VIEW decided AS
 SELECT count(*) AS decisions, count(*) FILTER (NOT valid) AS invalid,
-    count(*) FILTER (fallback) AS fallbacks
+    count(*) FILTER (fallback) AS fallbacks,
+    count(*) FILTER (failure = 'no_decision') AS no_decision
 FROM decisions SEMI JOIN played USING (trial_id, spec_hash);
 
 -- What was done first where drivers were only asked. The velocity is the driver's own, minus the

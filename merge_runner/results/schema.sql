@@ -140,7 +140,8 @@ CREATE TABLE decisions (
 COMMENT ON TABLE decisions IS 'A driver at a decision instant.';
 COMMENT ON COLUMN decisions.decision IS 'counts those of this driver from 0';
 COMMENT ON COLUMN decisions.valid IS 'whether the reply holds a plan';
-COMMENT ON COLUMN decisions.failure IS 'why it is invalid';
+COMMENT ON COLUMN decisions.failure IS 'why it is invalid; no_decision: it is valid, and lacks the '
+    'tactical decision asked for';
 COMMENT ON COLUMN decisions.tactical IS 'M, Y';
 COMMENT ON COLUMN decisions.rationale IS 'the reason in the reply';
 COMMENT ON COLUMN decisions.plan IS 'normalised to [-1, 1], the whole horizon';

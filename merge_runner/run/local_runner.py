@@ -161,8 +161,10 @@ class LocalRunner:
         self.meters = {name: client.meter for name, client in self.clients.items()}
         self._arms = self.plan.by_label()
         models = {
-            name: LanguageModel(partial(self._ask, name), partial(self.first.count, name))
-            for name in self.clients
+            name: LanguageModel(
+                partial(self._ask, name), partial(self.first.count, name), client.has_asked
+            )
+            for name, client in self.clients.items()
         }
         self._drivers: dict[str, MakeDriver] = {**PROGRAMS, **models}
 

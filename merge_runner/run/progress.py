@@ -378,6 +378,7 @@ def as_dict(
         "decisions": facts["decisions"],
         "invalid_decisions": facts["invalid"],
         "fallbacks": facts["fallbacks"],
+        "no_decision": facts["no_decision"],
         "model_mismatches": {f"{asked} -> {served}": n for asked, served, n in facts["others"]},
         "stand_ins": [row[:3] for row in facts["stand_ins"]],
         "failed": dict(facts["failed"]),
@@ -412,9 +413,11 @@ def _results(summary: dict[str, Any]) -> Iterator[str]:
             yield as_table(levels)
     decisions, invalid = summary["decisions"], summary["invalid_decisions"]
     share = f" ({invalid / decisions:.1%})" if invalid else ""
+    missing = summary["no_decision"]
     yield (
         f"decisions: {decisions}, {invalid} invalid{share}, "
         f"{summary['fallbacks']} fallbacks to an earlier plan"
+        + (f", {missing} without the tactical decision asked for" if missing else "")
     )
 
 

@@ -40,8 +40,8 @@ ANSWERS = ("ok", "refusal", "truncated", "empty")
 class Said:
     """What became of the left driver's call: the outcomes of its attempts, the answer's last.
 
-    With a ``failure`` the answer holds no plan, and with ``lost`` there is no answer; what is
-    driven is the same. ``served`` is the model that answered.
+    With a ``failure`` the answer holds no plan, or no tactical decision (``no_decision``), and with
+    ``lost`` there is no answer; what is driven is the same. ``served`` is the model that answered.
     """
 
     outcomes: tuple[str, ...] = ("ok",)
@@ -134,11 +134,12 @@ def answered(drive: Drive, side: Side, number: int, decision: Decision) -> Decis
     )
     if said.lost:
         return FailedCall(number, side, request, attempts)
+    has_plan = said.failure in {None, "no_decision"}
     return replace(
         decision,
-        plan=None if said.failure else decision.plan,
+        plan=decision.plan if has_plan else None,
         failure=said.failure,
-        fallback=said.failure is not None,
+        fallback=not has_plan,
         reply=ChatReply("", said.outcomes[-1], request, attempts, earlier=0),
     )
 

@@ -1,5 +1,7 @@
 """What a language model drives: its plan, the rest of it, and what happens without one."""
 
+from dataclasses import replace
+
 import pytest
 
 from merge_runner.config import ScenarioConfig
@@ -34,8 +36,8 @@ def chat_reply(text, outcome="ok"):
     return ChatReply(text=text, outcome=outcome, request=REQUEST, attempts=(), earlier=0)
 
 
-async def decide(*replies, seen=SEEN, variant="baseline", **scenario):
-    """One decision per reply, a text or a ChatReply, and what the model was asked with."""
+async def decide(*replies, seen=SEEN, variant="baseline", known=None, **scenario):
+    """One decision per reply, a text or a ChatReply; ``known`` says what was asked earlier."""
     asked = []
 
     async def ask(prompt, slot, _):
@@ -45,7 +47,8 @@ async def decide(*replies, seen=SEEN, variant="baseline", **scenario):
 
     scenario = ScenarioConfig(**scenario)
     spec = TrialSpec("t", "s", "llm", "m", "m", variant, "N_0_0", 1, 0, 0)
-    driver = LlmDriver(ask, spec, Seat(scenario, "left", model_pace(scenario), 0))
+    seat = Seat(scenario, "left", model_pace(scenario), 0)
+    driver = LlmDriver(ask, spec, seat, known=known)
     decisions = [await driver.decide(seen, number) for number in range(len(replies))]
     assert [prompt for prompt, _ in asked] == [decision.prompt for decision in decisions]
     assert [number for _, number in asked] == list(range(len(replies)))
@@ -81,6 +84,60 @@ async def test_a_decision_keeps_the_reply_it_was_read_from():
 async def test_the_first_prompt_has_no_previous_plan():
     (decision,) = await decide(valid(PLAN))
     assert remaining(decision) == "none, this is your first decision"
+
+
+async def test_only_the_first_prompt_says_that_it_is_the_first():
+    decisions = await decide(*[INVALID] * 3, valid(PLAN), INVALID)
+    assert [remaining(d) for d in decisions[:4]] == [
+        "none, this is your first decision",
+        *["none"] * 3,
+    ]
+    assert remaining(decisions[4]) == listed(PLAN[5:])
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ({"none, this is your first decision"}, "none, this is your first decision"),
+        ({"none, this is your first decision", "none"}, "none"),
+        (set(), "none"),
+    ],
+)
+async def test_a_prompt_that_an_earlier_version_has_asked_stays_as_it_was(asked, expected):
+    def known(prompt, slot):
+        return slot.decision == 1 and any(f"yet): {words}\n" in prompt for words in asked)
+
+    decisions = await decide(INVALID, INVALID, INVALID, known=known)
+    assert [remaining(d) for d in decisions[1:]] == [expected, "none"]
+
+
+STRAIGHT = replace(SEEN, road="straight", distance_to_merge_m=None)
+
+
+async def test_a_plan_without_the_decision_that_was_asked_for_is_driven_and_named():
+    (decision,) = await decide(f"I go on.\n{list(PLAN)}")
+    assert (decision.valid, decision.failure, decision.tactical) == (True, "no_decision", None)
+    assert (decision.plan, decision.applied, decision.fallback) == (PLAN, PLAN[:5], False)
+
+
+@pytest.mark.parametrize(
+    ("seen", "variant", "text"),
+    [
+        (STRAIGHT, "baseline", f"I go on.\n{list(PLAN)}"),
+        (SEEN, "A7", f"I go on.\n{list(PLAN)}"),
+        (SEEN, "baseline", f"Decision: Merge first\n{list(PLAN)}"),
+    ],
+)
+async def test_nothing_is_missing_where_no_decision_is_asked_for_or_one_is_given(
+    seen, variant, text
+):
+    (decision,) = await decide(text, seen=seen, variant=variant)
+    assert (decision.valid, decision.failure) == (True, None)
+
+
+async def test_what_is_wrong_with_a_plan_goes_before_a_missing_decision():
+    (decision,) = await decide(INVALID)
+    assert (decision.valid, decision.failure) == (False, "no_array")
 
 
 async def test_the_next_prompt_shows_the_fifteen_actions_that_were_not_executed():
@@ -124,7 +181,7 @@ async def test_without_any_valid_plan_yet_the_actions_are_zero():
     decisions = await decide(INVALID, INVALID, valid(PLAN))
     assert [d.applied for d in decisions] == [ZEROS, ZEROS, PLAN[:5]]
     assert [d.fallback for d in decisions] == [True, True, False]
-    assert remaining(decisions[2]) == "none, this is your first decision"
+    assert remaining(decisions[2]) == "none"
 
 
 async def test_restart_drives_the_old_plan_from_its_first_action():

@@ -213,6 +213,25 @@ def test_a_driver_that_is_not_judged_has_no_verdict(tmp_path):
     site.computing.close()
 
 
+def test_missing_decisions_are_counted_and_lead_to_their_trials(tmp_path):
+    missing = dict.fromkeys(range(2), Said(failure="no_decision"))
+    every = enumerate(yielding("o3", reps=1))
+    drives = [replace(drive, said=missing if n < 3 else {}) for n, drive in every]
+    site = Site(db := write_study(tmp_path / "t.duckdb", drives))
+    site.computing = Awaited(db, InProcess)
+    client = client_of(site)
+    text = client.get("/").text
+    assert "100.0 %" in text
+    ((url, count),) = re.findall(
+        r'<a href="([^"]+)">(\d+)</a>\s+without the decision asked for', text
+    )
+    assert count == "6"
+    assert client.get(unescape(url)).text.count("rep01</a>") == 3
+    assert "Without the decision asked for" in client.get("/drivers/o3?variant=baseline").text
+    assert "missing decisions" in client.get("/sweeps/sweep-1").text
+    site.computing.close()
+
+
 def test_the_strip_says_what_to_type_and_nothing_twice(db, tmp_path):
     copy = shutil.copy(db, tmp_path / "study.duckdb")
     with duckdb.connect(copy) as connection:

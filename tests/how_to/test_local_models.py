@@ -95,8 +95,8 @@ def test_replies_of_both_forms_are_read_with_letter_reason_and_plan():
     assert by_schema.rationale.startswith("The situation in a merge is no longer possible.")
 
 
-def test_of_an_object_the_plan_is_read_but_not_the_letter():
+def test_of_an_object_letter_and_plan_are_read():
     reply = json.dumps({"decision": "M", "rationale": "I am ahead.", "plan": [0.5] * 20})
     parsed = parse_reply(reply, 20)
     assert parsed.plan == (0.5,) * 20
-    assert parsed.tactical is None
+    assert parsed.tactical == "M"

@@ -237,7 +237,14 @@ def test_an_em_dash_parts_the_token_from_the_rationale_as_a_hyphen_does(head):
         "Merging first is safe.",
         "Yes, I go first.",
         "Yielding is safe.",
-        "Yield",
+        "Yield or merge?",
+        "Merge first (Y)",
+        "Decision: M/Y",
+        "Decision: merge first or yield",
+        "Decision: do not yield",
+        "Decision: not M",
+        '{"choice": "none"}',
+        "I think.\nDecision: M\nNo.\nDecision: Y",
         "You see me ahead.",
         "Decision: Maybe",
         "I merge first (M).",
@@ -249,6 +256,64 @@ def test_an_em_dash_parts_the_token_from_the_rationale_as_a_hyphen_does(head):
 def test_a_word_or_a_late_letter_is_no_token_and_stays_in_the_rationale(prose):
     parsed = parse_reply(f"{prose}\n```python\n{LIST}\n```", N)
     assert (parsed.tactical, parsed.rationale, parsed.plan) == (None, prose, PLAN)
+
+
+@pytest.mark.parametrize(
+    ("head", "token", "rationale"),
+    [
+        ("Decision: Merge first\nI am ahead.", "M", "I am ahead."),
+        ("**Yield**\nI am behind.", "Y", "I am behind."),
+        ("Yield\nI am behind.", "Y", "I am behind."),
+        ("Yield to the other car.\nI am behind.", "Y", "I am behind."),
+        ("Merge first (M)\n\nI am ahead.", "M", "I am ahead."),
+        ("1. Merge\nI am ahead.", "M", "I am ahead."),
+        ("1. M\nI am ahead.", "M", "I am ahead."),
+        ("My decision is to yield.\nI am behind.", "Y", "I am behind."),
+        ("## Tactical decision\n\n**Yield**\nI am behind.", "Y", "I am behind."),
+        ("## Decision\nM\nI am ahead.", "M", "I am ahead."),
+        ("Decision: Y - I am behind.", "Y", "I am behind."),
+        ("**Decision: yield**, I am behind.", "Y", "I am behind."),
+        ("Tactical decision: merge first because I am ahead.", "M", "because I am ahead."),
+        # What stands further below stays in the rationale.
+        ("I am ahead.\n**Decision:** Merge first.", "M", "I am ahead.\n**Decision:** Merge first."),
+        ("Decision: M\nSo: go.\nDecision: M", "M", "So: go.\nDecision: M"),
+        ('{"decision": "yield"}', "Y", '{"decision": "yield"}'),
+    ],
+)
+def test_a_decision_in_other_words_is_read(head, token, rationale):
+    parsed = parse_reply(f"{head}\n```python\n{LIST}\n```", N)
+    assert (parsed.tactical, parsed.rationale, parsed.plan) == (token, rationale, PLAN)
+
+
+@pytest.mark.parametrize("key", ["decision", "tactical_decision", "Tactical decision", "choice"])
+@pytest.mark.parametrize(("word", "token"), [("M", "M"), ("yield", "Y"), ("Merge first", "M")])
+def test_a_decision_is_a_member_of_an_object(key, word, token):
+    text = f'{{"{key}": "{word}", "plan": {LIST}}}'
+    for reply in (text, f"```json\n{text}\n```", text.replace('"', "'")):
+        parsed = parse_reply(reply, N)
+        assert (parsed.tactical, parsed.plan) == (token, PLAN)
+
+
+@law
+@given(st.text(st.characters(blacklist_characters="[]`")), st.sampled_from("MY"))
+def test_whatever_is_below_a_letter_changes_nothing_of_it(prose, letter):
+    assert parse_reply(f"{letter}\n{prose}", N).tactical == letter
+
+
+@pytest.mark.parametrize("minus", "\u2010\u2011\u2012\u2013\u2014\u2212\ufe63\uff0d")
+@pytest.mark.parametrize("space", " \u00a0\u202f\u2009")
+def test_another_character_for_the_minus_or_a_space_is_read(minus, space):
+    code = LIST.replace("-", minus).replace(" ", space)
+    assert parse_reply(fenced(code), N).plan == PLAN
+
+
+@pytest.mark.parametrize("invisible", "\u200b\u200c\u200d\u2060\ufeff")
+def test_a_character_that_nobody_sees_is_nothing_within_a_plan(invisible):
+    for code in (
+        LIST.replace("0.", f"{invisible}0.{invisible}"),
+        LIST.replace(",", invisible + ","),
+    ):
+        assert parse_reply(fenced(code), N).plan == PLAN
 
 
 def test_the_rationale_holds_all_prose_and_no_list():
@@ -318,6 +383,10 @@ def _watchdog():
         "M" * MB,
         "M " * (MB // 2),
         "decision: " * (MB // 10),
+        "decision:\n" * (MB // 10),
+        ("decision: " * 7 + "\n") * (MB // 71),
+        ("-" * 79 + "\n") * (MB // 80),
+        '{"decision": ' * (MB // 13),
         "[" + " " * MB + "x]",
         "[-" + " " * MB + "]",
         "[" + "-" * MB + "]",

@@ -12,7 +12,7 @@ from typing import Any
 from merge_runner.audit.checks import not_judged
 from merge_runner.config import both_sides, pair_name
 from merge_runner.run.progress import Standing, read_standing
-from merge_runner_analysis.explorer.catalogue import Catalogue, Wanted
+from merge_runner_analysis.explorer.catalogue import MISSING, Catalogue, Wanted
 from merge_runner_analysis.explorer.computing import Job
 from merge_runner_analysis.explorer.pages.computed import computed
 from merge_runner_analysis.explorer.reading import Row
@@ -47,6 +47,8 @@ TRUST = [
          "the reply held no valid plan", {"validity": "fallbacks"}),
         ("fallbacks", "fallbacks", "asked", "decisions asked",
          "an older plan was driven on, or none", {"validity": "fallbacks"}),
+        ("missing decisions", "no_decision", "asked", "decisions asked",
+         "a valid plan without the tactical decision that was asked for", {"cause": MISSING}),
         ("faults", "faults", "attempts", "attempts",
          "no answer, a refusal, or one that was cut off", {}),
         ("another model answered", "others", "answers", "answers",

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from operator import itemgetter
 from typing import Any
 
 from markupsafe import Markup
 
+from merge_runner.llm.formats import reasoning_of
+from merge_runner.records import DAMAGED, reply_object
 from merge_runner.text_safety import quoted
 from merge_runner_analysis.explorer import views
 from merge_runner_analysis.explorer.display_text import clamped, shortened, visible
@@ -112,6 +114,9 @@ def decision_panel(
     """What a driver was told, said, planned and did; ``others`` are answers of another model."""
     named = {"side": decision["side"], "decision": decision["decision"]}
     before = decision["before"]
+    thoughts = ""
+    with suppress(*DAMAGED):  # a reply of a server that failed is any text
+        thoughts = reasoning_of(reply_object(decision["reply"]))
     panel = site.render(
         "_decision.html",
         d=decision,
@@ -123,6 +128,7 @@ def decision_panel(
         meaning=views.block_meaning,
         others=others,
         reply=shortened(decision["reply"]) if decision["reply"] else None,
+        reasoning=shortened(thoughts) if thoughts else None,
         raw=site.at.to("sql.csv", q=REPLY.format(decision["call_key"])),
         chart=views.plan_chart(decision, trial),
         points=step_points,

@@ -90,6 +90,26 @@ def test_a_driver_that_asks_no_model_has_no_rate_but_a_reason(small):
     assert row.values["fallback_percent"] == 0
 
 
+def test_a_missing_decision_has_a_count_of_its_own_and_is_not_invalid(tmp_path):
+    """Its plan is driven: no rate of failure has it."""
+    missing = dict.fromkeys(range(3), Said(failure="no_decision"))
+    drives = [
+        replace(drive, said=missing if n < 2 else {0: FAILED} if n == 2 else {})
+        for n, drive in enumerate(yielding("o3", reps=1))
+    ]
+    study = Study(write_study(tmp_path / "t.duckdb", drives))
+    (table,) = make_tables(study, ["attempts"])
+    row = row_of(table, "o3/baseline")
+    counts = {"no_decision": 6, "invalid": 1, "no_array": 1, "fallback": 1}
+    assert {name: row.values[name] for name in counts} == counts
+    assert row.values["no_decision_percent"] == 100 * 6 / row.values["calls"]
+    for column, trials in (("no_decision", 2), ("invalid", 1), ("fallback", 1)):
+        (source,) = explain(study, table, f"o3/baseline:{column}").sources
+        assert len(source.numerator) == trials, column
+    without = Study(study.db, without_fallbacks=True)
+    assert len(without.models[0].trials) == len(drives) - 1
+
+
 @pytest.fixture(scope="module")
 def biased(tmp_path_factory):
     """Who is ahead goes first, but in the trials with a fallback the right one always does."""
