@@ -20,7 +20,7 @@ from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import (
     HTMLResponse,
     JSONResponse,
@@ -48,7 +48,14 @@ from merge_runner_analysis.explorer.pages import (
     words,
 )
 from merge_runner_analysis.explorer.reading import reading
-from merge_runner_analysis.explorer.site import STATIC, NothingNew, NotThere, Site, download
+from merge_runner_analysis.explorer.site import (
+    STATIC,
+    NothingNew,
+    NotThere,
+    Site,
+    TooMuch,
+    download,
+)
 from merge_runner_analysis.explorer.urls import whole
 
 LOG = logging.getLogger(__name__)
@@ -194,6 +201,9 @@ def _errors(site: Site) -> dict[Any, Callable[[Request, Exception], Response]]:
     return {
         NothingNew: lambda *_: Response(status_code=204),
         NotThere: partial(said, "Not there", 404),
+        TooMuch: partial(said, "Too much", 400),
+        # Nobody reads what is answered to a browser that has left.
+        ClientDisconnect: lambda *_: Response(status_code=400),
         404: partial(said, "Not there", 404),
         MergeRunnerError: partial(said, "Not now", 503),
         Exception: partial(said, "A fault", 500),

@@ -54,6 +54,10 @@ class NotThere(Exception):
     """What an address asks for is not there; the text says what is."""
 
 
+class TooMuch(Exception):
+    """An address asks for more than a query may hold; the text says how much it may."""
+
+
 class NothingNew(Exception):
     """What was seen of a page is what it still shows."""
 

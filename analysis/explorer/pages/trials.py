@@ -8,10 +8,14 @@ from merge_runner_analysis.explorer.catalogue import FACETS, FACTOR, PAGE, SORTS
 from merge_runner_analysis.explorer.pages.computed import awaited, computed
 from merge_runner_analysis.explorer.pictures import sparkline, speed_range
 from merge_runner_analysis.explorer.scope import carried
-from merge_runner_analysis.explorer.site import NotThere, Site, news_of
+from merge_runner_analysis.explorer.search import LONGEST_QUERY, MOST_TERMS
+from merge_runner_analysis.explorer.site import NotThere, Site, TooMuch, news_of
 from merge_runner_analysis.explorer.urls import whole
 from merge_runner_analysis.tables import TABLES
 
+# So many facets may be chosen at once, each by a value of up to so many characters. What is longer
+# is a fault within DuckDB, or the end of the process.
+MOST_CHOSEN, LONGEST_VALUE = 30, 1_000
 # What facets are called that have another name in an address.
 HEADINGS = {"sweep": "run", "model": "driver", "variant": "prompt"}
 
@@ -61,7 +65,10 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
 
 
 def export_filter(site: Site, asked: Mapping[str, str]) -> Wanted:
-    """The filter in an address, whose cell may have to be computed; raises NotThere, StoreError."""
+    """The filter in an address, whose cell may have to be computed.
+
+    Raises NotThere, StoreError and TooMuch.
+    """
     wanted, cell = filter_of(asked), asked.get("cell", "")
     return {**wanted, "trials": awaited(site, cell_request(cell))["trials"]} if cell else wanted
 
@@ -76,12 +83,25 @@ def cell_request(cell: str) -> tuple[str, str, str, str]:
 
 
 def filter_of(asked: Mapping[str, str]) -> dict[str, str]:
-    """The filter in an address."""
-    return {
+    """The filter in an address; raises TooMuch."""
+    wanted = {
         name: value
         for name, value in asked.items()
         if value and (name in {*FACETS, "q"} or name.startswith(FACTOR))
     }
+    words = wanted.get("q", "")
+    if len(words) > LONGEST_QUERY or len(words.split()) > MOST_TERMS:
+        raise TooMuch(
+            f"a search has up to {MOST_TERMS} words and {LONGEST_QUERY} characters, this one "
+            f"{len(words.split()):,} and {len(words):,}"
+        )
+    longest = max(map(len, asked.values()), default=0)
+    if len(wanted) > MOST_CHOSEN or longest > LONGEST_VALUE:
+        raise TooMuch(
+            f"a filter has up to {MOST_CHOSEN} parts of up to {LONGEST_VALUE:,} characters, this "
+            f"one {len(wanted):,} of up to {longest:,}"
+        )
+    return wanted
 
 
 def sort_of(asked: Mapping[str, str]) -> str:
