@@ -189,11 +189,15 @@ class ScenarioConfig(Frozen):
 
 
 class Price(Frozen):
-    """USD per million tokens, and where the figures were read."""
+    """USD per million tokens, and where the figures were read.
+
+    ``tiers`` are factors of them by the ``service_tier`` that a reply names.
+    """
 
     input: NotNegative
     cached_input: NotNegative | None = None
     output: NotNegative
+    tiers: dict[str, Positive] = {}
     source: str
 
 
@@ -502,9 +506,9 @@ def base_urls(entries: Mapping[str, ModelEntry]) -> dict[str, str]:
 
 
 def read_text(path: Path) -> str:
-    """The text of a file; raises UsageError."""
+    """The text of a file, without the byte order mark of Windows editors; raises UsageError."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as exc:
         why = getattr(exc, "strerror", exc)
         raise UsageError(f"{path} cannot be read: {why}") from exc

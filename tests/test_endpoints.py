@@ -344,3 +344,13 @@ def test_a_registry_that_is_wrong_is_one_line_that_says_where(tmp_path, text, na
 def test_a_registry_that_is_missing_is_an_error(tmp_path):
     with pytest.raises(UsageError, match="cannot be read: No such file"):
         read_models(tmp_path / "models.toml")
+
+
+def test_toml_files_with_the_byte_order_mark_of_windows_editors_are_read(tmp_path):
+    entry = '[m]\nprovider = "local"\nformat = "openai-chat"\nid = "x"\nmax_output_tokens = 10\n'
+    models = tmp_path / "models.toml"
+    models.write_text(entry, encoding="utf-8-sig")
+    assert read_models(models)["m"].id == "x"
+    study = tmp_path / "study.toml"
+    study.write_text("[repetitions]\nbaseline = 2\n", encoding="utf-8-sig")
+    assert read_study(str(study)).text == "[repetitions]\nbaseline = 2\n"

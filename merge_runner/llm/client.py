@@ -27,8 +27,9 @@ from merge_runner.errors import (
     SweepStopped,
 )
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.formats import FORMATS, WireFormat, read_reply
+from merge_runner.llm.formats import FORMATS, WireFormat, as_text, read_reply
 from merge_runner.llm.http_outcome import (
+    UNSURE,
     AttemptOutcome,
     TransportFailure,
     TryAgain,
@@ -37,9 +38,19 @@ from merge_runner.llm.http_outcome import (
     judge,
     may_be_charged,
     next_wait_s,
+    reason_of,
+    utc_after,
     why_refused,
 )
-from merge_runner.llm.ledger import TOLERANCE_USD, Asked, Budget, Ledger, PaidAttempt, cost_usd
+from merge_runner.llm.ledger import (
+    TOLERANCE_USD,
+    Asked,
+    Budget,
+    Ledger,
+    PaidAttempt,
+    cost_usd,
+    is_underpriced,
+)
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import (
     SCRIPTED_HEADER,
@@ -65,6 +76,8 @@ LONG_WAIT_S = 5.0
 # How often a format that knows empty answers as a fault is asked again after one; and how many
 # refusals by an endpoint that has answered before mean the configuration.
 EMPTY_RETRIES, SEVERAL = 2, 3
+# How Gemini names a quota of a day, beside a delay that is none.
+GEMINI_DAY = "PerDay"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +135,9 @@ class Call:
 class Meter:
     """Counts of calls, attempts and cost.
 
-    ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name; ``damaged``
-    are the keys of recorded replies that could not be read.
+    ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name;
+    ``underpriced`` those that cost more than the registry knows, by service tier; ``damaged`` are
+    the keys of recorded replies that could not be read.
     """
 
     calls_live: int = 0
@@ -133,6 +147,7 @@ class Meter:
     outcomes: Counter[str] = field(default_factory=Counter)
     mismatches: Counter[str] = field(default_factory=Counter)
     stand_ins: int = 0
+    underpriced: Counter[str] = field(default_factory=Counter)
     notes: deque[str] = field(default_factory=deque)
     damaged: list[str] = field(default_factory=list)
 
@@ -335,7 +350,9 @@ class LlmClient:
         worst = Usage(
             input_tokens=len(request.body.encode()), output_tokens=self.entry.max_output_tokens
         )
-        asked = Asked(self.driver, str(request.slot), cost_usd(self.entry, worst) or 0.0)
+        tier = as_text(self.entry.parameters.get("service_tier"))
+        dearest_usd = max(cost_usd(self.entry, worst, each) or 0.0 for each in (None, tier))
+        asked = Asked(self.driver, str(request.slot), dearest_usd)
         call = Call(request, order, asked, worst, self.entry.deadline_s)
         call.task = asyncio.create_task(self._call(call))
         self.under_way[request.key] = call
@@ -358,12 +375,16 @@ class LlmClient:
         with self._waiting(call, "for trials before it to end, under --max-cost", idle=True):
             await self.money.admit(call.order)
         alone = not self.passed and not call.open  # nobody waits for an answer that may take hours
+        telling: asyncio.TimerHandle | None = None
         if alone:
             with self._waiting(call, f"for the first answer of {self.driver}"):
                 await self._alone.acquire()
             if self.passed:  # answered meanwhile: nobody goes alone any more
                 self._alone.release()
                 alone = False
+            else:
+                loop = asyncio.get_running_loop()
+                telling = loop.call_later(LONG_WAIT_S, self._tell_first_wait, call)
         try:
             self._resume(call)
             return await self._attempts(call)
@@ -371,8 +392,19 @@ class LlmClient:
             alone = False  # the next call would only be refused in the same way
             raise
         finally:
+            if telling is not None:
+                telling.cancel()
             if alone:
                 self._alone.release()
+
+    def _tell_first_wait(self, call: Call) -> None:
+        """Note that the first call of a run has waited for LONG_WAIT_S."""
+        left = timedelta(seconds=self.entry.deadline_s - LONG_WAIT_S)
+        last = f"after {call.last_failure}" if call.own_attempts else "nothing has come yet"
+        self.meter.notes.append(
+            f"{self.driver}: {call.asked.slot}: the first call of this run waits for its answer "
+            f"until {datetime.now(UTC) + left:%H:%M:%S} UTC at the latest, {last}"
+        )
 
     def _resume(self, call: Call) -> None:
         """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
@@ -489,7 +521,9 @@ class LlmClient:
             )
             outcome = judge(raw, self._wire)
         except TransportFailure as exc:
-            outcome = AttemptOutcome(exc.action, exc.outcome, str(exc), charged=exc.sent)
+            outcome = AttemptOutcome(
+                exc.action, exc.outcome, str(exc), charged=exc.sent, reason=exc.reason
+            )
         took_s = clock_s() - began_s
         call.left_s -= took_s
         record = self._record(call, outcome, began, took_s)
@@ -508,6 +542,9 @@ class LlmClient:
         """Keep an attempt and return its answer, or raise why there is none."""
         call.attempts.append(record)
         self.meter.count_attempt(record)
+        tier = outcome.reading.service_tier
+        if tier and is_underpriced(self.entry, tier):
+            self.meter.underpriced[tier] += 1
         aside_usd = paid.aside_usd or math.inf  # none: a user has released it meanwhile
         if (record.cost_usd or 0.0) > aside_usd + TOLERANCE_USD:
             self.meter.notes.append(
@@ -530,24 +567,29 @@ class LlmClient:
         """Return the error that follows from a call's last attempt, None if it is an answer."""
         driver, message = self.driver, outcome.message or outcome.name
         if outcome.action == "refused" or not self.passed:
-            why = why_refused(self.name, self.entry, outcome)
-            self._refused += why is not None and outcome.action == "fail"
+            reason = reason_of(outcome, self.endpoint + call.request.path)
+            self._refused += reason is not None
             # An endpoint that has answered before may mean this prompt alone.
-            sure = outcome.action == "refused" or not self.known or self._refused >= SEVERAL
-            if why is not None and sure:
+            sure = not (self.known or reason in UNSURE) or self._refused >= SEVERAL
+            if reason is not None and (sure or outcome.action == "refused"):
+                why = why_refused(reason, self.name, self.entry, outcome)
                 return EndpointRefused(f"{driver}: {why}")
         # A server that is just starting is waited for, but only for seconds.
         is_late = self.entry.deadline_s - call.left_s >= NOBODY_S
         if outcome.name == "no_connection" and not self.passed and is_late:
             return ProviderDown(f"{driver}: {message}: {if_nobody(self.name, self.entry)}")
-        why, delay_s = None, outcome.delay_s or 0.0
+        delay_s, closed = outcome.delay_s or 0.0, ""
         if outcome.action == "quota":
-            why = "the account's quota is exhausted"
+            closed = "the account's quota is exhausted"
         elif outcome.pause and delay_s > self.entry.deadline_s:
-            why = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
-        if why is not None:
+            closed = f"the provider asks to wait {delay_s:.0f} s, longer than a call's deadline"
+        if closed:
             later = "run the same command later to go on"
-            return QuotaExhausted(f"{driver}: {why} ({message}): {later}")
+            if outcome.delay_s is not None:
+                later = f"it opens again at {utc_after(delay_s)}: run the same command then"
+            elif outcome.raw and GEMINI_DAY in outcome.raw.body:
+                later = "it opens again at midnight Pacific time: run the same command then"
+            return QuotaExhausted(f"{driver}: {closed} ({message}): {later}")
         if outcome.action == "retry":
             return TryAgain(message, outcome.delay_s)
         if outcome.action == "fail":
@@ -589,9 +631,10 @@ class LlmClient:
             return 0.0
         if raw is None:
             return None if outcome.charged else 0.0
+        tier = outcome.reading.service_tier
         if usage.input_tokens and usage.output_tokens is not None:
-            return cost_usd(self.entry, usage)
+            return cost_usd(self.entry, usage, tier)
         if (usage.output_tokens or 0) > self.entry.max_output_tokens:
-            return cost_usd(self.entry, replace(worst, output_tokens=usage.output_tokens))
+            return cost_usd(self.entry, replace(worst, output_tokens=usage.output_tokens), tier)
         stray = raw.status == 200 and raw.is_web_page and not self.known
         return None if may_be_charged(raw, self.endpoint) and not stray else 0.0

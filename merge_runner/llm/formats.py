@@ -19,15 +19,25 @@ from merge_runner.records import Usage
 from merge_runner.registry import Registry
 
 MOST_TOKENS = 2**31 - 1
-# How an error names an exhausted quota: at OpenAI, LiteLLM (the seventh) and Anthropic.
+# How an error names an exhausted quota: at OpenAI, LiteLLM (the eighth), Anthropic, Moonshot and
+# MiniMax.
 QUOTA = {
     *("insufficient_quota", "billing_hard_limit_reached", "credit_balance_exhausted"),
     *("organization_spend_limit_exceeded", "project_spend_limit_exceeded"),
-    *("organization_usage_limit_exceeded", "budget_exceeded"),
+    *("organization_usage_limit_exceeded", "billing_not_active", "budget_exceeded"),
     *("enforced_spend_limit_reached", "contract_spend_limit_reached"),
+    *("exceeded_current_quota_error", "base_resp 1008"),
 }
-# Anthropic reports these as invalid requests.
-SPENT = ("credit balance is too low", "spend limit")
+# The words of one that is named otherwise. Anthropic reports the first three as invalid requests;
+# the last one is OpenRouter's limit of a key.
+SPENT = re.compile(
+    "credit balance is too low|spend limit|reached your specified API usage limits"
+    "|insufficient (account |user )?balance|balance is (insufficient|not enough)"
+    "|check your billing details on our website|key limit exceeded",
+    re.IGNORECASE,
+)
+# A limit of a day, as OpenAI, Groq and OpenRouter name it.
+PER_DAY = re.compile(r"per[-_ ]?day\b|\b[rt]pd\b|\bdaily\b", re.IGNORECASE)
 # What ends an answer of Gemini that was refused.
 REFUSALS = (
     *("SAFETY", "RECITATION", "LANGUAGE", "OTHER", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII"),
@@ -61,8 +71,9 @@ class Reading:
     """What a JSON body of status 200 says.
 
     ``outcome`` is ``ok``, ``refusal``, ``truncated``, ``empty``, or ``error`` where the body
-    reports a failure after all. ``finish_reason`` is the provider's own word. ``reasoning`` is
-    what stands apart from the text of the answer.
+    reports a failure after all. ``finish_reason`` is the provider's own word, and so is
+    ``service_tier``, at which the reply is billed. ``reasoning`` is what stands apart from the text
+    of the answer.
     """
 
     outcome: str
@@ -71,6 +82,7 @@ class Reading:
     model_served: str | None = None
     usage: Usage = field(default_factory=Usage)
     reasoning: str = ""
+    service_tier: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,10 +233,20 @@ def read_error(status: int, headers: Mapping[str, str], body: str, payload: obje
     details = as_dicts(error.get("details")) or [as_dict(error.get("details"))]
     names = [error.get(name) for name in ("type", "code", "status")]
     names += [detail.get(name) for detail in details for name in ("error_code", "reason")]
+    known = {str(name) for name in names if name is not None}
+    minimax = as_dict(top.get("base_resp"))
+    known |= {f"base_resp {code}" for code in [minimax.get("status_code")] if code}
+    words = as_text(error.get("message")) or as_text(minimax.get("status_msg")) or body[:200]
     # It reaches a user as one line; Gemini's has several.
-    message = " ".join((as_text(error.get("message")) or body[:200]).split())
-    known = frozenset(str(name) for name in names if name is not None)
-    return ServerError(status, headers, body, message, known, tuple(details))
+    message = " ".join(words.split()) or "no reason is given"
+    passed_on = as_dict(as_dict(error.get("metadata")).get("headers"))  # by OpenRouter
+    all_headers = {**{name.lower(): str(value) for name, value in passed_on.items()}, **headers}
+    return ServerError(status, all_headers, body, message, frozenset(known), tuple(details))
+
+
+def is_per_day(error: ServerError) -> bool:
+    """Return whether an error speaks of a limit of a day, in whose words Gemini's does not."""
+    return error.status == 429 and any(map(PER_DAY.search, (error.message, *error.names)))
 
 
 def known_meaning(error: ServerError) -> str | None:
@@ -243,9 +265,9 @@ def known_meaning(error: ServerError) -> str | None:
         # OpenRouter's want of credit while other requests run: it passes when they end.
         (402, in_flight, "rate_limited"),
         (error.status, bool(names & QUOTA), "quota_exhausted"),
-        (400, any(spent in words for spent in SPENT), "quota_exhausted"),
+        *((each, SPENT.search(words), "quota_exhausted") for each in (400, 403, 429)),
         # Gemini's quota per day has the words of one per minute, and does not pass.
-        (429, per_day, "quota_exhausted"),
+        (429, per_day or is_per_day(error), "quota_exhausted"),
         *((each, "model_not_found" in names, "unknown_model") for each in (400, 401, 403, 404)),
         (429, words.startswith("Request too large"), "request_too_large"),
         (400, "invalid_prompt" in names, "bad_prompt"),
@@ -261,13 +283,24 @@ def known_delay_s(error: ServerError) -> float | None:
     return next((float(found[1]) for d in delays if (found := DURATION.fullmatch(d))), None)
 
 
-def usage_of(counts: object, **places: str) -> Usage:
-    """Return the tokens that stand in ``counts`` at these places; of several the sum."""
+def usage_of(counts: object, *, total: str = "", **places: str) -> Usage:
+    """Return the tokens that stand in ``counts`` at these places; of several the sum.
+
+    Some servers (xAI, gateways) leave the reasoning out of the output: it is at least what the
+    ``total`` has beside the input, and where it is less than the reasoning alone both are added.
+    """
     told = dict[str, int | None]()
     for name, paths in places.items():
         known = [count for p in paths.split() if (count := as_count(at(counts, p))) is not None]
         told[name] = sum(known) if known else None
-    return Usage(**told)
+    usage = Usage(**told)
+    read, written, reasoned = usage.input_tokens, usage.output_tokens, usage.reasoning_tokens or 0
+    if written is not None and reasoned > written:
+        written = min(written + reasoned, MOST_TOKENS)
+    in_all = as_count(at(counts, total)) if total else None
+    if in_all is not None and read is not None:
+        written = max(written or 0, in_all - read)
+    return replace(usage, output_tokens=written)
 
 
 def plain(*names: str) -> dict[str, tuple[str, ...]]:
@@ -325,8 +358,10 @@ class OpenAIChat(WireFormat):
                 cached_input_tokens="prompt_tokens_details.cached_tokens",
                 output_tokens="completion_tokens",
                 reasoning_tokens="completion_tokens_details.reasoning_tokens",
+                total="total_tokens",
             ),
             reasoning="".join(dict.fromkeys(as_text(each) or "" for each in thoughts)),
+            service_tier=as_text(payload.get("service_tier")),
         )
 
 
@@ -386,8 +421,10 @@ class OpenAIResponses(WireFormat):
                 cached_input_tokens="input_tokens_details.cached_tokens",
                 output_tokens="output_tokens",
                 reasoning_tokens="output_tokens_details.reasoning_tokens",
+                total="total_tokens",
             ),
             reasoning="\n\n".join(filter(None, thoughts)),
+            service_tier=as_text(payload.get("service_tier")),
         )
 
 
@@ -441,8 +478,10 @@ class GeminiGenerateContent(WireFormat):
                 cached_input_tokens="cachedContentTokenCount",
                 output_tokens="candidatesTokenCount thoughtsTokenCount",
                 reasoning_tokens="thoughtsTokenCount",
+                total="totalTokenCount",
             ),
             reasoning=joined(part for part in parts if part.get("thought")),
+            service_tier=(as_text(at(payload, "usageMetadata.serviceTier")) or "").lower() or None,
         )
 
 

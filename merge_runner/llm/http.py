@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import re
 import select
+import socket
 import ssl
 from base64 import b64encode
 from collections.abc import Iterable, Iterator, Mapping
@@ -24,7 +25,7 @@ from httpx_aiohttp import AiohttpTransport
 from merge_runner.config import LOOPBACK, SHORTEST_SECRET, Endpoint, http_url
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import as_dict, as_dicts, as_text
-from merge_runner.llm.http_outcome import RawReply, TransportFailure
+from merge_runner.llm.http_outcome import Action, RawReply, TransportFailure
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, ChatRequest, canonical_json
 
 if TYPE_CHECKING:
@@ -34,7 +35,12 @@ if TYPE_CHECKING:
 # Many servers and gateways echo one of these.
 ID_HEADERS = ("x-request-id", "x-client-request-id")
 MOST_BYTES = 16_000_000
+# Some gateways send policies of more than the 8,190 bytes that aiohttp takes by default.
+MOST_HEADER_BYTES = 65_536
 KEPT_S = 5.0
+# As the official SDKs set them: on a connection that is silent while a model thinks, a router with
+# address translation would forget it, and the answer be lost.
+ALIVE = {"TCP_KEEPIDLE": 60, "TCP_KEEPALIVE": 60, "TCP_KEEPINTVL": 60, "TCP_KEEPCNT": 5}
 # A server that answers one call at a time may be busy with one.
 LIST_TIMEOUT_S = 60.0
 HEADERS = {
@@ -43,6 +49,13 @@ HEADERS = {
     "content-type": "application/json",
     "user-agent": "merge-runner",
 }
+# What a proxy says to all connections; anything else may pass.
+PROXY_REFUSES = frozenset({401, 403, 405, 407})
+# The note of an error that came before there was a connection, as where a proxy hangs up.
+NOT_SENT = "nothing was sent"
+UNPACKABLE = "the reply is not in the Content-Encoding that it names"
+# What aiohttp says of a header beyond the bound.
+TOO_LONG, LONGEST = "Got more than", 300
 MASK = "[key]"
 # So many characters of a secret in a row are masked, too. Wherever they begin in it, they contain
 # one of its pieces, each half as long.
@@ -188,7 +201,20 @@ class HttpTransport:
         """Return the TransportFailure for an error of the libraries."""
         # httpx reports refused, reset and cut connections alike; what aiohttp said is its cause.
         reason = self._mask(str(error)) or type(error).__name__
-        cause = error.__cause__ or error
+        cause = error if isinstance(error, aiohttp.ClientError) else error.__cause__ or error
+        if isinstance(error, httpx.DecodingError):
+            return self._unreadable(f"{UNPACKABLE} ({reason})")
+        if isinstance(cause, aiohttp.ClientHttpProxyError):
+            host = httpx.URL(self._endpoint.base_url).netloc.decode()
+            why = f"HTTP {cause.status}: {self._mask(cause.message)}"
+            message = f"the proxy does not connect to {host} ({why})"
+            action: Action = "refused" if cause.status in PROXY_REFUSES else "retry"
+            return TransportFailure(
+                "proxy_refused", message, sent=False, action=action, reason="proxy_refused"
+            )
+        if isinstance(cause, aiohttp.ClientResponseError) and TOO_LONG in cause.message:
+            words = self._mask(" ".join(cause.message.split()))[:LONGEST]
+            return self._unreadable(f"a header is too long: {words}")
         if isinstance(cause, aiohttp.ClientConnectorCertificateError):
             return TransportFailure("bad_certificate", reason, sent=False, action="refused")
         if isinstance(cause, aiohttp.ClientConnectorError):
@@ -198,7 +224,12 @@ class HttpTransport:
                 message = f"nothing listens at {self._endpoint.base_url}"
             return TransportFailure("no_connection", message, sent=False)
         self.doubted = True
-        return TransportFailure("connection_lost", reason)
+        sent = NOT_SENT not in getattr(cause, "__notes__", ())
+        return TransportFailure("connection_lost", reason, sent=sent)
+
+    def _unreadable(self, why: str) -> TransportFailure:
+        self.doubted = True
+        return TransportFailure("connection_lost", why, reason="unreadable_reply")
 
     def _network(self, connections: int) -> AiohttpTransport:
         """Return the connections, by the proxies and certificates of the environment."""
@@ -218,6 +249,8 @@ class HttpTransport:
         def session() -> aiohttp.ClientSession:
             return aiohttp.ClientSession(
                 connector=Connections(self, **kept),
+                max_line_size=MOST_HEADER_BYTES,
+                max_field_size=MOST_HEADER_BYTES,
                 cookie_jar=aiohttp.DummyCookieJar(),  # one would tie independent samples together
             )
 
@@ -246,12 +279,17 @@ class Connections(aiohttp.TCPConnector):
     async def connect(self, *args: Any, **options: Any) -> Connection:  # noqa: ANN401
         """Return a new connection, or one on which nothing has come since its last answer."""
         while True:
-            connection = await super().connect(*args, **options)
+            try:
+                connection = await super().connect(*args, **options)
+            except aiohttp.ClientError as exc:
+                exc.add_note(NOT_SENT)
+                raise
             handler, channel = connection.protocol, connection.transport
             assert handler is not None
             assert channel is not None
             if handler not in self._used:
                 self._used.add(handler)
+                keep_alive(channel.get_extra_info("socket"))
                 return connection
             # The event loop may have had no time to read what has arrived: so ask the system.
             arrived = select.poll()
@@ -260,6 +298,14 @@ class Connections(aiohttp.TCPConnector):
             if not (handler.should_close or arrived.poll(0) or self._transport.one_each):
                 return connection
             connection.close()
+
+
+def keep_alive(connection: socket.socket) -> None:
+    """Let the system ask the other end now and then whether it is there."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in ALIVE.items():
+        if hasattr(socket, name):  # each system has its own
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 @lru_cache

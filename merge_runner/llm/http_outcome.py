@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from email.utils import parsedate_to_datetime
 from functools import cached_property
 from math import inf
@@ -26,8 +26,10 @@ from merge_runner.llm.formats import (
     ServerError,
     WireFormat,
     as_dict,
+    as_text,
     at,
     is_error,
+    is_per_day,
     known_delay_s,
     known_meaning,
     read_error,
@@ -39,27 +41,47 @@ if TYPE_CHECKING:
 
 Action = Literal["accept", "retry", "fail", "quota", "refused"]
 REGISTRY = "experiments/models.toml"
+EXCERPT = 200
 FIRST_BACKOFF_S, LONGEST_BACKOFF_S = 0.5, 60.0
+# In 2001: a smaller number of s is no moment.
+SMALLEST_UNIX_S = 1e9
 # The statuses of a refusal that names the request.
 REQUEST_ITSELF = (200, 400, 413, 422, 429)
 # Azure charges for a prompt that it has looked at, also where it then refuses it.
 CHARGED_ERRORS = frozenset({"content_filter", "context_length_exceeded"})
 TOO_LATE = frozenset({408, 499, 504, 524})
 
-# What a status means unless a format knows better; any other one means a bad request.
+# What a status means unless a format knows better; any other 5xx passes, and all else means a bad
+# request.
 STATUSES = {
     401: "not_allowed",
     402: "quota_exhausted",
     403: "not_allowed",
     404: "unknown_model",
+    407: "proxy_refused",
     408: "request_timeout",
     409: "conflict",
     429: "rate_limited",
+    499: "server_timeout",  # Gemini's CANCELLED
     503: "overloaded",
     504: "server_timeout",
     524: "server_timeout",
     529: "overloaded",
-    **dict.fromkeys((500, 502, 520, 521, 522, 523), "server_error"),
+    # Not implemented, another HTTP version, a network that wants a login.
+    **dict.fromkeys((501, 505, 511), "bad_request"),
+}
+# The status that a named error within a 200 stands for, where it has no number; the first counts.
+WITHIN = {
+    **dict.fromkeys(("rate_limit_exceeded", "rate_limit_error", "base_resp 1002"), 429),
+    "RESOURCE_EXHAUSTED": 429,
+    "invalid_prompt": 400,
+    "base_resp 1008": 402,
+    **dict.fromkeys(("base_resp 1004", "base_resp 2049"), 401),
+    **dict.fromkeys(("overloaded_error", "server_is_overloaded"), 529),
+    **dict.fromkeys(("service_unavailable_error", "UNAVAILABLE"), 503),
+    **dict.fromkeys(("timeout_error", "DEADLINE_EXCEEDED", "base_resp 1001"), 504),
+    **dict.fromkeys(("server_error", "api_error", "internal_server_error", "INTERNAL"), 500),
+    **dict.fromkeys(("base_resp 1000", "base_resp 1013"), 500),
 }
 # What to do about it; anything else fails its call.
 ACTIONS: dict[str, Action] = {
@@ -67,9 +89,43 @@ ACTIONS: dict[str, Action] = {
     "quota_exhausted": "quota",
     "not_allowed": "refused",
     "unknown_model": "refused",
+    "proxy_refused": "refused",
     **dict.fromkeys(("rate_limited", "request_timeout", "conflict"), "retry"),
     **dict.fromkeys(("server_error", "overloaded", "server_timeout"), "retry"),
 }
+
+# Why no call of a run would be answered, and what a user can do.
+REASONS = {
+    "bad_certificate": "the endpoint's certificate cannot be trusted, and nothing was sent; check "
+    "the base URL, or set SSL_CERT_FILE to the certificates of whoever signed it",
+    "not_allowed": "the endpoint does not accept the key; set {key} to a valid one",
+    "unknown_model": "the endpoint has no model {id!r}; see `merge-runner models`, or {base_url}",
+    "twice_the_version": "the base URL must not end with the version with which the path begins: "
+    "{base_url}",
+    "proxy_refused": "the proxy (HTTPS_PROXY, HTTP_PROXY or ALL_PROXY) lets nothing through, and "
+    "nothing was sent: give its URL a user name and a password if it asks for them (407), have it "
+    "allow the host, or name the host in NO_PROXY",
+    "request": "the request is refused: look at {place}",
+    "other_format": "what answers there does not speak {format}: {base_url}",
+    "other_error": "the endpoint sends an error in the place of an answer: {base_url}",
+    "stream": "the endpoint sends a stream of events (SSE), though none is asked for: switch "
+    "streaming off at the server or at the gateway before it, take `stream` out of `parameters` of "
+    "{place}, or {base_url}",
+    "page": "what answers there is a web page and does not speak {format}: {base_url}",
+    "packed": "the body has a Content-Encoding ({encoding}) that cannot be read: have the server, "
+    "or the gateway before it, send it plain or as gzip",
+    "unreadable_reply": "what answers there cannot be read: have the server, or the gateway before "
+    "it, send headers of at most 64 KiB and a body that is plain or gzip",
+    "reasoning_alone": "the whole answer lies in `reasoning_content`, and the content is empty: "
+    "start the server without its reasoning parser (vLLM, SGLang: leave --reasoning-parser out; "
+    "llama.cpp: --reasoning-format none), or let the model think, as `chat_template_kwargs = "
+    "{{ enable_thinking = true }}` among `parameters` of {place} does",
+}
+# Those that a passing fault may look like: several in a row tell.
+UNSURE = frozenset({"other_error", "text", "unreadable_reply", "proxy_refused"})
+# The version of a path that follows itself, as in /v1/v1/messages.
+_TWICE = re.compile(r"(/v\d\w*)\1/")
+_EVENTS = re.compile(r"\s*(data|event|id|retry)?:", re.ASCII)
 
 _UNIT_S = {"ms": 0.001, "milli": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 # 1.574s and 6m0s, but also 5 minutes.
@@ -111,21 +167,49 @@ class RawReply:
         """Whether a web site answers: no service of any format sends this as an answer."""
         return self.body.lstrip("\ufeff \t\r\n")[:9].lower().startswith(("<!doctype", "<html"))
 
+    @property
+    def kind(self) -> str:
+        """The kind of a body that is no answer, by the names of REASONS, or ``text``."""
+        if self.payload is not None:
+            return "other_format"
+        if self._is("content-type", "text/event-stream") or _EVENTS.match(self.body):
+            return "stream"
+        if self.is_web_page:
+            return "page"
+        is_packed = "\ufffd" in self.body and not self._is("content-encoding", "identity")
+        return "packed" if is_packed and self.headers.get("content-encoding") else "text"
+
+    @property
+    def excerpt(self) -> str:
+        """The content type and the beginning of the body, in one line."""
+        words = " ".join(self.body[:EXCERPT].split()) or "an empty body"
+        return f"{self.headers.get('content-type', 'no content type')}: {words}"
+
+    def _is(self, header: str, value: str) -> bool:
+        return self.headers.get(header, "").lower().strip().startswith(value)
+
 
 class TransportFailure(MergeRunnerError):
     """An attempt brought no reply; ``outcome`` names the failure in the calls table.
 
     ``sent`` is False where the request was certainly never sent, so that nobody can charge for it.
-    ``action`` is that of an AttemptOutcome.
+    ``action`` and ``reason`` are those of an AttemptOutcome.
     """
 
     def __init__(
-        self, outcome: str, message: str, *, sent: bool = True, action: Action = "retry"
+        self,
+        outcome: str,
+        message: str,
+        *,
+        sent: bool = True,
+        action: Action = "retry",
+        reason: str | None = None,
     ) -> None:
         super().__init__(message)
         self.outcome = outcome
         self.sent = sent
         self.action = action
+        self.reason = reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +219,8 @@ class AttemptOutcome:
     ``accept`` it as the answer, ``retry`` after ``delay_s`` (all calls of the key wait where
     ``pause``), ``fail`` this call, or stop the sweep because the ``quota`` is exhausted or the
     endpoint ``refused`` the key or the model. ``name`` is its outcome in the calls table.
-    Without a ``raw`` reply the attempt may have been ``charged`` all the same.
+    Without a ``raw`` reply the attempt may have been ``charged`` all the same, and has the
+    ``reason`` of ``reason_of`` where it is known.
     """
 
     action: Action
@@ -146,6 +231,7 @@ class AttemptOutcome:
     pause: bool = False
     raw: RawReply | None = None
     charged: bool = True
+    reason: str | None = None
 
 
 def may_be_charged(raw: RawReply, endpoint: str) -> bool:
@@ -167,7 +253,8 @@ def may_be_charged(raw: RawReply, endpoint: str) -> bool:
 def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     """Classify a reply by the rules of docs/reference/providers.md."""
     if raw.status == 200 and not isinstance(raw.payload, dict):
-        return AttemptOutcome("retry", "bad_body", "the body is not a JSON object", raw=raw)
+        why = f"the body is not a JSON object: {raw.excerpt}"
+        return AttemptOutcome("retry", "bad_body", why, raw=raw)
     body = as_dict(raw.payload)
     reading = read_reply(wire, body)
     if raw.status != 200:
@@ -177,34 +264,37 @@ def judge(raw: RawReply, wire: WireFormat) -> AttemptOutcome:
     if reading.outcome == "error" and not told and reading.finish_reason in BROKEN_OFF:
         why = f"the server broke its answer off (finish reason {reading.finish_reason})"
         return AttemptOutcome("retry", "server_error", why, reading, raw=raw)
-    if reading.outcome == "error":
+    is_nothing = reading.outcome == "empty" and not any(body.get(name) for name in wire.members)
+    # Also an error in another format's form, or in MiniMax's.
+    failed = told or as_dict(body.get("base_resp")).get("status_code")
+    if reading.outcome == "error" or (is_nothing and failed):
         error = replace(raw.error, status=status_within(raw.error))
+        reading = replace(reading, outcome="error")
         return replace(judge_error(error, wire), reading=reading, raw=raw)
-    if reading.outcome == "empty" and not any(body.get(name) for name in wire.members):
-        why = "the body has nothing of an answer"
+    if is_nothing:
+        why = f"the body has nothing of an answer: {raw.excerpt}"
         return AttemptOutcome("retry", "bad_body", why, reading, raw=raw)
     return AttemptOutcome("accept", reading.outcome, reading=reading, raw=raw)
 
 
 def status_within(error: ServerError) -> int:
     """Return the status that an error within a 200 stands for: 400 or 500 if nobody knows it."""
-    if "rate_limit_exceeded" in error.names:
-        return 429
-    if error.names == {"server_error"}:
-        return 500
     numbers = [int(name) for name in error.names if re.fullmatch("[45][0-9][0-9]", name)]
-    return numbers[0] if numbers else 400 if error.names else 500
+    named = [status for name, status in WITHIN.items() if name in error.names]
+    return next(iter([*numbers, *named]), 400 if error.names else 500)
 
 
 def judge_error(error: ServerError, wire: WireFormat) -> AttemptOutcome:
     """Classify an error, whatever was asked for."""
-    name = wire.meaning(error) or known_meaning(error) or STATUSES.get(error.status, "bad_request")
+    default = "server_error" if 500 <= error.status < 600 else "bad_request"
+    name = wire.meaning(error) or known_meaning(error) or STATUSES.get(error.status, default)
     action = ACTIONS.get(name, "fail")
+    tells = action == "retry" or (action == "quota" and is_per_day(error))
     return AttemptOutcome(
         action,
         name,
         f"HTTP {error.status}: {error.message}",
-        delay_s=server_delay_s(error, wire) if action == "retry" else None,
+        delay_s=server_delay_s(error, wire) if tells else None,
         pause=name == "rate_limited",
     )
 
@@ -215,8 +305,8 @@ def server_delay_s(
     """Return the delay in s that a failed reply asks for, None if it says nothing usable.
 
     Sources in order: ``retry-after-ms``, ``retry-after`` (seconds or HTTP date), a member of the
-    error, and "try again in 1.574s" or "retry after 5 minutes" in the message. Of several values of
-    a header the longest counts.
+    error, "try again in 1.574s" or "retry after 5 minutes" in the message, and for a 429
+    ``x-ratelimit-reset``. Of several values of a header the longest counts.
     """
     told = _IN_TEXT.search(error.message)
     parts = re.findall(_PART, told[1], re.I) if told else []
@@ -225,6 +315,7 @@ def server_delay_s(
         _longest_s(error.headers.get("retry-after", ""), now),
         wire.delay_s(error) or known_delay_s(error) or 0.0,
         sum(float(number) * _UNIT_S[unit.lower()] for number, unit in parts),
+        _reset_s(error, now) if error.status == 429 else 0.0,
     )
     return next((delay for delay in candidates if 0 < delay < inf), None)
 
@@ -241,6 +332,29 @@ def _longest_s(header: str, now: datetime | None) -> float:
             aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
             delays.append((aware - (now or datetime.now(UTC))).total_seconds())
     return max(delay for delay in delays if 0 <= delay < inf)
+
+
+def _reset_s(error: ServerError, now: datetime | None) -> float:
+    """Return the time in s until a used-up limit is reset, 0 if it is not said.
+
+    The header is a number of seconds, or a moment as Unix time in s or ms, as OpenRouter has it.
+    """
+    reset = error.headers.get("x-ratelimit-reset", "")
+    if error.headers.get("x-ratelimit-remaining", "0") != "0" or not reset.isdecimal():
+        return 0.0
+    number = float(reset)
+    for scale in (1000, 1):
+        if number / scale > SMALLEST_UNIX_S:
+            return number / scale - (now or datetime.now(UTC)).timestamp()
+    return number
+
+
+def utc_after(seconds: float) -> str:
+    """Return the moment after a delay in s, to the minute."""
+    try:
+        return f"{datetime.now(UTC) + timedelta(seconds=seconds):%Y-%m-%d %H:%M} UTC"
+    except OverflowError:
+        return "a moment after the year 9999"
 
 
 class TryAgain(MergeRunnerError):
@@ -268,33 +382,41 @@ def next_wait_s(state: RetryCallState) -> float:
     )
 
 
-def why_refused(name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str | None:
-    """Return why all calls of a run would fail, and what to set; None: they might not."""
-    raw, place = outcome.raw, f"[{name}] in {REGISTRY}"
-    base_url = set_base_url(name, entry)
-    key = " or ".join(entry.key_envs) or f"`key_env` of {place}"
+def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
+    """Return why all calls of a run would fare as this one to ``url``: a name of REASONS or UNSURE.
+
+    None: they might not.
+    """
+    raw, name = outcome.raw, outcome.name
     if outcome.action == "refused":
-        why = {
-            "bad_certificate": "the endpoint's certificate cannot be trusted, and nothing was "
-            "sent; check the base URL, or set SSL_CERT_FILE to the certificates of whoever signed "
-            "it",
-            "not_allowed": f"the endpoint does not accept the key; set {key} to a valid one",
-            "unknown_model": f"the endpoint has no model {entry.id!r}; see `merge-runner models`, "
-            f"or {base_url}",
-        }[outcome.name]
-    elif raw is None or outcome.name == "bad_prompt":
-        return None
-    elif outcome.action == "fail" and raw.status in REQUEST_ITSELF:
-        why = f"the request is refused: look at {place}"
-    elif (
-        outcome.action == "fail"
-        or (raw.is_web_page and raw.status == 200)
-        or (outcome.name == "bad_body" and isinstance(raw.payload, dict))
-    ):
-        why = f"what answers there does not speak {entry.format}: {base_url}"
-    else:
-        return None
-    return f"{why} ({outcome.message})"
+        return "twice_the_version" if name == "unknown_model" and _TWICE.search(url) else name
+    if raw is None or name == "bad_prompt":
+        return outcome.reason
+    if name == "bad_body":
+        return raw.kind
+    if outcome.action == "fail":
+        return "request" if raw.status in REQUEST_ITSELF else "other_format"
+    is_told = is_error(as_dict(raw.payload).get("error"))
+    if outcome.action == "retry" and raw.status == 200 and is_told and not raw.error.names:
+        return "other_error"
+    message = as_dict(at(raw.payload, "choices.0.message"))
+    thoughts = (as_text(message.get(n)) or "" for n in ("reasoning_content", "reasoning"))
+    return "reasoning_alone" if name == "empty" and any(map(str.strip, thoughts)) else None
+
+
+def why_refused(reason: str, name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:
+    """Return a reason in words, with what to set and what came."""
+    place = f"[{name}] in {REGISTRY}"
+    raw = outcome.raw
+    why = REASONS["other_format" if reason == "text" else reason].format(
+        place=place,
+        key=" or ".join(entry.key_envs) or f"`key_env` of {place}",
+        id=entry.id,
+        format=entry.format,
+        encoding=raw and raw.headers.get("content-encoding"),
+        base_url=set_base_url(name, entry),
+    )
+    return f"{why} ({outcome.message or (raw and raw.excerpt)})"
 
 
 def if_nobody(name: str, entry: ModelEntry) -> str:

@@ -95,8 +95,16 @@ WHERE scope = ? GROUP BY driver, outcome ORDER BY sum(usd) DESC
 """
 
 
-def cost_usd(entry: ModelEntry, usage: Usage) -> float | None:
-    """Return the cost of an attempt in USD, None where the price or the tokens are unknown."""
+# What is billed at more than the plain price, about twice at OpenAI.
+DEARER_TIERS = frozenset({"priority"})
+
+
+def cost_usd(entry: ModelEntry, usage: Usage, tier: str | None = None) -> float | None:
+    """Return the cost of an attempt in USD, None where the price or the tokens are unknown.
+
+    ``tier`` is the service tier that the reply names; one without a price of its own is priced as
+    the plain one.
+    """
     price, read, written = entry.price, usage.input_tokens, usage.output_tokens
     if price == "free":
         return 0.0
@@ -109,17 +117,31 @@ def cost_usd(entry: ModelEntry, usage: Usage) -> float | None:
         cached_price = price.input if price.cached_input is None else price.cached_input
         parts = ((read - cached, price.input), (cached, cached_price), (written, price.output))
         # Decimals of the written figures, so that sums of costs have no digits that nobody wrote.
-        return float(sum(n * Decimal(str(usd)) for n, usd in parts) / PER_MILLION)
+        plain = sum(n * Decimal(str(usd)) for n, usd in parts) / PER_MILLION
+        return float(plain * Decimal(str(price.tiers.get(tier or "", 1))))
     from genai_prices import Usage as PricedUsage  # here, since it takes long to load
     from genai_prices import calc_price
 
     priced = PricedUsage(input_tokens=read, cache_read_tokens=cached, output_tokens=written)
     provider = GENAI_PRICES_PROVIDER.get(entry.provider, entry.provider)
+    calculate = partial(calc_price, priced, model_ref=entry.id, provider_id=provider)
     try:
-        found = calc_price(priced, model_ref=entry.id, provider_id=provider)
+        # Older versions of the package know no tiers.
+        with contextlib.suppress(TypeError):
+            if tier is not None:
+                return float(calculate(price_context={"service_tier": tier}).total_price)
+        return float(calculate().total_price)
     except LookupError:
         return None
-    return float(found.total_price)
+
+
+def is_underpriced(entry: ModelEntry, tier: str | None) -> bool:
+    """Return whether a reply of this tier costs more than the registry knows."""
+    if tier not in DEARER_TIERS:
+        return False
+    million = Usage(1_000_000, 0, 1_000_000)
+    plain_usd = cost_usd(entry, million)
+    return bool(plain_usd) and cost_usd(entry, million, tier) == plain_usd
 
 
 @dataclass(frozen=True, slots=True)

@@ -230,6 +230,7 @@ class Progress:
             yield from (f"another model answers: {pair}" for pair in sorted(meter.mismatches))
             if meter.stand_ins:
                 yield f"a scripted stand-in answers, not {name}"
+            yield from (f"{name}: {underpriced(tier)}" for tier in sorted(meter.underpriced))
 
     def _waits(self) -> list[str]:
         """How many calls wait, for what, and the latest time until when, if known."""
@@ -239,6 +240,15 @@ class Progress:
             until = f" until {max(ends):%H:%M:%S} UTC" if ends else ""
             texts.append(f"{number} {what}{until}")
         return first_of(texts, "other reasons")
+
+
+def underpriced(tier: str) -> str:
+    """Return the warning about replies whose service tier has no price in the registry."""
+    return (
+        f"replies are of the service tier {tier!r}, which is billed at about twice the price that "
+        "is counted, and --max-cost knows nothing of that: leave that tier out, or give the model "
+        f"a price with tiers = {{ {tier} = 2.0 }}"
+    )
 
 
 def first_of(texts: list[str], others: str, shown: int = REASONS_SHOWN) -> list[str]:
@@ -359,6 +369,7 @@ def as_dict(
         "attempts_of_unknown_cost": spending.open_attempts,
         "over_the_worst_case_usd": round(spending.overrun_usd, 6),
         "dearest": spending.dearest,
+        "underpriced": meter.underpriced,
         "damaged_entries": meter.damaged,
         "open_batches": progress.batches(),
         "playing_s": round(playing_s, 3),
@@ -442,6 +453,8 @@ def _costs(summary: dict[str, Any]) -> Iterator[str]:
             f"WARNING: replies cost {over_usd:.4f} USD more than their worst case "
             f"({summary['dearest']}): the server does not keep to the output cap"
         )
+    for tier, answers in summary["underpriced"].items():
+        yield f"WARNING: {answers} {underpriced(tier)}"
 
 
 def _faults(summary: dict[str, Any]) -> Iterator[str]:

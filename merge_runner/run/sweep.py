@@ -35,7 +35,7 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody
+from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody, set_base_url
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.records import TrialRecord, TrialSpec, canonical_json
@@ -479,7 +479,8 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
     except TransportFailure as exc:
         if exc.outcome == "no_connection":
             raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
-        listed, models = [], f"models that it does not list ({exc})"
+        wrong = f"; if that is another server, {set_base_url(name, entry)}"
+        listed, models = [], f"models that it does not list ({exc}{wrong})"
     if len(listed) != 1:
         variable = PROVIDERS.require(entry.provider).model_env
         raise UsageError(

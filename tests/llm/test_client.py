@@ -721,3 +721,40 @@ async def test_attempts_at_a_free_model_are_kept_as_they_fail(make, cache):
     with pytest.raises(CallFailed) as caught:
         await client.ask("prompt", slot())
     assert cache.unanswered(caught.value.request.key) == caught.value.attempts
+
+
+@in_virtual_time
+async def test_a_dearer_service_tier_is_priced_where_its_price_is_known_and_else_counted(make):
+    paid = json.loads(answer(usage=(1_000_000, 0)).body) | {"service_tier": "priority"}
+    plain = make(raw(paid), price=PRICE)
+    await plain.ask("prompt", slot())
+    assert plain.meter.cost_usd == pytest.approx(PRICE.input)
+    assert plain.meter.underpriced == {"priority": 1}
+    tiered = make(raw(paid), price=PRICE.model_copy(update={"tiers": {"priority": 2.0}}))
+    await tiered.ask("prompt", slot(2))
+    assert tiered.meter.cost_usd == pytest.approx(2 * PRICE.input)
+    assert not tiered.meter.underpriced
+
+
+@in_virtual_time
+async def test_the_worst_case_of_a_dearer_tier_that_is_asked_for_is_its_own(make):
+    price = PRICE.model_copy(update={"tiers": {"priority": 2.0}})
+    plain = make(answer(), price=price, cap=100.0)
+    dearer = make(answer(), price=price, cap=100.0, parameters={"service_tier": "priority"})
+    worst = []
+    for client in (plain, dearer):
+        client.transport.open.clear()
+        asked = asyncio.create_task(client.ask("prompt", slot()))
+        while not client.transport.sent:
+            await asyncio.sleep(0.01)
+        worst.append(client.budget.ledger.read().reserved_usd)
+        client.transport.open.set()
+        await asked
+    assert worst[1] > 1.9 * worst[0]
+
+
+@in_virtual_time
+async def test_the_reply_keeps_the_service_tier_on_record(make):
+    paid = json.loads(answer().body) | {"service_tier": "priority"}
+    reply = await make(raw(paid)).ask("prompt", slot())
+    assert json.loads(reply.attempts[-1].reply)["service_tier"] == "priority"

@@ -22,6 +22,7 @@ from tests.llm.test_client import (  # noqa: F401 # fixtures
 from tests.virtual_time import in_virtual_time, now_s
 
 WEB_PAGE = raw("\n<!DOCTYPE html><html>Welcome</html>")
+PROXY_407 = TransportFailure("proxy_refused", "the proxy says 407", sent=False, action="refused")
 REFUSED = TransportFailure("no_connection", "refused", sent=False)
 
 
@@ -85,6 +86,10 @@ async def test_what_passes_is_tried_again_by_one_call_alone(begin):
         (raw("moved", 301), "set OPENAI_BASE_URL"),
         (WEB_PAGE, "does not speak openai-chat"),
         (raw({"status": "up"}), "does not speak openai-chat"),
+        (raw("data: {}", content_type="text/event-stream"), r"events \(SSE\).*text/event-stream"),
+        (raw("\ufffd", content_encoding="br"), r"Content-Encoding \(br\) that cannot be read"),
+        (answer(None, reasoning_content="M"), "lies in `reasoning_content`.*enable_thinking"),
+        (PROXY_407, r"HTTPS_PROXY.*nothing was sent.*\(the proxy says 407\)"),
     ],
 )
 @in_virtual_time
@@ -97,6 +102,83 @@ async def test_a_wrong_configuration_is_told_by_one_call(begin, reply, advice):
     assert len(client.transport.sent) == 1
     assert "\n" not in str(caught.value)
     assert all(isinstance(result, BaseException) for result in await results(tasks))
+
+
+@pytest.mark.parametrize(
+    ("reply", "advice"),
+    [
+        (raw({"error": "Unexpected endpoint (POST /x)"}), "set OPENAI_BASE_URL.*Unexpected endp"),
+        (raw(""), "set OPENAI_BASE_URL.*an empty body"),
+        (raw('{"choices": ['), "does not speak openai-chat"),
+        (
+            TransportFailure("connection_lost", "Got more than 9", reason="unreadable_reply"),
+            "64 KiB.*Got more than 9",
+        ),
+        (
+            TransportFailure("proxy_refused", "HTTP 503", sent=False, reason="proxy_refused"),
+            "HTTPS_PROXY.*HTTP 503",
+        ),
+    ],
+)
+@in_virtual_time
+async def test_what_may_pass_is_told_after_three_of_them_within_seconds(begin, reply, advice):
+    client = begin(reply)
+    with pytest.raises(EndpointRefused, match=advice):
+        await client.ask("prompt", slot())
+    assert len(client.transport.sent) == 3
+    assert now_s() < 5
+    passing = begin(reply, reply, answer())
+    assert (await passing.ask("prompt", slot())).outcome == "ok"
+
+
+@pytest.mark.parametrize("body", ["data: {}", "<html>", "", {"status": "up"}, {"error": "m"}])
+@in_virtual_time
+async def test_in_the_midst_of_a_run_what_is_not_understood_is_asked_again(begin, body):
+    client = begin(answer(), *[raw(body)] * 4, answer())
+    await client.ask("prompt", slot())
+    assert (await client.ask("prompt", slot(2))).outcome == "ok"
+    assert len(client.transport.sent) == 6
+
+
+@in_virtual_time
+async def test_an_endpoint_that_has_answered_before_is_given_three_tries(begin):
+    client = begin(raw("data: {}", content_type="text/event-stream"), known=True)
+    with pytest.raises(EndpointRefused, match="SSE"):
+        await client.ask("prompt", slot())
+    assert len(client.transport.sent) == 3
+
+
+@in_virtual_time
+async def test_a_model_that_has_answered_before_may_think_without_an_answer(begin):
+    client = begin(answer(None, reasoning_content="hm"), known=True)
+    assert (await client.ask("prompt", slot())).outcome == "empty"
+
+
+@in_virtual_time
+async def test_a_first_call_that_waits_says_so_once_with_what_came_last_and_until_when(begin):
+    client = begin(*[error(503, "warming up")] * 5, answer(), deadline_s=600)
+    await client.ask("prompt", slot())
+    told = [note for note in client.meter.notes if "first call" in note]
+    assert len(told) == 1
+    assert "UTC at the latest, after HTTP 503: warming up" in told[0]
+    silent = begin(answer(), deadline_s=600)
+    silent.transport.open.clear()
+    asked = asyncio.create_task(silent.ask("prompt", slot(2)))
+    await asyncio.sleep(6)
+    assert ["nothing has come yet" in note for note in silent.meter.notes] == [True]
+    silent.transport.open.set()
+    await asked
+    await silent.ask("prompt", slot(3))
+    await asyncio.sleep(9)
+    assert len(silent.meter.notes) == 1
+
+
+@in_virtual_time
+async def test_what_certainly_was_not_sent_costs_nothing(begin):
+    client = begin(PROXY_407, price=PRICE, cap=1.0)
+    with pytest.raises(EndpointRefused):
+        await client.ask("prompt", slot())
+    assert client.budget.ledger.read().committed_usd == 0
 
 
 @in_virtual_time

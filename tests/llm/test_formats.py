@@ -446,6 +446,34 @@ def test_the_providers_own_word_for_the_end_is_kept():
         ("openai-chat", None, Usage()),
         ("openai-responses", {"input_tokens": 7, "output_tokens": 8}, Usage(7, None, 8, None)),
         ("openai-responses", None, Usage()),
+        # xAI leaves the reasoning out of the output, gateways before Gemini all of it; the total
+        # has it. Without a total it is more than the output that should include it.
+        *(
+            (
+                "openai-chat",
+                {
+                    "prompt_tokens": 700,
+                    "completion_tokens": visible,
+                    "completion_tokens_details": {"reasoning_tokens": 3000},
+                    **total,
+                },
+                Usage(700, None, 3000 + visible, 3000),
+            )
+            for visible in (100, 0)
+            for total in ({"total_tokens": 700 + visible + 3000}, {})
+        ),
+        ("openai-chat", {"prompt_tokens": 7, "total_tokens": 15}, Usage(7, None, 8, None)),
+        (
+            "openai-chat",
+            {"prompt_tokens": 7, "completion_tokens": 8, "total_tokens": 9},
+            Usage(7, None, 8, None),
+        ),
+        (
+            "openai-responses",
+            {"input_tokens": 7, "output_tokens": 1, "total_tokens": 15},
+            Usage(7, None, 8, None),
+        ),
+        ("gemini", {"promptTokenCount": 7, "totalTokenCount": 15}, Usage(7, None, 8, None)),
         # All output was thoughts.
         (
             "gemini",
@@ -473,6 +501,16 @@ def test_the_providers_own_word_for_the_end_is_kept():
 def test_how_tokens_are_counted(wire, usage, expected):
     name = "usageMetadata" if wire == "gemini" else "usage"
     assert read(wire, {**SAMPLES[wire], name: usage}).usage == expected
+
+
+def test_the_service_tier_is_read():
+    assert read("openai-chat", {**CHAT, "service_tier": "priority"}).service_tier == "priority"
+    assert read("openai-responses", {**RESPONSES, "service_tier": "flex"}).service_tier == "flex"
+    usage = {**GEMINI["usageMetadata"], "serviceTier": "PRIORITY"}
+    assert read("gemini", {**GEMINI, "usageMetadata": usage}).service_tier == "priority"
+    assert read("gemini", GEMINI).service_tier is None
+    # Anthropic sells that tier beforehand.
+    assert read("anthropic", ANTHROPIC).service_tier is None
 
 
 def test_gemini_alone_is_known_to_send_empty_answers():

@@ -17,7 +17,7 @@ from merge_runner.emulator.driver import answer
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
-from merge_runner.llm.http import HttpTransport
+from merge_runner.llm.http import Connections, HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.limiter import Limiter
 from merge_runner.prompts.blocks import render_prompt
@@ -350,7 +350,7 @@ async def test_a_refused_connection_cannot_be_charged(dead_port):
         b'HTTP/1.1 200 OK\r\ncontent-length: 9\r\n\r\n{"a"',
         b'HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n9\r\n{"a"',
         b'HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\nzz\r\n{"a"',
-        b"HTTP/1.1 200 OK\r\nx: " + b"a" * 10_000 + b"\r\n\r\n",
+        b"HTTP/1.1 200 OK\r\nx: " + b"a" * 70_000 + b"\r\n\r\n",
         b"HTTP/1.1 200 OK\r\ncontent-encoding: gzip\r\ncontent-length: 4\r\n\r\nabcd",
     ],
     ids=[
@@ -369,6 +369,66 @@ async def test_a_reply_that_cannot_be_read_is_a_transport_failure(raw):
     async with server_that_says(raw) as url:
         with pytest.raises(TransportFailure):
             await send(endpoint_at(url))
+
+
+async def test_headers_up_to_64_kib_are_read_and_what_cannot_be_read_is_told(recorder):
+    recorder.reply = lambda request: web.json_response({}, headers={"x-policy": "a" * 60_000})
+    assert (await send(endpoint_at(recorder.url))).status == 200
+    for raw, why in (
+        (b"HTTP/1.1 200 OK\r\nx: " + b"a" * 70_000 + b"\r\n\r\n", "Got more than 65536 bytes"),
+        (
+            b"HTTP/1.1 200 OK\r\ncontent-encoding: gzip\r\ncontent-length: 4\r\n\r\nabcd",
+            "not in the Content-Encoding that it names",
+        ),
+    ):
+        async with server_that_says(raw) as url:
+            with pytest.raises(TransportFailure, match=why) as failure:
+                await send(endpoint_at(url))
+        assert (failure.value.reason, failure.value.sent) == ("unreadable_reply", True)
+
+
+async def test_connections_are_kept_alive_while_a_model_thinks(recorder):
+    options = []
+
+    class Watched(Connections):
+        async def connect(self, *args, **changes):
+            connection = await super().connect(*args, **changes)
+            channel = connection.transport.get_extra_info("socket")
+            options.append(
+                (
+                    channel.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE),
+                    channel.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE),
+                    channel.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL),
+                    channel.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT),
+                )
+            )
+            return connection
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("merge_runner.llm.http.Connections", Watched)
+        await send(endpoint_at(recorder.url))
+    assert options == [(1, 60, 60, 5)]
+
+
+@pytest.mark.parametrize(
+    ("answer_of_the_proxy", "outcome", "action", "words"),
+    [
+        (b"HTTP/1.1 403 Forbidden\r\n\r\n", "proxy_refused", "refused", "HTTP 403: Forbidden"),
+        (b"HTTP/1.1 407 Needs X\r\n\r\n", "proxy_refused", "refused", "HTTP 407: Needs X"),
+        (b"HTTP/1.1 503 No\r\n\r\n", "proxy_refused", "retry", "llm.invalid (HTTP 503: No)"),
+        (b"", "connection_lost", "retry", "disconnected"),
+    ],
+)
+async def test_a_proxy_that_does_not_connect_has_sent_nothing(
+    monkeypatch, answer_of_the_proxy, outcome, action, words
+):
+    async with server_that_says(answer_of_the_proxy) as url:
+        monkeypatch.setenv("HTTPS_PROXY", url)
+        with pytest.raises(TransportFailure) as failure:
+            await send(endpoint_at("https://llm.invalid/v1"))
+    told = failure.value
+    assert (told.outcome, told.action, told.sent) == (outcome, action, False)
+    assert words in str(told)
 
 
 async def test_no_more_connections_are_open_than_allowed(recorder):

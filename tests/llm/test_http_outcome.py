@@ -1,11 +1,20 @@
 import json
+from datetime import UTC, datetime
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from merge_runner.config import ModelEntry
 from merge_runner.llm.formats import FORMATS, Reading, WireFormat, WireRequest
-from merge_runner.llm.http_outcome import RawReply, judge, may_be_charged
+from merge_runner.llm.http_outcome import (
+    RawReply,
+    judge,
+    may_be_charged,
+    reason_of,
+    server_delay_s,
+    why_refused,
+)
 
 OPENAI_QUOTA = (
     "You exceeded your current quota, please check your plan and billing details. For more "
@@ -50,6 +59,11 @@ def anthropic(kind, message="m", **details):
 
 def openrouter(code, message="m", **metadata):
     return {"error": {"code": code, "message": message, "metadata": metadata}}
+
+
+def minimax(code, words):
+    body = {"base_resp": {"status_code": code, "status_msg": words}}
+    return body if code == 0 else {**body, "choices": None}
 
 
 PER_MINUTE = "GenerateRequestsPerMinutePerProjectPerModel-FreeTier"
@@ -190,6 +204,48 @@ ERRORS = [
     ("anthropic", 500, anthropic("api_error"), {}, "retry", "server_error"),
     ("anthropic", 504, anthropic("timeout_error"), {}, "retry", "server_timeout"),
     ("anthropic", 529, anthropic("overloaded_error"), {}, "retry", "overloaded"),
+    # Its monthly limit, and an account without money, in others' words.
+    (
+        "anthropic",
+        400,
+        anthropic(
+            "invalid_request_error",
+            "You have reached your specified API usage limits. You will regain access on "
+            "2027-01-01 at 00:00 UTC.",
+        ),
+        {"x-should-retry": "false"},
+        "quota",
+        "quota_exhausted",
+    ),
+    *(
+        ("openai-chat", status, body, {}, "quota", "quota_exhausted")
+        for status, body in (
+            (429, openai("Your account is not active.", "billing_not_active")),
+            (429, openai("Please check your billing details on our website.", "x")),
+            (429, openai("Your account is suspended.", "exceeded_current_quota_error")),
+            (403, openai("Insufficient account balance", "x")),
+            (403, {"code": 30001, "message": "Sorry, your account balance is insufficient"}),
+            (403, openrouter(403, "Key limit exceeded (monthly limit).")),
+        )
+    ),
+    # Limits of a day, of which the delay is no reason to wait.
+    *(
+        ("openai-chat", 429, body, headers, "quota", "quota_exhausted")
+        for body, headers in (
+            (openrouter(429, "Rate limit exceeded: free-models-per-day"), {}),
+            (openai("Rate limit reached on requests per day (RPD): Limit 200.", "requests"), {}),
+            (openai("Rate limit reached on tokens per day (TPD): Used 99.", "tokens"), {}),
+            (openai("You have hit your daily limit.", "x"), {"retry-after": "3"}),
+        )
+    ),
+    # Whatever breaks off at a provider or before it.
+    ("gemini", 499, gemini(499, "CANCELLED"), {}, "retry", "server_timeout"),
+    *(
+        ("openai-chat", status, HTML, {}, "retry", "server_error")
+        for status in (507, 525, 526, 527, 530, 561, 599)
+    ),
+    *(("openai-chat", status, HTML, {}, "fail", "bad_request") for status in (501, 505, 511)),
+    ("openai-chat", 407, HTML, {}, "refused", "proxy_refused"),
     # vLLM: the code is a number; older ones send no envelope.
     (
         "openai-chat",
@@ -360,6 +416,8 @@ LIMITS = [
     ("openai-chat", 429, [gemini(429, "RESOURCE_EXHAUSTED", "m", RETRY_38)], {}, 38),
     # Answers with status 200 that carry a rate limit.
     ("openai-chat", 200, openrouter(429), {"retry-after": "3"}, 3),
+    ("anthropic", 200, anthropic("rate_limit_error"), {"retry-after": "3"}, 3),
+    ("openai-chat", 200, minimax(1002, "rate limit"), {}, None),
     ("openai-chat", 200, {"choices": [{"error": {"code": 429, "message": "m"}}]}, {}, None),
     (
         "openai-responses",
@@ -394,6 +452,101 @@ def candidate(finish, *parts):
 
 def failed(code):
     return {"status": "failed", "error": {"code": code, "message": "m"}, "output": []}
+
+
+@pytest.mark.parametrize(
+    ("headers", "within", "delay_s"),
+    [
+        ({"x-ratelimit-reset": "60"}, {}, 60),
+        ({"x-ratelimit-reset": "60", "x-ratelimit-remaining": "0"}, {}, 60),
+        ({"x-ratelimit-reset": "60", "x-ratelimit-remaining": "7"}, {}, None),
+        ({"x-ratelimit-reset": "soon"}, {}, None),
+        ({"x-ratelimit-reset": "60", "retry-after": "3"}, {}, 3),
+        ({}, {"X-RateLimit-Reset": str(1_800_000_030_000), "X-RateLimit-Remaining": "0"}, 30),
+        ({}, {"X-RateLimit-Reset": str(1_800_000_030)}, 30),
+        ({}, {"X-RateLimit-Reset": str(1_700_000_000)}, None),
+    ],
+)
+def test_the_reset_of_a_used_up_limit_is_a_delay(headers, within, delay_s):
+    body = json.dumps(openrouter(429, "Rate limit exceeded", headers=within))
+    now = datetime.fromtimestamp(1_800_000_000, UTC)
+    error = RawReply(429, headers, body).error
+    assert server_delay_s(error, FORMATS["openai-chat"], now) == delay_s
+
+
+def test_a_quota_of_a_day_says_when_it_opens_again_unless_that_is_not_known():
+    when = {"X-RateLimit-Reset": "1999999999000"}
+    told = judged("openai-chat", 200, openrouter(429, "free-models-per-day", headers=when))
+    assert told.delay_s > 1e6
+    gemini_day = gemini(429, "RESOURCE_EXHAUSTED", "m", violations(PER_DAY), RETRY_38)
+    assert judged("gemini", 429, gemini_day).delay_s is None
+    spent = openai("m", "insufficient_quota")
+    assert judged("openai-chat", 429, spent, {"retry-after": "1"}).delay_s is None
+
+
+def test_what_came_in_the_place_of_an_answer_is_in_the_message():
+    events = 'data: {"choices": [{"delta": {"content": "M"}}]}\n\ndata: [DONE]\n'
+    kind = {"content-type": "text/event-stream"}
+    message = judged("openai-chat", 200, events, kind).message
+    assert "text/event-stream: data: {" in message
+    assert "\n" not in message
+    long = judged("openai-chat", 200, {"status": "x" * 1000}, {"content-type": "text/json"})
+    assert "text/json: " in long.message
+    assert len(long.message) < 300
+
+
+# Status, body, headers, and which reason not to ask on they are at the first call of a run.
+KINDS = [
+    (200, "data: {}\n\n", {}, "stream"),
+    (200, ": OPENROUTER PROCESSING\n\ndata: {}", {}, "stream"),
+    (200, "", {"content-type": "text/event-stream; charset=utf-8"}, "stream"),
+    (200, HTML, {"content-type": "text/html"}, "page"),
+    (200, '{"status": "up"}', {}, "other_format"),
+    (200, '{"detail": "Not Found"}', {}, "other_format"),
+    (200, "[1]", {}, "other_format"),
+    (200, '{"choices": [', {}, "text"),
+    (200, "", {}, "text"),
+    (200, "\ufffd\ufffd", {"content-encoding": "br"}, "packed"),
+    (200, "\ufffd\ufffd", {"content-encoding": "identity"}, "text"),
+    (200, '{"error": "Unexpected endpoint or method. (POST /chat)"}', {}, "other_error"),
+    (200, '{"error": {"message": "m", "type": "overloaded_error"}}', {}, None),
+    (502, HTML, {}, None),
+    (503, "", {}, None),
+    (405, "", {}, "other_format"),
+    (400, "{}", {}, "request"),
+]
+
+
+@pytest.mark.parametrize(("status", "body", "headers", "reason"), KINDS)
+def test_what_no_call_of_a_run_would_fare_better_with(status, body, headers, reason):
+    outcome = judged("openai-chat", status, body, headers)
+    assert reason_of(outcome, "http://localhost/v1/chat/completions") == reason
+    if reason is not None:
+        entry = ModelEntry(provider="local", format="openai-chat", id="m", max_output_tokens=10)
+        assert "\n" not in why_refused(reason, "local", entry, outcome)
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("http://localhost/v1/v1/messages", "twice_the_version"),
+        ("http://localhost/x/v1beta/v1beta/models/m:generateContent", "twice_the_version"),
+        ("http://localhost/v1/messages", "unknown_model"),
+        ("anthropic/v1/messages", "unknown_model"),
+    ],
+)
+def test_a_version_that_stands_twice_in_a_url_is_no_unknown_model(url, reason):
+    assert reason_of(judged("anthropic", 404, anthropic("not_found_error")), url) == reason
+
+
+@pytest.mark.parametrize("member", ["reasoning_content", "reasoning"])
+def test_an_answer_that_is_nothing_but_reasoning_is_told(member):
+    message = {"content": None, member: "M\nI go first."}
+    outcome = judged("openai-chat", 200, {"choices": [{"message": message}]})
+    assert reason_of(outcome, "") == "reasoning_alone"
+    cut = {"choices": [{"message": message, "finish_reason": "length"}]}
+    assert reason_of(judged("openai-chat", 200, cut), "") is None
+    assert reason_of(judged("openai-chat", 200, choice("")), "") is None
 
 
 # A body of status 200: format, body, and what is to be done.
@@ -447,6 +600,33 @@ SUCCESSES = [
     ("openai-chat", {**choice("M", "abort"), "error": {"code": 503}}, "retry", "overloaded"),
     ("openai-chat", {"error": "m"}, "retry", "server_error"),
     ("openai-chat", openai("m", "insufficient_quota"), "quota", "quota_exhausted"),
+    # A gateway passes on an error that came within a stream.
+    *(
+        (wire, body, "retry", outcome)
+        for code, outcome in (
+            ("overloaded_error", "overloaded"),
+            ("service_unavailable_error", "overloaded"),
+            ("api_error", "server_error"),
+            ("timeout_error", "server_timeout"),
+        )
+        for wire, body in (
+            ("openai-chat", openai("m", code)),
+            ("openai-chat", anthropic(code)),
+            ("anthropic", anthropic(code)),
+            ("anthropic", {"error": {"type": code, "message": "m"}}),
+            ("gemini", openai("m", "x", code)),
+        )
+    ),
+    ("openai-chat", openai("m", "x", "529"), "retry", "overloaded"),
+    ("openai-chat", openai("m", "x", 530), "retry", "server_error"),
+    ("openai-chat", openai("m", "invalid_request_error"), "fail", "bad_request"),
+    # MiniMax.
+    ("openai-chat", minimax(1008, "insufficient balance"), "quota", "quota_exhausted"),
+    ("openai-chat", minimax(1013, "internal"), "retry", "server_error"),
+    ("openai-chat", minimax(1004, "no key"), "refused", "not_allowed"),
+    ("openai-chat", choice() | minimax(0, ""), "accept", "ok"),
+    # A quota of a day within a 200.
+    ("openai-chat", openrouter(429, "free-models-per-day"), "quota", "quota_exhausted"),
 ]
 
 
@@ -499,6 +679,7 @@ def test_a_body_that_is_nested_too_deep_is_no_json(status, outcome):
         ({"message": "the words", "object": "error"}, "HTTP 400: the words"),
         ("some\n  text\twithout JSON", "HTTP 400: some text without JSON"),
         ("x" * 1000, "HTTP 400: " + "x" * 200),
+        ("", "HTTP 400: no reason is given"),
     ],
 )
 def test_the_servers_words_are_the_message(body, message):

@@ -2,7 +2,7 @@ import pytest
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.ledger import cost_usd
+from merge_runner.llm.ledger import cost_usd, is_underpriced
 from merge_runner.records import Usage
 
 PRICE = Price(input=2.0, cached_input=0.5, output=8.0, source="contract")
@@ -94,3 +94,32 @@ def test_more_cached_input_than_input_is_taken_for_none():
     """A server that counts wrongly neither ends a sweep nor makes it cheap."""
     priced = entry()
     assert cost_usd(priced, Usage(100, 500, 10)) == cost_usd(priced, Usage(100, 0, 10))
+
+
+def test_a_service_tier_is_priced_where_the_registry_knows_it():
+    """The table of genai-prices knows OpenAI's tiers; explicit figures have factors."""
+    usage = Usage(1000, 0, 1000)
+    assert cost_usd(entry(), usage) == pytest.approx(0.010)
+    assert cost_usd(entry(), usage, "priority") == pytest.approx(0.0175)
+    assert cost_usd(entry(), usage, "flex") == pytest.approx(0.005)
+    assert cost_usd(entry(), usage, "default") == pytest.approx(0.010)
+    with_tiers = entry(price=PRICE.model_copy(update={"tiers": {"priority": 2.0}}))
+    assert cost_usd(with_tiers, usage, "priority") == pytest.approx(0.020)
+    assert cost_usd(with_tiers, usage, "flex") == pytest.approx(0.010)
+    assert not is_underpriced(entry(), "priority")
+    assert not is_underpriced(with_tiers, "priority")
+
+
+@pytest.mark.parametrize(
+    ("model", "tier", "expected"),
+    [
+        (entry(price=PRICE), "priority", True),
+        (entry("gemini", "gemini-3.8-flash"), "priority", True),
+        (entry(price=PRICE), "default", False),
+        (entry(price=PRICE), None, False),
+        (entry(price="free"), "priority", False),
+        (entry("local", "anything"), "priority", False),  # that the price is unknown is said
+    ],
+)
+def test_a_dearer_tier_without_a_price_is_known_as_such(model, tier, expected):
+    assert is_underpriced(model, tier) == expected

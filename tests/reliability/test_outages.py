@@ -105,6 +105,98 @@ async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_pat
     assert again.summary["trials"]["finished"] + again.summary["trials"]["collided"] == 33
 
 
+STREAM = ('data: {"choices": [{"delta": {"content": "M"}}]}\n\ndata: [DONE]\n', "text/event-stream")
+DAY = {
+    "message": "Rate limit exceeded: free-models-per-day",
+    "code": 429,
+    "metadata": {"headers": {"X-RateLimit-Remaining": "0", "X-RateLimit-Reset": "1999999999000"}},
+}
+USED_UP = "You have reached your specified API usage limits. You will regain access on 2027-01-01."
+
+
+def as_reply(body, status=200):
+    """A reply of JSON, or of a text and its type."""
+    if isinstance(body, tuple):
+        return web.Response(text=body[0], content_type=body[1], status=status)
+    return web.json_response(body, status=status)
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "code", "words"),
+    [
+        (200, STREAM, 2, ["events (SSE)", 'charset=utf-8: data: {"choices"']),
+        (
+            200,
+            ("<html>Welcome</html>", "text/html"),
+            2,
+            ["is a web page", "charset=utf-8: <html>W"],
+        ),
+        (200, {"status": "up"}, 2, ["does not speak openai-chat", '{"status": "up"}']),
+        (200, {"error": "Unexpected endpoint."}, 2, ["EMULATOR_BASE_URL", "Unexpected endpoint."]),
+        (200, {"error": DAY}, 3, ["free-models-per-day", "again at 2033-05-18 03:33 UTC"]),
+        (429, {"error": DAY}, 3, ["free-models-per-day", "again at 2033-05-18 03:33 UTC"]),
+        (400, {"error": {"message": USED_UP, "type": "x"}}, 3, [USED_UP]),
+        (200, {"base_resp": {"status_code": 1008, "status_msg": "no money"}}, 3, ["no money"]),
+    ],
+    ids=["SSE", "page", "JSON", "LM Studio", "day in a 200", "day", "usage limits", "MiniMax"],
+)
+async def test_what_no_call_would_fare_better_with_ends_the_run_at_its_first_call(
+    merge_runner, tmp_path, status, body, code, words
+):
+    async def middle(request, handler):
+        return as_reply(body, status)
+
+    sweep = configured(tmp_path, deadline_s=600)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, **env)
+    assert run.code == code, run.err
+    last = run.err.splitlines()[-1]
+    assert all(each in last for each in words), last
+    assert run.summary["trials"]["failed"] == 0
+    assert server.requests <= 3
+
+
+async def test_a_quota_that_is_used_up_in_the_midst_fails_no_trial(merge_runner, tmp_path):
+    async def middle(request, handler):
+        if server.requests > 5:
+            return as_reply({"error": {"message": USED_UP, "type": "invalid_request_error"}}, 400)
+        return await handler(request)
+
+    sweep = configured(tmp_path, deadline_s=600)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, **env)
+    assert run.code == 3, run.err
+    assert USED_UP in run.err
+    assert run.summary["trials"]["failed"] == 0
+
+
+async def test_errors_within_a_200_and_odd_bodies_in_the_midst_of_a_run_cost_no_trial(
+    merge_runner, tmp_path
+):
+    odd = [
+        {"error": {"type": "overloaded_error", "message": "Overloaded"}},
+        {"error": {"type": "api_error", "message": "m"}},
+        {"error": {"message": "m", "code": 529}},
+        {"error": "Model unloaded."},
+        STREAM,
+        {"status": "up"},
+    ]
+
+    async def middle(request, handler):
+        if server.requests > 3 and odd and server.requests % 3 == 0:
+            return as_reply(odd.pop())
+        return await handler(request)
+
+    sweep = configured(tmp_path, deadline_s=600)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, "--conditions", "L_4_8,N_0_0", **env)
+    assert run.code == 0, run.err
+    assert not odd
+
+
 async def test_nobody_listens(merge_runner, tmp_path):
     sweep = configured(tmp_path, deadline_s=0.6)
     run = await merge_runner(*sweep, EMULATOR_BASE_URL="http://127.0.0.1:9/v1")

@@ -52,3 +52,11 @@ def test_batches_are_shown_and_that_nobody_need_wait():
         "you may close this: the same command goes on",
     ]
     assert "left" not in dict(rows(shown))["time"]  # nobody knows how long a batch takes
+
+
+def test_replies_that_cost_more_than_is_counted_are_a_warning():
+    meter = Meter(calls_live=3)
+    meter.underpriced["priority"] = 2
+    warning = dict(rows(progress(runner(meter))))["WARNING"]
+    assert warning.startswith("0: replies are of the service tier 'priority'")
+    assert "tiers = { priority = 2.0 }" in warning

@@ -292,8 +292,8 @@ class OpenAIBatches(BatchService):
     def _status_of(self, batch: dict[str, Any]) -> BatchStatus:
         word = (as_text(batch.get("status")) or "").upper()
         answered = as_count(as_dict(batch.get("request_counts")).get("completed")) or 0
-        error = at(batch, "errors.data.0")
-        why = read_error(400, {}, "", {"error": error})
+        error, told = at(batch, "errors.data.0"), batch.get("errors")
+        why = read_error(400, {}, json.dumps(told) if told else "", {"error": error})
         why = replace(why, status=status_within(why) if why.names else 400)
         failure = self._failure_of(why) if word == "FAILED" else None
         if word not in ("COMPLETED", "EXPIRED", "CANCELLED"):

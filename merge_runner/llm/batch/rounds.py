@@ -356,9 +356,10 @@ class Rounds:
             )
         if exc.kind in ("quota", "refused"):
             kind = QuotaExhausted if exc.kind == "quota" else EndpointRefused
+            batch_id = batch.note.batch_id and f" batch {batch.note.batch_id}"
             batch.error = kind(
-                f"{model}: its batch mode refuses: {exc}. Every reply so far is saved: correct "
-                "that, or leave --batch out, and run the same command to go on"
+                f"{model}: its batch mode refuses{batch_id}: {exc}. Every reply so far is saved: "
+                "correct that, or leave --batch out, and run the same command to go on"
             )
         elif calls > 1 or not is_alone:
             if model not in self._most:

@@ -474,3 +474,10 @@ async def test_a_failed_batch_says_why_and_what_to_do(server, service_at, form, 
     status = await service_at(server.url, form).status("b1")
     assert (status.paths, status.failure.kind) == (None, kind)
     assert batch["message"] in str(status.failure)
+
+
+@pytest.mark.parametrize("told", [{}, {"errors": None}, {"errors": {"data": []}}])
+async def test_a_batch_that_fails_without_a_word_is_told_as_such(server, service_at, told):
+    server.replies[BATCH["openai-chat"]] = (200, {"status": "failed", **told})
+    failure = (await service_at(server.url, "openai-chat").status("b1")).failure
+    assert str(failure) in ("HTTP 400: no reason is given", 'HTTP 400: {"data": []}')
