@@ -41,6 +41,7 @@ from merge_runner.records import (
 )
 from merge_runner.results import database
 from merge_runner.results.database import Settings, append, fetched, in_memory
+from merge_runner.results.parquet import group_bytes
 from merge_runner.results.rows import Row
 from merge_runner.text_safety import first_line, one_line, quoted
 
@@ -70,6 +71,8 @@ SLOT = ("condition", "repetition", "side", "decision", "sample_set")
 MOST_CALLS = 10_000_000
 BLOCK, MOST_BLOCK_BYTES = 2048, 2**28
 """DuckDB hands out this many rows at once, and their texts may have this many bytes."""
+MOST_GROUP_BYTES = 2 * MOST_BLOCK_BYTES
+"""What decoding a row group may take: an export writes little more than BLOCK rows into one."""
 WRITTEN_AT_ONCE = 16
 SHOWN = 70
 # Misses that differ in numbers alone have one cause.
@@ -322,7 +325,7 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
                     f"{file} has the format {versions[0]!r} with keys of version {versions[1]!r}, "
                     f"this program reads {FORMAT!r} with keys of version {KEY_VERSION}"
                 )
-            _refuse_bombs(file, connection)
+            _refuse_bombs(file, pattern, connection)
             yield connection, metadata
         except (duckdb.Error, UnicodeDecodeError) as exc:
             raise RecordingError(
@@ -330,22 +333,30 @@ def opened(file: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, dict[str, st
             ) from exc
 
 
-def _refuse_bombs(file: Path, connection: duckdb.DuckDBPyConnection) -> None:
-    """Raise RecordingError for more rows or longer texts than recordings have."""
+def _refuse_bombs(file: Path, pattern: str, connection: duckdb.DuckDBPyConnection) -> None:
+    """Raise RecordingError for more rows or longer texts than recordings have.
+
+    Nothing is decoded before it is known how much that takes.
+    """
+    not_ours = f"{file} is not one of our recordings"
+    ((calls,),) = connection.execute("SELECT count(*) FROM recording").fetchall()
+    if calls > MOST_CALLS:  # what a footer claims is not there to be read
+        raise RecordingError(f"{not_ours}: it claims {calls} calls")
+    try:
+        largest = max(group_bytes(file, pattern, connection), default=0)
+    except ValueError as exc:
+        raise RecordingError(f"{not_ours}: {exc}") from exc
+    if largest > MOST_GROUP_BYTES:
+        raise RecordingError(f"{not_ours}: a row group of it unpacks to {largest} bytes")
     texts = (name for name, kind in COLUMNS.items() if kind == "VARCHAR")
     bytes_of_row = " + ".join(f"coalesce(strlen({name}), 0)" for name in texts)
     blocks = (
         f"SELECT sum({bytes_of_row}) FROM recording GROUP BY file_row_number // {BLOCK} "  # noqa: S608 # constants
         "ORDER BY 1 DESC"
     )
-    ((calls,),) = connection.execute("SELECT count(*) FROM recording").fetchall()
-    # What a footer claims is not there to be read.
-    (longest,) = (connection.execute(blocks).fetchone() if calls <= MOST_CALLS else None) or (0,)
-    if calls > MOST_CALLS or longest > MOST_BLOCK_BYTES:
-        raise RecordingError(
-            f"{file} is not one of our recordings: it claims {calls} calls, {longest} bytes in "
-            f"{BLOCK} of them"
-        )
+    (longest,) = connection.execute(blocks).fetchone() or (0,)
+    if longest > MOST_BLOCK_BYTES:
+        raise RecordingError(f"{not_ours}: it has {longest} bytes in {BLOCK} calls")
 
 
 def read_provenance(file: Path) -> dict[str, str]:

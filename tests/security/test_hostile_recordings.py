@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import random
+import re
 import sqlite3
 import subprocess
 import sys
@@ -17,8 +18,22 @@ import pytest
 
 from merge_runner.errors import MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.records import Attempt, Slot, call_key, canonical_json, make_request
-from merge_runner.results.recording import COLUMNS, export_recording, import_recording, summarise
+from merge_runner.records import (
+    KEY_VERSION,
+    Attempt,
+    Slot,
+    call_key,
+    canonical_json,
+    make_request,
+)
+from merge_runner.results.recording import (
+    COLUMNS,
+    FORMAT,
+    export_recording,
+    import_recording,
+    summarise,
+)
+from tests.security import parquet
 
 CALLS = 3
 ANSWER = json.dumps({"choices": [{"message": {"content": "M\n[0.1]"}}]})
@@ -356,8 +371,8 @@ def test_a_few_more_rows_than_there_are_are_refused(file, cache):
 #   SELECT * REPLACE (repeat(chr(0), 1000000000) AS body) FROM calls LIMIT 1
 #   SELECT calls.* REPLACE (repeat('x', 1000000) AS attempts) FROM calls, range(10000)
 BOMBS = {
-    "one-text-of-1-gb.parquet": "Out of Memory",
-    "30000-texts-of-1-mb.parquet": " bytes in 2048 of them",
+    "one-text-of-1-gb.parquet": "a row group of it unpacks to 1000000494 bytes",
+    "30000-texts-of-1-mb.parquet": " bytes in 2048 calls",
 }
 PEAK_MB = """
 import sys
@@ -394,6 +409,84 @@ def test_a_small_file_that_unpacks_to_much_is_refused_in_little_memory(name):
     said, grown_mb = peak_mb(PEAK_MB, str(bomb))
     assert BOMBS[name] in said
     assert grown_mb < 200
+
+
+TOLD = [("format", FORMAT), ("key_version", str(KEY_VERSION))]
+WRITTEN = {
+    "a dictionary of many empty texts": (
+        1,
+        parquet.dictionary(25_000_000),
+        "a dictionary has more entries than its column has values",
+    ),
+    "texts that are each the one before": (
+        10_000,
+        parquet.prefixes(50_000, 10_000),
+        "a column has encoding 7, which no export writes",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_what_the_memory_limit_does_not_cover_is_refused_before_it_is_decoded(tmp_path, name):
+    """Such pages took 500 MB here, and 9 GB where they were larger."""
+    rows, column, says = WRITTEN[name]
+    bomb = parquet.write(tmp_path / "bomb.parquet", rows, {"body": column}, TOLD)
+    said, grown_mb = peak_mb(PEAK_MB, str(bomb))
+    assert says in said
+    assert grown_mb < 200
+
+
+def with_pages(tmp_path, rows=1, **columns):
+    written = parquet.write(tmp_path / "written.parquet", rows, columns, TOLD)
+    with pytest.raises(RecordingError) as refused:
+        summarise(written)
+    return str(refused.value)
+
+
+def test_a_file_that_is_written_by_hand_is_read_to_its_rows(tmp_path):
+    """Or else the others would be refused for the hand that wrote them."""
+    assert "row 1 is damaged: Expecting value" in with_pages(tmp_path)
+    assert "row 1 is damaged: Expecting value" in with_pages(tmp_path, body=parquet.dictionary(1))
+    with duckdb.connect() as connection:
+        file = parquet.write(tmp_path / "a.parquet", 3, {"body": parquet.prefixes(5, 3)}, TOLD)
+        assert connection.execute(f"SELECT body FROM '{file}'").fetchall() == [("xxxxx",)] * 3
+
+
+def text_page(packed=bytes(4), size=4, values=1, **changes):
+    return parquet.UNCOMPRESSED, parquet.page(parquet.DATA, values, packed, size, **changes)
+
+
+UNREADABLE = {
+    "a page more": (parquet.UNCOMPRESSED, 2 * text_page()[1]),
+    "fewer values": text_page(values=0),
+    "more values": text_page(values=2),
+    "a negative size": text_page(size=-1),
+    "no header": (parquet.UNCOMPRESSED, bytes(30)),
+    "half a header": (parquet.UNCOMPRESSED, text_page()[1][:5]),
+    "a page of no known kind": (
+        parquet.UNCOMPRESSED,
+        text_page()[1].replace(b"\x15\x00", b"\x15\x02", 1),
+    ),
+    "a number of more than 32 bits": text_page(size=2**32 + 4),
+    "a struct in a struct": (parquet.UNCOMPRESSED, b"\x1c" * 100_000),
+    "a number without an end": (parquet.UNCOMPRESSED, b"\x15" + b"\xff" * 100_000),
+    "a list": (parquet.UNCOMPRESSED, b"\x19" + text_page()[1]),
+    "a field twice": (parquet.UNCOMPRESSED, b"\x15\x00\x05\x02" + text_page()[1]),
+}
+
+
+@pytest.mark.parametrize("name", UNREADABLE)
+def test_pages_that_a_reader_may_take_in_another_way_are_refused(tmp_path, name):
+    said = with_pages(tmp_path, body=UNREADABLE[name])
+    assert "is not one of our recordings: " in said
+    assert "page" in said
+
+
+def test_the_columns_of_a_row_group_are_bounded_together(tmp_path):
+    packed = parquet.zeros(200_000_000)
+    large = parquet.ZSTD, parquet.page(parquet.DATA, 1, packed, 200_000_000)
+    said = with_pages(tmp_path, body=large, attempts=large, model=large)
+    assert re.search(r"a row group of it unpacks to 600000\d{3} bytes", said)
 
 
 def test_the_measurement_sees_memory():
