@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import math
 import secrets
 from collections import defaultdict
@@ -67,11 +68,13 @@ class OpenBatch(BaseModel, frozen=True):
 
     ``mark`` is its name at the provider, ``batch_id`` its id, empty until the provider has told it.
     ``lines`` has the number of the attempt by the key of each call. ``model`` is its name in the
-    registry. ``submitted_at`` is UTC.
+    registry. ``number`` counts the batches noted in a cache, since a clock may be set back between
+    two of them; it is 0 in notes of versions that did not count. ``submitted_at`` is UTC.
     """
 
     mark: str
     model: str
+    number: int = 0
     submitted_at: AwareDatetime
     lines: dict[str, int]
     batch_id: str = ""
@@ -129,7 +132,8 @@ class Rounds:
         for name in cache.names(_BATCH):
             with contextlib.suppress(RecordingError, ValidationError):  # a damaged one is none
                 noted.append(OpenBatch.model_validate_json(cache.read(name) or ""))
-        noted.sort(key=lambda note: note.submitted_at)
+        noted.sort(key=lambda note: (note.number, note.submitted_at))
+        self._numbers = itertools.count(1 + max((note.number for note in noted), default=0))
         self.batches = {note.mark: Batch(note) for note in noted if note.model in models}
         # Where earlier runs have submitted calls last whose attempts there have not ended.
         self.waiting: dict[str, Batch] = {}
@@ -220,6 +224,7 @@ class Rounds:
                 note = OpenBatch(
                     mark=secrets.token_hex(16),
                     model=model,
+                    number=next(self._numbers),
                     submitted_at=datetime.now(UTC),
                     lines={each.call.request.key: len(each.call.attempts) + 1 for each in part},
                 )

@@ -569,6 +569,41 @@ async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice
     assert not Run(cache, service).rounds.batches
 
 
+class SetBack(datetime):
+    """A clock that goes an hour back with each batch."""
+
+    hours = 0
+
+    @classmethod
+    def now(cls, tz=None):
+        cls.hours += 1
+        return datetime.now(tz) - timedelta(hours=cls.hours)
+
+
+@in_virtual_time
+async def test_of_a_failed_batch_and_its_smaller_ones_the_smaller_are_taken_up_whatever_the_clock(
+    cache, monkeypatch
+):
+    class TooLarge(Memory):
+        async def status(self, batch_id):
+            if batch_id == "batch-0":
+                return BatchStatus(failure=BatchFailed("smaller", "enqueued"))
+            if not died.is_set():
+                died.set()
+                return BatchStatus()
+            return await super().status(batch_id)
+
+    monkeypatch.setattr("merge_runner.llm.batch.rounds.datetime", SetBack)
+    died = asyncio.Event()
+    service = TooLarge()
+    await killed(Run(cache, service), 4, died)
+    assert service.sizes == [4, 2]
+    run = Run(cache, service)
+    assert texts(await run.ask(4)) == [f"batched {number}" for number in range(1, 5)]
+    paid = Counter(line.key for each in list(service.batches.values())[1:] for line in each)
+    assert sorted(paid.values()) == [1] * 4
+
+
 @in_virtual_time
 async def test_a_run_that_dies_before_an_id_is_noted_where_no_mark_is_asks_that_round_alone(cache):
     class Dying(Memory):
