@@ -177,6 +177,7 @@ def power(
     """Say what a study could find and what it costs; send nothing."""
     import asyncio
 
+    from merge_runner.registry import use
     from merge_runner.run.plan import Options, make_plan
     from merge_runner.run.sweep import unsent
     from merge_runner_analysis.data.study import Study
@@ -185,6 +186,7 @@ def power(
 
     parts, wanted = (listed(conditions), listed(variants)), cli.levels(only or (), "--only")
     plan = make_plan(study, model or (), reps, *parts, only=wanted, trust=trust)
+    use(plan.parts.catalogue)
     expected = asyncio.run(unsent(plan, Options(db=db, cache=cache), say=say, whole=True))
     cost_usd = 0.0 if expected.free else expected.cost_usd
     played = Study(db).models if db.exists() else []

@@ -84,7 +84,7 @@ def records(count: int) -> list[TrialRecord]:
         return ChatReply(text, "ok", request, (attempt,), 0)
 
     async def play() -> list[TrialRecord]:
-        task, model = plan.arms[0].scenario, LanguageModel(ask)
+        task, model = plan.arms[0].scenario, LanguageModel(ask, plan.parts.prompts)
         specs = plan.trial_specs()
         return [
             await play_trial(spec, task, {side: model.make(task, spec, side) for side in SIDES})

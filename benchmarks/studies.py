@@ -144,6 +144,7 @@ def _played(
     spec = TrialSpec(
         f"{driver}/{variant}/{name}/rep{rep:02d}",
         *(f"{driver}-{variant}", "llm", driver, driver, variant, name, rep, 0, 0),
+        kinematics=condition,
     )
     decisions: list[DecisionRow] = []
     lost: list[FailedCall] = []
@@ -217,6 +218,7 @@ def _human(rng: np.random.Generator, name: str, rep: int) -> TrialRecord:
         f"human/{pair}/{name}/iter{rep:03d}",
         *(SPEC_HASH, "human", "human", "human", None, name, rep, 0, 0),
         pair=pair,
+        kinematics=condition,
     )
     states: tuple[StateRow, ...] = world.states()
     return TrialRecord(spec, world.status, world.merged_first(), world.time_s, None, states, ())

@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partialmethod, wraps
@@ -20,7 +19,7 @@ from merge_runner.drivers.program_seat import ProgramSeat
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB, home_of
-from merge_runner.registry import Registry
+from merge_runner.registry import Catalogue, Registry, collecting, remember
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
 from merge_runner.run.progress import as_lines, estimate_lines
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 PARTS = ("repetitions", "conditions", "variants")
-# The catalogue in use is that of the whole process, so one study is played at a time.
-_playing = threading.Lock()
 
 
 def sync(method: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
@@ -112,6 +109,8 @@ class Study:
     are awaited, as in a notebook; ``run``, ``replay`` and ``dry_run`` are for scripts. How a run
     goes on is said by the fields of ``Options``, as ``in_flight=50, max_cost_usd=20``.
 
+    Studies run side by side, in one event loop or in threads, each with its own parts.
+
     All of them raise UsageError for what cannot be run as it is asked for. What goes wrong on the
     way is in the outcome, beside the trials that ended: the same call goes on from there.
     """
@@ -133,15 +132,21 @@ class Study:
             name: [level_text(level) for level in (given if isinstance(given, list) else [given])]
             for name, given in (only or {}).items()
         }
+        self._own = Catalogue()
         self._wanted: dict[str, Any] = {"only": levels, "variants": prompts, **wanted}
 
     def register(self, registry: Registry[T], name: str, thing: T) -> T:
-        """Add a prompt, a condition, a metric, ... to its registry, and return it.
+        """Add a prompt, a condition, a metric, ... of this study, and return it.
 
-        It takes the place of what was so added by this name, so that a cell can be run again.
-        Raises UsageError where the name is that of something else.
+        It takes the place of what was so added by this name, so that a cell can be run again; a run
+        that is under way goes on with what it began with. Raises UsageError where the name is that
+        of something else.
         """
-        return registry.replace(name, thing)
+        self._own.parts.get(registry.kind, {}).pop(name, None)
+        with collecting(self._own):
+            registry.register(name, thing)
+        remember(self.db, self._own)
+        return thing
 
     def register_driver(
         self,
@@ -155,7 +160,10 @@ class Study:
 
     def plan(self, *, first: bool = False, grid: str | None = None) -> Plan:
         """What would be played: all, or only the first decisions; raises UsageError."""
-        return make_plan(self.file, db=self.db, first=first, grid=grid, **self._wanted)
+        wanted = {"db": self.db, "first": first, "grid": grid, **self._wanted}
+        plan = make_plan(self.file, own=self._own, **wanted)
+        remember(self.db, plan.parts.catalogue)
+        return plan
 
     async def adry_run(self) -> Estimate:
         """The trials, calls, tokens, cost and time of a run; nothing is sent."""
@@ -180,15 +188,10 @@ class Study:
                 lines = "; ".join(estimate_lines(expected))
                 raise UsageError(f"this run spends money; yes=True goes ahead: {lines}")
 
-        if not _playing.acquire(blocking=False):
-            raise UsageError("another study is running in this process: wait for its end")
-        try:
-            plan = self.plan(first=first, grid=grid)
-            options = Options(self.db, self.cache, **how)
-            whole = any(self._wanted.get(each) is not None for each in PARTS)
-            return StudyOutcome(await play(plan, options, whole=whole, say=say, agree=agree))
-        finally:
-            _playing.release()
+        plan = self.plan(first=first, grid=grid)
+        options = Options(self.db, self.cache, **how)
+        whole = any(self._wanted.get(each) is not None for each in PARTS)
+        return StudyOutcome(await play(plan, options, whole=whole, say=say, agree=agree))
 
     async def areplay(self, *recordings: Path | str) -> StudyOutcome:
         """Play all trials from recorded replies alone, those of the files first; sends nothing."""

@@ -13,11 +13,14 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from functools import lru_cache
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, JsonValue
 
 from merge_runner.registry import NAME
+
+if TYPE_CHECKING:
+    from merge_runner.scenarios.merge.conditions import Condition
 
 KEY_VERSION = 1
 SPEC_VERSION = 2  # since then one valid array in a reply is enough
@@ -32,6 +35,7 @@ MOST_STEPS = MOST_REPETITIONS = 100_000
 
 Side = Literal["left", "right"]
 Road = Literal["merge", "straight"]
+ROADS: tuple[Road, Road] = ("merge", "straight")
 Tactical = Literal["M", "Y"]
 Status = Literal["finished", "collided", "timeout", "failed"]
 
@@ -221,7 +225,8 @@ class TrialSpec:
     ``seat`` is the source of one that only asks: it ends before its drivers decide again.
     ``order`` is its place in the sweep: lower goes first. ``scripted`` says that the emulator
     takes part, a stand-in and no language model. Humans have a ``pair`` and no ``variant``.
-    ``factors`` are the levels of the study's factors, ``arm`` names their crossing.
+    ``factors`` are the levels of the study's factors, ``arm`` names their crossing. ``kinematics``
+    are what its condition's name stands for.
     """
 
     trial_id: str
@@ -238,6 +243,7 @@ class TrialSpec:
     pair: str | None = None
     factors: tuple[tuple[str, str], ...] = ()
     arm: str = ""
+    kinematics: Condition = field(kw_only=True)
 
 
 @dataclass(frozen=True, slots=True)

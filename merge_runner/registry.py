@@ -6,16 +6,19 @@ imported before the first look into any table; what it registers is then as good
     [project.entry-points.merge_runner]
     anything = "my_package.my_drivers"
 
-What a study adds is in a ``Catalogue`` of its own, which the tables show while it is in use.
+The tables are complete once that is done. What a study adds is in a ``Catalogue`` of its own, which
+the tables show where it is in use: in one thread, or one task of an event loop, and what it begins.
 """
 
 from __future__ import annotations
 
 import re
+import threading
 from collections import ChainMap
 from collections.abc import ItemsView, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -43,6 +46,12 @@ class Catalogue:
     parts: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
+NO_STUDY = Catalogue()
+_in_use: ContextVar[Catalogue] = ContextVar("_in_use", default=NO_STUDY)
+_collecting: ContextVar[bool] = ContextVar("_collecting", default=False)
+_installing: ContextVar[bool] = ContextVar("_installing", default=False)
+
+
 def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
     """The thing of this name; raises UsageError."""
     try:
@@ -54,33 +63,40 @@ def require(things: Mapping[str, T], kind: str, name: str, hint: str = "") -> T:
 class Registry(Mapping[str, T]):
     """The things of one kind by name, in the order in which they were registered."""
 
-    catalogue: ClassVar[Catalogue] = Catalogue()
-    collecting: ClassVar[bool] = False
+    made: ClassVar[list[Registry[Any]]] = []
 
     def __init__(self, kind: str) -> None:
         """``kind`` is what one of them is called in messages."""
         self.kind = kind
         self._things: dict[str, T] = {}
-        self._replaceable: set[str] = set()
+        self._complete = False
+        self.made.append(self)
 
     def register(self, name: str, thing: T) -> T:
-        """Add a thing, and return it; raises UsageError where the name is taken or odd."""
+        """Add a thing, and return it.
+
+        It belongs to the study whose plug-in registers it. Raises UsageError where the name is
+        taken or odd, and where it belongs neither to a study nor to an installed package.
+        """
         if not NAME.fullmatch(name):
             raise UsageError(f"the {self.kind} {name!r} needs a name of letters, digits, _ - and .")
         if name in self._things or name in in_use().parts.get(self.kind, {}):
             raise UsageError(f"there is a {self.kind} {name!r} already")
-        things = in_use().parts.setdefault(self.kind, {}) if self.collecting else self._things
-        things[name] = thing
+        if _collecting.get():
+            in_use().parts.setdefault(self.kind, {})[name] = thing
+        elif self._complete and not _installing.get():
+            raise UsageError(
+                f"the {self.kind} {name!r} comes too late: register it in a plug-in of a study "
+                "(`files` of [plugins]), by Study.register, or in a module that an installed "
+                f"package names under the entry point group {GROUP}"
+            )
+        else:
+            self._things[name] = thing
         return thing
 
-    def replace(self, name: str, thing: T) -> T:
-        """Like ``register``, but in place of what was registered here by ``replace`` before."""
-        if name in self._replaceable:
-            del self._things[name]
-        self.register(name, thing)
-        self._replaceable.add(name)
-        use(replace(in_use()))  # another object, so that nothing derived from the old thing is kept
-        return thing
+    def complete(self) -> None:
+        """Take nothing more but from installed packages."""
+        self._complete = True
 
     def require(self, name: str, hint: str = "") -> T:
         """See ``require``."""
@@ -90,6 +106,8 @@ class Registry(Mapping[str, T]):
     def _all(self) -> ChainMap[str, T]:
         """Those of the study, and before them those that are installed."""
         load_plugins()
+        if not _installing.get():
+            self.complete()
         return ChainMap(in_use().parts.get(self.kind, {}), self._things)
 
     def __getitem__(self, name: str) -> T:
@@ -107,31 +125,67 @@ class Registry(Mapping[str, T]):
 
 
 def in_use() -> Catalogue:
-    """Return the catalogue that the registries show beside what is installed."""
-    return Registry.catalogue
+    """Return the catalogue that the registries show here beside what is installed."""
+    return _in_use.get()
 
 
 def use(catalogue: Catalogue) -> None:
-    """Show this catalogue in the registries, in place of the one before."""
-    Registry.catalogue = catalogue
+    """Show this catalogue in the registries from now on, in this thread and what it begins.
+
+    That is for a process that serves one study, as a command or a worker does.
+    """
+    _in_use.set(catalogue)
+
+
+@contextmanager
+def _set(variable: ContextVar[T], value: T) -> Iterator[None]:
+    token = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(token)
+
+
+@contextmanager
+def using(catalogue: Catalogue) -> Iterator[None]:
+    """Show this catalogue in the registries meanwhile, to what runs within."""
+    with _set(_in_use, catalogue):
+        yield
 
 
 @contextmanager
 def collecting(catalogue: Catalogue) -> Iterator[Catalogue]:
-    """Put what is registered meanwhile into a catalogue, and then use the one before again."""
+    """Put what is registered within into a catalogue, and show it meanwhile."""
     load_plugins()  # first: a study may build on what is installed
-    before = in_use()
-    Registry.catalogue, Registry.collecting = catalogue, True
-    try:
+    with _set(_in_use, catalogue), _set(_collecting, True):
         yield catalogue
-    finally:
-        Registry.catalogue, Registry.collecting = before, False
+
+
+@contextmanager
+def installing() -> Iterator[None]:
+    """Take what is registered within for a part of what is installed."""
+    with _set(_installing, True), _set(_collecting, False):
+        yield
+
+
+_of_results: dict[Path, Catalogue] = {}
+
+
+def remember(db: Path, catalogue: Catalogue) -> None:
+    """Let the tables of a database show what the study adds that stores its trials there."""
+    _of_results[db.absolute()] = catalogue
+
+
+def in_use_for(db: Path) -> Catalogue:
+    """Return the catalogue in use, or else that of the study that was last planned into ``db``."""
+    return in_use() if in_use().text else _of_results.get(db.absolute(), in_use())
 
 
 # What the code of somebody else may raise while it is imported.
 FAULTS = (ArithmeticError, AttributeError, ImportError, LookupError, NameError, OSError,
           RuntimeError, SyntaxError, TypeError, ValueError)  # fmt: skip
-_loaded: set[str] = set()
+_loading = threading.RLock()
+_loaded: list[UsageError | None] = []  # what went wrong, once all are imported
 
 
 def plugins() -> list[EntryPoint]:
@@ -151,12 +205,24 @@ def plugin_sources() -> Iterator[Path]:
 
 
 def load_plugins() -> None:
-    """Import what installed packages register, once; raises UsageError where that fails."""
-    if GROUP in _loaded:
-        return
-    _loaded.add(GROUP)  # before, since a plug-in may look into a table while it is imported
+    """Import what installed packages register, once; raises UsageError where that has failed."""
+    with _loading:
+        if not _loaded:
+            _loaded.append(None)  # before, since a plug-in may look into a table meanwhile
+            with installing():
+                _loaded[0] = _import_all()
+            for registry in Registry.made:
+                registry.complete()
+    if (failure := _loaded[0]) is not None:
+        raise UsageError(str(failure)) from failure.__cause__
+
+
+def _import_all() -> UsageError | None:
     for point in plugins():
         try:
             point.load()
-        except FAULTS as exc:
-            raise UsageError(f"the plug-in {point.name} = {point.value!r} fails: {exc}") from exc
+        except (UsageError, *FAULTS) as exc:
+            failure = UsageError(f"the plug-in {point.name} = {point.value!r} fails: {exc}")
+            failure.__cause__ = exc
+            return failure
+    return None

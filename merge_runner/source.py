@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
@@ -14,6 +15,9 @@ from tokenize import COMMENT, NL, generate_tokens
 from merge_runner.errors import UsageError
 
 SHARED = "merge_runner.drivers"
+STUDY_PLUGINS = "study_plugins"
+"""The package of a study's plug-ins, with a hash behind it: those of two studies are two."""
+_OF_A_STUDY = re.compile(rf"{STUDY_PLUGINS}_[0-9a-f]+(?=\.)")
 # The registry makes no decision, and what is typed into a notebook is in no file.
 WITHOUT = (f"{SHARED}.registry", "__main__")
 
@@ -50,7 +54,9 @@ def source_digest(driver: type) -> str:
             "notebook or a script: put it into a file of its own, such as my_driver.py, and "
             "import it"
         )
-    code = [(name, code_of(source)) for name, source in sorted(sources.items())]
+    # Each plug-in of a study counts by itself, whatever the others are.
+    named = {_OF_A_STUDY.sub(STUDY_PLUGINS, name): source for name, source in sources.items()}
+    code = [(name, code_of(source)) for name, source in sorted(named.items())]
     return hashlib.sha256(repr(code).encode()).hexdigest()
 
 

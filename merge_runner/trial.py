@@ -28,7 +28,6 @@ from merge_runner.records import (
     TrialRecord,
     TrialSpec,
 )
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
@@ -51,7 +50,7 @@ async def play_trial(
     # Each side starts as its own driver says, or else as the other's does.
     given = {side: d.starts for side, d in drivers.items() if hasattr(d, "starts")}
     starts = {side: given.get(side, other)[side] for other in given.values() for side in SIDES}
-    world = World(scenario, CONDITIONS.require(spec.condition), TRACK, starts)
+    world = World(scenario, spec.kinematics, TRACK, starts)
     seats = [_Seated(drivers[side], side, scenario, world) for side in SIDES]
     decisions: list[DecisionRow] = []
     failures: dict[Side, CallFailed] = {}

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from merge_runner.registry import Catalogue, collecting
 from merge_runner.results.store import results_digest
 from tests.crossed_study import play
 from tests.harness import PROGRAM, Run, environment
@@ -112,6 +113,13 @@ def quiet(prepare, tmp_path_factory):
 def played(prepare, tmp_path_factory):
     """A study with several factors and models; see ``tests.crossed_study``."""
     return play(tmp_path_factory.mktemp("mine"), prepare)
+
+
+@pytest.fixture
+def own_parts():
+    """What the test registers belongs to a study of its own."""
+    with collecting(Catalogue()):
+        yield
 
 
 def beside(emulator_url, changes):

@@ -262,7 +262,17 @@ def test_no_speed_appears_negative():
 
 def spec_of(condition="L_4_-8", repetition=1, model="projected-order"):
     return TrialSpec(
-        "trial", "hash", "driver", model, model, "baseline", condition, repetition, 0, 0
+        "trial",
+        "hash",
+        "driver",
+        model,
+        model,
+        "baseline",
+        condition,
+        repetition,
+        0,
+        0,
+        kinematics=CONDITIONS[condition],
     )
 
 

@@ -11,6 +11,7 @@ from merge_runner.drivers.pace import model_pace, program_pace
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed, SweepStopped, TrialSuspended, UsageError
 from merge_runner.records import SIDES, Attempt, ChatRequest, Decision, Slot, TrialSpec
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
 EXECUTED = 5
@@ -39,6 +40,7 @@ def spec_of(condition):
         repetition=1,
         sample_set=0,
         order=0,
+        kinematics=CONDITIONS[condition],
     )
 
 

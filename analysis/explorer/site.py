@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import shlex
 import threading
+from contextvars import copy_context
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -143,7 +144,9 @@ class Site:
     def begin(self) -> None:
         """Read the trials and make the first page's table, before anything is asked."""
         self.computing.ask(("table", TABLE, "", ""), stamp_of(self.db))
-        self._first_reading = threading.Thread(target=self._read_first, daemon=True)
+        self._first_reading = threading.Thread(
+            target=copy_context().run, args=(self._read_first,), daemon=True
+        )
         self._first_reading.start()
 
     def _read_first(self) -> None:

@@ -161,6 +161,7 @@ def trial_record(trace: Trace, experiment: int, iteration: int, page: str = "") 
             repetition=iteration,
             sample_set=0,
             order=0,
+            kinematics=HUMAN_CONDITIONS[condition],
         ),
         status=status,
         merged_first=first if decided else None,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from merge_runner.errors import unknown_name
+from merge_runner.registry import in_use_for, using
 from merge_runner_analysis.data.derived_cache import (
     finished,
     keep_finished,
@@ -140,15 +141,17 @@ def finished_tables(
 def table(study: Study | Path | str, name: str) -> pd.DataFrame:
     """A table of a study, or of a database, as a data frame at full precision.
 
-    It has the rows of the table's CSV. Raises UsageError.
+    It has the rows of the table's CSV, and what the study adds that this process has planned into
+    the database. Raises UsageError.
     """
     import pandas as pd
 
     from merge_runner_analysis.data.study import Study
 
-    read = study if isinstance(study, Study) else Study(study)
-    (made,) = make_tables(read, [name])
-    frame = pd.DataFrame(value_rows(made), columns=names_of(made)).set_index("row")
+    with using(in_use_for(study.db if isinstance(study, Study) else Path(study))):
+        read = study if isinstance(study, Study) else Study(study)
+        (made,) = make_tables(read, [name])
+        frame = pd.DataFrame(value_rows(made), columns=names_of(made)).set_index("row")
     # Of a column without a value pandas cannot tell the type.
     missing = [name for name in frame if frame[name].isna().all()]
     return frame.astype(dict.fromkeys(missing, "float64"))

@@ -85,9 +85,11 @@ StudyOption = Annotated[
 def use_study(file: str | None, *, trust: bool) -> None:
     """Use what the study of ``--study`` adds, once the user agrees to its code."""
     if file is not None:
+        from merge_runner.registry import use
         from merge_runner.study.parts import load_study
 
-        load_study(file, trust=trust)
+        _, catalogue = load_study(file, trust=trust)
+        use(catalogue)
 
 
 def levels(given: Sequence[str], option: str) -> dict[str, list[str]]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import model_pace
-from merge_runner.prompts.blocks import asks_tactical, render_prompt
+from merge_runner.prompts.blocks import Prompt, render_prompt
 from merge_runner.prompts.parse import ParsedReply, parse_reply
 from merge_runner.records import (
     NO_DECISION,
@@ -31,16 +31,19 @@ Decided = Callable[[Decision], None]
 
 @dataclass(frozen=True, slots=True)
 class LanguageModel:
-    """Makes drivers that ask one model."""
+    """Makes drivers that ask one model, with the prompts of the variants."""
 
     ask: Ask
+    prompts: Mapping[str, Prompt]
     decided: Decided | None = None
     known: Known | None = None
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> LlmDriver:
         """See MakeDriver."""
         seat = take_seat(scenario, spec, side, model_pace(scenario))
-        return LlmDriver(self.ask, spec, seat, self.decided, self.known)
+        assert spec.variant is not None, "only human trials have no prompt variant"
+        prompt = self.prompts[spec.variant]
+        return LlmDriver(self.ask, spec, seat, prompt, self.decided, self.known)
 
 
 @dataclass(slots=True)
@@ -50,6 +53,7 @@ class LlmDriver:
     ask: Ask
     spec: TrialSpec
     seat: Seat
+    prompt: Prompt
     decided: Decided | None = None
     known: Known | None = None
     _plan: tuple[float, ...] | None = None
@@ -61,7 +65,6 @@ class LlmDriver:
         Where the plan is exhausted, or there is none, the vehicle cruises.
         """
         scenario, spec = self.seat.scenario, self.spec
-        assert spec.variant is not None, "only human trials have no prompt variant"
         slot = Slot(spec.condition, spec.repetition, self.seat.side, number, spec.sample_set)
         prompt = self._prompt(observation, slot)
         reply = await self.ask(prompt, slot, spec)
@@ -80,7 +83,7 @@ class LlmDriver:
         self._executed += wanted
         failure = parsed.failure
         if failure is None and parsed.tactical is None:
-            asked = asks_tactical(spec.variant, observation.road)
+            asked = self.prompt.asks_tactical(observation.road)
             failure = NO_DECISION if asked else None
         decision = Decision(
             plan=parsed.plan,
@@ -102,13 +105,11 @@ class LlmDriver:
         Earlier versions told a driver without a valid plan at each decision that it was its first
         one. Where such a prompt has been asked it stays, so that recordings replay.
         """
-        spec = self.spec
-        assert spec.variant is not None, "only human trials have no prompt variant"
         render = partial(
             render_prompt,
             observation,
             None if self._plan is None else self._plan[self._executed :],
-            variant=spec.variant,
+            prompt=self.prompt,
             scenario=self.seat.scenario,
         )
         prompt = render(first=slot.decision == 0)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from math import inf, isfinite
 from pkgutil import iter_modules
-from typing import Any, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from merge_runner import drivers
 from merge_runner.config import ScenarioConfig
@@ -19,10 +21,14 @@ from merge_runner.records import SIDES, Side, TrialSpec, other_side
 from merge_runner.registry import Registry, require
 from merge_runner.source import source_digest
 
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
+
 EMULATOR = "emulator"
 MOCKS = frozenset({EMULATOR, "random"})
 """The models of our own, under whose names no other is expected to answer."""
 SET = "set"  # the parameter that names a set of others
+_making = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +42,10 @@ class Program:
     UsageError for parameters that cannot be, ``check_clock`` for a clock in s (the time between two
     decisions) that cannot be beside them. ``data`` are imported human trials that it replays: an
     object with their hash as ``digest``, whose ``read`` takes those of an open database (None:
-    there is none yet), and whose ``check`` raises UsageError where a program has too few trials of
-    a condition for a scenario and so many repetitions. ``chance`` declares that it draws by the
+    there is none yet), whose ``keep`` takes the ``trials`` of another such object, and whose
+    ``check`` raises UsageError where a program has too few trials of a condition for a scenario and
+    so many repetitions. ``shared`` is the one object in which its class looks for them, where
+    ``data`` are the own ones of a plan (``replaying``). ``chance`` declares that it draws by the
     seed of its seat: the analysis counts equal first decisions of others once. ``based_on``
     names the program that a study has given other parameters or another clock.
     """
@@ -51,6 +59,7 @@ class Program:
     check: Callable[[Mapping[str, Parameter]], None] | None = None
     check_clock: Callable[[Mapping[str, Parameter], float], None] | None = None
     data: Any = None
+    shared: Any = None
     chance: bool = False
     based_on: str = ""
 
@@ -119,7 +128,21 @@ class Program:
 
     def make(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> Driver:
         """Return the driver of one side of a trial."""
-        return self.driver(self.seat(scenario, spec, side))
+        seat = self.seat(scenario, spec, side)
+        if self.shared is None:
+            return self.driver(seat)
+        with _making:  # the plan of another thread may have other human trials
+            if self.shared.digest != self.data.digest:
+                self.shared.keep(self.data.trials)
+            return self.driver(seat)
+
+    def replaying(self, connection: DuckDBPyConnection | None) -> Program:
+        """The same with the human trials of a database, if it replays some; None: it has none."""
+        if self.data is None:
+            return self
+        own = copy(self.data)
+        own.read(connection)
+        return replace(self, data=own, shared=self.shared or self.data)
 
     def seat(self, scenario: ScenarioConfig, spec: TrialSpec, side: Side) -> ProgramSeat:
         """Return what that driver is given."""

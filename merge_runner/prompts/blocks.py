@@ -14,7 +14,7 @@ import hashlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from itertools import dropwhile
 from statistics import fmean
 from string import Formatter
@@ -22,8 +22,8 @@ from string import Formatter
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner.prompts.state_lines import LINES, NOT_SEEN
-from merge_runner.records import Observation, Road
-from merge_runner.registry import Catalogue, Registry, require
+from merge_runner.records import ROADS, Observation, Road
+from merge_runner.registry import Registry, require
 
 TACTICAL, OUTPUT_FORMAT = "C4", "C5"
 LAST = "the end"
@@ -333,41 +333,53 @@ def with_block(
     return {each: blocks.get(each, added) for each in names}
 
 
-def block_digests(variant: str) -> dict[str, str]:
-    """Block name to digest, for the blocks of a variant."""
-    return {name: block.digest for name, block in blocks_of(variant).items()}
+class Prompt:
+    """The blocks of a prompt by name, in order, and the template that they make on each road."""
+
+    def __init__(self, blocks: Mapping[str, Block]) -> None:
+        self.blocks = dict(blocks)
+        self.templates = {road: _template(blocks.values(), road) for road in ROADS}
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """Block name to digest."""
+        return {name: block.digest for name, block in self.blocks.items()}
+
+    def asks_tactical(self, road: Road) -> bool:
+        """Whether it asks for a tactical decision on a road."""
+        block = self.blocks.get(TACTICAL)
+        return (
+            block is not None and (block.merge if road == "merge" else block.straight) is not None
+        )
+
+
+def prompt_of(variant: str) -> Prompt:
+    """The prompt of a variant; raises UsageError."""
+    return Prompt(blocks_of(variant))
 
 
 def render_prompt(
     observation: Observation,
     remaining_plan: Sequence[float] | None,
     *,
-    variant: str,
+    prompt: Prompt,
     scenario: ScenarioConfig,
     first: bool = True,
 ) -> str:
-    """The prompt of a variant.
+    """The text of a prompt.
 
     ``remaining_plan`` is the unexecuted rest of the last valid plan (normalised accelerations),
     None before the first. ``first`` says that the driver has not decided before; it makes a
     difference only where there is no plan.
     """
-    template, names = _template(variant, observation.road, Registry.catalogue)
+    template, names = prompt.templates[observation.road]
     now = Situation(observation, scenario, remaining_plan, first)
-    prompt = template.format_map({name: FIELDS[name](now) for name in names})
-    return prompt if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", prompt)
+    text = template.format_map({name: FIELDS[name](now) for name in names})
+    return text if observation.other_seen else _UNIT_OF_NOTHING.sub(r"\1", text)
 
 
-def asks_tactical(variant: str, road: Road) -> bool:
-    """Whether the prompt of a variant asks for a tactical decision on a road."""
-    block = blocks_of(variant).get(TACTICAL)
-    return block is not None and (block.merge if road == "merge" else block.straight) is not None
-
-
-@lru_cache
-def _template(variant: str, road: Road, _: Catalogue) -> tuple[str, frozenset[str]]:
-    """The blocks of a variant that a road has, one below the other; and the fields they name."""
-    blocks = blocks_of(variant).values()
+def _template(blocks: Iterable[Block], road: Road) -> tuple[str, frozenset[str]]:
+    """The blocks that a road has, one below the other; and the fields that they name."""
     templates = (block.merge if road == "merge" else block.straight for block in blocks)
     whole = "\n\n".join(template for template in templates if template is not None) + "\n"
     return whole, frozenset(named(whole))

@@ -27,7 +27,6 @@ from merge_runner.records import (
     is_scripted,
 )
 from merge_runner.results.database import names_of
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 Row = tuple[Any, ...]
 TrialKey = tuple[str, str]
@@ -61,7 +60,7 @@ _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]|[\ud800-\udfff]")
 
 def rows_of(record: TrialRecord) -> dict[str, list[Row]]:
     """All rows of a trial, by table."""
-    spec, condition = record.spec, CONDITIONS[record.spec.condition]
+    spec, condition = record.spec, record.spec.kinematics
     key = (spec.trial_id, spec.spec_hash)
     trial = (
         *(*key, spec.pair, spec.source),

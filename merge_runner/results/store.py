@@ -46,7 +46,6 @@ from merge_runner.results.rows import (
     rows_of_trials,
     stored_rows,
 )
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.measures import measures_sql
 from merge_runner.served_model import other_models
 
@@ -120,17 +119,18 @@ class Store:
                 [ended_at, exit_code, sweep_id],
             )
 
-    def ended_trials(self, keys: Collection[TrialKey]) -> set[TrialKey]:
-        """Which of these trials are stored and did not fail.
+    def ended_trials(self, specs: Mapping[TrialKey, TrialSpec]) -> set[TrialKey]:
+        """The keys of those trials that are stored and did not fail.
 
         Raises UsageError where one of their conditions had other numbers when they were stored:
         the spec's hash does not cover these.
         """
-        named = list(keys)
+        named = list(specs)
+        kinematics = {spec.condition: spec.kinematics for spec in specs.values()}
         columns = "DISTINCT condition, projected_headway_m, relative_velocity_mps"
         with write_database(self.path) as connection:
             for name, *numbers in rows_of_trials(connection, columns, "trials", named).fetchall():
-                condition = CONDITIONS[name]
+                condition = kinematics[name]
                 if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
                     raise UsageError(
                         f"the condition {name} is stored with a headway of {numbers[0]:g} m and a "
@@ -187,8 +187,8 @@ class Store:
         Returns how many were added, how many were stored already, and the ids of those that are
         stored with other values.
         """
-        keys = {*map(_key, records)}
-        added = len(keys - self.ended_trials(keys))
+        keys = {_key(record): record.spec for record in records}
+        added = len(keys.keys() - self.ended_trials(keys))
         differing = list(self.write(None, records, specs))
         return added, len(records) - added - len(differing), differing
 

@@ -42,11 +42,11 @@ from merge_runner.llm.client import Meter, Wait
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
-from merge_runner.registry import in_use, plugin_sources, use
+from merge_runner.registry import Catalogue, plugin_sources, using
 from merge_runner.run.clients import live_clients
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.local_runner import Ended, FirstDecisions, LocalRunner, Room
-from merge_runner.run.plan import Options, Plan
+from merge_runner.run.plan import Options, Plan, find_parts
 from merge_runner.study.parts import catalogue_of
 
 if TYPE_CHECKING:
@@ -180,10 +180,26 @@ async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Pla
     # Dask's profiler samples all threads; Python 3.11 can deadlock there.
     dask_worker.periodic_callbacks["profile"].stop()
     task: Task = pickle.loads(pickled)  # noqa: S301 # whoever reaches a scheduler can run code
-    study = task.plan.study
-    if (in_use().text, in_use().plugins) != (study.text, study.plugins):
-        use(catalogue_of(study.file, study.text, study.plugins))
     kept = dask_worker.extensions
+    try:
+        if (plan := kept.get(f"{task.run} plan")) is None:
+            plan = kept[f"{task.run} plan"] = _rebuilt(task.plan)
+    except MergeRunnerError as exc:
+        return Played(error=type(exc)(str(exc)))
+    with using(plan.parts.catalogue):
+        return await _play(replace(task, plan=plan), kept)
+
+
+def _rebuilt(plan: Plan) -> Plan:
+    """The plan with its programs, and all that its study adds, made anew from their sources."""
+    study = plan.study
+    catalogue = catalogue_of(study.file, study.text, study.plugins)
+    programs = find_parts(plan.arms, (), catalogue).programs
+    parts = replace(plan.parts, programs=programs, catalogue=catalogue)
+    return plan.model_copy(update={"parts": parts})
+
+
+async def _play(task: Task, kept: dict[str, Any]) -> Played:
     stopping: asyncio.Event = kept.setdefault(task.run, asyncio.Event())
     # What the last task asked within a minute counts for this one, too.
     limiters: dict[str, Limiter] = kept.setdefault(f"{task.run} {task.share}", {})
@@ -250,6 +266,9 @@ class DaskTasks:
     def __post_init__(self) -> None:
         self.meters = {name: Meter() for name in self._plan.entries}
         self._costs = trial_costs(self._plan, self._earlier)
+        # Classes of plug-ins are in no module that a worker could import.
+        parts = replace(self._plan.parts, programs={}, catalogue=Catalogue())
+        self._sent = self._plan.model_copy(update={"parts": parts})
 
     @property
     def running(self) -> int:
@@ -316,7 +335,7 @@ class DaskTasks:
             run=self._run,
             name=name,
             specs=specs,
-            plan=self._plan,
+            plan=self._sent,
             options=replace(self._options, in_flight=in_flight, max_cost_usd=cap_usd),
             urls=base_urls(self._plan.entries),
             earlier=self._earlier,

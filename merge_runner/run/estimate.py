@@ -16,7 +16,6 @@ from merge_runner.llm.ledger import cost_usd
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import Usage, canonical_json, is_scripted, without_prompt
 from merge_runner.run.plan import Options, Plan, usual_prompts
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.study.crossing import Arm
@@ -174,6 +173,8 @@ def _limited_s(options: Options, entry: ModelEntry, usage: Usage) -> float:
 def typical_prompt(plan: Plan, arm: Arm) -> str:
     """Return an arm's prompt in the middle of an approach."""
     scenario = arm.scenario
-    world = World(scenario, CONDITIONS[plan.conditions[0]], TRACK)
+    world = World(scenario, plan.parts.conditions[plan.conditions[0]], TRACK)
     rest = (0.25,) * (scenario.plan_actions - scenario.executed_actions)
-    return render_prompt(world.observe("left"), rest, variant=arm.variant, scenario=scenario)
+    return render_prompt(
+        world.observe("left"), rest, prompt=plan.parts.prompts[arm.variant], scenario=scenario
+    )

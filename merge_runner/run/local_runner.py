@@ -22,7 +22,6 @@ from itertools import accumulate, chain
 
 from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
-from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import (
     NoValidDecision,
     ProviderDown,
@@ -162,11 +161,14 @@ class LocalRunner:
         self._arms = self.plan.by_label()
         models = {
             name: LanguageModel(
-                partial(self._ask, name), partial(self.first.count, name), client.has_asked
+                partial(self._ask, name),
+                self.plan.parts.prompts,
+                partial(self.first.count, name),
+                client.has_asked,
             )
             for name, client in self.clients.items()
         }
-        self._drivers: dict[str, MakeDriver] = {**PROGRAMS, **models}
+        self._drivers: dict[str, MakeDriver] = {**self.plan.parts.programs, **models}
 
     @classmethod
     def sealed(cls, plan: Plan, cache: ResponseCache, in_flight: int = 1) -> LocalRunner:

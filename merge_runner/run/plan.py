@@ -7,13 +7,13 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from itertools import chain, product
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, computed_field
+from pydantic import BaseModel, ConfigDict, Field, InstanceOf, computed_field
 
 from merge_runner.config import (
     ModelEntry,
@@ -28,7 +28,7 @@ from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
-from merge_runner.prompts.blocks import VARIANTS, block_digests, blocks_of
+from merge_runner.prompts.blocks import VARIANTS, Prompt, blocks_of, prompt_of
 from merge_runner.records import (
     MOST_REPETITIONS,
     SIDES,
@@ -38,6 +38,7 @@ from merge_runner.records import (
     canonical_json,
     spec_hash,
 )
+from merge_runner.registry import Catalogue, using
 from merge_runner.results.database import read_database
 from merge_runner.scenarios.merge.conditions import (
     CONDITIONS,
@@ -61,6 +62,11 @@ from merge_runner.study.crossing import (
 from merge_runner.study.file import EVERY_CONDITION, EVERY_PROMPT, StudyFile, StudySource
 from merge_runner.study.parts import load_study
 from merge_runner.text_safety import in_a_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from duckdb import DuckDBPyConnection
 
 USUAL_GRID = "h=-6:6:2,dv=-1.6:1.6:0.4"
 """Projected headways in m and relative velocities in m/s, left minus right: FROM:TO:STEP."""
@@ -115,6 +121,49 @@ class Options:
         return self.rpm or entry.rpm, self.tpm or entry.tpm
 
 
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What the names in a plan stand for.
+
+    It is found when the plan is made, and not looked up again: another study may give the same
+    names to other things. ``prompts`` are by variant, ``programs`` are those of its arms. The
+    ``catalogue`` is all that its study adds.
+    """
+
+    conditions: Mapping[str, Condition] = field(default_factory=dict)
+    prompts: Mapping[str, Prompt] = field(default_factory=dict)
+    programs: Mapping[str, Program] = field(default_factory=dict)
+    catalogue: Catalogue = field(default_factory=Catalogue)
+
+    @property
+    def replays_humans(self) -> bool:
+        """Whether a program replays imported human trials."""
+        return any(program.data is not None for program in self.programs.values())
+
+    def with_humans(self, connection: DuckDBPyConnection | None) -> Parts:
+        """The same with the human trials of a database, which are replayed; None: it has none."""
+        programs = {name: each.replaying(connection) for name, each in self.programs.items()}
+        return replace(self, programs=programs)
+
+
+def find_parts(
+    arms: Iterable[Arm], conditions: Iterable[str], catalogue: Catalogue, hint: str = ""
+) -> Parts:
+    """What the names in arms and conditions stand for where a catalogue is in use.
+
+    Raises UsageError, with a ``hint``, where that is not known.
+    """
+    arms = list(arms)
+    asked = {name: None for arm in arms for name in arm.asked.values() if name not in arm.entries}
+    with using(catalogue):
+        return Parts(
+            {name: CONDITIONS.require(name, hint) for name in conditions},
+            {variant: prompt_of(variant) for variant in {a.variant: 0 for a in arms if a.entries}},
+            {name: PROGRAMS.require(name, hint) for name in asked},
+            catalogue,
+        )
+
+
 class Plan(BaseModel):
     """A sweep before it runs: the arms of its study, each played in all conditions.
 
@@ -123,7 +172,7 @@ class Plan(BaseModel):
     of each factor of its file, a factor's reference first. ``entries`` are the language models of
     all arms by what an arm's ``asked`` calls them, and ``endpoints`` the identities of their
     endpoints (see ``config.Endpoint``). ``seat`` is ``first`` where only first decisions are asked,
-    and empty in a sweep.
+    and empty in a sweep. ``parts`` are no part of the JSON: a plan that is read has none.
     """
 
     model_config = ConfigDict(frozen=True, serialize_by_alias=True, validate_by_name=True)
@@ -140,6 +189,7 @@ class Plan(BaseModel):
     sample_set: int
     order_seed: int
     seat: Literal["", "first"] = ""
+    parts: Annotated[InstanceOf[Parts], Field(exclude=True)] = Parts()
 
     @property
     def ledger(self) -> str:
@@ -188,7 +238,7 @@ class Plan(BaseModel):
     @property
     def replays_humans(self) -> bool:
         """Whether imported human trials are replayed, which only this process has read."""
-        return any(map(_replayed, self.arms))
+        return self.parts.replays_humans
 
     @property
     def driver(self) -> str:
@@ -210,12 +260,13 @@ class Plan(BaseModel):
 
         These stand in its row, where a change of them is refused; another mean speed does not.
         """
-        mean_speed_mps = CONDITIONS[condition].mean_speed_mps
+        mean_speed_mps = self.parts.conditions[condition].mean_speed_mps
+        prompts = self.parts.prompts
         return canonical_json(
             {
                 "spec_version": SPEC_VERSION,
                 "scenario": arm.scenario.model_dump(),
-                "prompt_blocks": block_digests(arm.variant) if arm.entries else {},
+                "prompt_blocks": prompts[arm.variant].digests if arm.entries else {},
                 "left": self._driver(arm, "left"),
                 "right": self._driver(arm, "right"),
                 "sample_set": self.sample_set,
@@ -244,6 +295,7 @@ class Plan(BaseModel):
                 scripted=_is_scripted(arm),
                 factors=tuple(arm.factors.items()),
                 arm=arm.label,
+                kinematics=self.parts.conditions[condition],
             )
             for arm, condition in product(self.arms, self.conditions)
             for hashed in (spec_hash(self.spec(arm, condition)),)
@@ -273,7 +325,7 @@ class Plan(BaseModel):
         name = arm.asked[side]
         entry = arm.entries.get(name)
         if entry is None:
-            return PROGRAMS[name].in_spec(name)
+            return self.parts.programs[name].in_spec(name)
         sent = FORMATS[entry.format].request(entry, "")
         return {
             "endpoint": self.endpoints[name],
@@ -308,12 +360,13 @@ def make_plan(
     first: bool = False,
     grid: str | None = None,
     trust: bool = False,
+    own: Catalogue | None = None,
 ) -> Plan:
     """The plan of a study's file and what a user asks for; None or nothing keeps the file's value.
 
     ``first``: only the first situations, in the conditions or on a ``grid`` (``grid_conditions``).
-    Uses the study's catalogue (``study.parts.load_study``, which ``trust`` is for), and the human
-    trials of ``db`` where they are to be replayed. Raises UsageError.
+    ``own`` are parts beside those that the study itself adds (``study.parts.load_study``, which
+    ``trust`` is for); ``db`` has the human trials that are to be replayed. Raises UsageError.
     """
     if grid is not None:
         if conditions is not None or not first:
@@ -322,17 +375,26 @@ def make_plan(
     if sample_set < 0:
         raise UsageError("--sample-set is a whole number from 0")
     asked = (models,) if isinstance(models, str) else tuple(models)
-    study = load_study(sweep, asked, trust=trust)
-    file, registry = study.file, load_models(study.path.parent)
+    study, catalogue = load_study(sweep, asked, trust=trust, own=own)
+    file = study.file
     drivers = chosen_models(file, asked)
     pairs = (dict.fromkeys(both_sides(name).values()) for name in drivers)
-    wanted = _repetitions(study, variants, repetitions)
-    names = _conditions(file, conditions)
-    arms = cross(file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror)
-    _check_arms(arms, names, db, first=first)
+    with using(catalogue):
+        registry = load_models(study.path.parent)
+        wanted = _repetitions(study, variants, repetitions)
+        names = _conditions(file, conditions)
+        arms = cross(
+            file, drivers, wanted, registry, only or {}, conditions=len(names), mirror=mirror
+        )
+        entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
+        endpoints = {name: endpoint_identity(entry) for name, entry in entries.items()}
+    parts = find_parts(arms, names, catalogue)
+    if parts.replays_humans and db is not None:
+        with read_database(db) if db.is_file() else nullcontext() as connection:
+            parts = parts.with_humans(connection)
+    _check_arms(arms, parts, first=first)
     if first:
         arms = list(map(_first_decision, arms))
-    entries = {name: entry for arm in arms for name, entry in arm.entries.items()}
     return Plan(
         name=f"{study.name}-first" if first else study.name,
         study=study,
@@ -341,11 +403,12 @@ def make_plan(
         description=file.description,
         arms=tuple(arms),
         entries=entries,
-        endpoints={name: endpoint_identity(entry) for name, entry in entries.items()},
+        endpoints=endpoints,
         conditions=names,
         sample_set=sample_set,
         order_seed=order_seed,
         seat="first" if first else "",
+        parts=parts,
     )
 
 
@@ -388,34 +451,23 @@ def _axis(text: str) -> tuple[str, list[float]]:
     )
 
 
-def _replayed(arm: Arm) -> list[tuple[Program, Any]]:
-    """Return the programs of an arm that replay human trials, with these."""
-    programs = (PROGRAMS[name] for name in {*arm.asked.values()} - {*arm.entries})
-    return [(program, program.data) for program in programs if program.data is not None]
-
-
-def _check_arms(
-    arms: Sequence[Arm], conditions: Sequence[str], db: Path | None, *, first: bool
-) -> None:
-    """Read the human trials of a database where programs replay them, and check all crossings.
+def _check_arms(arms: Sequence[Arm], parts: Parts, *, first: bool) -> None:
+    """Check all crossings of arms and conditions.
 
     Raises UsageError for a condition that an arm cannot be played in, or both drivers of which
     cannot be asked ``first``.
     """
-    replayed = {humans for arm in arms for _, humans in _replayed(arm)}
-    if replayed and db is not None:
-        with read_database(db) if db.is_file() else nullcontext() as connection:
-            for humans in replayed:
-                humans.read(connection)
-    for arm, name in product(arms, conditions):
-        world = World(arm.scenario, CONDITIONS.require(name), TRACK)
+    for arm, (name, condition) in product(arms, parts.conditions.items()):
+        world = World(arm.scenario, condition, TRACK)
         if first and not all(map(world.in_control, SIDES)):
             raise UsageError(
                 f"{name}: a vehicle is in its tunnel yet when the first driver decides. First "
                 'situations need control_start = "both_exits"'
             )
-        for program, humans in _replayed(arm):
-            humans.check(program, arm.scenario, name, arm.repetitions)
+        for asked in {*arm.asked.values()} - {*arm.entries}:
+            program = parts.programs[asked]
+            if program.data is not None:
+                program.data.check(program, arm.scenario, name, arm.repetitions)
 
 
 def _conditions(file: StudyFile, chosen: Sequence[str] | None) -> tuple[str, ...]:

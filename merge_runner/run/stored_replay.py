@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, nullcontext, suppress
+from contextvars import copy_context
 from dataclasses import dataclass, field, fields, replace
 from operator import itemgetter
 from pathlib import Path
@@ -20,12 +21,10 @@ import duckdb
 
 from merge_runner.audit.checks import Audit, Finding, audited_database, check_rest, check_sweep
 from merge_runner.config import ModelEntry
-from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed, MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import RawReply, judge
-from merge_runner.prompts.blocks import blocks_of
 from merge_runner.records import (
     ANSWERS,
     DAMAGED,
@@ -37,12 +36,11 @@ from merge_runner.records import (
     Usage,
     make_request,
 )
-from merge_runner.registry import in_use, require, use
+from merge_runner.registry import Catalogue, in_use, require, using
 from merge_runner.results.recording import leaves
 from merge_runner.results.rows import Stored, in_order, rows_of
 from merge_runner.run.local_runner import LocalRunner
-from merge_runner.run.plan import Plan
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.run.plan import Plan, find_parts
 from merge_runner.study.crossing import Arm
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.text_safety import one_line
@@ -113,9 +111,6 @@ def _audit(
     specs: list[TrialSpec] = []
     try:
         plan = Plan.model_validate_json(config)
-        # The stored plug-ins are somebody's code and never run.
-        if not in_use().text:
-            use(declared_catalogue(plan.study.file))
         stored, members = json.loads(config), plan.model_dump(mode="json").items()
         if wrong := [name for name, value in members if stored.get(name, value) != value]:
             text = f"it disagrees with itself in {', '.join(wrong)}"
@@ -126,7 +121,9 @@ def _audit(
             for condition in plan.conditions
             for repetition in range(1, arm.repetitions + 1)
         }
-        plan = _installed_part(connection, plan, notes)
+        # The stored plug-ins are somebody's code and never run.
+        known = in_use() if in_use().text else declared_catalogue(plan.study.file)
+        plan = _installed_part(connection, plan, known, notes)
         specs = plan.trial_specs()
         planned |= {spec.trial_id: spec.spec_hash for spec in specs}
     except (*DAMAGED, AttributeError, MergeRunnerError) as exc:
@@ -137,31 +134,31 @@ def _audit(
     if specs:
         specs = _replayable(connection, plan, specs, audit, notes)
         audit.counts["replayed"] = len(specs)
-        audit.findings += _replay(connection, plan, specs, cache, sweep_id)
+        with using(plan.parts.catalogue):
+            audit.findings += _replay(connection, plan, specs, cache, sweep_id)
     audit.notes += [f"not replayed: {count} trials, since {why}" for why, count in notes.items()]
     return audit
 
 
-def _installed_part(connection: duckdb.DuckDBPyConnection, plan: Plan, notes: Counter[str]) -> Plan:
-    """Return the arms of a plan that are installed; the notes count the trials of the others.
+def _installed_part(
+    connection: duckdb.DuckDBPyConnection, plan: Plan, known: Catalogue, notes: Counter[str]
+) -> Plan:
+    """Return the arms of a plan that are installed or ``known``; the notes count other trials.
 
     Reads the human trials that the arms replay.
     """
     arms = []
     for arm in plan.arms:
         try:
-            for name in plan.conditions:
-                CONDITIONS.require(name, HINT)
-            if arm.entries:
-                blocks_of(arm.variant)
-            for name in {*arm.asked.values()} - {*arm.entries}:
-                if (humans := PROGRAMS.require(name, HINT).data) is not None:
-                    humans.read(connection)
+            find_parts([arm], plan.conditions, known, HINT)
         except MergeRunnerError as exc:
             notes[str(exc)] += arm.repetitions * len(plan.conditions)
         else:
             arms.append(arm)
-    return plan.model_copy(update={"arms": tuple(arms)})
+    parts = find_parts(arms, plan.conditions if arms else (), known)
+    if parts.replays_humans:
+        parts = parts.with_humans(connection)
+    return plan.model_copy(update={"arms": tuple(arms), "parts": parts})
 
 
 def _replayable(
@@ -218,7 +215,7 @@ def _replay(
 
     # An event loop may run in the caller's thread, where no other one can.
     with ThreadPoolExecutor(max_workers=1) as thread:
-        return thread.submit(asyncio.run, compared()).result()
+        return thread.submit(copy_context().run, asyncio.run, compared()).result()
 
 
 @dataclass

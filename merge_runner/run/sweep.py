@@ -39,6 +39,7 @@ from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody,
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.records import TrialRecord, TrialSpec, canonical_json
+from merge_runner.registry import using
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Miss, Spilled, described, explain, recorded_part
@@ -88,6 +89,17 @@ async def play(
         if part.trials < plan.trials:
             say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
         plan = part
+    with using(plan.parts.catalogue):  # it has the study's own wire formats and providers
+        return await _play(plan, options, say=say, agree=agree)
+
+
+async def _play(
+    plan: Plan,
+    options: Options,
+    *,
+    say: Callable[[str], None],
+    agree: Callable[[Estimate], None],
+) -> dict[str, Any]:
     async with open_sweep(plan, options, say=say) as sweep:
         expected = None
         if sweep.todo and not (options.replay or plan.is_free):
@@ -525,8 +537,9 @@ async def unsent(
         recorded = (options.cache / "cache.db").is_file()
         cache = options.cache if recorded else Path(folder) / "responses"
         options = replace(options, db=db, cache=cache, dry_run=True)
-        async with open_sweep(plan, options, say=say) as sweep:
-            return await sweep.estimate(whole=whole)
+        with using(plan.parts.catalogue):
+            async with open_sweep(plan, options, say=say) as sweep:
+                return await sweep.estimate(whole=whole)
 
 
 @contextmanager

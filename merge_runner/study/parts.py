@@ -6,6 +6,7 @@ import ast
 import hashlib
 import re
 import sys
+import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -31,8 +32,9 @@ from merge_runner.llm.models import REGISTRY, read_entries, registry_files
 from merge_runner.paths import SHIPPED_EXPERIMENTS
 from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks_of, with_block
 from merge_runner.records import canonical_json
-from merge_runner.registry import FAULTS, Catalogue, collecting, require, use
+from merge_runner.registry import FAULTS, Catalogue, collecting, installing, require
 from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.source import STUDY_PLUGINS
 from merge_runner.study.crossing import OPPONENT, chosen_models, level_text
 from merge_runner.study.file import (
     PLUGIN,
@@ -44,19 +46,23 @@ from merge_runner.study.file import (
 )
 from merge_runner.text_safety import one_line, printable, say
 
-PACKAGE = "study_plugins"
-"""The package of a study's plug-ins: one imports from another by ``from .other import thing``."""
 # Who answers, where, with which key, at what price: the rest is how the same model is asked.
 IDENTITY = {"provider", "format", "id", "base_url", "path", "key_env", "auth", "price"}
+_importing = threading.RLock()
 
 
 def load_study(
-    name: str, models: Sequence[str] | None = None, *, trust: bool = False
-) -> StudySource:
-    """Read a study and use its catalogue, once the user agrees to its code.
+    name: str,
+    models: Sequence[str] | None = None,
+    *,
+    trust: bool = False,
+    own: Catalogue | None = None,
+) -> tuple[StudySource, Catalogue]:
+    """Read a study, and return it with what it adds, once the user agrees to its code.
 
-    ``models`` are those that are to be asked, in place of the file's own; None: nobody is asked.
-    The user also agrees to where their keys go. ``trust`` agrees. Raises UsageError.
+    ``own`` are parts that were registered for it. ``models`` are those that are to be asked, in
+    place of the file's own; None: nobody is asked. The user also agrees to where their keys go.
+    ``trust`` agrees. Raises UsageError.
     """
     study = read_study(name)
     file = study.file
@@ -66,8 +72,7 @@ def load_study(
         pairs = map(both_sides, [*chosen_models(file, models), *opponents])
         asked = {name for pair in pairs for name in pair.values()}
     _require_agreement(study, asked, trust=trust)
-    use(catalogue_of(file, study.text, study.plugins))
-    return study
+    return study, catalogue_of(file, study.text, study.plugins, own)
 
 
 def _require_agreement(study: StudySource, models: Iterable[str], *, trust: bool) -> None:
@@ -156,14 +161,17 @@ def _endpoints(beside: Path, models: Iterable[str]) -> Iterator[tuple[Path, str,
             yield path, words, identity if replaces else None
 
 
-def catalogue_of(file: StudyFile, text: str, plugins: Mapping[str, str]) -> Catalogue:
-    """Run a study's plug-ins and return what they and its file add; raises UsageError.
+def catalogue_of(
+    file: StudyFile, text: str, plugins: Mapping[str, str], own: Catalogue | None = None
+) -> Catalogue:
+    """Run a study's plug-ins and return what they and its file add to its ``own`` parts.
 
-    The user has agreed to the code (``load_study``).
+    The user has agreed to the code (``load_study``). Raises UsageError.
     """
     for source in plugins.values():
         _import_others(source)
-    with collecting(Catalogue(text, plugins)) as catalogue:
+    parts = {kind: dict(things) for kind, things in own.parts.items()} if own else {}
+    with collecting(Catalogue(text, plugins, parts)) as catalogue:
         _run_plugins(plugins)
         for name, condition in (file.conditions or {}).items():
             if condition is not None:
@@ -193,13 +201,16 @@ def declared_catalogue(file: StudyFile) -> Catalogue:
 
 def _import_others(source: str) -> None:
     """Import what a plug-in imports from elsewhere: what that registers is no part of the study."""
+    names: list[str] = []
     with suppress(*FAULTS):  # it is told, with its line, when the plug-in runs
         for node in ast.parse(source).body:
             if isinstance(node, ast.Import):
-                for alias in node.names:
-                    import_module(alias.name)
+                names += [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                import_module(node.module)
+                names.append(node.module)
+    for name in names:
+        with suppress(UsageError, *FAULTS), installing():
+            import_module(name)
 
 
 @dataclass
@@ -217,27 +228,41 @@ class _Source(InspectLoader):
 
 
 def _run_plugins(sources: Mapping[str, str]) -> None:
-    """Run plug-ins, given by file name and source, as the modules of one package."""
-    for name in [name for name in sys.modules if name.startswith(f"{PACKAGE}.")]:
-        del sys.modules[name]
-    package = sys.modules[PACKAGE] = ModuleType(PACKAGE)
-    package.__path__ = []
-    for file, source in sources.items():
-        name = f"{PACKAGE}.{re.sub('[^A-Za-z0-9_]', '_', Path(file).stem)}"
-        if name in sys.modules:
-            raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
-        loader = _Source(file, source)
-        spec = spec_from_loader(name, loader)
-        assert spec is not None
-        module = sys.modules[name] = module_from_spec(spec)
-        try:
-            loader.exec_module(module)
-        except (UsageError, AssertionError, *FAULTS) as exc:
-            lines = [f.lineno for f in extract_tb(exc.__traceback__) if f.filename == file]
-            line = lines[-1] if lines else getattr(exc, "lineno", None)
-            where = f"{file}, line {line}" if line else file
-            said = str(exc) if isinstance(exc, UsageError) else f"{type(exc).__name__}: {exc}"
-            raise UsageError(f"the plug-in {where}, fails: {said}") from exc
+    """Run plug-ins, given by file name and source, as the modules of one package.
+
+    One imports from another by ``from .other import thing``. The package is called by a hash of
+    its sources, so that no study finds the modules of another one.
+    """
+    digest = hashlib.sha256(canonical_json([*sources.items()]).encode()).hexdigest()
+    package = f"{STUDY_PLUGINS}_{digest[:16]}"
+    named = {
+        f"{package}.{re.sub('[^A-Za-z0-9_]', '_', Path(file).stem)}": (file, source)
+        for file, source in sources.items()
+    }
+    if len(named) < len(sources):
+        raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
+    with _importing:  # nobody finds half of a package
+        for name in named:
+            sys.modules.pop(name, None)
+        sys.modules[package] = ModuleType(package)
+        sys.modules[package].__path__ = []
+        for name, (file, source) in named.items():
+            _run_plugin(name, file, source)
+
+
+def _run_plugin(name: str, file: str, source: str) -> None:
+    loader = _Source(file, source)
+    spec = spec_from_loader(name, loader)
+    assert spec is not None
+    module = sys.modules[name] = module_from_spec(spec)
+    try:
+        loader.exec_module(module)
+    except (UsageError, AssertionError, *FAULTS) as exc:
+        lines = [f.lineno for f in extract_tb(exc.__traceback__) if f.filename == file]
+        line = lines[-1] if lines else getattr(exc, "lineno", None)
+        where = f"{file}, line {line}" if line else file
+        said = str(exc) if isinstance(exc, UsageError) else f"{type(exc).__name__}: {exc}"
+        raise UsageError(f"the plug-in {where}, fails: {said}") from exc
 
 
 def _variant(name: str, prompt: StudyPrompt) -> Variant:

@@ -104,6 +104,7 @@ def played(drive: Drive, scenario: ScenarioConfig = SCENARIO) -> TrialRecord:
             repetition=drive.rep,
             sample_set=0,
             order=0,
+            kinematics=CONDITIONS[drive.condition],
         ),
         status="failed" if lost else world.status,
         merged_first=None if lost else world.merged_first(),

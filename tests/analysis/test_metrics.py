@@ -38,9 +38,8 @@ from tests.analysis.studies import write_study, yielding
 
 
 @pytest.fixture
-def added(monkeypatch):
+def added(own_parts):
     """Adds a metric for the length of a test."""
-    monkeypatch.setattr(METRICS, "_things", dict(METRICS._things))
 
     def add(**changes):
         return register(replace(RMSE, paper_of_humans="", paper_of_drivers="", **changes))

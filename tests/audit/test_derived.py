@@ -11,6 +11,7 @@ import pytest
 
 from merge_runner.audit.checks import audit_recording
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.prompts.blocks import Prompt
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.recording import export_recording
 from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
@@ -199,7 +200,7 @@ def test_trials_of_another_program_are_a_note(db, monkeypatch):
 
 
 def test_trials_of_other_prompts_are_a_note(db, monkeypatch):
-    monkeypatch.setattr("merge_runner.run.plan.block_digests", lambda _: {"C0": "older"})
+    monkeypatch.setattr(Prompt, "digests", {"C0": "older"})
     (audit, _) = audit_database(db)
     assert audit.findings == []
     assert "made by another version or other data: prompt_blocks.C0" in audit.notes[-1]

@@ -8,7 +8,9 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.base import Seat
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.drivers.pace import model_pace
+from merge_runner.prompts.blocks import prompt_of
 from merge_runner.records import ChatReply, ChatRequest, Observation, Slot, TrialSpec
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 
 PLAN = tuple(round(0.01 * k, 2) for k in range(1, 21))  # 0.01 to 0.20, no two alike
 OTHER_PLAN = tuple(-a for a in PLAN)
@@ -46,9 +48,11 @@ async def decide(*replies, seen=SEEN, variant="baseline", known=None, **scenario
         return chat_reply(reply) if isinstance(reply, str) else reply
 
     scenario = ScenarioConfig(**scenario)
-    spec = TrialSpec("t", "s", "llm", "m", "m", variant, "N_0_0", 1, 0, 0)
+    spec = TrialSpec(
+        "t", "s", "llm", "m", "m", variant, "N_0_0", 1, 0, 0, kinematics=CONDITIONS["N_0_0"]
+    )
     seat = Seat(scenario, "left", model_pace(scenario), 0)
-    driver = LlmDriver(ask, spec, seat, known=known)
+    driver = LlmDriver(ask, spec, seat, prompt_of(variant), known=known)
     decisions = [await driver.decide(seen, number) for number in range(len(replies))]
     assert [prompt for prompt, _ in asked] == [decision.prompt for decision in decisions]
     assert [number for _, number in asked] == list(range(len(replies)))

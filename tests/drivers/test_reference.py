@@ -28,7 +28,19 @@ MIRRORABLE = {"idm": PROGRAMS["idm"], "human-odds": EVEN, "quantal": PROGRAMS["q
 
 
 def spec_of(condition, repetition=1):
-    return TrialSpec("t", "s", "driver", "a", "b", "baseline", condition, repetition, 0, 0)
+    return TrialSpec(
+        "t",
+        "s",
+        "driver",
+        "a",
+        "b",
+        "baseline",
+        condition,
+        repetition,
+        0,
+        0,
+        kinematics=CONDITIONS[condition],
+    )
 
 
 async def play(programs, condition, repetition=1, scenario=FINE, seeds=None):

@@ -32,6 +32,7 @@ async def play(condition, driver, **scenario):
         repetition=1,
         sample_set=0,
         order=0,
+        kinematics=CONDITIONS[condition],
     )
     drivers = {side: PROGRAMS[driver].make(scenario, spec, side) for side in SIDES}
     return await play_trial(spec, scenario, drivers)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.prompts.blocks import render_prompt
+from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
@@ -30,4 +30,4 @@ def driving_prompt():
     """What the left driver is asked first in a symmetric trial."""
     scenario = ScenarioConfig()
     seen = World(scenario, CONDITIONS["N_0_0"], TRACK).observe("left")
-    return render_prompt(seen, None, variant="baseline", scenario=scenario)
+    return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)

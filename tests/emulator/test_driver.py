@@ -10,7 +10,7 @@ from merge_runner.chance import draw, draw_between, draw_index
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.emulator.driver import NEEDED, Seen, answer, read_prompt
-from merge_runner.prompts.blocks import VARIANTS, Variant, render_prompt
+from merge_runner.prompts.blocks import VARIANTS, Variant, prompt_of, render_prompt
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import SIDES, ChatReply, Slot, TrialSpec, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -25,13 +25,13 @@ REPETITIONS = range(1, 11)
 
 def first_prompt(condition, side, variant="baseline"):
     seen = World(SCENARIO, CONDITIONS[condition], TRACK).observe(side)
-    return render_prompt(seen, None, variant=variant, scenario=SCENARIO)
+    return render_prompt(seen, None, prompt=prompt_of(variant), scenario=SCENARIO)
 
 
 def straight_prompt(variant="baseline", previous=None, **changes):
     seen = World(SCENARIO, CONDITIONS["L_4_0"], TRACK).observe("right")
     seen = replace(seen, road="straight", distance_to_merge_m=None, **changes)
-    return render_prompt(seen, previous, variant=variant, scenario=SCENARIO)
+    return render_prompt(seen, previous, prompt=prompt_of(variant), scenario=SCENARIO)
 
 
 FIRST_PROMPTS = {(name, side): first_prompt(name, side) for name in CONDITIONS for side in SIDES}
@@ -76,8 +76,12 @@ async def play(condition, repetition, sample_set):
         repetition=repetition,
         sample_set=sample_set,
         order=0,
+        kinematics=CONDITIONS[condition],
     )
-    drivers = {side: LanguageModel(ask).make(SCENARIO, spec, side) for side in SIDES}
+    drivers = {
+        side: LanguageModel(ask, {"baseline": prompt_of("baseline")}).make(SCENARIO, spec, side)
+        for side in SIDES
+    }
     return await play_trial(spec, SCENARIO, drivers)
 
 
@@ -292,8 +296,7 @@ def test_who_goes_first_does_not_brake_and_who_yields_does_not_accelerate():
                     assert action <= 0.02
 
 
-def test_a_table_is_read_as_the_list_is(monkeypatch):
-    monkeypatch.setattr(VARIANTS, "_things", dict(VARIANTS))
+def test_a_table_is_read_as_the_list_is(own_parts):
     tabled = Variant(removes=frozenset({"C0"}), adds=frozenset({"state.table"}))
     VARIANTS.register("tabled", tabled)
     for condition in CONDITIONS:
@@ -307,7 +310,7 @@ def test_a_car_that_is_not_seen_is_no_reason_to_act():
     for condition in CONDITIONS:
         seen = World(SCENARIO, CONDITIONS[condition], TRACK).observe("left")
         unseen = replace(seen, other_seen=False, other_speeds_mps=())
-        prompt = render_prompt(unseen, None, variant="baseline", scenario=SCENARIO)
+        prompt = render_prompt(unseen, None, prompt=prompt_of("baseline"), scenario=SCENARIO)
         assert abs(first_action(prompt, Slot(condition, 1, "left", 0, 0))) == 0
         assert "I do not see the other car" in answer(prompt, None)
 

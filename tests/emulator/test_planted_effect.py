@@ -12,7 +12,7 @@ import pytest
 from merge_runner.config import PROVIDERS, ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.planted_effect import PARAMETERS, PlantedEffect, planted_fields
-from merge_runner.prompts.blocks import render_prompt
+from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import SIDES, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
@@ -34,7 +34,7 @@ x_relative_speed = [-2.0, 0.0]
 def first_prompt(condition: str, side: str) -> str:
     scenario = ScenarioConfig()
     seen = World(scenario, CONDITIONS[condition], TRACK).observe(side)
-    return render_prompt(seen, None, variant="baseline", scenario=scenario)
+    return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
 
 
 def told(condition, repetition, side, effect, added=""):

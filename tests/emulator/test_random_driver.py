@@ -4,7 +4,7 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import random_answer as answer
-from merge_runner.prompts.blocks import VARIANTS, render_prompt
+from merge_runner.prompts.blocks import VARIANTS, prompt_of, render_prompt
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import SIDES, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -30,7 +30,7 @@ OTHER_SLOTS = [
                 render_prompt(
                     World(SCENARIO, CONDITIONS["L_4_8"], TRACK).observe("left"),
                     None,
-                    variant=variant,
+                    prompt=prompt_of(variant),
                     scenario=SCENARIO,
                 ),
                 SCENARIO.plan_actions,

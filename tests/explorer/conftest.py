@@ -7,7 +7,6 @@ import shutil
 
 import pytest
 
-from merge_runner.registry import Catalogue, Registry
 from merge_runner.results.store import Store
 from tests.analysis.studies import Drive, Said, as_humans, played
 from tests.explorer.hostile import hostile_trial
@@ -31,12 +30,6 @@ def pytest_runtest_setup(item):
         if os.environ.get("MERGE_RUNNER_BROWSER") == "required":
             pytest.fail("no chromium is installed")
         pytest.skip("needs chromium: apt install chromium")
-
-
-@pytest.fixture(autouse=True)
-def no_study_of_another_test(monkeypatch):
-    """The study of another test is in use no longer."""
-    monkeypatch.setattr(Registry, "catalogue", Catalogue())
 
 
 @pytest.fixture(scope="session")

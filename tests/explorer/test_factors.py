@@ -70,9 +70,10 @@ import sys
 from html import unescape
 from pathlib import Path
 from merge_runner_analysis.explorer.computing import Worker
+from merge_runner.registry import use
 from merge_runner.study.parts import load_study
 
-load_study(sys.argv[2], trust=True)
+use(load_study(sys.argv[2], trust=True)[1])
 Path(sys.argv[2]).with_name("mine.py").write_text("raise RuntimeError('nobody agreed to this')")
 worker = Worker(Path(sys.argv[1]))
 found = worker.submit(("table", "factors")).result(timeout=60)

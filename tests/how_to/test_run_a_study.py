@@ -9,7 +9,7 @@ from dataclasses import fields, is_dataclass
 import pytest
 
 from merge_runner.config import ScenarioConfig, model_in
-from merge_runner.prompts.blocks import BLOCKS, FIELDS, VARIANTS, Variant, render_prompt
+from merge_runner.prompts.blocks import BLOCKS, FIELDS, VARIANTS, Variant, prompt_of, render_prompt
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.sweep import unsent
 from merge_runner.study.file import StudyFile
@@ -94,10 +94,9 @@ def test_all_fields_and_blocks_of_a_prompt_are_named():
 
 
 @pytest.mark.parametrize("name", [name for name in BLOCKS if name.startswith("state.")][:-1])
-def test_what_a_ready_block_says_is_shown(name, monkeypatch):
-    monkeypatch.setattr(VARIANTS, "_things", dict(VARIANTS))
+def test_what_a_ready_block_says_is_shown(name, own_parts):
     VARIANTS.register(f"with_{name}", Variant(adds=frozenset({name})))
-    prompt = render_prompt(FIRST, None, variant=f"with_{name}", scenario=ScenarioConfig())
+    prompt = render_prompt(FIRST, None, prompt=prompt_of(f"with_{name}"), scenario=ScenarioConfig())
     said = prompt.split("\n\n")[2]
     assert f"| `{name}` | {' '.join(said.splitlines())} |" in PAGE
 

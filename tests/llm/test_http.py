@@ -20,7 +20,7 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http import Connections, HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.limiter import Limiter
-from merge_runner.prompts.blocks import render_prompt
+from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import Slot, call_key, canonical_json, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -460,7 +460,7 @@ SLOTS = [Slot("L_4_8", repetition, "left", 0, 0) for repetition in range(1, 5)]
 def driving_prompt():
     scenario = ScenarioConfig()
     seen = World(scenario, CONDITIONS["L_4_8"], TRACK).observe("left")
-    return render_prompt(seen, None, variant="baseline", scenario=scenario)
+    return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
 
 
 @contextlib.asynccontextmanager

@@ -19,7 +19,8 @@ from merge_runner.prompts.blocks import (
     VARIANTS,
     Block,
     Variant,
-    block_digests,
+    blocks_of,
+    prompt_of,
     render_prompt,
 )
 from merge_runner.records import SIDES, Observation
@@ -83,7 +84,9 @@ law = settings(deadline=None, derandomize=True)  # the gate must not depend on l
 
 def render(variant, form, **scenario):
     observation, rest = FORMS[form]
-    return render_prompt(observation, rest, variant=variant, scenario=ScenarioConfig(**scenario))
+    return render_prompt(
+        observation, rest, prompt=prompt_of(variant), scenario=ScenarioConfig(**scenario)
+    )
 
 
 @pytest.mark.parametrize(("variant", "form"), CASES)
@@ -130,7 +133,9 @@ def test_both_sides_of_the_symmetric_condition_get_the_identical_prompt():
     world = World(scenario, CONDITIONS["N_0_0"], TRACK)
     for action in (0.0, 0.3, -0.7):
         left, right = (
-            render_prompt(world.observe(side), None, variant="baseline", scenario=scenario)
+            render_prompt(
+                world.observe(side), None, prompt=prompt_of("baseline"), scenario=scenario
+            )
             for side in SIDES
         )
         assert left == right
@@ -148,7 +153,9 @@ def test_a_value_that_rounds_to_zero_has_no_sign(value):
     seen = Observation(
         "merge", value, value, value, value, (value,) * 10, (value,) * 10, value, value
     )
-    prompt = render_prompt(seen, (value,) * 15, variant="baseline", scenario=ScenarioConfig())
+    prompt = render_prompt(
+        seen, (value,) * 15, prompt=prompt_of("baseline"), scenario=ScenarioConfig()
+    )
     assert "-0.00" not in prompt
     # Three speeds and distances, one to the merge point, two histories and the plan.
     assert prompt.count("0.00") == 4 + 2 * 10 + 15
@@ -158,7 +165,7 @@ def test_a_value_that_rounds_to_zero_has_no_sign(value):
 @given(st.floats(-200, 200))
 def test_every_value_is_shown_to_two_decimals(value):
     seen = replace(FIRST, relative_distance_m=value)
-    prompt = render_prompt(seen, None, variant="baseline", scenario=ScenarioConfig())
+    prompt = render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=ScenarioConfig())
     line = next(x for x in prompt.splitlines() if x.startswith("- Relative distance"))
     shown = line.split("): ")[1].removesuffix(" m")
     assert abs(float(shown) - value) <= 0.005 + 1e-9
@@ -208,25 +215,22 @@ def test_texts_that_change_roads_change_the_digest():
     assert Block("x", "One.", "Two.").digest != Block("x", "Two.", "One.").digest
 
 
-def test_added_blocks_stand_where_they_say_in_the_order_of_their_names(monkeypatch):
+def test_added_blocks_stand_where_they_say_in_the_order_of_their_names(own_parts):
     """Also where the last one was registered first."""
-    monkeypatch.setattr(BLOCKS, "_things", dict(BLOCKS))
-    monkeypatch.setattr(VARIANTS, "_things", dict(VARIANTS))
     for name, before in (("Z", "C5"), ("B", "C1"), ("Y", "C5"), ("X", "C5")):
         BLOCKS.register(name, Block("more", f"Text {name}.", None, before=before))
     VARIANTS.register("A8", Variant(removes=frozenset({"C4"}), adds=frozenset("ZBY")))
-    kept = [name for name in block_digests("baseline") if name != "C4"]
-    assert [*block_digests("A8")] == ["C0", "B", *kept[1:-1], "Y", "Z", "C5"]
-    prompt = render_prompt(FIRST, None, variant="A8", scenario=ScenarioConfig())
+    kept = [name for name in blocks_of("baseline") if name != "C4"]
+    assert [*blocks_of("A8")] == ["C0", "B", *kept[1:-1], "Y", "Z", "C5"]
+    prompt = render_prompt(FIRST, None, prompt=prompt_of("A8"), scenario=ScenarioConfig())
     assert "\n\nText B.\n\nHistory of" in prompt
     assert "\n\nText Y.\n\nText Z.\n\nOutput format" in prompt
 
 
-def test_a_variant_of_a_block_that_there_is_not_is_refused(monkeypatch):
-    monkeypatch.setattr(VARIANTS, "_things", dict(VARIANTS))
+def test_a_variant_of_a_block_that_there_is_not_is_refused(own_parts):
     VARIANTS.register("A8", Variant(adds=frozenset({"C6"})))
     with pytest.raises(UsageError, match=r"unknown prompt block 'C6'; valid: C0, .*variant A8"):
-        block_digests("A8")
+        blocks_of("A8")
 
 
 @pytest.mark.parametrize("history_start", ["cruise", "empty"])
@@ -236,7 +240,9 @@ def test_in_a_finer_world_the_histories_are_those_of_the_plans_steps(history_sta
     worlds = [World(scenario, CONDITIONS["L_4_0"], TRACK) for scenario in (coarse, fine)]
     for number in range(4):
         prompts = [
-            render_prompt(world.observe("right"), [0.5], variant="baseline", scenario=scenario)
+            render_prompt(
+                world.observe("right"), [0.5], prompt=prompt_of("baseline"), scenario=scenario
+            )
             for world, scenario in zip(worlds, (coarse, fine), strict=True)
         ]
         assert prompts[0] == prompts[1]
@@ -250,9 +256,9 @@ def test_in_a_finer_world_the_histories_are_those_of_the_plans_steps(history_sta
 @pytest.mark.parametrize("variant", REMOVED)
 def test_a_variant_keeps_the_digests_of_all_blocks_but_its_own(variant):
     (removed,) = VARIANTS[variant].removes
-    kept = dict(block_digests("baseline"))
+    kept = prompt_of("baseline").digests
     del kept[removed]
-    assert block_digests(variant) == kept
+    assert prompt_of(variant).digests == kept
 
 
 def test_the_seven_ablations_remove_seven_different_blocks():

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.prompts import state_lines
-from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant, render_prompt
+from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Variant, prompt_of, render_prompt
 from merge_runner.records import FAR_BEHIND_M
 from tests.prompts.test_render import FIRST, FORMS, STRAIGHT
 
@@ -39,15 +39,14 @@ STATE = [name for name in BLOCKS if name.startswith("state.")]
 
 
 @pytest.fixture
-def everything(monkeypatch):
+def everything(own_parts):
     """A variant with all state blocks."""
-    monkeypatch.setattr(VARIANTS, "_things", dict(VARIANTS))
     VARIANTS.register("everything", Variant(adds=frozenset(STATE)))
     return "everything"
 
 
 def render(observation, variant):
-    return render_prompt(observation, None, variant=variant, scenario=ScenarioConfig())
+    return render_prompt(observation, None, prompt=prompt_of(variant), scenario=ScenarioConfig())
 
 
 @pytest.mark.parametrize("case", CASES)

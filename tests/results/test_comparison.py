@@ -8,6 +8,7 @@ import pytest
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.prompts.blocks import prompt_of
 from merge_runner.records import (
     Attempt,
     ChatReply,
@@ -20,11 +21,22 @@ from merge_runner.records import (
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.rows import PLACES, rows_of, stored_rows
 from merge_runner.results.store import OF_A_RUN
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
 CLOCK = "2026-01-01T00:00:00.000+00:00"
 SPEC = TrialSpec(
-    "m/baseline/L_4_0/rep01", "h", "llm", "m", "constant", "baseline", "L_4_0", 1, 0, 0
+    "m/baseline/L_4_0/rep01",
+    "h",
+    "llm",
+    "m",
+    "constant",
+    "baseline",
+    "L_4_0",
+    1,
+    0,
+    0,
+    kinematics=CONDITIONS["L_4_0"],
 )
 KEY = (SPEC.trial_id, SPEC.spec_hash)
 ANOTHER = {
@@ -51,7 +63,10 @@ def played() -> TrialRecord:
         )  # fmt: skip
         return ChatReply(text, "ok", request, attempts, earlier=0)
 
-    makers = {"left": LanguageModel(ask), "right": PROGRAMS["constant"]}
+    makers = {
+        "left": LanguageModel(ask, {"baseline": prompt_of("baseline")}),
+        "right": PROGRAMS["constant"],
+    }
     drivers = {side: maker.make(scenario, SPEC, side) for side, maker in makers.items()}
     return asyncio.run(play_trial(SPEC, scenario, drivers))
 

@@ -31,8 +31,22 @@ LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush
 def spec(condition="L_4_0", repetition=1, spec_hash="h"):
     trial_id = f"m/baseline/{condition}/rep{repetition:02d}"
     return TrialSpec(
-        trial_id, spec_hash, "driver", "m", "m", "baseline", condition, repetition, 0, 0
+        trial_id,
+        spec_hash,
+        "driver",
+        "m",
+        "m",
+        "baseline",
+        condition,
+        repetition,
+        0,
+        0,
+        kinematics=CONDITIONS[condition],
     )
+
+
+def keyed(record: TrialRecord) -> dict:
+    return {(record.spec.trial_id, record.spec.spec_hash): record.spec}
 
 
 def played(condition="L_4_0", *, driver="projected-order", **of_spec) -> TrialRecord:
@@ -77,7 +91,7 @@ def test_a_trial_is_stored_whole_and_once(store, path):
 def test_a_failed_trial_is_replaced_and_an_ended_one_never(store, path):
     record = played()
     store.write("s1", [failed(record)], patience_s=1)
-    assert store.ended_trials([("m/baseline/L_4_0/rep01", "h")]) == set()
+    assert store.ended_trials(keyed(record)) == set()
     assert sweep_facts(path, "s1")["failed"] == [("m/baseline/L_4_0/rep01", "it broke")]
     store.write("s1", [record], patience_s=1)
     assert store.write("s1", [failed(record)], patience_s=1) == {}
@@ -103,9 +117,8 @@ def test_a_trial_that_ends_otherwise_than_the_stored_one_is_named_and_not_stored
 def test_two_specs_of_one_trial_stay_apart(store, path):
     one, other = played(), played(spec_hash="g")
     store.write("s1", [one, other], patience_s=1)
-    assert store.ended_trials([(one.spec.trial_id, "g"), (one.spec.trial_id, "x")]) == {
-        (one.spec.trial_id, "g")
-    }
+    named = keyed(other) | {(one.spec.trial_id, "x"): one.spec}
+    assert store.ended_trials(named) == {(one.spec.trial_id, "g")}
     assert results_digest(path)[1] == 2
 
 
@@ -181,11 +194,11 @@ def test_a_changed_condition_needs_another_name(store, path):
     record = played()
     store.write("s1", [record], patience_s=1)
     key = (record.spec.trial_id, record.spec.spec_hash)
-    assert store.ended_trials([key]) == {key}
+    assert store.ended_trials({key: record.spec}) == {key}
     with duckdb.connect(str(path)) as connection:
         connection.execute("UPDATE trials SET projected_headway_m = 3")
     with pytest.raises(UsageError, match=r"is stored with a headway of 3 m .* a new name"):
-        store.ended_trials([key])
+        store.ended_trials({key: record.spec})
 
 
 def test_a_query_changes_nothing_and_reads_no_file(store, path, tmp_path):

@@ -22,9 +22,12 @@ from merge_runner.run.local_runner import (
     MOST_PENDING_BYTES,
     Flusher,
 )
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.gate import HANGS_S
 
-SPEC = TrialSpec("t", "h", "llm", "m", "m", "baseline", "L_4_0", 1, 0, 0)
+SPEC = TrialSpec(
+    "t", "h", "llm", "m", "m", "baseline", "L_4_0", 1, 0, 0, kinematics=CONDITIONS["L_4_0"]
+)
 MB = 2**20
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
-from merge_runner.prompts.blocks import render_prompt
+from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -68,7 +68,7 @@ def emulated():
     for name, condition in CONDITIONS.items():
         for variant in ("baseline", "A1"):
             seen = World(scenario, condition, TRACK).observe("left")
-            prompt = render_prompt(seen, None, variant=variant, scenario=scenario)
+            prompt = render_prompt(seen, None, prompt=prompt_of(variant), scenario=scenario)
             yield answer(prompt, Slot(name, 1, "left", 0, 0))
 
 

@@ -11,7 +11,7 @@ from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES, ChatReply, ChatRequest
-from merge_runner.registry import use
+from merge_runner.registry import using
 from merge_runner.run.plan import make_plan
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import declared_catalogue
@@ -51,14 +51,15 @@ def plan_of(tmp_path):
         file.write_text(f'{head}[plugins]\nfiles = ["mine.py"]\n')
         return make_plan(str(file), models, trust=True)
 
-    yield plan
-    make_plan("baseline", "constant")  # what the study added is taken out again
+    return plan
 
 
 async def played(plan):
     """The first trial of a plan whose drivers are programs."""
     (spec, *_), (arm, *_) = plan.trial_specs(), plan.arms
-    drivers = {side: PROGRAMS[arm.sides[side]].make(arm.scenario, spec, side) for side in SIDES}
+    drivers = {
+        side: plan.parts.programs[arm.sides[side]].make(arm.scenario, spec, side) for side in SIDES
+    }
     return await play_trial(spec, arm.scenario, drivers)
 
 
@@ -149,9 +150,9 @@ def test_a_stored_study_has_its_drivers_without_running_its_plugins(plan_of):
     text = plan_of(MINE + '[drivers.slow]\nprogram = "constant"\nclock = 2.0\n', "mine").study.text
     plan_of("", "constant")
     content = tomllib.loads(text.replace("braking", "not-installed"))
-    use(declared_catalogue(StudyFile.model_validate(content)))
-    assert PROGRAMS["slow"].rate_hz == 0.5
-    assert "mine" not in PROGRAMS
+    with using(declared_catalogue(StudyFile.model_validate(content))):
+        assert PROGRAMS["slow"].rate_hz == 0.5
+        assert "mine" not in PROGRAMS
 
 
 def steps(plan):
@@ -195,7 +196,10 @@ async def test_a_model_is_told_the_same_in_the_finer_world(plan_of):
             request = ChatRequest("", "", "", "", "", {}, "", slot)
             return ChatReply(f"Y\n```python\n{[-0.513, -0.107] * 10}\n```", "ok", request, (), 0)
 
-        makers = {"left": LanguageModel(ask), "right": PROGRAMS[arm.sides["right"]]}
+        makers = {
+            "left": LanguageModel(ask, plan.parts.prompts),
+            "right": plan.parts.programs[arm.sides["right"]],
+        }
         drivers = {side: makers[side].make(arm.scenario, spec, side) for side in SIDES}
         await play_trial(spec, arm.scenario, drivers)
         told.append(prompts)

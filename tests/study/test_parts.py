@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
+
 import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.prompts.blocks import block_digests, blocks_of, render_prompt
+from merge_runner.prompts.blocks import blocks_of, prompt_of, render_prompt
+from merge_runner.registry import Catalogue, collecting, using
 from merge_runner.run.plan import make_plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from merge_runner.source import STUDY_PLUGINS, source_digest
 from tests.harness import how_to
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
@@ -42,10 +47,10 @@ def plan_of(tmp_path):
     return plan
 
 
-def prompt(variant):
-    world = World(ScenarioConfig(), CONDITIONS["N_0_0"], TRACK)
+def prompt(plan, variant):
     scenario = ScenarioConfig()
-    return render_prompt(world.observe("left"), None, variant=variant, scenario=scenario)
+    seen = World(scenario, CONDITIONS["N_0_0"], TRACK).observe("left")
+    return render_prompt(seen, None, prompt=plan.parts.prompts[variant], scenario=scenario)
 
 
 def persona(text="You are a taxi driver."):
@@ -71,11 +76,12 @@ def test_models_beside_a_study_may_speak_a_wire_format_of_its_plug_ins(plan_of, 
 
 
 def test_a_paragraph_is_added_where_it_belongs(plan_of):
-    plan_of(persona("You drive {own_speed_kmh} km/h, {own_speed_mph} mph."))
-    lines = prompt("taxi").split("\n\n")
+    plan = plan_of(persona("You drive {own_speed_kmh} km/h, {own_speed_mph} mph."))
+    lines = prompt(plan, "taxi").split("\n\n")
     place = lines.index("You drive 36.00 km/h, 22.37 mph.")
     assert lines[place - 1].startswith("Drive the way a human driver")
-    assert lines[:place] + lines[place + 1 :] == prompt("baseline").split("\n\n")
+    plain = prompt(make_plan("baseline"), "baseline")
+    assert lines[:place] + lines[place + 1 :] == plain.split("\n\n")
 
 
 @pytest.mark.parametrize(
@@ -90,40 +96,41 @@ def test_a_ready_block_stands_behind_the_situation_unless_it_is_put_elsewhere(
     plan_of, change, neighbours
 ):
     head = '[factors]\nprompt = ["more"]\n[prompts.more]\n'
-    plan_of(f'{head}{change}add = [{{ block = "state.time_gap" }}]\n')
-    names = list(blocks_of("more"))
+    plan = plan_of(f'{head}{change}add = [{{ block = "state.time_gap" }}]\n', "emulator")
+    names = list(plan.parts.prompts["more"].blocks)
     place = names.index("state.time_gap")
     assert (names[place - 1], names[place + 1]) == neighbours
-    plan_of(f'{head}{change}add = [{{ block = "state.time_gap", before = "C5" }}]\n')
-    assert list(blocks_of("more"))[-2:] == ["state.time_gap", "C5"]
-    assert "\n\nTime gap (" in prompt("more")
+    plan = plan_of(f'{head}{change}add = [{{ block = "state.time_gap", before = "C5" }}]\n')
+    assert list(plan.parts.prompts["more"].blocks)[-2:] == ["state.time_gap", "C5"]
+    assert "\n\nTime gap (" in prompt(plan, "more")
 
 
 def test_an_edited_prompt_is_another_spec_at_once(plan_of):
     texts = ["You are late.", "You are early."]
-    specs = [plan_of(persona(text)).trial_specs()[0].spec_hash for text in texts]
+    plans = [plan_of(persona(text)) for text in texts]
+    specs = [plan.trial_specs()[0].spec_hash for plan in plans]
     assert specs[0] != specs[1]
-    assert "You are early." in prompt("taxi")
-    assert "You are late." not in prompt("taxi")
+    for plan, text in zip(plans, texts, strict=True):
+        assert [each in prompt(plan, "taxi") for each in texts] == [each == text for each in texts]
 
 
 def test_blocks_are_removed_replaced_and_moved(plan_of):
-    plan_of(
+    plan = plan_of(
         '[factors]\nprompt = ["other"]\n[prompts.other]\nbased_on = "A2"\n'
         'remove = ["C3.safety", "C4"]\nreplace = { "C3.human" = "Drive like a robot." }\n'
         'add = [{ after = "C0", block = "C4" }]\n'
     )
     rest = [name for name in blocks_of("A2") if name not in ("C0", "C3.safety", "C4")]
-    assert list(blocks_of("other")) == ["C0", "C4", *rest]
-    assert "Drive like a robot." in prompt("other")
+    assert list(plan.parts.prompts["other"].blocks) == ["C0", "C4", *rest]
+    assert "Drive like a robot." in prompt(plan, "other")
 
 
 def test_the_place_of_a_block_is_in_the_hash_of_its_prompt(plan_of):
-    plan_of(
+    plan = plan_of(
         '[factors]\nprompt = ["other"]\n[prompts.other]\nremove = ["C4"]\n'
         'add = [{ after = "C0", block = "C4" }]\n'
     )
-    assert block_digests("other") != block_digests("baseline")
+    assert plan.parts.prompts["other"].digests != prompt_of("baseline").digests
 
 
 OWN = """
@@ -139,7 +146,7 @@ def test_an_own_condition_is_played_and_another_mean_speed_is_another_spec(plan_
     specs = []
     for speed in (10.0, 12.0):
         specs += plan_of(OWN.format(speed=speed), conditions=False).trial_specs()
-        assert CONDITIONS["X"].speeds_mps[0] == speed + 0.25
+        assert specs[-1].kinematics.speeds_mps[0] == speed + 0.25
     assert len({spec.spec_hash for spec in specs}) == 2
     plain = make_plan("baseline", "emulator").trial_specs()[0].spec_hash
     assert specs[0].spec_hash == plain  # its headway and velocity stand in the trial's row
@@ -241,6 +248,46 @@ def test_what_cannot_be_is_refused_in_one_line(plan_of, text, plugin, says):
     assert "\n" not in str(caught.value)
 
 
+def test_an_import_that_fails_hides_no_other_one(plan_of, tmp_path, monkeypatch):
+    """What the others register is no part of the study, also where one needs a path of its own."""
+    (tmp_path / "found_by_a_plug_in.py").write_text(
+        "from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition\n"
+        'CONDITIONS.register("found", Condition(1.0, 0.0))\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(CONDITIONS, "_things", dict(CONDITIONS._things))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    beside = tmp_path / "beside"
+    beside.mkdir()
+    (beside / "found_by_its_path.py").write_text("")
+    own = f"import sys\nsys.path.insert(0, {str(beside)!r})\nimport found_by_its_path\n"
+    own += "import found_by_a_plug_in\n"
+    plan = plan_of('[plugins]\nfiles = ["mine.py"]\n', plugin=own)
+    assert "found" in CONDITIONS
+    assert not plan.parts.catalogue.parts
+
+
+def test_the_hash_of_a_plug_in_is_that_of_a_package_of_its_name(plan_of, tmp_path, monkeypatch):
+    """However many others there are: what was stored of it stays its own."""
+    study = tmp_path / "study.toml"
+    driver = "from .gains import GAIN\n" + DRIVER.format(action="GAIN")
+    study.write_text(HEAD + '[plugins]\nfiles = ["gains.py", "mine.py", "other.py"]\n')
+    for folder in (tmp_path, tmp_path / STUDY_PLUGINS):
+        folder.mkdir(exist_ok=True)
+        (folder / "gains.py").write_text("GAIN = -0.1\n")
+        (folder / "other.py").write_text("")
+        (folder / "mine.py").write_text(driver)
+    hashed = []
+    for text in ("", "X = 1\n"):
+        (tmp_path / "other.py").write_text(text)
+        plan = make_plan(str(study), ["braking"], trust=True)
+        hashed.append(plan.parts.programs["braking"].in_spec("braking")["source"])
+    monkeypatch.syspath_prepend(tmp_path)
+    with collecting(Catalogue()):
+        package = import_module(f"{STUDY_PLUGINS}.mine")
+    assert hashed == [source_digest(package.Braking)] * 2
+
+
 def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monkeypatch):
     register = 'CONDITIONS.register("elsewhere", Condition(1.0, 0.0))\n'
     imports = "from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition\n"
@@ -248,8 +295,8 @@ def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monke
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(CONDITIONS, "_things", dict(CONDITIONS._things))
     own = f"import imported_by_a_plug_in\n{imports}{register.replace('elsewhere', 'own')}"
-    plan_of('[plugins]\nfiles = ["mine.py"]\n', plugin=own)
-    assert {"elsewhere", "own"} < {*CONDITIONS}
-    make_plan("baseline", "constant")
+    plan = plan_of('[plugins]\nfiles = ["mine.py"]\n', plugin=own)
+    with using(plan.parts.catalogue):
+        assert {"elsewhere", "own"} < {*CONDITIONS}
     assert "elsewhere" in CONDITIONS
     assert "own" not in CONDITIONS

@@ -62,5 +62,6 @@ def _seed(
         repetition=repetition,
         sample_set=sample_set,
         order=0,
+        kinematics=HUMAN_CONDITIONS[condition],
     )
     return PROGRAMS["cei"].seat(scenario, spec, side).seed

@@ -9,7 +9,7 @@ import pytest
 
 from merge_runner.records import StateRow, TrialRecord, TrialSpec
 from merge_runner.results.store import Store
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner_analysis.data.imported_humans import (
     by_condition,
     by_pair,
@@ -89,7 +89,7 @@ def stored(tmp_path):
             first = row.merged_first if isinstance(row.merged_first, str) else None
             spec = TrialSpec(
                 f"human/{number}", "h", "human", "human", "human", None, row.condition, number,
-                0, 0, pair=row.pair,
+                0, 0, pair=row.pair, kinematics=HUMAN_CONDITIONS[row.condition],
             )  # fmt: skip
             states = tuple(
                 StateRow(0, 0.0, side, at_m, 10.0, 0.0)

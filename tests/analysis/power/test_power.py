@@ -15,7 +15,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.emulator.driver import answer
 from merge_runner.errors import UsageError
 from merge_runner.planted_effect import PlantedEffect
-from merge_runner.prompts.blocks import render_prompt
+from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.records import SIDES, Slot
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.sweep import unsent
@@ -53,7 +53,7 @@ def chance(case, question, simulations=150):
 def first_prompt(condition: str, side: str) -> str:
     scenario = ScenarioConfig()
     seen = World(scenario, CONDITIONS[condition], TRACK).observe(side)
-    return render_prompt(seen, None, variant="baseline", scenario=scenario)
+    return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
 
 
 def emulated(effect: PlantedEffect, repetitions: int, sample_set: int) -> pd.DataFrame:

@@ -6,7 +6,7 @@ from functools import cache
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.llm.formats import FORMATS
-from merge_runner.prompts.blocks import render_prompt
+from merge_runner.prompts.blocks import prompt_of, render_prompt
 from merge_runner.records import Slot, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
@@ -18,7 +18,7 @@ from tests.llm.batch.conftest import entry_of
 def prompt(condition):
     scenario = ScenarioConfig()
     seen = World(scenario, CONDITIONS[condition], TRACK).observe("left")
-    return render_prompt(seen, None, variant="baseline", scenario=scenario)
+    return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
 
 
 def lines(form, count=11, *, provider=None, first=0):

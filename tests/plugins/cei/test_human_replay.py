@@ -19,7 +19,7 @@ from merge_runner.trial import play_trial
 from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.human.load import import_trials, sort_files
-from merge_runner_cei.human_replay import HUMAN_REPLAY, HUMANS
+from merge_runner_cei.human_replay import HUMAN_REPLAY
 from tests.analysis.recordings import drive, file
 
 HUMAN = '\nrepetitions = 1\nconditions = ["L_4_0"]\n[scenario]\nresistance = "human"\n'
@@ -37,9 +37,7 @@ def db(tmp_path):
     path = tmp_path / "results/merge.duckdb"
     download = sort_files(file(name, trial.csv()) for name, trial in FILES.items())
     assert import_trials(download, Store(path)).added == 4
-    yield path
-    HUMANS.keep(())
-    make_plan("baseline", "constant")
+    return path
 
 
 @pytest.fixture
@@ -52,9 +50,13 @@ def plan_of(tmp_path, db):
 
 
 async def played(plan, number=0):
-    spec, (arm, *_) = plan.trial_specs()[number], plan.arms
-    drivers = {side: PROGRAMS[arm.sides[side]].make(arm.scenario, spec, side) for side in SIDES}
+    spec, (arm, *_), programs = plan.trial_specs()[number], plan.arms, plan.parts.programs
+    drivers = {side: programs[arm.sides[side]].make(arm.scenario, spec, side) for side in SIDES}
     return await play_trial(spec, arm.scenario, drivers)
+
+
+def humans_of(plan):
+    return plan.parts.programs[HUMAN_REPLAY].data
 
 
 def recorded(db, trial_id):
@@ -128,8 +130,9 @@ async def test_the_pairs_take_turns_and_a_trial_that_collided_is_left_out(db, pl
 
 async def test_a_human_keeps_its_speed_once_its_trace_has_ended(plan_of):
     text = HUMAN + '[drivers.weak]\nprogram = "idm"\ndesired_speed_factor = 0.5\n'
-    trial = await played(plan_of("weak+human-replay", text))
-    traced = HUMANS.trials[0].speeds_mps["right"]
+    plan = plan_of("weak+human-replay", text)
+    trial = await played(plan)
+    traced = humans_of(plan).trials[0].speeds_mps["right"]
     after = [row for row in trial.states if row.side == "right"][len(traced) :]
     assert len(after) > 20
     assert {round(row.velocity_mps, 6) for row in after} == {round(traced[-1], 6)}
@@ -140,6 +143,19 @@ def test_the_trials_that_are_replayed_determine_the_spec(db, plan_of):
     more = sort_files([file("experiment_6_iter_1.csv", drive("L_4_0").csv())])
     import_trials(more, Store(db))
     assert plan_of(HUMAN_REPLAY).trial_specs()[0].spec_hash != before
+
+
+async def test_another_database_that_is_read_meanwhile_changes_no_trial_of_a_plan(
+    db, plan_of, tmp_path
+):
+    plan = plan_of(HUMAN_REPLAY)
+    hashes, wanted = plan.specs().keys(), await played(plan)
+    other = tmp_path / "other.duckdb"
+    trials = sort_files([file("experiment_6_iter_1.csv", drive("L_4_0", yields="left").csv())])
+    import_trials(trials, Store(other))
+    second = plan_of(HUMAN_REPLAY, db=other)
+    assert (await played(plan)).states == wanted.states != (await played(second)).states
+    assert plan.specs().keys() == hashes != second.specs().keys()
 
 
 async def test_a_study_names_the_pair(db, plan_of):
@@ -160,15 +176,13 @@ async def test_a_study_names_the_pair(db, plan_of):
 
 
 def test_a_trial_that_was_imported_in_two_ways_is_replayed_once(db, plan_of):
-    plan_of(HUMAN_REPLAY)
-    once = HUMANS.trials
+    once = humans_of(plan_of(HUMAN_REPLAY)).trials
     with duckdb.connect(str(db)) as connection:
         for table in ("trials", "states"):
             connection.execute(
                 f"INSERT INTO {table} SELECT * REPLACE ('another' AS spec_hash) FROM {table}"
             )
-    plan_of(HUMAN_REPLAY)
-    assert HUMANS.trials == once
+    assert humans_of(plan_of(HUMAN_REPLAY)).trials == once
 
 
 def test_without_an_import_it_says_what_to_type(tmp_path, plan_of):
@@ -177,14 +191,14 @@ def test_without_an_import_it_says_what_to_type(tmp_path, plan_of):
 
 
 def test_what_a_vehicle_cannot_do_is_not_replayed(db, plan_of):
-    plan_of(HUMAN_REPLAY)
-    config = plan_of(HUMAN_REPLAY).arms[0].scenario
+    plan = plan_of(HUMAN_REPLAY)
+    humans, config = humans_of(plan), plan.arms[0].scenario
     weak = config.model_copy(update={"max_acceleration_mps2": 1.0})
-    assert HUMANS.usable(config, "L_4_0", "all")
-    assert not HUMANS.usable(weak, "L_4_0", "all")
-    (first, *_), before = HUMANS.trials, HUMANS.digest
-    HUMANS.keep((replace(first, pair="pair9"), *HUMANS.trials[1:]))
-    assert HUMANS.digest != before
+    assert humans.usable(config, "L_4_0", "all")
+    assert not humans.usable(weak, "L_4_0", "all")
+    (first, *_), before = humans.trials, humans.digest
+    humans.keep((replace(first, pair="pair9"), *humans.trials[1:]))
+    assert humans.digest != before
 
 
 async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(

@@ -35,6 +35,7 @@ def spec(condition: str, repetition: int = 1) -> TrialSpec:
         repetition=repetition,
         sample_set=0,
         order=0,
+        kinematics=CONDITIONS[condition],
     )
 
 
