@@ -23,7 +23,7 @@ from merge_runner.registry import Catalogue, Registry, collecting, remember
 from merge_runner.run.estimate import Estimate
 from merge_runner.run.plan import Options, Plan, make_plan
 from merge_runner.run.progress import as_lines, estimate_lines
-from merge_runner.run.sweep import play, unsent
+from merge_runner.run.sweep import on_event, play, unsent
 from merge_runner.study.crossing import level_text
 from merge_runner.text_safety import say
 
@@ -175,9 +175,13 @@ class Study:
         yes: bool = False,
         first: bool = False,
         grid: str | None = None,
+        stop: asyncio.Event | None = None,
         **how: Any,  # noqa: ANN401 # fields of Options
     ) -> StudyOutcome:
         """Play all trials that are not stored yet; ``yes`` lets it spend money.
+
+        Where ``stop`` is set, no more is asked, and what is paid for is saved; so it is where the
+        task is cancelled.
 
         ``first`` asks only what drivers do first, in the study's conditions or on a ``grid``, as
         ``sweep --first`` and its ``--grid``.
@@ -191,7 +195,10 @@ class Study:
         plan = self.plan(first=first, grid=grid)
         options = Options(self.db, self.cache, **how)
         whole = any(self._wanted.get(each) is not None for each in PARTS)
-        return StudyOutcome(await play(plan, options, whole=whole, say=say, agree=agree))
+        how_to_stop = on_event(stop)
+        return StudyOutcome(
+            await play(plan, options, whole=whole, say=say, agree=agree, stopping=how_to_stop)
+        )
 
     async def areplay(self, *recordings: Path | str) -> StudyOutcome:
         """Play all trials from recorded replies alone, those of the files first; sends nothing."""

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import duckdb
 import pytest
 
 from merge_runner import Study
@@ -23,6 +26,7 @@ from tests.harness import CONFIGURING
 WORDS = {"a": "You are late.", "b": "You have time."}
 HEADWAYS_M = {"a": 3.0, "b": -3.0}
 BRAKING = {"a": -0.1, "b": -0.3}
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 STUDY = """
 models = ["emulator", "mine"]
 repetitions = 3
@@ -174,3 +178,69 @@ async def test_a_table_has_the_metrics_and_titles_of_the_study_of_its_database(f
     assert "stops" not in METRICS
     other = await Study("baseline", models="constant", repetitions=1, db="b.duckdb").arun()
     assert "stops" not in table(other.db, "ablation-quantitative")
+
+
+@pytest.mark.slow
+async def test_a_study_runs_in_any_thread(folder):
+    loop = asyncio.get_running_loop()
+    with ThreadPoolExecutor(1) as thread:
+        outcome = await loop.run_in_executor(thread, study("a").run)
+    check("a", outcome)
+
+
+@pytest.mark.slow
+async def test_two_studies_run_in_two_threads_while_both_are_planned(folder, monkeypatch):
+    Meanwhile(lambda: [study(name).plan() for name in WORDS]).patch(monkeypatch)
+    loop = asyncio.get_running_loop()
+    with ThreadPoolExecutor(2) as threads:
+        runs = [loop.run_in_executor(threads, study(name).run) for name in WORDS]
+        for name, outcome in zip(WORDS, await asyncio.gather(*runs), strict=True):
+            check(name, outcome)
+
+
+def test_the_handlers_of_signals_are_those_of_the_host_during_a_run_and_after_it(folder):
+    ours = {number: signal.getsignal(number) for number in STOPPING}
+    theirs = {number: lambda *_: None for number in STOPPING[1:]}
+    for number, handler in theirs.items():
+        signal.signal(number, handler)
+    seen = []
+    run = Study("baseline", models="constant", repetitions=1, db="x.duckdb")
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            drive = ConstantDriver.decide
+
+            async def decide(driver, observation, number):
+                seen.append({each: signal.getsignal(each) for each in theirs})
+                return await drive(driver, observation, number)
+
+            patch.setattr(ConstantDriver, "decide", decide)
+            assert run.run().ok
+        seen.append({each: signal.getsignal(each) for each in theirs})
+    finally:
+        for number, handler in ours.items():
+            signal.signal(number, handler)
+    assert all(each == theirs for each in seen)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["event", "cancel"])
+async def test_a_run_that_is_stopped_saves_what_is_answered(folder, monkeypatch, how):
+    event = asyncio.Event()
+    wanted = {"models": "emulator", "repetitions": 10}
+    run = asyncio.create_task(Study("baseline", **wanted).arun(stop=event, in_flight=2))
+    tenths = Meanwhile(
+        lambda: tenths.count > 80 and (event.set if how == "event" else run.cancel)()
+    )
+    tenths.patch(monkeypatch)
+    if how == "event":
+        assert (await run).exit_code == 130
+    else:
+        with pytest.raises(asyncio.CancelledError):
+            await run
+    with duckdb.connect(str(folder / "results/merge.duckdb"), read_only=True) as connection:
+        (code,) = connection.execute("SELECT exit_code FROM sweeps").fetchone()
+        (ended,) = connection.execute("SELECT count(*) FROM trials").fetchone()
+    assert code == 130
+    assert 0 < ended < 110
+    again = await Study("baseline", **wanted | {"repetitions": 1}, db="again.duckdb").areplay()
+    assert again.facts["calls"]["cached"] > 10

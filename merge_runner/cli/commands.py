@@ -21,6 +21,7 @@ import typer
 
 from merge_runner.cli import options as cli
 from merge_runner.cli.options import agree, print_out
+from merge_runner.cli.signals import on_signal
 from merge_runner.errors import UsageError, unknown_name
 from merge_runner.paths import DEFAULT_CACHE, DEFAULT_DB
 from merge_runner.text_safety import say
@@ -168,7 +169,8 @@ def _play(
             signal.signal(signal.SIGINT, by_asyncio)
 
     try:
-        facts = asyncio.run(running.play(plan, options, whole=whole, say=say, agree=leave))
+        playing = running.play(plan, options, whole=whole, say=say, agree=leave, stopping=on_signal)
+        facts = asyncio.run(playing)
     except KeyboardInterrupt:  # before the trials began or after they ended
         say("interrupted: run the same command again to go on")
         return running.INTERRUPTED

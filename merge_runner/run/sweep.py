@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import signal
-import stat
 import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager, closing, contextmanager
+from contextlib import (
+    AbstractContextManager,
+    AsyncExitStack,
+    asynccontextmanager,
+    closing,
+    contextmanager,
+)
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -61,6 +64,33 @@ from merge_runner.run.progress import Progress, as_dict, show_progress, write_st
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
 SHOWN = 5
+Stopping = Callable[
+    [Callable[[], object] | None, Callable[[], object]], AbstractContextManager[None]
+]
+"""Meanwhile whoever may stop a run does so by the first function, and has what it still waits for
+dropped by the second. Where there is nothing to stop any more, the first is None."""
+
+
+def on_event(event: asyncio.Event | None) -> Stopping:
+    """A run is stopped by an event; None: it is not."""
+
+    @contextmanager
+    def waiting(stop: Callable[[], object] | None, _: Callable[[], object]) -> Iterator[None]:
+        async def wait(told: asyncio.Event, call: Callable[[], object]) -> None:
+            await told.wait()
+            call()
+
+        task = asyncio.create_task(wait(event, stop)) if event and stop else None
+        try:
+            yield
+        finally:
+            if task is not None:
+                task.cancel()
+
+    return waiting
+
+
+NEVER = on_event(None)
 
 
 async def play(
@@ -70,12 +100,14 @@ async def play(
     whole: bool,
     say: Callable[[str], None],
     agree: Callable[[Estimate], None],
+    stopping: Stopping = NEVER,
 ) -> dict[str, Any]:
     """Play what is not stored yet of a plan, and return the summary (``summary.as_dict``).
 
     A replay without a recording, or replies of the models in the cache, is of the recording that
     ships with the program; one that is not ``whole`` plays what its recordings hold. ``agree`` gets
-    an estimate before money is spent, and raises where it is not to be. Raises UsageError.
+    an estimate before money is spent, and raises where it is not to be. ``stopping`` says who stops
+    it; a task that is cancelled saves what is paid for before it ends. Raises UsageError.
     """
     if options.replay:
         shipped = SHIPPED_RECORDINGS / f"{plan.model}-{plan.study.name}.parquet"
@@ -90,7 +122,7 @@ async def play(
             say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
         plan = part
     with using(plan.parts.catalogue):  # it has the study's own wire formats and providers
-        return await _play(plan, options, say=say, agree=agree)
+        return await _play(plan, options, say=say, agree=agree, stopping=stopping)
 
 
 async def _play(
@@ -99,13 +131,14 @@ async def _play(
     *,
     say: Callable[[str], None],
     agree: Callable[[Estimate], None],
+    stopping: Stopping,
 ) -> dict[str, Any]:
     async with open_sweep(plan, options, say=say) as sweep:
         expected = None
         if sweep.todo and not (options.replay or plan.is_free):
             expected = await sweep.estimate()
             agree(expected)
-        return await sweep.run(expected)
+        return await sweep.run(expected, stopping)
 
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
@@ -156,12 +189,17 @@ class Sweep:
     exit_code: int = 0
     messages: list[str] = field(default_factory=list)
     _rounds: Rounds | None = None
+    _stopping: Stopping = NEVER
+    _cancelled: bool = False
 
-    async def run(self, expected: Estimate | None = None) -> dict[str, Any]:
+    async def run(
+        self, expected: Estimate | None = None, stopping: Stopping = NEVER
+    ) -> dict[str, Any]:
         """Play what is missing and store it; what goes wrong is in the summary.
 
         ``expected`` is an estimate that the user has agreed to.
         """
+        self._stopping = stopping
         db, sweep_id, checked = self._options.db, "", None
         if self._options.replay and (missing := await self._missing()):
             progress = self._progress(LocalRunner.sealed(self._plan, self._cache))
@@ -182,6 +220,8 @@ class Sweep:
                 write_standing(db, progress.standing(sweep_id))
                 if is_stored:
                     checked = self._check(store, sweep_id, progress.runner.first)
+        if self._cancelled:
+            raise asyncio.CancelledError
         return as_dict(
             self._options, progress, expected, checked,
             sweep_id=sweep_id, exit_code=self.exit_code, messages=self.messages,
@@ -334,8 +374,15 @@ class Sweep:
             self._say(f"Stopping: {runner.unsaved} are saved first; Ctrl-C again drops them.")
 
         try:
-            with on_interrupt(interrupted, drain.cancel):
-                await asyncio.wait([drain])
+            with self._stopping(interrupted, drain.cancel):
+                try:
+                    await asyncio.wait([drain])
+                except asyncio.CancelledError:  # by whoever runs this task
+                    self._cancelled = True
+                    interrupted()
+                    await asyncio.wait([drain])
+                finally:
+                    drain.cancel()
                 await asyncio.wait([work])
             if work.cancelled():
                 self._fail(INTERRUPTED, f"Interrupted. {GO_ON}")
@@ -358,8 +405,11 @@ class Sweep:
     async def _store_rest(self, flusher: Flusher) -> bool:
         """Store what is not stored yet; False where Ctrl-C ended the waiting for that."""
         closing = asyncio.create_task(self._store_all(flusher))
-        with on_interrupt(closing.cancel, closing.cancel):
-            await asyncio.wait([closing])
+        with self._stopping(None, closing.cancel):
+            try:
+                await asyncio.wait([closing])
+            finally:
+                closing.cancel()
         if closing.cancelled():
             why = f": {flusher.problem}. {AGAIN}" if flusher.problem else ". " + GO_ON
             self._fail(INTERRUPTED, f"Interrupted{why}")
@@ -540,44 +590,3 @@ async def unsent(
         with using(plan.parts.catalogue):
             async with open_sweep(plan, options, say=say) as sweep:
                 return await sweep.estimate(whole=whole)
-
-
-@contextmanager
-def on_interrupt(first: Callable[[], object], again: Callable[[], object]) -> Iterator[None]:
-    """Call ``first`` at the first signal and ``again`` at each later Ctrl-C.
-
-    A terminal that closes sends SIGHUP more than once, often with a SIGTERM. Under nohup SIGHUP
-    is ignored, and stays so.
-    """
-    loop = asyncio.get_running_loop()
-    handled = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        handled.append(signal.SIGHUP)
-    calls = iter((first,))
-
-    def handle(number: signal.Signals) -> None:
-        if number is signal.SIGHUP:
-            handled.remove(number)
-            loop.remove_signal_handler(number)
-            signal.signal(number, signal.SIG_IGN)
-            _leave_terminal()
-        call = next(calls, again if number is signal.SIGINT else None)
-        if call is not None:
-            call()
-
-    for number in handled:
-        loop.add_signal_handler(number, handle, number)
-    try:
-        yield
-    finally:
-        for number in handled:
-            loop.remove_signal_handler(number)
-
-
-def _leave_terminal() -> None:
-    """Send the output to nowhere: writing to a closed terminal fails."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in (1, 2):
-        if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty is false once it is closed
-            os.dup2(nowhere, stream)
-    os.close(nowhere)

@@ -1,0 +1,51 @@
+"""What Ctrl-C, SIGTERM and a terminal that closes do to a run of the command line."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def on_signal(stop: Callable[[], object] | None, drop: Callable[[], object]) -> Iterator[None]:
+    """Call ``stop`` at the first signal, and ``drop`` at each later Ctrl-C.
+
+    Where there is nothing to stop, the first signal drops. A terminal that closes sends SIGHUP more
+    than once, often with a SIGTERM. Under nohup SIGHUP is ignored, and stays so.
+    """
+    loop = asyncio.get_running_loop()
+    handled = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        handled.append(signal.SIGHUP)
+    calls = iter((stop or drop,))
+
+    def handle(number: signal.Signals) -> None:
+        if number is signal.SIGHUP:
+            handled.remove(number)
+            loop.remove_signal_handler(number)
+            signal.signal(number, signal.SIG_IGN)
+            _leave_terminal()
+        call = next(calls, drop if number is signal.SIGINT else None)
+        if call is not None:
+            call()
+
+    for number in handled:
+        loop.add_signal_handler(number, handle, number)
+    try:
+        yield
+    finally:
+        for number in handled:
+            loop.remove_signal_handler(number)
+
+
+def _leave_terminal() -> None:
+    """Send the output to nowhere: writing to a closed terminal fails."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        if stat.S_ISCHR(os.fstat(stream).st_mode):  # isatty is false once it is closed
+            os.dup2(nowhere, stream)
+    os.close(nowhere)
