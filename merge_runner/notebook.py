@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partialmethod, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -132,7 +132,7 @@ class Study:
             name: [level_text(level) for level in (given if isinstance(given, list) else [given])]
             for name, given in (only or {}).items()
         }
-        self._own = Catalogue()
+        self._own = self._planned = Catalogue()
         self._wanted: dict[str, Any] = {"only": levels, "variants": prompts, **wanted}
 
     def register(self, registry: Registry[T], name: str, thing: T) -> T:
@@ -145,7 +145,9 @@ class Study:
         self._own.parts.get(registry.kind, {}).pop(name, None)
         with collecting(self._own):
             registry.register(name, thing)
-        remember(self.db, self._own)
+        known, own = self._planned.parts, self._own.parts
+        parts = {kind: {**known.get(kind, {}), **own.get(kind, {})} for kind in {**known, **own}}
+        remember(self.db, replace(self._planned, parts=parts))
         return thing
 
     def register_driver(
@@ -162,7 +164,8 @@ class Study:
         """What would be played: all, or only the first decisions; raises UsageError."""
         wanted = {"db": self.db, "first": first, "grid": grid, **self._wanted}
         plan = make_plan(self.file, own=self._own, **wanted)
-        remember(self.db, plan.parts.catalogue)
+        self._planned = plan.parts.catalogue
+        remember(self.db, self._planned)
         return plan
 
     async def adry_run(self) -> Estimate:

@@ -140,6 +140,15 @@ async def test_two_studies_run_in_one_event_loop(folder):
         check(name, outcome)
 
 
+async def test_two_studies_that_share_a_cache_never_ask_one_model_at_once(folder):
+    runs = [Study("baseline", models="emulator", repetitions=1, db=f"{n}.db").arun() for n in "ab"]
+    first, second = await asyncio.gather(*runs, return_exceptions=True)
+    assert first.ok
+    assert isinstance(second, UsageError)
+    assert "asks scripted-driver at" in str(second)
+    assert "name another folder with --cache" in str(second)
+
+
 def test_what_is_registered_for_a_study_is_unknown_to_others_and_to_the_process(folder):
     mine = Study("baseline", db="mine.duckdb")
     mine.register(VARIANTS, "own", Variant(frozenset({"C1"})))
@@ -175,6 +184,9 @@ async def test_a_table_has_the_metrics_and_titles_of_the_study_of_its_database(f
     mine.register(METRICS, stops.name, stops)
     outcome = await mine.arun()
     assert "stops" in table(outcome.db, "ablation-quantitative")
+    ends = Metric(name="ends", label="ends", unit="", meaning="m", value="end_time_s")
+    mine.register(METRICS, ends.name, ends)
+    assert {"stops", "ends"} <= {*table(outcome.db, "ablation-quantitative")}
     assert "stops" not in METRICS
     other = await Study("baseline", models="constant", repetitions=1, db="b.duckdb").arun()
     assert "stops" not in table(other.db, "ablation-quantitative")
