@@ -98,8 +98,9 @@ def sources_of(
     if table.name == ACCOUNTS:
         groups = [group.stored for group in groups]
     condition = column.counts if column else ""
+    predicate = " AND ".join(filter(None, (row.counts, column.trials if column else "")))
     return tuple(
-        _source(study, group, row.counts, condition)
+        _source(study, group, predicate, condition)
         if row.counts and group.measured
         else Source(group.id, f"published, not from traces: {row.note or SEE_NOTES}")
         for group in groups

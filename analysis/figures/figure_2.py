@@ -153,8 +153,8 @@ def gap(trials: pd.DataFrame) -> Estimate:
 
 
 def deviation(trials: pd.DataFrame) -> Estimate:
-    """Panel E: mean RMSE of the speed in m/s, two values per trial."""
-    return mean(trials[["rmse_left_mps", "rmse_right_mps"]].to_numpy(float).ravel())
+    """Panel E: mean RMSE of the speed in m/s, of a trial that of both vehicles."""
+    return mean(trials["rmse_mps"].to_numpy(float))
 
 
 Summary = Callable[[pd.DataFrame], Estimate]

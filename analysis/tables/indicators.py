@@ -216,7 +216,13 @@ def criticality(study: Study) -> Table:
         f"merge never close in faster than {NO_CONFLICT_MPS} m/s are in no conflict, and have no "
         "time to collision"
     )
-    return _table("criticality", study.measured, "criticality", note)
+    ended = ", ".join(one.heading for one in shown_in("criticality") if one.trials == "ended")
+    medians = (
+        "medians are of finished trials that have the measure; their number stands before each"
+    )
+    if ended:
+        medians += f". {ended}: of all trials that ended"
+    return _table("criticality", study.measured, "criticality", medians, note)
 
 
 def _table(name: str, groups: list[Group], place: str, *notes: str) -> Table:
@@ -225,17 +231,27 @@ def _table(name: str, groups: list[Group], place: str, *notes: str) -> Table:
     for one in metrics:
         kind: Kind = "percent" if one.rate else "number"
         counts = one.column if one.rate else ""
+        meaning, trials = one.meaning, ""
+        if one.estimator == "median":
+            of, trials = f"{one.trials} trials that have the measure", one.counts
+            meaning = f"median over the {of}: {meaning}"
+            columns.append(Optional(f"{one.name}_n", "n", "count", 0, of, trials=trials))
         columns += [
-            Column(one.name, one.heading, kind, one.decimals, one.meaning, counts),
-            interval(f"{one.name}_ci", f"of {one.label}", one.decimals),
+            Column(one.name, one.heading, kind, one.decimals, meaning, counts, trials=trials),
+            interval(f"{one.name}_ci", f"of {one.label}", one.decimals, trials),
         ]
     rows = []
     for group in groups:
         found, remarks = measured(group, metrics)
         values = {name: one.value for name, one in found.items()}
         intervals = {f"{name}_ci": one.bounds() for name, one in found.items()}
-        n = len(group.ended_outcomes)
-        rows.append(row_of(group, {"n": n, **values, **intervals}, *remarks, counts=ENDED))
+        sizes = {
+            f"{one.name}_n": estimate.n or None
+            for one in metrics
+            if one.estimator == "median" and isinstance(estimate := found.get(one.name), Estimate)
+        }
+        cells = {"n": len(group.ended_outcomes), **sizes, **values, **intervals}
+        rows.append(row_of(group, cells, *remarks, counts=ENDED))
     return Table(name, columns, rows, (f"intervals: {INTERVALS}", *notes))
 
 

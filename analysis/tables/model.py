@@ -27,8 +27,9 @@ ENDED = "status <> 'failed'"
 class Column:
     """One column.
 
-    ``meaning`` describes its values in words. ``counts`` is the SQL condition, beside the row's, of
-    the trials that a share or a count counts. If ``optional``, a value may be missing without a
+    ``meaning`` describes its values in words. Both are SQL conditions beside the row's: ``trials``
+    of the trials that its values rest on, where these are not all of the row's, and ``counts`` of
+    those that a share or a count counts. If ``optional``, a value may be missing without a
     note. One that is ``noted`` stands in the values alone: the notes say it to a reader.
     """
 
@@ -40,14 +41,15 @@ class Column:
     counts: str = ""
     optional: bool = False
     noted: bool = False
+    trials: str = ""
 
 
 Optional = partial(Column, optional=True)
 
 
-def interval(name: str, meaning: str, digits: int = 2) -> Column:
+def interval(name: str, meaning: str, digits: int = 2, trials: str = "") -> Column:
     """The column of a 95 % interval."""
-    return Optional(name, "95 % CI", "interval", digits, meaning)
+    return Optional(name, "95 % CI", "interval", digits, meaning, trials=trials)
 
 
 @dataclass(frozen=True, slots=True)

@@ -196,7 +196,8 @@ SELECT
     joint,
     first_s AS time_to_merge_s,
     CASE WHEN finished THEN abs(left_s - right_s) END AS merge_interval_s,
-    CASE WHEN finished AND left_s < right_s THEN right_front_s - left_rear_s
+    -- The front of the second vehicle may be there at the end, and its centre not yet.
+    CASE WHEN finished AND (left_s < right_s OR right_s IS NULL) THEN right_front_s - left_rear_s
         WHEN finished THEN left_front_s - right_rear_s END AS post_encroachment_s,
     min_ttc_s,
     max_acceleration_mps2,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from math import sqrt
 
@@ -15,6 +16,8 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.data.load import load, load_trials
 from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.metrics import SURROGATES
 from merge_runner_analysis.tables.indicators import criticality
 from tests.analysis.studies import Drive, played, write_study
 
@@ -234,6 +237,47 @@ def test_the_measures_of_vehicles_of_8_m_are_those_worked_out_by_hand(tmp_path):
     assert np.isnan(first["min_ttc_s"])
     closing_mps, distance_m = 8 - 6.5, (136.75 + 6.5 * 2.2) - (108 + 8 * 2.2)
     assert second["min_ttc_s"] == pytest.approx((distance_m - 8) / closing_mps)
+
+
+def test_no_measure_prefers_a_side(tmp_path):
+    """Also where the front of the second vehicle is at the merge point, and its centre never."""
+    drives = [
+        replace(drive, driver=driver)
+        for rep, brakes in enumerate(np.linspace(0.05, 0.75, 36), 1)
+        for driver, drive in {
+            "ahead": Drive("", "baseline", "L_4_0", rep, (0.0,), (-brakes,) * 4),
+            "mirrored": Drive("", "baseline", "R_-4_0", rep, (-brakes,) * 4, (0.0,)),
+        }.items()
+    ]
+    trials = load_trials(write_study(tmp_path / "mirror.duckdb", drives)).set_index("rep")
+    one, other = (trials[trials["model_left"] == name] for name in ("ahead", "mirrored"))
+    other = other.rename(
+        columns={"rmse_left_mps": "rmse_right_mps", "rmse_right_mps": "rmse_left_mps"}
+    )
+    columns = ["gap_m", "rmse_left_mps", "rmse_right_mps", "joint", *SURROGATES]
+    pd.testing.assert_frame_equal(one[columns], other[columns])
+    only_front = one["post_encroachment_s"].notna() & one["merge_interval_s"].isna()
+    assert only_front.any()
+
+
+def test_each_median_of_criticality_says_of_how_many_finished_trials_it_is(tmp_path):
+    ends = [
+        Drive("hand", "baseline", "L_4_0", 1, (0.8, 0.8), (-0.4, -0.4)),
+        Drive("hand", "baseline", "L_4_0", 2, (0.8, 0.8, 0, 0, -1, -1, -1), (-0.4, -0.4)),
+        Drive("hand", "baseline", "N_0_0", 1, (0.0,), (0.0,)),
+    ]
+    study = Study(write_study(tmp_path / "hand.duckdb", ends))
+    assert set(study.models[0].trials["status"]) == {"finished", "collided"}
+    table = criticality(study)
+    (row,) = table.rows
+    counts = {"min_ttc_s": 1, "conflict_resolution_s": 2, "max_acceleration_mps2": 2}
+    assert row.values["n"] == 3
+    for name, n in counts.items():
+        assert row.values[f"{name}_n"] == n
+        for column in (name, f"{name}_n"):
+            (source,) = explain(study, table, f"hand/baseline:{column}").sources
+            assert len(source.trials) == n
+    assert any("medians are of finished trials" in note for note in table.notes)
 
 
 @pytest.mark.parametrize(("closing_mps", "in_conflict"), [(0.009, False), (0.011, True)])
