@@ -1,6 +1,7 @@
 """The loop of a trial: observe, decide together, drive, and keep what there is when it ends."""
 
 import asyncio
+import re
 from dataclasses import replace
 
 import pytest
@@ -11,6 +12,7 @@ from merge_runner.drivers.pace import model_pace, program_pace
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed, SweepStopped, TrialSuspended, UsageError
 from merge_runner.records import SIDES, Attempt, ChatRequest, Decision, Slot, TrialSpec
+from merge_runner.results.database import SCHEMA
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 
@@ -264,6 +266,9 @@ async def test_under_own_exit_the_driver_in_the_tunnel_is_not_asked():
     right_rows = [row for row in trial.states if row.side == "right"]
     assert [row.velocity_mps for row in right_rows[:6]] == [10.4] * 6
     assert right_rows[6].acceleration_mps2 == -2.5
+    # Who waits for number 0 would never begin: the reference says what is counted.
+    (said,) = re.findall(r"decisions\.decision IS (.*?);", SCHEMA.read_text(), re.DOTALL)
+    assert "begins above 0 where it leaves its tunnel later" in said
 
 
 async def test_under_both_exits_both_are_asked_from_the_beginning():

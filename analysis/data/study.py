@@ -420,11 +420,11 @@ def in_one_study(study: Study, *groups: Group) -> bool:
 def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str, Order]:
     """The name of the study that was chosen, empty without one, and the order of its levels.
 
-    Where several studies are pooled none of them says the order. Raises UsageError where the
-    database has no trial of the study.
+    Where several studies are pooled the one that lists the most levels of a factor says their
+    order, of equal ones the newest. Raises UsageError where the database has no trial of the study.
     """
     if source is None:
-        return "", next(iter(studies.orders.values())) if len(studies.orders) == 1 else {}
+        return "", _pooled_order(studies)
     order = listed_levels(source.file, source.file.models)
     study = study_name(source.name, order)
     if study not in studies.orders:
@@ -435,6 +435,17 @@ def _chosen(db: Path, studies: Studies, source: StudySource | None) -> tuple[str
         factor: list(dict.fromkeys([*order.get(factor, ()), *recorded.get(factor, ())]))
         for factor in {**order, **recorded}
     }
+
+
+def _pooled_order(studies: Studies) -> Order:
+    """The levels of each factor in the order of the studies; one level alone says no order."""
+    pooled: dict[str, list[str]] = {}
+    for factor in dict.fromkeys(name for order in studies.orders.values() for name in order):
+        lists = [order[factor] for order in studies.orders.values() if factor in order]
+        several = [levels for levels in lists if len(levels) > 1 or len(lists) == 1]
+        ranked = sorted(several, key=len, reverse=True)
+        pooled[factor] = list(dict.fromkeys(level for levels in ranked for level in levels))
+    return pooled
 
 
 def _at(

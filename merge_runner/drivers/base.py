@@ -41,7 +41,11 @@ class Driver(Protocol):
         ...
 
     async def decide(self, observation: Observation, number: int) -> Decision:
-        """Decide at the ``number``-th instant of its own pace (from 0); raises CallFailed."""
+        """Decide at the ``number``-th instant of its own pace; raises CallFailed.
+
+        Instants count from 0, the start of control. With the control start ``own_exit`` that is
+        the earlier exit, and the first number of the driver that exits later is above 0.
+        """
         ...
 
 

@@ -138,7 +138,8 @@ CREATE TABLE decisions (
     told_other_speeds_mps DOUBLE[]
 );
 COMMENT ON TABLE decisions IS 'A driver at a decision instant.';
-COMMENT ON COLUMN decisions.decision IS 'counts those of this driver from 0';
+COMMENT ON COLUMN decisions.decision IS 'counts the instants of this driver''s pace from 0, the '
+    'start of control, and begins above 0 where it leaves its tunnel later (control_start own_exit)';
 COMMENT ON COLUMN decisions.valid IS 'whether the reply holds a plan';
 COMMENT ON COLUMN decisions.failure IS 'why it is invalid; no_decision: it is valid, and lacks the '
     'tactical decision asked for';

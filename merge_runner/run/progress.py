@@ -426,8 +426,7 @@ def _results(summary: dict[str, Any]) -> Iterator[str]:
     share = f" ({invalid / decisions:.1%})" if invalid else ""
     missing = summary["no_decision"]
     yield (
-        f"decisions: {decisions}, {invalid} invalid{share}, "
-        f"{summary['fallbacks']} fallbacks to an earlier plan"
+        f"decisions: {decisions}, {invalid} invalid{share}, {summary['fallbacks']} fallbacks"
         + (f", {missing} without the tactical decision asked for" if missing else "")
     )
 

@@ -87,6 +87,25 @@ def test_without_a_choice_tables_say_what_they_pool_and_test_nothing_across_stud
     assert not any("/A1/baseline/" in name for name in contrasted)
 
 
+def test_a_second_study_changes_no_reference(db, tmp_path):
+    copy = tmp_path / "t.duckdb"
+    copy.write_bytes(db.read_bytes())
+    levels = {"perception": ["perfect", "foggy"], "prompt": ["A1"], "model": ["human-odds"]}
+    study = changed(
+        copy,
+        "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'perception', "
+        "if(rep % 2 = 0, 'foggy', 'perfect') FROM trials",
+        f"UPDATE sweeps SET config = json_merge_patch(config, '{json.dumps({'levels': levels})}') "
+        "WHERE started_at = (SELECT max(started_at) FROM sweeps)",
+    )
+    known, _ = rows(study, "factors")
+    assert [name for name in known if name.endswith("=perfect/gap_m") or "=foggy/gap" in name] == [
+        "perception=perfect/gap_m",
+        "perception=foggy/gap_m",
+    ]
+    assert study.reference == "baseline", "a study of one prompt lists it first, and says nothing"
+
+
 @pytest.mark.slow
 def test_the_trials_behind_a_cell_are_those_of_the_study(db, folder):
     study = Study(db, file=str(folder / "mood.toml"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pandas as pd
@@ -18,11 +19,12 @@ from merge_runner_analysis.data.imported_humans import (
 )
 from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.reference_data import PAIRS, human_outcomes
-from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.data.study import Study, _humans
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.metrics import BOXES, COLLISIONS, LEFT_FIRST
 from merge_runner_analysis.stats.measures import counts, known
 from merge_runner_analysis.tables import make_tables
+from tests.harness import PROJECT
 
 
 def published_trials() -> pd.DataFrame:
@@ -77,6 +79,13 @@ def test_trials_of_other_pairs_are_counted_for_nothing():
 def test_trials_of_other_pairs_alone_are_another_data_set_however_many():
     (said,) = findings(published_trials().assign(pair="experiment_7"))
     assert said == "another data set than the published one"
+
+
+def test_the_docs_say_how_the_row_of_another_data_set_reads():
+    text = (PROJECT / "docs/reference/analysis.md").read_text(encoding="utf-8")
+    (said,) = re.findall(r"\*\*Another data set\*\*.*?\n- ", text, re.DOTALL)
+    label = _humans(changed(published_trials()[:129], "N_0_0", LEFT, CRASH, 1)).label
+    assert f"reads `{label}`" in said
 
 
 @pytest.fixture
