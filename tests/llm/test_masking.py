@@ -1,4 +1,7 @@
-from hypothesis import given
+import json
+
+import pytest
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.llm.http import MASK, Mask
@@ -31,6 +34,56 @@ def test_nothing_else_is_changed(text):
     assert Mask([])(text) == text
 
 
+def escaped(text, data):
+    """The text with some of its characters as escapes of JSON, as it stands between quotes."""
+    spelled = ""
+    for character in text:
+        code = data.draw(st.sampled_from(["", "04x", "04X"]))
+        spelled += f"\\u{ord(character):{code}}" if code else json.dumps(character)[1:-1]
+    return spelled
+
+
+@settings(deadline=None)
+@given(KEYS.filter(lambda key: len(key) >= 12), st.data(), st.integers(0, 3))
+def test_no_key_is_left_however_json_spells_it(key, data, nested):
+    spelled = escaped(key, data)
+    for _ in range(nested):
+        spelled = json.dumps(spelled)[1:-1]
+    left = Mask([key])(f'{{"a\\n": "\\u00e4 {spelled}.", "b": "\\"{spelled}"}}')
+    assert left == f'{{"a\\n": "\\u00e4 {MASK}.", "b": "\\"{MASK}"}}'
+
+
+@pytest.mark.parametrize(
+    ("spelled", "left"),
+    [
+        (r"\u0073k-proj-AbC\/d+9xYz_01=23.~", MASK),
+        (r"\\u0073k-proj-AbC\\/d+9xYz_01=23.~", MASK),
+        (r"\u0061bc \u0073k-proj-AbC\u002Fd\n", rf"\u0061bc {MASK}\n"),
+        (r"\u0073k-proj", r"\u0073k-proj"),  # fewer than 12 characters
+        (rf"\ud83d\ude00 {KEY} \x", rf"\ud83d\ude00 {MASK} \x"),
+    ],
+)
+def test_of_a_key_with_escapes_its_whole_spelling_is_masked(spelled, left):
+    assert Mask([KEY])(spelled) == left
+
+
+@given(st.text() | st.text('\\\\u0073/"nk-'))
+def test_no_other_escape_is_changed(text):
+    assert Mask([KEY])(text) == text
+
+
+@pytest.mark.parametrize("text", ["\\" * 400_000, "\\u0073" * 60_000, "\\n" * 200_000])
+def test_a_megabyte_of_escapes_is_read_in_no_time(text):
+    assert Mask([KEY])(text + KEY) == text + MASK
+
+
 def test_each_of_several_keys_is_masked_wherever_it_stands():
     mask = Mask([KEY, "another-key"])
     assert mask(f"{KEY}another-key {KEY}") == f"{MASK}{MASK} {MASK}"
+
+
+def test_a_key_of_plain_characters_is_found_in_its_escapes():
+    """Nothing but a code can stand for these."""
+    mask = Mask(["sk-plain-0123456789"])
+    assert mask(r"\"\u0073k-plain-0123456789\"") == rf"\"{MASK}\""
+    assert mask(r"\u005cu0073k-plain-0123456789 \/ \n") == rf"{MASK} \/ \n"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import re
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -51,6 +53,11 @@ def echo(request, how):
     if how == "page":
         page = f"<html><h1>502</h1><pre>Authorization: Bearer {key}</pre></html>"
         return web.Response(status=502, text=page, content_type="text/html", headers=again)
+    if how == "escaped":  # as JSON may spell any character, here within a string of JSON
+        spelled = "".join(f"\\u{ord(character):04x}" for character in key)
+        upstream = json.dumps({"error": {"metadata": {"raw": f'{{"key": "{spelled}"}}'}}})
+        body = f'{{"message": "key {spelled}", "upstream": {upstream}}}'
+        return web.Response(status=400, text=f'{{"error": {body}}}', headers=again)
     status = {"refused": 401, "bad": 400, "busy": 503}[how]
     message = f"Incorrect API key provided: {key}. {dict(request.headers)}"
     error = {"error": {"message": message, "type": "error", "code": "invalid", "param": key}}
@@ -101,7 +108,8 @@ def everything_in(folder: Path) -> str:
 
 
 def leaks(text):
-    """The markers of keys and accounts that a text holds; both also in part."""
+    """The markers of keys and accounts that a text holds; both also in part, and as escapes."""
+    text = re.sub(r"\\+u00(\w\w)", lambda code: chr(int(code[1], 16)), text)
     return [marker for marker in ("Zx81Qp55", "Kw72") if marker in text]
 
 
@@ -160,6 +168,7 @@ async def test_no_key_and_no_account_id_is_in_anything_that_a_sweep_leaves(
     [
         ("refused", "claude-sonnet-4-6", ()),
         ("bad", "o3", ("--debug",)),
+        ("escaped", "o3", ("--debug",)),
         ("redirect", "gemini-2.5-pro", ("--debug",)),
     ],
 )
