@@ -136,15 +136,15 @@ class Numbers:
     def _cell(self, name: str, row: str, column: str) -> dict[str, Any]:
         from merge_runner_analysis.explain import explain
 
-        table = from_text(self._table(name))
+        table, study = from_text(self._table(name)), self.study
         try:
-            found = explain(self.study, table, f"{row}:{column}")
+            found = explain(study, table, f"{row}:{column}")
         except UsageError as exc:
             return {"absent": str(exc)}
         counts = any(one.counts for one in table.columns if one.name == column)
         specs = {
             group.id: dict(zip(trials["trial_id"], trials["spec_hash"], strict=True))
-            for group in (*self.study.measured, *self.study.unjudged)
+            for group in (*study.measured, *study.asked, *study.unjudged, *study.unjudged_asked)
             for trials in [group.stored.trials]
         }
         trials = [
