@@ -38,6 +38,7 @@ from merge_runner.llm.durable import (
     ModelLocks,
     Operation,
     ResultT,
+    alone,
     connect,
     making,
 )
@@ -189,7 +190,7 @@ class ResponseCache:
         self.money = LedgerFile(folder)
         self._read_overlay = overlay
         self._disk = TextDisk(str(folder))
-        self._writer = BatchWriter(self.run_now)
+        self._writer = BatchWriter(self._run_each)
         if read_only and not (folder / FILE).exists():
             raise UsageError(f"there is no cache in {folder}: name one with --cache")
         try:
@@ -197,8 +198,11 @@ class ResponseCache:
                 _make(folder)
             refuse_others(folder)
             self._opened = self._file
-            self._reading, self._one_query = connect(folder / FILE), Lock()
-            self._texts: Any = None if read_only else open_texts(folder)
+            self._one_query = Lock()
+            with contextlib.ExitStack() as unless_opened:
+                self._reading = unless_opened.enter_context(closing(connect(folder / FILE)))
+                self._texts: Any = None if read_only else open_texts(folder)
+                unless_opened.pop_all()
         except FAILURES as exc:
             raise UsageError(f"the cache {folder} cannot be used: {exc}. {NEW_CACHE}") from exc
 
@@ -212,7 +216,7 @@ class ResponseCache:
 
     async def put(self, entry: CachedCall) -> CachedCall:
         """Keep an entry durably; returns what is kept, another one where an import was first."""
-        self.set_damage_aside(entry.request.key)
+        await self.quarantine(entry.request.key)
         return await self.write(partial(self._keep, entry))
 
     def put_now(
@@ -240,17 +244,14 @@ class ResponseCache:
 
     def set_damage_aside(self, key: str) -> list[str]:
         """Move a damaged entry or list of attempts to quarantine as it is; returns their names."""
-        damaged = []
-        for name, check in ((key, self._kept), (_UNANSWERED + key, self._tried)):
-            try:
-                check(key)
-            except RecordingError:
-                damaged.append(name)
-        for name in damaged:
-            aside = _DAMAGED + name
-            aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
-            with self._told("written"), closing(connect(self.folder / FILE, "rw")) as own:
-                own.execute("UPDATE Cache SET key = ? WHERE key = ? AND raw = 1", [aside, name])
+        if damaged := self._damaged(key):
+            self.run_now([partial(self._move_aside, damaged)])
+        return damaged
+
+    async def quarantine(self, key: str) -> list[str]:
+        """Do the same in the next durable batch."""
+        if damaged := self._damaged(key):
+            await self.write(partial(self._move_aside, damaged))
         return damaged
 
     def unanswered(self, key: str) -> Attempts:
@@ -278,6 +279,12 @@ class ResponseCache:
             if self._file != self._opened:
                 raise FileNotFoundError("it is no longer there")
         return results
+
+    def _run_each(self, operations: list[Operation]) -> list[Any]:
+        """Run operations in one durable transaction, each with its result or its own error."""
+        told = self._told("written")
+        # Of this thread, in which the transaction is.
+        return self.run_now([partial(alone, self._texts._sql, told(each)) for each in operations])
 
     def read(self, name: str) -> str | None:
         """Return the text under a name, or None; raises RecordingError where it is damaged."""
@@ -345,6 +352,23 @@ class ResponseCache:
             return self._kept(key) or entry
         self._texts.delete(_UNANSWERED + key)
         return entry
+
+    def _damaged(self, key: str) -> list[str]:
+        damaged = []
+        for name, check in ((key, self._kept), (_UNANSWERED + key, self._tried)):
+            try:
+                check(key)
+            except RecordingError:
+                damaged.append(name)
+        return damaged
+
+    def _move_aside(self, names: list[str]) -> None:
+        """Rename rows, whatever they hold; an operation."""
+        for name in names:
+            aside = _DAMAGED + name
+            aside += f" {len(before) + 1}" if (before := self.names(aside)) else ""
+            sql = "UPDATE Cache SET key = ? WHERE key = ? AND raw = 1"
+            self._texts._sql(sql, [aside, name])
 
     def _keep_tried(self, key: str, attempts: Attempts) -> None:
         self.replace(_UNANSWERED + key, ATTEMPTS.dump_json(attempts).decode())

@@ -386,7 +386,7 @@ class LlmClient:
                 loop = asyncio.get_running_loop()
                 telling = loop.call_later(LONG_WAIT_S, self._tell_first_wait, call)
         try:
-            self._resume(call)
+            await self._resume(call)
             return await self._attempts(call)
         except SweepStopped:
             alone = False  # the next call would only be refused in the same way
@@ -406,10 +406,10 @@ class LlmClient:
             f"until {datetime.now(UTC) + left:%H:%M:%S} UTC at the latest, {last}"
         )
 
-    def _resume(self, call: Call) -> None:
+    async def _resume(self, call: Call) -> None:
         """Give a call the attempts of earlier runs; what is damaged goes to quarantine."""
         key = call.request.key
-        for name in self.cache.set_damage_aside(key):
+        for name in await self.cache.quarantine(key):
             self.meter.damaged.append(name)
             self.meter.notes.append(
                 f"{self.driver}: {call.asked.slot}: what is recorded is damaged; it is set aside "

@@ -18,7 +18,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-from merge_runner.errors import UsageError
+from merge_runner.errors import CacheFailed, MergeRunnerError, UsageError
+from merge_runner.records import DAMAGED
 
 BUSY_S = 600.0  # another process may be writing long replies to a slow disk
 # Live runs share it, and who releases what is set aside holds it alone.
@@ -50,8 +51,29 @@ def connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
     )
 
 
+def alone(execute: Callable[[str], object], operation: Operation) -> object:
+    """Run an operation in a savepoint of a transaction; an error of its own is returned.
+
+    It is undone then, and the others of the transaction go on. Raises what is wrong with the disk.
+    """
+    execute("SAVEPOINT operation")
+    result: object
+    try:
+        result = operation()
+    except CacheFailed:
+        raise
+    except (MergeRunnerError, *DAMAGED) as exc:
+        execute("ROLLBACK TO operation")
+        result = exc
+    execute("RELEASE operation")
+    return result
+
+
 class BatchWriter:
-    """Hands operations to ``run`` in batches, in a thread, one batch at a time."""
+    """Hands operations to ``run`` in batches, in a thread, one batch at a time.
+
+    It returns their results, and for one that failed alone its error.
+    """
 
     def __init__(self, run: Callable[[list[Operation]], list[Any]]) -> None:
         self._run = run
@@ -67,7 +89,9 @@ class BatchWriter:
         batch, place = self._next_batch, len(self._pending)
         self._pending.append(operation)
         # Shielded: if one gives up waiting, the writes of the others go on.
-        result: ResultT = (await asyncio.shield(batch))[place]
+        result: ResultT | Exception = (await asyncio.shield(batch))[place]
+        if isinstance(result, Exception):
+            raise result
         return result
 
     async def _write_batch(self) -> list[Any]:

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Any
 
 from merge_runner.config import ModelEntry, Price
 from merge_runner.errors import CacheFailed, RecordingError, TrialSuspended, UsageError
-from merge_runner.llm.durable import BatchWriter, Operation, connect, making
+from merge_runner.llm.durable import BatchWriter, Operation, alone, connect, making
 from merge_runner.records import Attempt, Usage
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ class LedgerFile:
         self._file = folder / FILE
         self._connections: dict[str, sqlite3.Connection] = {}
         self._one_query, self._one_writer = Lock(), RLock()
-        self.writer = BatchWriter(self.run_now)
+        self.writer = BatchWriter(self._run_each)
 
     def read(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises UsageError for a damaged file, and CacheFailed."""
@@ -216,6 +216,10 @@ class LedgerFile:
         with self._told(), self._one_writer, self._connection("rwc") as connection:
             connection.execute("BEGIN IMMEDIATE")
             return [operation() for operation in operations]
+
+    def _run_each(self, operations: list[Operation]) -> list[Any]:
+        """Run operations in one durable transaction, each with its result or its own error."""
+        return self.run_now([partial(alone, self.write, each) for each in operations])
 
     def begun(self, call: str, tried: int) -> Iterator[Attempt]:
         """Yield the attempts at a call, beyond those ``tried``, whose end nobody has seen."""

@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import diskcache
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache, TextDisk
+from merge_runner.llm.durable import connect
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
 
 
@@ -201,6 +203,67 @@ async def test_an_entry_that_no_file_can_hold_leaves_nobody_waiting(cache):
     await fails(cache, entry(1, error="\ud800"))
     await put(cache, entry(2))
     assert cache.get(entry(2).request.key)
+
+
+@pytest.mark.parametrize("place", ["replies", "money"])
+async def test_what_fails_alone_is_undone_alone_and_those_written_with_it_are_kept(cache, place):
+    money = cache.money
+    money.write("SELECT 1")  # makes its tables
+    write = cache.write if place == "replies" else money.writer.write
+
+    def add(name):
+        if place == "replies":
+            cache.replace(name, "text")
+        else:
+            money.write("INSERT INTO open (scope, usd) VALUES (?, 1.0)", name)
+        return name
+
+    def add_and_fail():
+        add("row 2")
+        raise RecordingError("no reply of ours")
+
+    writing = (write(partial(add, "row 1")), write(add_and_fail), write(partial(add, "row 3")))
+    first, failed, last = await asyncio.gather(*writing, return_exceptions=True)
+    assert isinstance(failed, RecordingError)
+    assert (first, last) == ("row 1", "row 3")
+    kept = money.read("SELECT scope FROM open ORDER BY scope")
+    assert (cache.names("row ") or [name for (name,) in kept]) == ["row 1", "row 3"]
+
+
+async def test_damage_is_set_aside_by_the_writer_while_another_process_writes(
+    cache, stock, folder, monkeypatch
+):
+    """Nothing else could go on while the event loop waited for the other one."""
+    monkeypatch.setattr("merge_runner.llm.durable.BUSY_S", 0.0)
+    key = entry(1).request.key
+    stock[key] = "no JSON"
+    with contextlib.closing(sqlite3.connect(folder / "cache.db", isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        keeping = asyncio.create_task(cache.put(entry(1)))
+        await asyncio.sleep(0)
+        other.execute("COMMIT")
+    assert await keeping == entry(1)
+    assert stock[f"damaged {key}"] == "no JSON"
+
+
+def test_a_folder_that_cannot_be_opened_is_left_without_a_connection(folder, monkeypatch):
+    ResponseCache(folder).close()
+    made = []
+
+    def opened(*arguments):
+        made.append(connect(*arguments))
+        return made[-1]
+
+    def fail(folder):
+        raise sqlite3.OperationalError("no room")
+
+    monkeypatch.setattr("merge_runner.llm.cache.connect", opened)
+    monkeypatch.setattr("merge_runner.llm.cache.open_texts", fail)
+    with pytest.raises(UsageError, match="no room"):
+        ResponseCache(folder)
+    for connection in made:
+        with pytest.raises(sqlite3.ProgrammingError, match="closed"):
+            connection.execute("SELECT 1")
 
 
 async def test_a_damaged_folder_leaves_nobody_waiting(cache, stock):
