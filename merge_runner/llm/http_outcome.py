@@ -100,8 +100,8 @@ REASONS = {
     "the base URL, or set SSL_CERT_FILE to the certificates of whoever signed it",
     "not_allowed": "the endpoint does not accept the key; set {key} to a valid one",
     "unknown_model": "the endpoint has no model {id!r}; see `merge-runner models`, or {base_url}",
-    "twice_the_version": "the base URL must not end with the version with which the path begins: "
-    "{base_url}",
+    "path_twice": "the base URL must not end with what the path begins with (such as /v1), or it "
+    "stands there twice: {base_url}",
     "proxy_refused": "the proxy (HTTPS_PROXY, HTTP_PROXY or ALL_PROXY) lets nothing through, and "
     "nothing was sent: give its URL a user name and a password if it asks for them (407), have it "
     "allow the host, or name the host in NO_PROXY",
@@ -123,8 +123,8 @@ REASONS = {
 }
 # Those that a passing fault may look like: several in a row tell.
 UNSURE = frozenset({"other_error", "text", "unreadable_reply", "proxy_refused"})
-# The version of a path that follows itself, as in /v1/v1/messages.
-_TWICE = re.compile(r"(/v\d\w*)\1/")
+# A part of a path that follows itself, as in /v1/v1/messages.
+_TWICE = re.compile(r"(/\w.*)\1(/|$)")
 _EVENTS = re.compile(r"\s*(data|event|id|retry)?:", re.ASCII)
 
 _UNIT_S = {"ms": 0.001, "milli": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -389,7 +389,8 @@ def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
     """
     raw, name = outcome.raw, outcome.name
     if outcome.action == "refused":
-        return "twice_the_version" if name == "unknown_model" and _TWICE.search(url) else name
+        is_twice = name == "unknown_model" and _TWICE.search(urlsplit(url).path)
+        return "path_twice" if is_twice else name
     if raw is None or name == "bad_prompt":
         return outcome.reason
     if name == "bad_body":

@@ -13,7 +13,7 @@ from contextlib import (
     contextmanager,
 )
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,7 @@ from merge_runner.errors import (
 )
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.client import LONG_WAIT_S
 from merge_runner.llm.http_outcome import REGISTRY, TransportFailure, if_nobody, set_base_url
 from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import SHIPPED_RECORDINGS
@@ -531,10 +532,14 @@ async def _with_names(
 
 async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], None]) -> str:
     """The one model that a server lists; raises ProviderDown where nobody listens, UsageError."""
-    from merge_runner.llm.http import listed_models  # imports httpx, which no replay needs
+    # Imports httpx, which no replay needs.
+    from merge_runner.llm.http import LIST_TIMEOUT_S, listed_models
 
     endpoint = resolve_endpoint(name, entry)
     driver = driver_name(name, endpoint.identity)
+    until = datetime.now(UTC) + timedelta(seconds=LIST_TIMEOUT_S)
+    waits = f"{driver} has not listed its models yet: waits until {until:%H:%M:%S} UTC for that"
+    telling = asyncio.get_running_loop().call_later(LONG_WAIT_S, say, waits)
     try:
         listed = await listed_models(endpoint)
         models = ", ".join(listed) or "no model"
@@ -543,6 +548,8 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
             raise ProviderDown(f"{driver}: {exc}: {if_nobody(name, entry)}") from exc
         wrong = f"; if that is another server, {set_base_url(name, entry)}"
         listed, models = [], f"models that it does not list ({exc}{wrong})"
+    finally:
+        telling.cancel()
     if len(listed) != 1:
         variable = PROVIDERS.require(entry.provider).model_env
         raise UsageError(

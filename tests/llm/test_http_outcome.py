@@ -529,13 +529,15 @@ def test_what_no_call_of_a_run_would_fare_better_with(status, body, headers, rea
 @pytest.mark.parametrize(
     ("url", "reason"),
     [
-        ("http://localhost/v1/v1/messages", "twice_the_version"),
-        ("http://localhost/x/v1beta/v1beta/models/m:generateContent", "twice_the_version"),
+        ("http://localhost/v1/v1/messages", "path_twice"),
+        ("http://localhost/x/v1beta/v1beta/models/m:generateContent", "path_twice"),
+        ("http://localhost/v1/chat/completions/chat/completions", "path_twice"),
         ("http://localhost/v1/messages", "unknown_model"),
+        ("http://localhost/v1/v1beta/messages", "unknown_model"),
         ("anthropic/v1/messages", "unknown_model"),
     ],
 )
-def test_a_version_that_stands_twice_in_a_url_is_no_unknown_model(url, reason):
+def test_a_path_that_stands_twice_in_a_url_is_no_unknown_model(url, reason):
     assert reason_of(judged("anthropic", 404, anthropic("not_found_error")), url) == reason
 
 

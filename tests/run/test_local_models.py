@@ -11,8 +11,10 @@ from aiohttp import web
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.models import load_models
+from merge_runner.run.sweep import _served_name
 from tests.gate import HANGS_S
 from tests.harness import watched
+from tests.virtual_time import in_virtual_time
 
 ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0", "--json")
 LOCAL = (*ONE, "--model", "local")
@@ -102,6 +104,24 @@ async def test_of_several_models_one_must_be_chosen(merge_runner, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("takes_s", "waits"), [(4, []), (9, ["local has not listed its models"])])
+@in_virtual_time
+async def test_a_server_that_is_slow_to_list_its_models_is_waited_for_with_a_line(
+    monkeypatch, takes_s, waits
+):
+    async def listed(endpoint):
+        await asyncio.sleep(takes_s)
+        return ["m"]
+
+    monkeypatch.setattr("merge_runner.llm.http.listed_models", listed)
+    said = []
+    assert await _served_name("local", load_models()["local"], say=said.append) == "m"
+    await asyncio.sleep(9)
+    *told, last = said
+    assert [line.partition(" yet")[0] for line in told] == waits
+    assert last == "local serves m, which is asked"
+
+
 async def test_a_server_without_a_list_needs_a_name(merge_runner, registry):
     async with watched(serving(status=404)) as server:
         at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
