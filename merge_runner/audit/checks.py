@@ -23,7 +23,6 @@ from merge_runner.results.database import (
     SETTINGS,
     append,
     by_name,
-    fetched,
     in_memory,
     limit_memory,
     read_database,
@@ -56,6 +55,16 @@ FROM ({ASKED_DECISIONS}) JOIN (SELECT trial_id, spec_hash, variant FROM trials)
     USING (trial_id, spec_hash)
 JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id, spec_hash)
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
+"""  # noqa: S608 # constants
+# Of one sweep, or of all.
+PLACES = """
+SELECT rowid FROM calls WHERE $sweep_id IS NULL OR (trial_id, spec_hash) IN
+    (SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = $sweep_id)
+ORDER BY rowid
+"""
+REPLIES = f"""
+SELECT rowid, reply::VARCHAR FROM calls
+WHERE rowid BETWEEN $first AND $last AND rowid IN ({PLACES})
 """  # noqa: S608 # constants
 OF_CALLS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
 BATCH = 100
@@ -115,27 +124,32 @@ class Audit:
 
 
 @contextmanager
-def audited_database(path: Path) -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open a database with the views of checks.sql; raises UsageError or StoreError."""
+def audited_database(
+    path: Path, sweep_id: str | None = None
+) -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open a database with the views of checks.sql; raises UsageError or StoreError.
+
+    Replies are read of one sweep, or of all.
+    """
     try:
         with read_database(path) as connection:
             limit_memory(connection)
-            prepare(connection)
+            prepare(connection, sweep_id)
             yield connection
     except duckdb.Error as exc:
         raise StoreError(f"{path} cannot be audited: {first_line(exc)}") from exc
 
 
-def prepare(connection: duckdb.DuckDBPyConnection) -> None:
-    """Make the views of checks.sql, and read the ids of all replies."""
+def prepare(connection: duckdb.DuckDBPyConnection, sweep_id: str | None = None) -> None:
+    """Make the views of checks.sql, and read the ids of the replies of a sweep, or of all."""
     make_views(connection)
     append(connection, "other_models", other_models(connection))
-    [(calls,)] = fetched(connection.execute("SELECT coalesce(max(rowid), -1) + 1 FROM calls"))
-    for first in range(0, calls, REPLIES_AT_ONCE):  # what they tell lies in memory meanwhile
-        some = connection.execute(
-            "SELECT rowid, reply::VARCHAR FROM calls WHERE rowid BETWEEN ? AND ?",
-            [first, first + REPLIES_AT_ONCE - 1],
-        ).fetchall()
+    of = {"sweep_id": sweep_id}
+    places = [place for (place,) in connection.execute(PLACES, of).fetchall()]
+    for first in range(0, len(places), REPLIES_AT_ONCE):  # what they tell lies in memory meanwhile
+        last = min(first + REPLIES_AT_ONCE, len(places)) - 1
+        between = {**of, "first": places[first], "last": places[last]}
+        some = connection.execute(REPLIES, between).fetchall()
         append(connection, "told", [row for each in some if (row := _told(*each))])
     connection.execute("INSERT INTO reply_ids FROM identified")
 
@@ -166,8 +180,8 @@ def make_views(connection: duckdb.DuckDBPyConnection) -> None:
 
 
 def audit_sweep(path: Path, sweep_id: str, planned: Sequence[TrialKey], *, finished: bool) -> Audit:
-    """Audit a sweep that has just been played; see ``check_sweep``."""
-    with audited_database(path) as connection:
+    """Audit a sweep that has just been played by its own replies; see ``check_sweep``."""
+    with audited_database(path, sweep_id) as connection:
         return check_sweep(connection, sweep_id, planned, finished=finished)
 
 

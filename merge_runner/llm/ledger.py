@@ -23,6 +23,7 @@ from __future__ import annotations
 import asyncio
 import bisect
 import contextlib
+import json
 import sqlite3
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -70,6 +71,10 @@ PRAGMA synchronous = full; -- it survives a power cut
 _SPENT = "SELECT driver, usd, overrun_usd, most_overrun FROM spent WHERE scope = ?1"
 # In one statement: what is settled meanwhile is in the one or in the other sum.
 _SUMS = f"SELECT NULL, total(usd), count(*), 0 FROM open WHERE scope = ?1 UNION ALL {_SPENT}"  # noqa: S608
+_COMMITTED = """
+SELECT total(usd) FROM (SELECT scope, usd FROM open UNION ALL SELECT scope, usd FROM spent)
+WHERE scope IN (SELECT value FROM json_each(?))
+"""
 _OPEN = "INSERT INTO open VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
 _BEGUN = """
 SELECT since FROM open WHERE call = ? AND attempt > ? AND outcome = 'in flight' ORDER BY attempt
@@ -271,12 +276,13 @@ class Ledger:
     """The spending of one sweep; ``scope`` names it in the file. ``spending`` is its last state.
 
     Several processes may run the sweep: every change sums anew. The ledger of a model that costs
-    nothing has no name, and keeps no record.
+    nothing has no name, and keeps no record. What ``others`` hold counts under the same cap.
     """
 
-    def __init__(self, cache: ResponseCache, scope: str) -> None:
+    def __init__(self, cache: ResponseCache, scope: str, others: Sequence[str] = ()) -> None:
         self.spending = Spending()
         self.scope = scope
+        self._others, self._elsewhere_usd = json.dumps(others), 0.0
         self.cache = cache
         self._money = cache.money
         # A damaged record is an error only where money is to be spent: a replay needs none.
@@ -287,7 +293,18 @@ class Ledger:
         """Return the current state; raises UsageError where its record is damaged."""
         if self.scope:
             self.spending = self._money.spending(self.scope, self._money.read)
+            self._elsewhere_usd = self._committed_elsewhere(self._money.read)
         return self.spending
+
+    @property
+    def committed_usd(self) -> float:
+        """The most that may have been spent under the cap, as last read."""
+        return self.spending.committed_usd + self._elsewhere_usd
+
+    def _committed_elsewhere(self, ask: Callable[..., Rows]) -> float:
+        if self._others == "[]":
+            return 0.0
+        return sum((float(usd) for (usd,) in ask(_COMMITTED, self._others)), 0.0)
 
     def reserve(
         self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
@@ -296,6 +313,7 @@ class Ledger:
         if not self.scope:
             return True
         committed_usd = self._money.spending(self.scope, self._money.write).committed_usd
+        committed_usd += self._committed_elsewhere(self._money.write)
         if cap_usd is not None and committed_usd + usd > cap_usd + TOLERANCE_USD:
             return False
         since = datetime.now(UTC).isoformat(timespec="milliseconds")
@@ -526,7 +544,8 @@ class Budget:
 
     def _left_usd(self) -> float:
         assert self.cap_usd is not None
-        return self.cap_usd - self.ledger.read().committed_usd - self.queued_usd + TOLERANCE_USD
+        self.ledger.read()
+        return self.cap_usd - self.ledger.committed_usd - self.queued_usd + TOLERANCE_USD
 
     def _needed_usd(self, trials: Iterable[int]) -> float:
         """Return what these begun trials are still expected to cost."""
@@ -553,9 +572,13 @@ class Budget:
         """Return the error of a trial that cannot be paid."""
         spending, kept_usd = self.ledger.spending, self._needed_usd(self._charged_usd)
         reserved_usd = spending.reserved_usd + self.queued_usd
+        elsewhere_usd = self.ledger.committed_usd - spending.committed_usd
+        elsewhere = f", {elsewhere_usd:.4f} by others under this cap" if elsewhere_usd else ""
+        total_usd = self.ledger.committed_usd + self.queued_usd
         return TrialSuspended(
-            f"{what}, and {spending.spent_usd + reserved_usd:.4f} of {self.cap_usd:g} USD are "
+            f"{what}, and {total_usd:.4f} of {self.cap_usd:g} USD are "
             f"spent or set aside ({spending.spent_usd:.4f} spent, {reserved_usd:.4f} set aside for "
-            f"{spending.open_attempts} attempts whose cost is not known: `merge-runner ledger`); "
+            f"{spending.open_attempts} attempts whose cost is not known{elsewhere}: "
+            "`merge-runner ledger`); "
             f"{kept_usd:.4f} more are kept for the trials that have begun"
         )

@@ -328,7 +328,8 @@ class DaskTasks:
         if not self._plan.is_free:
             usd = sum((self._costs(spec.order) for spec in specs), 0.0)
             if cap_usd is not None:
-                usd = cap_usd = max(0.0, cap_usd - self._ledger.read().committed_usd) / idle
+                self._ledger.read()
+                usd = cap_usd = max(0.0, cap_usd - self._ledger.committed_usd) / idle
             asked = Asked(f"Dask worker {address}", specs[0].trial_id, usd)
             self._ledger.reserve(name, 1, usd, None, asked)
         task = Task(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import sys
+import traceback
 from collections import Counter
 from collections.abc import (
     AsyncIterator,
@@ -19,6 +20,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import accumulate, chain
+from pathlib import Path
 
 from merge_runner.drivers.base import MakeDriver
 from merge_runner.drivers.language_model import LanguageModel
@@ -286,12 +288,15 @@ class Flusher:
     While storing fails, trials beyond a batch are dropped and others are played; where storing is
     merely slow, new trials wait for it. ``dropped`` trials can be played again from the recorded
     replies; failed ones cannot, and stay in memory. ``differing`` maps trials that were already
-    stored with other values to the columns that differ.
+    stored with other values to the columns that differ. After an error that is no StoreError it is
+    ``broken``: it writes nothing more, and calls ``on_break`` once.
     """
 
     def __init__(self, store: Store, sweep_id: str, say: Callable[[str], None]) -> None:
         self.differing: dict[str, list[str]] = {}
         self.dropped: list[TrialSpec] = []
+        self.broken = False
+        self.on_break: Callable[[], object] = lambda: None
         self._store = store
         self._sweep_id = sweep_id
         self._say = say
@@ -368,23 +373,38 @@ class Flusher:
 
     async def _flush(self) -> bool:
         """Write one batch, which may be empty; False if that did not work."""
+        if self.broken:
+            return False
         sizes = accumulate(size for _, size in self._pending[:BATCH])
         # At least one: a single trial may be larger than a batch should be.
         number = max(1, sum(size <= BATCH_BYTES for size in sizes))
         # It stays in front until it is stored: others are added behind it meanwhile.
         batch = [record for record, _ in self._pending[:number]]
-        try:
-            # In a thread, since DuckDB waits for the file's lock and for the disk.
-            self.differing |= await asyncio.to_thread(
-                self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S
-            )
-        except StoreError as exc:
-            self._problem = exc
-            self._drop_excess()
+        # In a thread, since DuckDB waits for the file's lock and for the disk.
+        write = partial(self._store.write, self._sweep_id, batch, patience_s=LOCK_PATIENCE_S)
+        writing = asyncio.create_task(asyncio.to_thread(write))
+        await asyncio.wait([writing])
+        if (error := writing.exception()) is not None:
+            self._fail(error)
             return False
+        self.differing |= writing.result()
         self._problem = None
         del self._pending[: len(batch)]
         return True
+
+    def _fail(self, error: BaseException) -> None:
+        """Note why a batch is not written."""
+        if isinstance(error, StoreError):
+            self._problem = error
+        else:
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            self._problem = StoreError(
+                f"the writer of results has failed ({one_line(repr(error))} in "
+                f"{Path(place.filename).name}, line {place.lineno})"
+            )
+            self.broken = True
+            self.on_break()
+        self._drop_excess()
 
     def _drop_excess(self) -> None:
         """Drop the newest trials beyond what may wait, which are in no batch under way."""

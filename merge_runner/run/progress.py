@@ -46,8 +46,7 @@ PULSE_S = 0.05
 PUBLISHED_EVERY, PLAIN_EVERY = 20, 100
 SHOWN, REASONS_SHOWN = 10, 3
 CLOSE_IT = "you may close this: the same command goes on"
-# While a sweep checks what it stored, the file is silent: only its process shows that it lives.
-STALE_S = {"playing": 10.0, "checking": 600.0}
+STALE_S = 10.0
 MOST_BYTES = 1_000_000
 # Identifies the machine among those that share a folder: process ids mean nothing on another one.
 MACHINE = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
@@ -84,7 +83,7 @@ class Standing(BaseModel):
             return False
         except PermissionError:
             pass  # it is another user's
-        return (datetime.now(UTC) - self.updated_at).total_seconds() < STALE_S[self.doing]
+        return (datetime.now(UTC) - self.updated_at).total_seconds() < STALE_S
 
 
 def write_standing(db: Path, standing: Standing) -> None:
@@ -190,7 +189,7 @@ class Progress:
         trials = f"{ended + failed}/{self.planned - self.stored} ended{before}, {running}"
         cost = f"{cost_usd:.2f} USD"
         if self.cap_usd is not None:
-            cost += f", {self.ledger.spending.committed_usd:.2f} of {self.cap_usd:g} over all runs"
+            cost += f", {self.ledger.committed_usd:.2f} of {self.cap_usd:g} over all runs"
         left = "" if left_s is None else f", about {left_s:.0f} s left"
         rows = [
             *dict.fromkeys(("WARNING", text) for text in self._warnings()),
@@ -309,6 +308,8 @@ async def show_progress(
             if live is not None:
                 live.stop()
         remove_standing(db, sweep_id)
+        with suppress(asyncio.CancelledError):
+            await following
 
 
 def terminal_text(progress: Progress) -> Text:

@@ -220,7 +220,8 @@ class Sweep:
                 progress.doing = "checking"
                 write_standing(db, progress.standing(sweep_id))
                 if is_stored:
-                    checked = self._check(store, sweep_id, progress.runner.first)
+                    self._end(store, sweep_id)
+                    checked = await self._check(store, sweep_id, progress.runner.first)
         if self._cancelled:
             raise asyncio.CancelledError
         return as_dict(
@@ -368,6 +369,7 @@ class Sweep:
 
         # Two tasks, since Ctrl-C stops the trials but lets the calls that are paid for end.
         work = asyncio.create_task(runner.play(self.todo, ended, room=flusher.room))
+        flusher.on_break = work.cancel  # no money is spent on what cannot be stored
         drain = asyncio.create_task(drained())
 
         def interrupted() -> None:
@@ -385,10 +387,10 @@ class Sweep:
                 finally:
                     drain.cancel()
                 await asyncio.wait([work])
-            if work.cancelled():
-                self._fail(INTERRUPTED, f"Interrupted. {GO_ON}")
-            else:
+            if not work.cancelled():
                 self._fail_by(work.exception())
+            elif not flusher.broken:  # whose error is told below
+                self._fail(INTERRUPTED, f"Interrupted. {GO_ON}")
             if suspended:
                 self._fail(
                     TrialSuspended.exit_code,
@@ -441,15 +443,23 @@ class Sweep:
                 flusher.add(await runner.play_one(spec))
             await flusher.close()
 
-    def _check(
+    def _end(self, store: Store, sweep_id: str) -> None:
+        """Note that the run has ended, and how."""
+        try:
+            store.end_sweep(sweep_id, datetime.now(UTC).replace(tzinfo=None), self.exit_code)
+        except StoreError as exc:
+            self._fail_by(exc)
+
+    async def _check(
         self, store: Store, sweep_id: str, first: FirstDecisions
     ) -> tuple[dict[str, Any], Audit] | None:
-        """Read back what the database holds of the sweep, audit it, and note how it ended."""
+        """Read back what the database holds of the run, which has ended, and audit it."""
         keys = [(spec.trial_id, spec.spec_hash) for spec in (*self._stored, *self.todo)]
-        checked = None
+        ended_with, checked = self.exit_code, None
+        audited = partial(audit_sweep, store.path, sweep_id, keys, finished=self.exit_code == 0)
         try:
-            facts = sweep_facts(store.path, sweep_id)
-            audit = audit_sweep(store.path, sweep_id, keys, finished=self.exit_code == 0)
+            facts = await asyncio.to_thread(sweep_facts, store.path, sweep_id)
+            audit = await asyncio.to_thread(audited)
             checked = facts, audit
             if not (self.exit_code or self._options.sends_nothing or self._options.keep_going):
                 for line in first.without_a_valid_one():
@@ -461,9 +471,10 @@ class Sweep:
             self.messages += map(str, findings[:SHOWN])
             if not self._options.replay:
                 self._ledger.read()
-            store.end_sweep(sweep_id, datetime.now(UTC).replace(tzinfo=None), self.exit_code)
         except MergeRunnerError as exc:
             self._fail_by(exc)
+        if self.exit_code != ended_with:
+            self._end(store, sweep_id)
         return checked
 
 
@@ -488,14 +499,15 @@ async def open_sweep(
             ended = set() if options.replay else Store(options.db).ended_trials(specs)
         stored = [spec for key, spec in specs.items() if key in ended]
         todo = [spec for key, spec in specs.items() if key not in ended]
+        others: list[str] = []
         if todo and not options.sends_nothing:
             if options.dask is None:
                 for name, entry in plan.entries.items():
                     resolve_endpoint(name, entry)  # raises where its key is missing
-            options = _less_what_is_spent(plan, options, cache, say)
+            others = _others_under_the_cap(plan, options, cache, say)
             asked = plan.entries.items()
             cache.locks.take({f"{e.id} at {plan.endpoints[name]}" for name, e in asked})
-        yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger))
+        yield Sweep(plan, options, cache, stored, todo, say, Ledger(cache, plan.ledger, others))
 
 
 async def _with_names(
@@ -560,14 +572,16 @@ async def _served_name(name: str, entry: ModelEntry, *, say: Callable[[str], Non
     return listed[0]
 
 
-def _less_what_is_spent(
+def _others_under_the_cap(
     plan: Plan, options: Options, cache: ResponseCache, say: Callable[[str], None]
-) -> Options:
-    """The options with a cap that is lower by what other ledgers under it hold.
+) -> list[str]:
+    """The other ledgers whose money counts under the cap, where there is one and they hold any.
 
     They are those of sweeps that share the cap, and others of this study: it was run before its
     file had a budget, or has none any more.
     """
+    if options.max_cost_usd is None:
+        return []
     own, study = plan.ledger, plan.study.name
     others = [
         scope
@@ -575,11 +589,9 @@ def _less_what_is_spent(
         if scope != own
         and (scope in options.ledgers or (study in (own, scope) and scope.split("/")[0] == study))
     ]
-    spent_usd = sum(Ledger(cache, scope).read().committed_usd for scope in others)
-    if options.max_cost_usd is None or not spent_usd:
-        return options
-    say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
-    return replace(options, max_cost_usd=max(0.0, options.max_cost_usd - spent_usd))
+    if spent_usd := sum(Ledger(cache, scope).read().committed_usd for scope in others):
+        say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
+    return others
 
 
 async def unsent(

@@ -15,6 +15,7 @@ import pytest
 from aiohttp import web
 from typer.testing import CliRunner
 
+from merge_runner.audit import checks
 from merge_runner.audit.checks import audit_sweep
 from merge_runner.cli import app
 from merge_runner.errors import UsageError
@@ -123,6 +124,23 @@ def test_whole_sweeps_pass_and_what_was_checked_is_counted(made):
         "more than 20 %)"
         for prompt in ("A7", "baseline")
     ]
+
+
+def test_the_audit_at_the_end_of_a_run_reads_that_run_s_replies_alone(made, monkeypatch):
+    db, read, told = made / "results/merge.duckdb", [], checks._told
+    monkeypatch.setattr(checks, "REPLIES_AT_ONCE", 50)
+    monkeypatch.setattr(checks, "_told", lambda *row: read.append(row) or told(*row))
+    with duckdb.connect(str(db), read_only=True) as connection:
+        rows = connection.execute("""
+            SELECT sweep_id, list((calls.rowid, reply::VARCHAR) ORDER BY calls.rowid)
+            FROM sweep_trials JOIN calls USING (trial_id, spec_hash) GROUP BY ALL
+        """).fetchall()
+    assert len(rows) > 3
+    for sweep, replies in rows:
+        read.clear()
+        found = audit_sweep(db, sweep, [], finished=True)
+        assert (found.findings, read) == ([], replies)
+        assert found.counts["reply ids"] > 0
 
 
 @pytest.mark.slow

@@ -82,8 +82,8 @@ async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, m
     [
         ({}, 9, True),
         ({}, 11, False),  # frozen
-        ({"doing": "checking"}, 11, True),  # it does nothing else meanwhile
-        ({"doing": "checking"}, 601, False),
+        ({"doing": "checking"}, 9, True),
+        ({"doing": "checking"}, 11, False),
         ({"doing": "checking", "pid": NO_PROCESS}, 1, False),
         ({"pid": NO_PROCESS}, 1, False),
         ({"pid": NO_PROCESS, "machine": "another"}, 1, True),  # its ids mean nothing here

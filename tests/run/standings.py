@@ -8,7 +8,8 @@ from merge_runner.llm.ledger import Spending
 from merge_runner.run.plan import make_plan
 from merge_runner.run.progress import Progress
 
-LEDGER = SimpleNamespace(spending=Spending(spent_usd=4.0, reserved_usd=0.25))
+SPENDING = Spending(spent_usd=4.0, reserved_usd=0.25)
+LEDGER = SimpleNamespace(spending=SPENDING, committed_usd=SPENDING.committed_usd)
 
 
 def runner(*meters, running=0, waits=()):
