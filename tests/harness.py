@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import re
 import sys
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,6 +60,13 @@ def plugin(folder: Path, source: str, module: str = "dummies") -> dict[str, str]
     (described / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
     (described / "entry_points.txt").write_text(f"[{GROUP}]\n{module} = {module}\n")
     return {"PYTHONPATH": os.pathsep.join(map(str, (folder, PROJECT)))}
+
+
+def asked_to_write(arguments: Sequence[str], what: str) -> None:
+    """Leave the program unless it is told to ``--write``, for which it says what that would do."""
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser.add_argument("--write", action="store_true", required=True, help=f"write {what}")
+    parser.parse_args(arguments)
 
 
 def environment(**changes: str) -> dict[str, str]:

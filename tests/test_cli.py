@@ -13,13 +13,17 @@ import subprocess
 import termios
 from contextlib import suppress
 from importlib.metadata import entry_points
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import typer.main
 from typer.testing import CliRunner
 
 import merge_runner as package
+from merge_runner.cli import commands
 from merge_runner.cli.app import alone
+from merge_runner.run.plan import Options
 from merge_runner_analysis.commands import app
 from tests.harness import PROGRAM, environment
 
@@ -62,6 +66,37 @@ def every_command(command, path=()):
     yield path, command
     for name, inner in getattr(command, "commands", {}).items():
         yield from every_command(inner, (*path, name))
+
+
+def test_every_option_of_a_sweep_reaches_its_plan_or_its_run(monkeypatch):
+    planned, played = [], []
+    plan = SimpleNamespace(ledger="a ledger", replays_humans=False)
+    made = lambda *names, **more: planned.append((names, more)) or plan  # noqa: E731
+    monkeypatch.setattr("merge_runner.run.plan.make_plan", made)
+    monkeypatch.setattr(commands, "_play", lambda *given, **more: played.append((given, more)) or 0)
+    words = """sweep mine --first --grid h=0:1:1,dv=0:1:1 --model o3 --only temperature=0.2 --mirror
+        --reps 3 --conditions N_0_0,L_4_8 --variants A1 --sample-set 4 --order-seed 5 --db d
+        --cache c --in-flight 6 --rpm 7 --tpm 8 --max-cost 9 --dask local:2 --batch --strict-model
+        --keep-going --yes --trust --quiet --json"""
+    assert CliRunner().invoke(app, words.split()).exit_code == 0
+    assert CliRunner().invoke(app, ["replay", "mine", "--recording", "r.parquet"]).exit_code == 0
+    first, second = planned
+    assert first == (
+        ("mine", ["o3"], 3, ["N_0_0", "L_4_8"], ["A1"]),
+        {
+            "sample_set": 4, "order_seed": 5, "only": {"temperature": ["0.2"]}, "db": Path("d"),
+            "mirror": True, "first": True, "grid": "h=0:1:1,dv=0:1:1", "trust": True,
+        },
+    )  # fmt: skip
+    assert second[0] == ("mine", (), None, None, None)
+    (given, how), (replayed, _) = played
+    assert how == {"whole": True, "dry_run": False, "yes": True, "as_json": True}
+    common = {"typed": given[1].typed}
+    assert given == (plan, Options(
+        Path("d"), Path("c"), 6, 7, 8, 9, strict_model=True, keep_going=True, quiet=True,
+        dask="local:2", batch=True, **common,
+    ))  # fmt: skip
+    assert (replayed[1].replay, replayed[1].recordings) == (True, [Path("r.parquet")])
 
 
 @pytest.mark.parametrize("columns", [80, 100])

@@ -1,6 +1,7 @@
 """The numbers of every table, of the shipped recordings and two odd databases, stay what they are.
 
-``python -m tests.test_frozen_numbers`` renews them; what is equal but for noise keeps its digits.
+``python -m tests.test_frozen_numbers --write`` renews them; what is equal but for noise keeps its
+digits.
 """
 
 from __future__ import annotations
@@ -8,13 +9,15 @@ from __future__ import annotations
 import json
 import math
 import subprocess
+import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
 
+from tests import test_notebooks
 from tests.analysis.odd_databases import made, replayed
-from tests.harness import PROGRAM, PROJECT, environment
+from tests.harness import PROGRAM, PROJECT, asked_to_write, environment
 
 NUMBERS = PROJECT / "tests/golden/numbers.json"
 RECORDINGS = ("emulator", "smollm2", "smollm2-free")
@@ -94,6 +97,16 @@ def test_a_changed_a_missing_and_a_new_number_are_told():
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("-h",), ("--w",), ("all",)])
+@pytest.mark.parametrize("module", [sys.modules[__name__], test_notebooks])
+def test_nothing_is_renewed_that_nobody_asks_for(module, arguments, monkeypatch, capsys):
+    for name in ("DATABASES", "NOTEBOOKS"):
+        monkeypatch.setattr(module, name, None, raising=False)  # nothing is read, either
+    with pytest.raises(SystemExit):
+        module.main(*arguments)
+    assert "--write" in "".join(capsys.readouterr())
+
+
 def _kept(frozen: dict, found: dict) -> dict:
     """What was found, with the digits that are frozen where these are the same number."""
     for name, table in found.items():
@@ -121,8 +134,9 @@ def _text(frozen: dict) -> str:
     )
 
 
-def main() -> None:
-    """Write the numbers of today."""
+def main(*arguments: str) -> None:
+    """Write the numbers of today, where that is asked for."""
+    asked_to_write(arguments, f"the numbers of every table into {NUMBERS}")
     frozen = json.loads(NUMBERS.read_text()) if NUMBERS.exists() else {}
     found = {}
     for name in DATABASES:
@@ -132,4 +146,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -11,7 +12,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from tests.harness import CONFIGURING, PROJECT
+from tests.harness import CONFIGURING, PROJECT, asked_to_write
 
 pytestmark = pytest.mark.long
 
@@ -99,9 +100,15 @@ async def test_a_notebook_is_stored_with_what_its_cells_print_and_a_figure(execu
     assert results(await executed(stored)) == before
 
 
-if __name__ == "__main__":  # renews what the cells print
+def main(*arguments: str) -> None:
+    """Write what the cells print, where that is asked for."""
+    asked_to_write(arguments, "what the cells of docs/notebooks print below them")
     for path in NOTEBOOKS:
         notebook = nbformat.read(path, as_version=4)
         with TemporaryDirectory() as folder:
             asyncio.run(execute(notebook, folder))
         nbformat.write(notebook, path)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -9,10 +9,9 @@ import signal
 import sys
 import tempfile
 from contextlib import closing
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import wraps
-from inspect import signature
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -100,21 +99,45 @@ def sweep(
     as_json: cli.JsonOption = False,
 ) -> None:
     """Play all trials of one or more sweeps that are not stored yet."""
-    given = {name: value for name, value in locals().items() if value is not None}
     from merge_runner.run.plan import Options, make_plan
 
     if not isfinite(max_cost_usd or 0):
         raise UsageError("--max-cost is a number of USD")
     if recordings and not replay:
         raise UsageError("--recording goes with a replay; to keep its replies: recording import")
-    known = {each.name for each in fields(Options)} & given.keys() - {"dry_run"}
-    options = Options(**{name: given[name] for name in known}, typed=sys.argv[1:])
-    wanted = {name: given[name] for name in signature(make_plan).parameters if name in given}
-    wanted |= {"conditions": cli.listed(conditions), "variants": cli.listed(variants)}
-    wanted["only"] = cli.levels(only or (), "--only")
+    options = Options(
+        db=db,
+        cache=cache,
+        in_flight=in_flight,
+        rpm=rpm,
+        tpm=tpm,
+        max_cost_usd=max_cost_usd,
+        replay=replay,
+        recordings=recordings or (),
+        strict_model=strict_model,
+        keep_going=keep_going,
+        quiet=quiet,
+        dask=dask,
+        batch=batch,
+        typed=sys.argv[1:],
+    )
 
     def planned(name: str) -> Plan:
-        plan = make_plan(name, **wanted)
+        plan = make_plan(
+            name,
+            models or (),
+            repetitions,
+            cli.listed(conditions),
+            cli.listed(variants),
+            sample_set=sample_set,
+            order_seed=order_seed,
+            only=cli.levels(only or (), "--only"),
+            db=db,
+            mirror=mirror,
+            first=first,
+            grid=grid,
+            trust=trust,
+        )
         if dask is not None and (replay or plan.replays_humans):
             raise UsageError("a replay needs no cluster: leave --dask out")
         return plan

@@ -19,8 +19,8 @@ import re
 import secrets
 import signal
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager, closing
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from multiprocessing import resource_tracker
@@ -69,6 +69,36 @@ VALID = (
 )
 
 
+# Those with a level of their own: Dask logs tracebacks for what we report in a line, such as lost
+# workers, and so do the libraries below it.
+LOGGERS = ("distributed", "distributed.client", "tornado", "tornado.application")
+
+
+@contextmanager
+def _silenced(loggers: Iterable[logging.Logger]) -> Iterator[None]:
+    """Let loggers say nothing for a while."""
+    levels = [(logger, logger.level) for logger in loggers]
+    try:
+        for logger, _ in levels:
+            logger.setLevel(logging.CRITICAL + 1)
+        yield
+    finally:
+        for logger, level in levels:
+            logger.setLevel(level)
+
+
+@contextmanager
+def _environment_restored() -> Iterator[None]:
+    """Undo what is set meanwhile: Dask sets variables of this process for those it starts."""
+    before = {**os.environ}
+    try:
+        yield
+    finally:
+        for name in {*os.environ} - {*before}:
+            del os.environ[name]
+        os.environ.update(before)
+
+
 @asynccontextmanager
 async def connected(where: str) -> AsyncIterator[Client]:
     """Connect to the cluster that ``--dask`` names, or start a local one; raises UsageError."""
@@ -81,10 +111,11 @@ async def connected(where: str) -> AsyncIterator[Client]:
     except ModuleNotFoundError as exc:
         raise UsageError("--dask needs the package distributed: pip install distributed") from exc
 
-    logging.disable()  # Dask logs tracebacks for what we report in a line, such as lost workers
     async with AsyncExitStack() as stack:
+        stack.enter_context(_silenced(map(logging.getLogger, LOGGERS)))
         scheduler = {"scheduler_file" if named["file"] else "address": where}
         if named["workers"]:
+            stack.enter_context(_environment_restored())
             os.environ["PYTHONSAFEPATH"] = "1"  # workers import nothing of this folder
             # A terminal's Ctrl-C reaches this process alone, which stops them in order: children
             # inherit what is blocked. The tracker, if it were started meanwhile, would unblock it.

@@ -6,6 +6,7 @@ they say.
 
 from __future__ import annotations
 
+import argparse
 import atexit
 import os
 import random
@@ -232,9 +233,12 @@ def _run(db: Path, *arguments: str, **environment: str) -> None:
 
 def main() -> None:
     """Make the kinds that are named after the folder, else all, and say what they are."""
-    folder, *kinds = sys.argv[1:]
-    for kind in kinds or KINDS:
-        db = made(Path(folder), kind)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("kinds", nargs="*", help=f"of {', '.join(KINDS)}; all if none is named")
+    asked = parser.parse_args()
+    for kind in asked.kinds or KINDS:
+        db = made(asked.folder, kind)
         for _ in write_report(Study(db), db.with_name("report.html"), db.with_name("files")):
             pass
         export_folder(db, db.with_name("pages"))

@@ -7,6 +7,7 @@ that gives no plan, programs, a crossed study and human recordings. It takes abo
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from pathlib import Path
@@ -112,4 +113,6 @@ def _humans(folder: Path) -> Path:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(f"{make(Path(sys.argv[1]))}\n")
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    sys.stdout.write(f"{make(parser.parse_args().folder)}\n")

@@ -6,7 +6,10 @@ Its workers share nothing, so that a lost one's trials are asked again as a whol
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import logging
+import os
 import pickle
 import shutil
 import signal
@@ -157,6 +160,53 @@ async def test_a_word_that_names_no_cluster_is_refused(where, says):
     with pytest.raises(UsageError, match=says):
         async with connected(where):
             pass
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [None, OSError("nobody there")])
+async def test_the_host_s_logging_and_environment_are_as_before(monkeypatch, caplog, error):
+    import distributed
+
+    seen = []
+
+    class Started:
+        """In the place of a cluster and its client: sets what Dask sets."""
+
+        scheduler_address = "tcp://1"
+
+        def __init__(self, *arguments, **more):
+            os.environ["PYTHONHASHSEED"] = os.environ["OMP_NUM_THREADS"] = "6640"
+
+        def __await__(self):
+            if error is not None:
+                raise error
+            return iter(())
+
+        async def __aenter__(self):
+            seen.append(os.environ["PYTHONSAFEPATH"])
+            return self
+
+        async def __aexit__(self, *_):
+            logging.getLogger("distributed.client").error("a lost worker")
+
+        async def close(self, timeout): ...
+        async def wait_for_workers(self, number): ...
+
+    monkeypatch.setattr(distributed, "LocalCluster", Started)
+    monkeypatch.setattr(distributed, "Client", Started)
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    before, levels = {**os.environ}, level_of_loggers()
+    with contextlib.suppress(UsageError):
+        async with connected("local:1"):
+            logging.getLogger("merge_runner").warning("ours")
+    assert ({**os.environ}, level_of_loggers()) == (before, levels)
+    assert (seen, logging.root.manager.disable) == (["1"], 0)
+    logging.getLogger("merge_runner").warning("later")
+    assert [each.message for each in caplog.records] == ["ours"] * (error is None) + ["later"]
+
+
+def level_of_loggers():
+    return {name: logging.getLogger(name).level for name in ("", "distributed", "tornado")}
 
 
 async def test_a_word_that_names_no_cluster_is_told_in_one_line(merge_runner):
