@@ -106,6 +106,7 @@ class Instance:
 
 
 SHARED = Instance()
+OURS = "merge_runner_"  # begins the names under which files are attached here
 # Another process holds the file; another connection of this one does.
 _BUSY = ("Could not set lock", "Unique file handle conflict", "already attached")
 
@@ -116,7 +117,7 @@ def open_database(
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open the database, waiting until others close it; raises StoreError."""
     connection = instance.cursor()
-    name = f"results_{id(connection)}"  # of no other file that is open
+    name = f"{OURS}{id(connection)}"  # of no other file that is open
     mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
     # A name such as md:x or :memory: names a file, too.
     _attach(connection, f"{quoted(path.absolute())} AS {name} ({mode})", path, patience_s, instance)
@@ -160,6 +161,11 @@ def _attach(
                 raise StoreError(
                     f"{path} cannot be opened as a database: {first_line(exc)}"
                 ) from exc
+            if _is_of_this_process(exc):
+                raise StoreLocked(
+                    f"{path} is open in this process (PID {os.getpid()}) too, as by "
+                    "duckdb.connect: close that connection"
+                ) from exc
             if waited_s >= patience_s:
                 raise StoreLocked(f"{path} is held by {_holder(exc)}: close it there") from exc
             if waited_s > 1 and not told:
@@ -170,6 +176,11 @@ def _attach(
             time.sleep(LOCK_RETRY_S)
         else:
             return
+
+
+def _is_of_this_process(exc: duckdb.Error) -> bool:
+    """Whether a connection of the user, as in a notebook, holds the file; ours soon close it."""
+    return bool(re.search(rf'already attached by database "(?!{OURS}\d+")', str(exc)))
 
 
 def _holder(exc: duckdb.Error) -> str:

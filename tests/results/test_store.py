@@ -15,8 +15,9 @@ import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import UsageError
+from merge_runner.errors import StoreLocked, UsageError
 from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.results.database import Instance, open_database
 from merge_runner.results.store import Store, query, results_digest, sweep_facts
 from merge_runner.run.local_runner import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -270,6 +271,29 @@ async def test_trials_wait_in_memory_while_the_database_is_locked(store, path, h
     assert f"1 trials wait to be stored: {path} is held by python" in said[0]
     assert f"(PID {process.pid}): close it there" in said[0]
     assert rows(path, "select count(*) from trials") == [(1,)]
+
+
+def test_a_database_that_this_process_holds_itself_is_named_at_once(store, path, monkeypatch):
+    def sleep(_):
+        pytest.fail("it was waited for")
+
+    monkeypatch.setattr("merge_runner.results.database.time.sleep", sleep)
+    own = "is open in this process .* as by duckdb.connect: close that connection"
+    with duckdb.connect(path):
+        with pytest.raises(StoreLocked, match=own):
+            query(path, "SELECT 1")
+        with pytest.raises(StoreLocked, match=own):
+            store.write("s1", [])
+    assert rows(path, "select 1") == [(1,)]
+
+
+def test_a_database_that_we_hold_in_this_process_is_waited_for(store, path, monkeypatch):
+    waited = []
+    monkeypatch.setattr("merge_runner.results.database.time.sleep", waited.append)
+    opened = open_database(path, read_only=True, patience_s=1, instance=Instance())
+    with opened, pytest.raises(StoreLocked, match="held by another program"):
+        store.write("s1", [], patience_s=0.01)
+    assert waited
 
 
 def test_a_slow_query_draws_no_bar_on_the_output():
