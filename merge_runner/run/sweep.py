@@ -68,8 +68,8 @@ SHOWN = 5
 Stopping = Callable[
     [Callable[[], object] | None, Callable[[], object]], AbstractContextManager[None]
 ]
-"""Meanwhile whoever may stop a run does so by the first function, and has what it still waits for
-dropped by the second. Where there is nothing to stop any more, the first is None."""
+"""Within it, whoever may stop a run calls the first function to stop it, and the second one to drop
+what it then still waits for. The first is None where there is nothing left to stop."""
 
 
 def on_event(event: asyncio.Event | None) -> Stopping:
@@ -123,23 +123,12 @@ async def play(
             say(f"note: the recording holds {part.trials} of the plan's {plan.trials} trials")
         plan = part
     with using(plan.parts.catalogue):  # it has the study's own wire formats and providers
-        return await _play(plan, options, say=say, agree=agree, stopping=stopping)
-
-
-async def _play(
-    plan: Plan,
-    options: Options,
-    *,
-    say: Callable[[str], None],
-    agree: Callable[[Estimate], None],
-    stopping: Stopping,
-) -> dict[str, Any]:
-    async with open_sweep(plan, options, say=say) as sweep:
-        expected = None
-        if sweep.todo and not (options.replay or plan.is_free):
-            expected = await sweep.estimate()
-            agree(expected)
-        return await sweep.run(expected, stopping)
+        async with open_sweep(plan, options, say=say) as sweep:
+            expected = None
+            if sweep.todo and not (options.replay or plan.is_free):
+                expected = await sweep.estimate()
+                agree(expected)
+            return await sweep.run(expected, stopping)
 
 
 def _has_replies(cache: ResponseCache, plan: Plan) -> bool:
