@@ -14,7 +14,6 @@ from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import Call, LlmClient
-from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import Budget, Ledger, cost_usd
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.llm.models import load_models
@@ -113,7 +112,7 @@ def _connections(
             carrier=in_process if endpoint.provider == "emulator" else None,
         )
         if rounds is not None and batch_terms(entry) is not None:
-            service = SERVICES[entry.format](transport, endpoint, FORMATS[entry.format])
+            service = SERVICES[entry.format](transport, endpoint, plan.parts.formats[entry.format])
             rounds.services[plan.registered[name]] = service
         return transport
 

@@ -42,11 +42,11 @@ from merge_runner.llm.client import Meter, Wait
 from merge_runner.llm.ledger import Asked, Ledger, Rows
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
-from merge_runner.registry import Catalogue, plugin_sources, using
+from merge_runner.registry import plugin_sources, using
 from merge_runner.run.clients import live_clients
 from merge_runner.run.estimate import trial_costs
 from merge_runner.run.local_runner import Ended, FirstDecisions, LocalRunner, Room
-from merge_runner.run.plan import Options, Plan, find_parts
+from merge_runner.run.plan import Options, Plan
 from merge_runner.study.parts import catalogue_of
 
 if TYPE_CHECKING:
@@ -225,9 +225,7 @@ def _rebuilt(plan: Plan) -> Plan:
     """The plan with its programs, and all that its study adds, made anew from their sources."""
     study = plan.study
     catalogue = catalogue_of(study.file, study.text, study.plugins)
-    programs = find_parts(plan.arms, (), catalogue).programs
-    parts = replace(plan.parts, programs=programs, catalogue=catalogue)
-    return plan.model_copy(update={"parts": parts})
+    return plan.model_copy(update={"parts": plan.parts.with_code(plan.arms, catalogue)})
 
 
 async def _play(task: Task, kept: dict[str, Any]) -> Played:
@@ -297,9 +295,7 @@ class DaskTasks:
     def __post_init__(self) -> None:
         self.meters = {name: Meter() for name in self._plan.entries}
         self._costs = trial_costs(self._plan, self._earlier)
-        # Classes of plug-ins are in no module that a worker could import.
-        parts = replace(self._plan.parts, programs={}, catalogue=Catalogue())
-        self._sent = self._plan.model_copy(update={"parts": parts})
+        self._sent = self._plan.model_copy(update={"parts": self._plan.parts.without_code()})
 
     @property
     def running(self) -> int:

@@ -11,7 +11,6 @@ from statistics import fmean
 from merge_runner.config import ModelEntry
 from merge_runner.llm.batch.providers import batch_terms
 from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import cost_usd
 from merge_runner.prompts.blocks import render_prompt
 from merge_runner.records import Usage, canonical_json, is_scripted, without_prompt
@@ -34,7 +33,7 @@ def earlier_answers(plan: Plan, cache: ResponseCache) -> dict[str, Usage | None]
     """
     like = {}
     for name, entry in plan.entries.items():
-        sent = FORMATS[entry.format].request(entry, "")
+        sent = plan.parts.formats[entry.format].request(entry, "")
         like[name] = entry.id, plan.endpoints[name], sent.path, canonical_json(sent.body)
     answers: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
     for each in cache.entries():

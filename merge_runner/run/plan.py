@@ -26,7 +26,7 @@ from merge_runner.config import (
 from merge_runner.drivers.pace import model_pace
 from merge_runner.drivers.registry import PROGRAMS, Program
 from merge_runner.errors import UsageError
-from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats import FORMATS, WireFormat
 from merge_runner.llm.models import load_models
 from merge_runner.prompts.blocks import VARIANTS, Prompt, blocks_of, prompt_of
 from merge_runner.records import (
@@ -126,19 +126,35 @@ class Parts:
     """What the names in a plan stand for.
 
     It is found when the plan is made, and not looked up again: another study may give the same
-    names to other things. ``prompts`` are by variant, ``programs`` are those of its arms. The
-    ``catalogue`` is all that its study adds.
+    names to other things. ``prompts`` are by variant; ``programs``, and the wire ``formats`` of
+    models, are those of its arms. The ``catalogue`` is all that its study adds.
     """
 
     conditions: Mapping[str, Condition] = field(default_factory=dict)
     prompts: Mapping[str, Prompt] = field(default_factory=dict)
     programs: Mapping[str, Program] = field(default_factory=dict)
+    formats: Mapping[str, WireFormat] = field(default_factory=dict)
     catalogue: Catalogue = field(default_factory=Catalogue)
 
     @property
     def replays_humans(self) -> bool:
         """Whether a program replays imported human trials."""
         return any(program.data is not None for program in self.programs.values())
+
+    def with_code(self, arms: Iterable[Arm], catalogue: Catalogue, hint: str = "") -> Parts:
+        """The same with the programs and wire formats of arms; raises UsageError, with a hint."""
+        asked = {name: arm.entries.get(name) for arm in arms for name in arm.asked.values()}
+        with using(catalogue):
+            return replace(
+                self,
+                programs={n: PROGRAMS.require(n, hint) for n, entry in asked.items() if not entry},
+                formats={e.format: FORMATS[e.format] for e in asked.values() if e},
+                catalogue=catalogue,
+            )
+
+    def without_code(self) -> Parts:
+        """The same without what is in a study's plug-ins, which are not everywhere."""
+        return Parts(self.conditions, self.prompts)
 
     def with_humans(self, connection: DuckDBPyConnection | None) -> Parts:
         """The same with the human trials of a database, which are replayed; None: it has none."""
@@ -147,21 +163,18 @@ class Parts:
 
 
 def find_parts(
-    arms: Iterable[Arm], conditions: Iterable[str], catalogue: Catalogue, hint: str = ""
+    arms: Sequence[Arm], conditions: Iterable[str], catalogue: Catalogue, hint: str = ""
 ) -> Parts:
     """What the names in arms and conditions stand for where a catalogue is in use.
 
     Raises UsageError, with a ``hint``, where that is not known.
     """
-    arms = list(arms)
-    asked = {name: None for arm in arms for name in arm.asked.values() if name not in arm.entries}
     with using(catalogue):
-        return Parts(
+        parts = Parts(
             {name: CONDITIONS.require(name, hint) for name in conditions},
-            {variant: prompt_of(variant) for variant in {a.variant: 0 for a in arms if a.entries}},
-            {name: PROGRAMS.require(name, hint) for name in asked},
-            catalogue,
+            {name: prompt_of(name) for name in {arm.variant: 0 for arm in arms if arm.entries}},
         )
+    return parts.with_code(arms, catalogue, hint)
 
 
 class Plan(BaseModel):
@@ -326,7 +339,7 @@ class Plan(BaseModel):
         entry = arm.entries.get(name)
         if entry is None:
             return self.parts.programs[name].in_spec(name)
-        sent = FORMATS[entry.format].request(entry, "")
+        sent = self.parts.formats[entry.format].request(entry, "")
         return {
             "endpoint": self.endpoints[name],
             "path": sent.path,

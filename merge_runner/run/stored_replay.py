@@ -20,10 +20,9 @@ from typing import Any, cast
 import duckdb
 
 from merge_runner.audit.checks import Audit, Finding, audited_database, check_rest, check_sweep
-from merge_runner.config import ModelEntry
 from merge_runner.errors import CallFailed, MergeRunnerError, RecordingError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.formats import WireFormat
 from merge_runner.llm.http_outcome import RawReply, judge
 from merge_runner.records import (
     ANSWERS,
@@ -241,7 +240,8 @@ class StoredReplies:
         if name not in arm.entries:
             return None
         entry = arm.entries[name]
-        sent = FORMATS[entry.format].request(entry, "")
+        form = self.plan.parts.formats[entry.format]
+        sent = form.request(entry, "")
         try:
             request = make_request(
                 provider=entry.provider,
@@ -258,14 +258,14 @@ class StoredReplies:
             raise RecordingError(f"its request cannot be read: {exc}") from exc
         if request.key != key:
             raise RecordingError("its request and slot do not have the key")
-        attempts = tuple(_attempt(n, row, entry) for n, row in enumerate(rows, 1))
+        attempts = tuple(_attempt(n, row, form) for n, row in enumerate(rows, 1))
         if attempts[-1].outcome not in ANSWERS:
             message = attempts[-1].error or attempts[-1].outcome
             raise CallFailed(message, request, attempts, len(attempts))
         return CachedCall(request, attempts)
 
 
-def _attempt(number: int, row: Mapping[str, Any], entry: ModelEntry) -> Attempt:
+def _attempt(number: int, row: Mapping[str, Any], form: WireFormat) -> Attempt:
     """Read the reply of a row anew.
 
     A failed attempt is taken as it is stored: its outcome depends on headers, which are not. The
@@ -278,7 +278,7 @@ def _attempt(number: int, row: Mapping[str, Any], entry: ModelEntry) -> Attempt:
     names = ("outcome", "http_status", "model_served", "finish_reason", "error", "scripted")
     usage = Usage(*(row[each.name] for each in fields(Usage)))
     attempt = Attempt(number, **{name: row[name] for name in names}, usage=usage, reply=body)
-    outcome = judge(RawReply(attempt.http_status or 0, {}, body or ""), FORMATS[entry.format])
+    outcome = judge(RawReply(attempt.http_status or 0, {}, body or ""), form)
     if outcome.action != "accept" and attempt.outcome not in ANSWERS:
         return attempt
     reading = outcome.reading

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from importlib import import_module
 
@@ -73,6 +74,7 @@ def test_models_beside_a_study_may_speak_a_wire_format_of_its_plug_ins(plan_of, 
     named = 'models = ["talker-1"]\n[plugins]\nfiles = ["mine.py"]\n'
     plan = plan_of(named, plugin=how_to("add-a-wire-format"))
     assert plan.entries["talker-1"].format == "say"
+    assert {json.loads(text)["left"]["path"] for text in plan.specs().values()} == {"/say"}
 
 
 def test_a_paragraph_is_added_where_it_belongs(plan_of):
