@@ -15,7 +15,7 @@ from merge_runner_analysis.names import BASELINE
 TABLE = "verdicts"
 # Kinds of drivers: language models are in the headline, scripts that pose as one are not.
 HUMANS, LANGUAGE_MODEL, PROGRAM, MOCK = "humans", "language model", "program", "mock"
-# States. A trait is shown by its own test; the others need a difference whose interval excludes 0.
+# States. A trait is shown by its own test; the others need a difference with a corrected p < .05.
 SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike", "inconclusive"
 DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
 MOST_COLLISIONS = 25.0  # percent; with more of them collisions come first in a sentence
@@ -32,7 +32,7 @@ class Measure:
     difference, with the fields ``of`` (driver) and ``humans``, each a value with its interval, and
     ``decimals`` are those of its values there. ``says`` has by state the driver's part of a
     sentence, with the values of its row as fields, its ``rate`` and ``more`` or less. ``ends`` are
-    those of its axis. ``margin``: so far from the humans it still is alike.
+    those of its axis. ``margin``: so far from 0, where the humans are, it still is alike.
     """
 
     name: str
@@ -59,8 +59,7 @@ def _trait(does: str, does_not: str) -> dict[str, str]:
 
 
 MERGED = "status = 'finished' AND merged_first IS NOT NULL"
-# Those that are undecided count, too; what the first part names is a share with a numerator.
-ENDED = "(collided_boxes IS NOT NULL OR status <> 'failed')"
+DECIDED = "collided_boxes IS NOT NULL"
 WITH_GAP = "status = 'finished' AND gap_m IS NOT NULL"
 MEASURES = {
     measure.name: measure
@@ -93,8 +92,8 @@ MEASURES = {
             "Collisions by the humans' rule",
             "collisions",
             "% of trials",
-            ENDED,
-            "the difference excludes 0",
+            DECIDED,
+            "corrected p below .05",
             "collides in {of} % of trials, humans in {humans} %",
             (0.0, 30.0),
             {UNLIKE: "collides in {rate} % of trials"},
@@ -105,7 +104,7 @@ MEASURES = {
             "mean gap",
             "m",
             WITH_GAP,
-            "the difference excludes 0",
+            "corrected p below .05",
             "leaves a gap of {of} m, humans {humans} m",
             (0.0, 8.0),
             {UNLIKE: "leaves {estimate:.1f} m, humans {human:.1f} m"},
@@ -129,13 +128,14 @@ MEASURES = {
         Measure(
             "gap-velocity",
             "Relative velocity leaves the gap as it is (I4)",
-            "gap by relative velocity",
-            "m at 0.8 m/s",
+            "gap moved by relative velocity",
+            "m at most",
             WITH_GAP,
-            "HC3 errors: conditions that differ in it alone within 1 m, two one-sided tests; "
-            "unlike where the interval is beyond 1 m",
-            "changes its gap by {of} m at 0.8 m/s of relative velocity, humans by {humans} m",
-            (-3.0, 2.0),
+            "HC3 errors: largest difference of predicted gaps within 1 m, two one-sided tests at "
+            "5 %; unlike: corrected p of being within below .05",
+            "moves its gap by up to {of} m by relative velocity alone, humans by up to {humans} m",
+            (0.0, 3.0),
+            {UNLIKE: "moves its gap by {estimate:.1f} m by relative velocity alone"},
             margin=1.0,
         ),
         Measure(
@@ -144,7 +144,8 @@ MEASURES = {
             "accelerations held",
             "SD from humans",
             "status = 'finished'",
-            "the interval within 0.5 SD of the humans, or beyond it",
+            "within 0.5 SD, two one-sided tests at 5 %; unlike: corrected p of being within below "
+            ".05",
             "holds its accelerations {of} human SD more than humans do",
             (-2.0, 3.0),
             {UNLIKE: "holds accelerations {more}"},
@@ -188,10 +189,10 @@ def sentence(verdicts: Mapping[str, Values]) -> str:
     parts = {name: _part(values) for name, values in verdicts.items()}
     if state.get("headway") == state.get("velocity") == SHOWN:
         parts |= {"headway": "goes first as humans do", "velocity": ""}
-    if _least_percent(verdicts["collisions"]) > MOST_COLLISIONS:
+    if _percent(verdicts["collisions"], verdicts["collisions"].get("k") or 0) > MOST_COLLISIONS:
         parts = {"collisions": parts["collisions"], **parts}
     unclear = [
-        MEASURES[name].label
+        MEASURES[name].label + _between(verdicts[name])
         for name in ("headway", "velocity", "collisions", "gap")
         if state.get(name) == OPEN
     ]
@@ -207,17 +208,24 @@ def _part(values: Values) -> str:
     return says.format(**values, more=more, rate=share(values, 0))
 
 
-def _least_percent(collisions: Values) -> float:
-    return 100 * (collisions.get("k") or 0) / collisions["n"] if collisions["n"] else 0.0
+def _between(values: Values) -> str:
+    """Of a rate with undecided trials, what it lies between."""
+    return f" ({share(values, 0)} % of trials)" if values.get("undecided") else ""
+
+
+def _percent(collisions: Values, count: int) -> float:
+    """So many trials in percent of all that ended, with the undecided ones."""
+    ended = (collisions["n"] or 0) + (collisions.get("undecided") or 0)
+    return 100 * count / ended if ended else 0.0
 
 
 def share(collisions: Values, decimals: int = 1) -> str:
     """A rate in percent, or ``14 to 68`` where trials are undecided."""
-    least = _least_percent(collisions)
-    if not collisions.get("undecided"):
-        return number(least, decimals)
-    most = least + 100 * collisions["undecided"] / collisions["n"]
-    return f"{number(least, decimals)} to {number(most, decimals)}"
+    k, undecided = collisions.get("k") or 0, collisions.get("undecided") or 0
+    least = number(_percent(collisions, k), decimals)
+    if not undecided:
+        return least
+    return f"{least} to {number(_percent(collisions, k + undecided), decimals)}"
 
 
 def differs(values: Values) -> bool:
@@ -228,7 +236,8 @@ def differs(values: Values) -> bool:
 def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
     """The answer of language models in two parts: the claim, and what it rests on most.
 
-    ``drivers`` are those that are judged, by name: no mock model and no program.
+    ``drivers`` are those that are judged, by name: no mock model and no program. Of several of them
+    it says how many comparisons it rests on.
     """
     if not drivers:
         return "No language model is judged here.", ""
@@ -238,26 +247,31 @@ def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
     unlike = [
         (name, values) for name, of in drivers.items() for values in filter(differs, of.values())
     ]
+    count = _count(drivers, len(unlike)) if len(drivers) > 1 else ""
     if not unlike:
-        return f"No difference from humans is shown for {joined(compared)}.", ""
-    # The surest one by its corrected p; that of I5 has none.
-    name, values = min(
-        unlike, key=lambda one: 1.0 if one[1].get("p_holm") is None else one[1]["p_holm"]
-    )
+        return f"No difference from humans is shown for {joined(compared)}.", count
+    name, values = min(unlike, key=lambda one: one[1]["p_holm"])  # the surest one
     if others := [name for name in compared if name not in dict(unlike)]:
         claim = f"No difference from humans is shown for {joined(others)};"
-        return claim, f"but {name} {told(values)}."
+        return claim, f"but {name} {told(values)}. {count}"
     if len(drivers) == 1:
         return f"{name} does not drive like humans:", f"it {told(values)}."
-    return "No language model here drives like humans:", f"{name} {told(values)}."
+    return "No language model here drives like humans:", f"{name} {told(values)}. {count}"
+
+
+def _count(drivers: Mapping[str, Mapping[str, Values]], unlike: int) -> str:
+    """How many comparisons a headline rests on, and how they are corrected."""
+    tested = sum(v.get("p_holm") is not None for of in drivers.values() for v in of.values())
+    return (
+        f"{unlike} of {tested} comparisons with humans show a difference at 5 %, corrected by Holm "
+        f"within each of {len(drivers)} models."
+    )
 
 
 def told(values: Values) -> str:
     """The sentence of one difference: ``collides in 68 % [47, 84] of trials, ... (n = 22)``."""
     measure = MEASURES[str(values["measure"])]
     of = with_interval(values["estimate"], values["ci"], measure.decimals)
-    if values.get("undecided"):
-        of = share(values)
     humans = with_interval(values["human"], values["human_ci"], measure.decimals)
     return f"{measure.told.format(of=of, humans=humans)} (n = {values['n']})"
 

@@ -274,8 +274,8 @@ class Study:
         if not self.without_fallbacks:
             return group
         calls = of_trials(self.calls, group.trials)
-        fallen = calls.loc[calls["fallback"] > 0, "trial_id"]
-        kept = group.part(lambda trials: ~trials["trial_id"].isin(fallen))
+        fallen = _keys(calls[calls["fallback"] > 0])
+        kept = group.part(lambda trials: pd.Series(~_keys(trials).isin(fallen), trials.index))
         if kept.trials.empty:
             return replace(group, unjudged=group.unjudged or "every trial had a fallback")
         return kept
@@ -352,6 +352,11 @@ class Study:
     def calls(self) -> pd.DataFrame:
         """What became of the calls, by trial."""
         return load_calls(self.db)
+
+
+def _keys(trials: pd.DataFrame) -> pd.MultiIndex:
+    """The key of each trial: one id may stand under several specs."""
+    return pd.MultiIndex.from_frame(trials[KEYS])
 
 
 def of_trials(frame: pd.DataFrame, trials: pd.DataFrame) -> pd.DataFrame:

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from merge_runner_analysis.data.load import KEYS
 from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study
@@ -98,15 +99,16 @@ def _judged(fit: Regression, name: str, *, robust: bool) -> Verdict:
 @remembered
 def gains(study: Study, group: Group) -> pd.DataFrame:
     """One row a finished trial: condition, pair, ``steady`` (nobody acted), and ``gain`` or NaN."""
-    trials = group.finished[["trial_id", "condition", "pair"]]
-    by_trial = study.profiles_of(group).groupby("trial_id")
+    trials = group.finished[[*KEYS, "condition", "pair"]]
+    by_trial = study.profiles_of(group).groupby(KEYS, as_index=False)
     found = by_trial.agg(steady=("steady", "all"), gain=("gain", "mean"))
-    return trials.merge(found, left_on="trial_id", right_index=True)
+    return trials.merge(found, on=KEYS)
 
 
 def mean_gain(study: Study, group: Group) -> Estimate:
     """The mean gain of a group's trials; that of humans over the means of their pairs."""
-    return mean_over(gains(study, group).dropna(subset="gain"), "gain")
+    found = gains(study, group).dropna(subset="gain")
+    return replace(mean(_independent(found, "gain")), n=len(found))
 
 
 def less_humans(study: Study, group: Group) -> Estimate | None:
@@ -135,17 +137,16 @@ def compared(driver: pd.DataFrame, human: pd.DataFrame) -> Estimate:
     if own.value is None or own.se is None or pairs.se is None:
         return Estimate(own.value, None, None, own.n)
     found = difference(own, replace(pairs, value=0.0))
-    low, high = (found and found.bounds()) or (own.value, own.value)
-    return replace(own, low=low, high=high)
-
-
-def mean_over(trials: pd.DataFrame, column: str) -> Estimate:
-    """A mean of trials, or of the means of human pairs, whose trials hang together."""
-    return replace(mean(_independent(trials, column)), n=len(trials))
+    if found is None or found.se is None:  # nothing varies: it is sure
+        return Estimate(own.value, own.value, own.value, own.n, 0.0)
+    return Estimate(own.value, found.low, found.high, own.n, found.se, found.freedom)
 
 
 def _independent(trials: pd.DataFrame, column: str) -> pd.Series:
-    return trials.groupby(trials["pair"].fillna(trials["trial_id"]))[column].mean()
+    """Values of trials, or means of human pairs, whose trials hang together."""
+    paired = trials["pair"].notna()
+    means = trials[paired].groupby("pair")[column].mean()
+    return pd.concat([trials.loc[~paired, column], means])
 
 
 def piecewise_constant(study: Study, group: Group) -> Verdict:

@@ -12,13 +12,17 @@ from math import hypot, inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import optimize, special, stats
 
 from merge_runner_analysis.metrics import Bounded
 
 LEVEL = 0.95
 POWER = 0.8
 ROUNDING = 1e-12
+TINY = 1e-300
+# Points and weights of Gauss and Legendre's rule on 0 to 1, for chances.
+_POINTS, _SHARES = np.polynomial.legendre.leggauss(200)
+NODES, WEIGHTS = (1 + _POINTS) / 2, _SHARES / 2
 Z = float(stats.norm.ppf((1 + LEVEL) / 2))
 
 
@@ -87,6 +91,50 @@ def newcombe(rates: Sequence[tuple[float, float]], z: float = Z) -> tuple[float,
     return value - below, value + above
 
 
+def melded(
+    one: tuple[float, float], other: tuple[float, float], p: float, level: float = LEVEL
+) -> tuple[float, float]:
+    """Return the interval of one rate less another, (rate, trials) each, that agrees with ``p``.
+
+    The melded interval of Fay, Proschan and Brittain (2015) excludes 0 where a one-sided exact test
+    of Fisher is below half of what the interval leaves out. A two-sided ``p`` is seldom twice the
+    smaller side: where both would disagree, the end next to 0 leaves out the share of that side in
+    ``p``, so that the interval excludes 0 exactly where ``p`` is below 1 - ``level``.
+    """
+    alpha = 1 - level
+    tails = [_at_most(one, other, 0.0), _at_most(other, one, 0.0)]
+    near = min(tails)
+    wanted = min(alpha * near / max(p, TINY), (1 + near) / 2)
+    part = max(alpha / 2, wanted) if p < alpha else min(alpha / 2, wanted)
+    parts = [part if place == tails.index(near) else alpha / 2 for place in (0, 1)]
+    return _lower(one, other, parts[0]), -_lower(other, one, parts[1])
+
+
+def _lower(one: tuple[float, float], other: tuple[float, float], part: float) -> float:
+    """The lower end of the melded interval of a difference, which leaves this part out."""
+    if _at_most(one, other, -1.0) >= part:
+        return -1.0
+    return float(optimize.brentq(lambda at: _at_most(one, other, at) - part, -1.0, 1.0))
+
+
+def _at_most(one: tuple[float, float], other: tuple[float, float], at: float) -> float:
+    """The chance that one rate at its lowest exceeds another at its highest by at most this.
+
+    They are the lower and the upper beta distribution of Clopper and Pearson (1934). At 0 it is the
+    p of Fisher's exact test that the first rate is not the larger.
+    """
+    (rate, n), (share, m) = one, other
+    k, missed = rate * n, m - share * m
+    if k < ROUNDING:
+        return 1.0 if missed < ROUNDING else 1 - float(_beta(share * m + 1, missed, -at))
+    most = special.betaincinv(share * m + 1, missed, NODES) if missed > ROUNDING else 1 + 0 * NODES
+    return float(WEIGHTS @ _beta(k, n - k + 1, most + at))
+
+
+def _beta(a: float, b: float, x: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(special.betainc(a, b, np.clip(x, 0.0, 1.0)))
+
+
 def mean(values: Sequence[float] | NDArray[np.float64]) -> Estimate:
     """A mean of numbers with its interval of Student's t; none for fewer than two of them."""
     sample = np.asarray(values, dtype=float)
@@ -102,9 +150,11 @@ def estimate(value: float, se: float, freedom: float, n: int) -> Estimate:
     return Estimate(value, *interval(value, se, freedom), n, se, freedom)
 
 
-def interval(value: float, se: float, freedom: float = inf) -> tuple[float, float]:
-    """The 95 % interval of an estimate with this standard error."""
-    half = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) * se
+def interval(
+    value: float, se: float, freedom: float = inf, level: float = LEVEL
+) -> tuple[float, float]:
+    """The interval of an estimate with this standard error, by Student's t."""
+    half = float(stats.t.ppf((1 + level) / 2, freedom)) * se
     return value - half, value + half
 
 

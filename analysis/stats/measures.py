@@ -10,6 +10,7 @@ from merge_runner_analysis.data.reference_data import citation, published
 from merge_runner_analysis.data.study import Group
 from merge_runner_analysis.metrics import BOXES, JUDGED, HumanReference, Metric
 from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, Estimate, mean, wilson
+from merge_runner_analysis.stats.intervals import estimate as interval_of
 
 PAPER = "paper_ablation_quantitative"
 
@@ -36,9 +37,9 @@ def estimate(group: Group, metric: Metric) -> Estimate:
     Where trials end undecided a rate has no value, and the interval is that of both worst cases
     (Manski 1989): from none of them to all of them.
     """
-    sample = values(group, metric).to_numpy(float)
     if metric.estimator == "mean":
-        return mean(sample)
+        return mean_of(trials_of(group, metric), metric.column)
+    sample = values(group, metric).to_numpy(float)
     if metric.estimator == "median":
         return median(sample)
     k, cut_off = float(sample.sum()), undecided(group, metric)
@@ -46,6 +47,34 @@ def estimate(group: Group, metric: Metric) -> Estimate:
         return NOTHING
     low, high = wilson(k / every, every)[0], wilson((k + cut_off) / every, every)[1]
     return Estimate(None if cut_off else 100 * k / every, 100 * low, 100 * high, len(sample))
+
+
+def mean_of(trials: pd.DataFrame, column: str, shares: pd.Series | None = None) -> Estimate:
+    """The mean of trials with its interval; with ``shares`` conditions weigh so.
+
+    Trials of human pairs hang together: there the error is a jackknife over the pairs, with t on a
+    degree of freedom less than there are.
+    """
+    trials = trials.dropna(subset=[column])
+    pairs = trials["pair"].dropna().unique() if "pair" in trials else ()
+    if not len(pairs):
+        return mean(trials[column].to_numpy(float))
+    if shares is None:
+        shares = trials["condition"].value_counts()
+    whole = _weighted_mean(trials, column, shares)
+    if len(pairs) < 2:
+        return Estimate(whole, None, None, len(trials))
+    parts = [_weighted_mean(trials[trials["pair"] != pair], column, shares) for pair in pairs]
+    freedom = len(pairs) - 1
+    se = float(((np.array(parts) - whole) ** 2).sum() * freedom / len(pairs)) ** 0.5
+    return interval_of(whole, se, freedom, len(trials))
+
+
+def _weighted_mean(trials: pd.DataFrame, column: str, shares: pd.Series) -> float:
+    """The mean over conditions, which weigh by these shares as far as they have trials."""
+    means = trials.groupby("condition")[column].mean()
+    weights = shares.reindex(means.index, fill_value=0)
+    return float(means @ weights / weights.sum())
 
 
 def median(sample: np.ndarray) -> Estimate:

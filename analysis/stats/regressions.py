@@ -8,7 +8,7 @@ separation (Firth 1993; Heinze and Schemper 2002).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, sqrt
 
 import numpy as np
@@ -134,11 +134,12 @@ class Fit:
         """
         lost = stats.chi2.ppf(level, 1) / 2
         near = self.b  # the last profile: far out the other terms are far from the estimate, too
-        aside = self.b + self.errors  # of symmetric data the best profile may lie beside
+        # Of symmetric data the best profile may lie on either side.
+        aside = self.b + self.errors, self.b - self.errors
 
         def excess(value: float) -> float:
             nonlocal near
-            fits = [self.counts.fit(term, value, start) for start in (near, aside)]
+            fits = [self.counts.fit(term, value, start) for start in (near, *aside)]
             profile = max(filter(None, fits), key=lambda each: each.best, default=None)
             if profile is None:
                 return np.nan
@@ -172,7 +173,8 @@ class Regression:
     """A fit to ``n`` trials; ``problem`` says why there are no terms, and is else empty.
 
     ``freedom`` is the residual degrees of freedom of a linear fit, infinite where tests are normal;
-    ``remark`` is what to know of a fit that has terms. Of a gap alone: ``equivalence_p``, that
+    ``remark`` is what to know of a fit that has terms. Of a gap alone: the ``covariance`` of its
+    terms, (terms, terms); ``equivalence_p``, that
     relative velocity alone moves it by less than GAP_MARGIN_M, and ``velocity_p``, that no term
     with relative velocity has an effect (an F test of all of them). These are None where no two
     played conditions differ in relative velocity alone, and where the errors of the terms are not
@@ -186,19 +188,80 @@ class Regression:
     remark: str = ""
     equivalence_p: float | None = None
     velocity_p: float | None = None
+    covariance: Array | None = field(default=None, compare=False)
     profile: Fit | None = field(default=None, compare=False)
 
-    def difference(self, term: str) -> intervals.Difference | None:
-        """Return a term of Firth's fit against 0, with its test and the interval that agrees.
+    def interval(self, term: str, level: float) -> tuple[float, float] | None:
+        """Return the profile interval of a term of Firth's fit, which agrees with its test.
 
         None where there is no fit, or its profile does not converge.
         """
         if self.profile is None:
             return None
-        found = self.terms[term]
-        ends = self.profile.interval([*self.terms].index(term), intervals.LEVEL)
-        least = intervals.detectable(found.se)
-        return intervals.Difference(found.b, *ends, found.p, least, se=found.se) if ends else None
+        return self.profile.interval([*self.terms].index(term), level)
+
+    def moved(self, conditions: pd.DataFrame) -> Moved | None:
+        """Return how far relative velocity alone moves the gap between any of these conditions.
+
+        None where no two of them differ in relative velocity alone, and where there is no fit.
+        """
+        headway, velocity = conditions[CONDITION].drop_duplicates().to_numpy(float).T
+        design = gap_design(headway, velocity)
+        more, less = np.nonzero((headway[:, None] == headway) & (velocity[:, None] > velocity))
+        if self.covariance is None or not len(more):
+            return None
+        apart = design[more] - design[less]
+        variances = ((apart @ self.covariance) * apart).sum(axis=1)
+        b = np.array([term.b for term in self.terms.values()])
+        rank = int(np.linalg.matrix_rank(apart))
+        # Rounding leaves variances just below 0 where nothing varies.
+        errors = np.sqrt(np.maximum(variances, 0.0))
+        return Moved(np.abs(apart @ b), errors, self.freedom, rank)
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """The ``sizes`` of differences of predicted gaps with their ``errors``, in m, (pairs,).
+
+    They are combinations of ``rank`` coefficients, with so many degrees of ``freedom``.
+    """
+
+    sizes: Array
+    errors: Array
+    freedom: float
+    rank: int
+
+    @property
+    def most(self) -> float:
+        """The largest difference in m."""
+        return float(self.sizes.max())
+
+    def interval(self, level: float) -> tuple[float, float]:
+        """Return an interval of the largest difference in m.
+
+        It ends where an intersection-union test of all of them does (Berger 1982), as the largest
+        is below a bound only if all are, and begins where one of them is above in simultaneous
+        intervals (Scheffé 1953), as any of them may be the largest.
+        """
+        together = sqrt(self.rank * float(stats.f.ppf(level, self.rank, self.freedom)))
+        alone = float(stats.t.ppf((1 + level) / 2, self.freedom))
+        low = float((self.sizes - together * self.errors).max())
+        return max(0.0, low), float((self.sizes + alone * self.errors).max())
+
+    @property
+    def within_p(self) -> float:
+        """The p-value that all are below the margin: the largest of two one-sided tests each."""
+        each = zip(self.sizes, self.errors, strict=True)
+        return max(equivalence_p(float(b), float(se), self.freedom) for b, se in each)
+
+    @property
+    def beyond_p(self) -> float:
+        """The p-value that one is above the margin; the interval of 1 - p begins at the margin."""
+        above = self.sizes > GAP_MARGIN_M
+        with np.errstate(divide="ignore"):
+            ratio = (self.sizes[above] - GAP_MARGIN_M) / self.errors[above]
+        p = stats.f.sf(ratio**2 / self.rank, self.rank, self.freedom)
+        return float(p.min(initial=1.0))
 
 
 def who_first_data(trials: pd.DataFrame) -> tuple[Array, Array]:
@@ -292,32 +355,14 @@ def gap_ols(trials: pd.DataFrame, measure: str = "gap_m", *, robust: bool = Fals
     covariance = np.asarray(fit.cov_params())
     with_velocity = np.eye(len(GAP_TERMS))[2:]
     told_apart = np.linalg.matrix_rank(covariance[2:, 2:]) == len(with_velocity)
-    return Regression(
-        len(gap),
-        _terms(GAP_TERMS, fit.params, fit.bse, freedom),
-        freedom=freedom,
-        equivalence_p=_velocity_alone(chosen, fit.params, covariance, freedom),
+    terms = _terms(GAP_TERMS, fit.params, fit.bse, freedom)
+    found = Regression(len(gap), terms, freedom=freedom, covariance=covariance)
+    moved = found.moved(chosen)
+    return replace(
+        found,
+        equivalence_p=moved.within_p if moved else None,
         velocity_p=float(fit.f_test(with_velocity).pvalue) if told_apart else None,
     )
-
-
-def _velocity_alone(
-    trials: pd.DataFrame, b: Array, covariance: Array, freedom: int
-) -> float | None:
-    """The p-value that relative velocity alone moves no predicted gap by the margin.
-
-    That of an intersection-union test (Berger 1982), the largest over all pairs of played
-    conditions that differ in relative velocity alone; None where there is no such pair.
-    """
-    headway, velocity = trials[CONDITION].drop_duplicates().to_numpy(float).T
-    design = gap_design(headway, velocity)
-    more, less = np.nonzero((headway[:, None] == headway) & (velocity[:, None] > velocity))
-    tests = [
-        # Rounding leaves variances just below 0 where nothing varies.
-        equivalence_p(float(row @ b), sqrt(max(float(row @ covariance @ row), 0.0)), freedom)
-        for row in design[more] - design[less]
-    ]
-    return max(tests, default=None)
 
 
 def by_pairs(
@@ -339,10 +384,11 @@ def by_pairs(
     # CV3: the squares of what each pair moves an estimate by, about the whole fit and not the mean.
     b = np.array([[term.b for term in fit.terms.values()] for fit in (whole, *parts.values())])
     freedom = len(pairs) - 1
-    se = np.sqrt(((b[1:] - b[0]) ** 2).sum(axis=0) * freedom / len(pairs))
-    terms = _terms([*whole.terms], b[0], se, freedom)
+    apart = b[1:] - b[0]
+    covariance = apart.T @ apart * freedom / len(pairs)
+    terms = _terms([*whole.terms], b[0], np.sqrt(np.diag(covariance)), freedom)
     remark = f"errors by jackknife over {len(pairs)} pairs"
-    return Regression(whole.n, terms, freedom=freedom, remark=remark)
+    return Regression(whole.n, terms, freedom=freedom, remark=remark, covariance=covariance)
 
 
 def _terms(names: Sequence[str], b: Array, se: Array, freedom: float = inf) -> dict[str, Term]:

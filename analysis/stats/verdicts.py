@@ -3,21 +3,34 @@
 - Who goes first: Firth's penalised logit of left-first on h and dv, finite also under separation,
   with profile likelihood intervals and likelihood-ratio tests (Heinze and Schemper 2002); of a
   difference one model of both, in which every term may differ.
-- Collisions: rates with Wilson's interval, the humans' with the weights of the driver's conditions.
-- The mean gap: Student's t over trials, the humans' over their nine pairs; Welch's test.
-- Slopes of the gap: least squares with HC3 errors, the humans' as published or by pairs.
+- Collisions: Fisher's exact test within conditions, with the melded interval that agrees with it.
+- The mean gap: Student's t over trials, the humans' over their nine pairs, in the conditions of the
+  driver's trials; Welch's test.
+- The slope of the gap on headway: least squares with HC3 errors, the humans' as published or by
+  pairs. I4: the largest difference of predicted gaps that relative velocity alone makes.
 - I5: how far accelerations are held, in human standard deviations (see ``likeness``).
 
-A difference of rates has Newcombe's interval (1998), and its p is the level at which that interval
-leaves 0 out.
+The p of a driver's measures are corrected together by Holm (1979), and a driver differs in those
+with a corrected p below 5 %. The interval that such a state rests on has the level at which Holm
+tested it, so that both agree.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import PAIRS, published
+from merge_runner_analysis.data.reference_data import (
+    HUMAN_GAP_SD_M,
+    PAIRS,
+    human_outcomes,
+    published,
+)
 from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.metrics import BOXES, GAP
@@ -25,28 +38,34 @@ from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.stats.contrasts import (
     corrected,
     detectable_rate,
-    difference_of_rates,
+    shared_cells,
     weighted,
 )
 from merge_runner_analysis.stats.indicators import (
+    ALPHA,
+    NONE_APART,
     TESTED,
-    Verdict,
     fits,
     less_humans,
-    mean_over,
-    score,
+    verdicts,
 )
-from merge_runner_analysis.stats.intervals import NOTHING, Difference, Estimate, wilson
+from merge_runner_analysis.stats.intervals import LEVEL, NOTHING, Estimate, melded, wilson
 from merge_runner_analysis.stats.measures import (
     counts,
     estimate,
+    mean_of,
     undecided,
     undecided_note,
 )
 from merge_runner_analysis.stats.regressions import (
+    CONDITION,
+    GAP_TERMS,
     MIN_PAIRS,
+    Array,
     Regression,
+    Term,
     by_pairs,
+    gap_design,
     gap_ols,
     who_first_firth,
 )
@@ -63,9 +82,11 @@ from merge_runner_analysis.verdict_words import (
 # By measure: the indicator that tests it.
 SLOPES = {"headway": "I1", "velocity": "I2", "gap-headway": "I3", "gap-velocity": "I4"}
 WHO_FIRST = ("headway", "velocity")
-# Relative velocities of the conditions are 0 or so many m/s: what it does to the gap there.
-VELOCITY_MPS = 0.8
 PUBLISHED = "humans as published"
+# The level of an interval that lies within a margin where two one-sided tests at 5 % say so.
+WITHIN_LEVEL = 1 - 2 * ALPHA
+
+Ends = tuple[float, float] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,195 +105,341 @@ class Known:
 
 
 @dataclass(frozen=True, slots=True)
+class Tested:
+    """How a driver's ``own`` value is tested: against the ``human`` one, or against a margin.
+
+    ``interval`` gives by its level the ends that agree with ``p``: of the difference, or of a value
+    with a margin, beyond which it then lies. ``within``: a value with a margin is shown to be
+    inside; ``trait``: the one that is tested is shown, and None for what is no trait.
+    """
+
+    own: float
+    human: float
+    p: float
+    interval: Callable[[float], Ends]
+    detectable: float | None = None
+    within: bool = False
+    trait: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Comparison:
-    """A driver beside the humans in one measure; ``p_holm`` is corrected over its measures."""
+    """A driver beside the humans in one measure.
+
+    ``difference`` is driver minus humans with its ``interval``, and is None for a measure with a
+    margin. ``p`` is corrected over the driver's measures as ``p_holm``. ``level`` is that of the
+    interval that the state rests on: of the difference, or of the estimate beside a margin.
+    """
 
     measure: Measure
     own: Known
     human: Known
-    difference: Difference | None
     state: str
     note: str
+    difference: float | None = None
+    interval: Ends = None
+    level: float | None = None
+    p: float | None = None
     p_holm: float | None = None
+    detectable: float | None = None
 
 
 @remembered
 def compared(study: Study, group: Group) -> tuple[Comparison, ...]:
     """Compare a driver with the humans by every measure."""
-    # Conditions that no human drove would pass for another behaviour.
-    alike = group
-    if not group.trials["condition"].isin(HUMAN_CONDITIONS).all():
-        alike = group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
-    robust = score(study, alike).robust
-    found = [
-        _compared(study, alike, measure, robust.get(SLOPES.get(measure.name, "")))
-        for measure in MEASURES.values()
-    ]
-    holm = iter(corrected([one.difference.p for one in found if one.difference]))
-    return tuple(replace(one, p_holm=next(holm) if one.difference else None) for one in found)
+    alike = in_human_conditions(group)
+    likeness = less_humans(study, alike) if len(alike.finished) else None
+    tests = tests_of(alike, study.human, likeness)
+    states, p_holm = decided(tests)
+    levels = levels_of({name: test.p for name, test in tests.items()}, p_holm)
+    why = {
+        name: verdict.why
+        for name, indicator in SLOPES.items()
+        if (verdict := verdicts(fits(alike).firth, fits(alike).hc3, robust=True)[indicator]).why
+    }
+    found = []
+    for name, measure in MEASURES.items():
+        own, human = _own(study, alike, name, likeness), _human(study.human, alike, name)
+        test, state = tests.get(name), states.get(name, OPEN if own.undecided else "")
+        note = [own.problem, human.problem, "" if own.problem else why.get(name, "")]
+        level = WITHIN_LEVEL if test and test.within else levels.get(name)
+        one = Comparison(measure, own, human, state, "; ".join(filter(None, note)), level=level)
+        if test and level is not None:
+            ends = test.interval(level)
+            one = replace(one, p=test.p, p_holm=p_holm[name], detectable=test.detectable)
+            if measure.margin is None:
+                one = replace(one, difference=test.own - test.human, interval=ends)
+            elif ends:
+                at_level = replace(own.estimate, low=ends[0], high=ends[1])
+                one = replace(one, own=replace(own, estimate=at_level))
+        found.append(one)
+    return tuple(found)
 
 
 @remembered
 def of_humans(study: Study) -> dict[str, Known]:
     """The humans by measure, over all conditions."""
-    return {name: _human(study, study.human, name) for name in MEASURES}
+    return {name: _human(study.human, study.human, name) for name in MEASURES}
 
 
-def _compared(study: Study, group: Group, measure: Measure, verdict: Verdict | None) -> Comparison:
-    own, human = _own(study, group, measure.name), _human(study, group, measure.name)
-    if measure.name == "collisions":
-        difference = _of_rates(own, human)
-    elif measure.name in WHO_FIRST:
-        # One model of both, in which every term may differ.
-        less = who_first_firth(group.outcomes, less=study.human.outcomes)
-        difference = less.difference(TESTED[SLOPES[measure.name]][0])
-    else:
-        difference = intervals.difference(own.estimate, human.estimate)
-    state = _state(measure, own, human.estimate, difference, verdict)
-    why = verdict.why if verdict and verdict.passed is None and not own.problem else ""
-    note = "; ".join(filter(None, (own.problem, human.problem, why)))
-    return Comparison(measure, own, human, difference, state, note)
+def in_human_conditions(group: Group) -> Group:
+    """The group's trials in conditions that humans drove: others would pass for a difference."""
+    if group.trials["condition"].isin(HUMAN_CONDITIONS).all():
+        return group
+    return group.part(lambda trials: trials["condition"].isin(HUMAN_CONDITIONS))
 
 
-def _state(
-    measure: Measure,
-    own: Known,
-    human: Estimate,
-    difference: Difference | None,
-    verdict: Verdict | None,
-) -> str:
-    """The state of a measure, empty where it cannot be judged; see ``Measure.rule``."""
-    value, ends = own.estimate.value, own.estimate.bounds()
-    if ends is None or (value is None and not own.undecided):
-        return ""
+def tests_of(group: Group, human: Group, likeness: Estimate | None) -> dict[str, Tested]:
+    """The tests of a driver's measures; those that cannot be tested are missing."""
+    robust = verdicts(fits(group).firth, fits(group).hc3, robust=True)
+    found = {name: _who_first(group, human, name) for name in WHO_FIRST}
+    found["collisions"] = _rates(group, human)
+    found["gap"] = _means(_gap(group), human_gap(human, group))
+    found["gap-headway"] = _means(_headway(fits(group).hc3), _headway(human_fit(human)))
+    moved = fits(group).hc3.moved(group.trials)
+    if moved is not None:
+        found["gap-velocity"] = Tested(
+            moved.most, 0.0, moved.beyond_p, moved.interval, within=moved.within_p < ALPHA
+        )
+    if likeness is not None:
+        found["held"] = _held(likeness)
+    return {
+        name: replace(test, trait=robust[SLOPES[name]].passed) if name in SLOPES else test
+        for name, test in found.items()
+        if test is not None
+    }
+
+
+def decided(tests: Mapping[str, Tested]) -> tuple[dict[str, str], dict[str, float]]:
+    """The state of each measure that is tested, and its p as it is corrected over all of them."""
+    p_holm = dict(zip(tests, corrected([test.p for test in tests.values()]), strict=True))
+    return {
+        name: _state(MEASURES[name], test, p_holm[name]) for name, test in tests.items()
+    }, p_holm
+
+
+def levels_of(p: Mapping[str, float], p_holm: Mapping[str, float]) -> dict[str, float]:
+    """The levels of intervals that exclude no difference where the corrected p are below ALPHA.
+
+    Holm tests the smallest of m p-values at ALPHA / m, the next at ALPHA / (m - 1), and so on; all
+    from the first that fails are as at that step.
+    """
+    sure = sum(value < ALPHA for value in p_holm.values())
+    order = sorted(p, key=lambda name: p[name])
+    return {name: 1 - ALPHA / (len(order) - min(place, sure)) for place, name in enumerate(order)}
+
+
+def _state(measure: Measure, test: Tested, p_holm: float) -> str:
+    """The state of a measure; see ``Measure.rule``."""
+    differs = p_holm < ALPHA
     if measure.margin is not None:
-        low, high = ends
-        inside = verdict.passed if verdict else max(-low, high) < measure.margin
-        return SHOWN if inside else UNLIKE if max(low, -high) > measure.margin else OPEN
-    if difference is None or human.value is None or (verdict and verdict.passed is None):
-        return ""
-    low, high = difference.bounds() or ends
-    differs = not low <= 0 <= high
-    if verdict is None or not verdict.passed:
+        return SHOWN if test.within else UNLIKE if differs else OPEN
+    if not test.trait:
         return UNLIKE if differs else OPEN
-    weaker = abs(value or 0.0) < abs(human.value)
+    weaker = abs(test.own) < abs(test.human)
     return (WEAKER if weaker else STRONGER) if differs else SHOWN
 
 
-def _of_rates(own: Known, human: Known) -> Difference | None:
-    """How two rates differ, in percent.
-
-    With undecided trials it is that of both worst cases: the value nearer to 0, and the larger p.
-    """
-    n, humans = own.estimate.n, human.estimate
-    if own.k is None or humans.value is None or humans.weight is None:
+def _who_first(group: Group, human: Group, name: str) -> Tested | None:
+    """A slope of who goes first: a term of one model of both, in which every term may differ."""
+    term = TESTED[SLOPES[name]][0]
+    own, other = fits(group).firth.terms.get(term), fits(human).firth.terms.get(term)
+    less = _less_humans(group, human)
+    if own is None or other is None or term not in less.terms:
         return None
-    rate = humans.value / 100
-    cases = [
-        difference_of_rates([((own.k + more) / n, n), (rate, humans.weight)])
-        for more in (0, own.undecided)
-    ]
-    (low, _), (_, high) = (case.bounds(100) or (0.0, 0.0) for case in cases)
-    value = min((case.value for case in cases), key=abs)
-    least = detectable_rate(n, humans.n, rate)
-    p = max(case.p for case in cases)
-    return Difference(100 * value, low, high, p, None if least is None else 100 * least)
+    apart = less.terms[term]
+    least = intervals.detectable(apart.se)
+    return Tested(own.b, other.b, apart.p, partial(less.interval, term), least)
 
 
-def _own(study: Study, group: Group, name: str) -> Known:
-    """A driver's estimate, of its trials in the humans' conditions."""
+@remembered
+def _less_humans(group: Group, human: Group) -> Regression:
+    return who_first_firth(group.outcomes, less=human.outcomes)
+
+
+def _rates(group: Group, human: Group) -> Tested | None:
+    """Collisions in percent; None with undecided trials, whose rate has no value."""
+    cells = shared_cells(group.ended_outcomes, human.outcomes, BOXES.column)
+    if cells is None or undecided(group, BOXES):
+        return None
+    (k, n), humans = counts(group, BOXES), _standardised(human, group).estimate
+    assert humans.value is not None
+    assert humans.weight is not None
+    rates, p = ((k / n, n), (humans.value / 100, humans.weight)), cells.p
+
+    def interval(level: float) -> Ends:
+        low, high = melded(*rates, p, level)
+        return 100 * low, 100 * high
+
+    least = detectable_rate(n, humans.n, humans.value / 100)
+    least = None if least is None else 100 * least
+    return Tested(100 * k / n, humans.value, p, interval, least)
+
+
+def _means(own: Known, other: Known) -> Tested | None:
+    """Two estimates, by Welch's test."""
+    value, human = own.estimate.value, other.estimate.value
+    apart = intervals.difference(own.estimate, other.estimate)
+    if value is None or human is None or apart is None or apart.se is None:
+        return None
+    interval = partial(intervals.interval, apart.value, apart.se, apart.freedom)
+    return Tested(value, human, apart.p, interval, apart.detectable)
+
+
+def _held(likeness: Estimate) -> Tested | None:
+    """I5, against its margin."""
+    value, se, margin = likeness.value, likeness.se, MEASURES["held"].margin
+    if value is None or se is None or margin is None:
+        return None
+
+    def interval(level: float) -> tuple[float, float]:
+        return intervals.interval(value, se, likeness.freedom, level)
+
+    low, high = interval(WITHIN_LEVEL)
+    beyond = abs(value) - margin
+    p = 1.0
+    if beyond > 0:
+        p = intervals.two_sided_p(beyond / se, likeness.freedom) if se else 0.0
+    return Tested(value, 0.0, p, interval, within=max(-low, high) < margin)
+
+
+def _own(study: Study, group: Group, name: str, likeness: Estimate | None) -> Known:
+    """A driver's estimate."""
     if name == "collisions":
         return _collided(group)
     if name in WHO_FIRST:
         return _slope(group, name)
     if name == "gap":
-        return _gap(group, group)
-    if name != "held":
-        return _gap_slope(fits(group).hc3, name)
+        return _gap(group)
+    if name == "gap-headway":
+        return _headway(fits(group).hc3)
+    if name == "gap-velocity":
+        return _moved(fits(group).hc3, group)
     # I5: how far accelerations are held, less the humans, in human standard deviations.
-    likeness = less_humans(study, group) if len(group.finished) else None
     if likeness is not None and likeness.value is not None:
         return Known(likeness)
     why = "no trial acted" if study.calibrated else "too few human recordings are imported"
     return Known(replace(NOTHING, n=len(group.finished)), f"I5 is not compared: {why}")
 
 
-def _human(study: Study, group: Group, name: str) -> Known:
-    """The humans' estimate beside a group's: rates and means of the same conditions."""
-    human = study.human
+def _human(human: Group, group: Group, name: str) -> Known:
+    """The humans' estimate beside a group's, in the same conditions."""
     if name == "collisions":
         return _standardised(human, group)
     if name == "held":
         return Known(Estimate(0.0, None, None, len(human.finished)))
     if name in WHO_FIRST:
         return _slope(human, name)
-    if not human.measured or human.finished["pair"].nunique() < MIN_PAIRS:
-        return _published(group, name)
     if name == "gap":
-        return _gap(human, group)
-    return _gap_slope(by_pairs(gap_ols, human.trials, "gap_m"), name, "humans: ")
+        return human_gap(human, group)
+    fit = human_fit(human)
+    found = _headway(fit) if name == "gap-headway" else _moved(fit, group)
+    if found.problem:
+        return replace(found, problem=f"humans: {found.problem}")
+    return found if _imported(human) else replace(found, remark=PUBLISHED)
 
 
-def _gap(group: Group, like: Group) -> Known:
-    """The mean gap of a group in the conditions of another one."""
-    alike = group.finished["condition"].isin(like.trials["condition"])
-    found = mean_over(group.finished[alike].dropna(subset=[GAP.column]), GAP.column)
+def _imported(human: Group) -> bool:
+    """Whether so many pairs are imported that their gaps are known."""
+    return human.measured and human.finished["pair"].nunique() >= MIN_PAIRS
+
+
+def _gap(group: Group) -> Known:
+    """The mean gap of a driver."""
+    found = mean_of(group.finished, GAP.column)
     problem = "a single trial has no error" if found.n else "no trial finished with a gap"
     return Known(found, problem if found.se is None else "")
+
+
+def human_gap(human: Group, group: Group) -> Known:
+    """The humans' mean gap in the conditions of a group's trials with a gap, as these weigh.
+
+    The published mean is moved by what the published regression predicts for these conditions. It
+    has the spread of the nine pairs: of their random intercepts, which are shrunken, so that it is
+    rather too small.
+    """
+    gaps = group.finished[group.finished[GAP.column].notna()] if group.measured else None
+    if _imported(human):
+        shares = None if gaps is None else gaps["condition"].value_counts()
+        there = human.finished.loc[human.finished[GAP.column].notna(), "condition"]
+        if shares is not None and (lacking := {*shares.index} - {*there}):
+            problem = f"humans: no gap in {len(lacking)} of its conditions"
+            return Known(replace(NOTHING, n=len(there)), problem)
+        if shares is not None and not len(shares):
+            shares = None
+        within = there if shares is None else there[there.isin(shares.index)]
+        trials = human.finished.loc[within.index]
+        return Known(mean_of(trials, GAP.column, None if group is human else shares))
+    row = published("paper_ablation_quantitative").query("driver == 'human'").iloc[0]
+    fit, outcomes = human_fit(human), human_outcomes().query("status == 'finished'")
+    moved = np.zeros(len(GAP_TERMS))
+    if gaps is not None and len(gaps):
+        moved = _mean_design(gaps) - _mean_design(outcomes)
+    assert fit.covariance is not None
+    spread = published("human_gap_intercepts")["intercept_m"].std() / len(PAIRS) ** 0.5
+    se = float(spread**2 + moved @ fit.covariance @ moved) ** 0.5
+    value = float(row["gap_m"]) + float(moved @ [term.b for term in fit.terms.values()])
+    return Known(intervals.estimate(value, se, len(PAIRS) - 1, fit.n), remark=PUBLISHED)
+
+
+def _mean_design(trials: pd.DataFrame) -> Array:
+    return np.asarray(gap_design(*trials[CONDITION].to_numpy(float).T).mean(axis=0))
+
+
+@remembered
+def human_fit(human: Group) -> Regression:
+    """The humans' regression of the gap: by pairs, or as published.
+
+    The errors that are published follow from the published outcomes and one standard deviation of
+    the gaps about their regression; so do the covariances that are not.
+    """
+    if _imported(human):
+        return by_pairs(gap_ols, human.trials, "gap_m")
+    rows = published("paper_gap").query("driver == 'human'").set_index("term")
+    finished = human_outcomes().query("status == 'finished'")
+    design = gap_design(*finished[CONDITION].to_numpy(float).T)
+    covariance = HUMAN_GAP_SD_M**2 * np.asarray(np.linalg.inv(design.T @ design))
+    terms = {
+        name: Term(float(rows.at[name, "b"]), float(rows.at[name, "se"]), None, np.nan)
+        for name in GAP_TERMS
+    }
+    n = int(rows["n"].iloc[0])
+    return Regression(n, terms, freedom=n - len(GAP_TERMS), covariance=covariance)
 
 
 @remembered
 def _slope(group: Group, name: str) -> Known:
     """A slope of who goes first by Firth's fit."""
-    fit = fits(group).firth
-    found = fit.difference(TESTED[SLOPES[name]][0])
-    if found is None:
+    fit, term = fits(group).firth, TESTED[SLOPES[name]][0]
+    ends = fit.interval(term, LEVEL)
+    if ends is None:
         problem = fit.problem or "no profile of Firth's likelihood converges"
         return Known(replace(NOTHING, n=fit.n), problem)
-    return Known(Estimate(found.value, found.low, found.high, fit.n, found.se))
+    return Known(Estimate(fit.terms[term].b, *ends, fit.n, fit.terms[term].se))
 
 
-def _gap_slope(fit: Regression, name: str, whose: str = "") -> Known:
-    """A slope of the gap, on relative velocity what that of the conditions does."""
+def _headway(fit: Regression) -> Known:
+    """The slope of the gap on headway."""
     if fit.problem:
-        return Known(replace(NOTHING, n=fit.n), whose + fit.problem)
-    term = fit.terms[TESTED[SLOPES[name]][0]]
-    return Known(_at_its_velocity(name, term.b, term.se, fit.freedom, fit.n))
+        return Known(replace(NOTHING, n=fit.n), fit.problem)
+    term = fit.terms[TESTED["I3"][0]]
+    return Known(intervals.estimate(term.b, term.se, fit.freedom, fit.n))
 
 
-def _at_its_velocity(name: str, b: float, se: float, freedom: float, n: int) -> Estimate:
-    factor = VELOCITY_MPS if name == "gap-velocity" else 1.0
-    return intervals.estimate(factor * b, factor * se, freedom, n)
-
-
-def _published(group: Group, name: str) -> Known:
-    """The published gap: its regression, or its mean over all conditions.
-
-    The mean has the spread of the nine pairs: of their random intercepts, which are shrunken, so
-    that it is rather too small.
-    """
-    rows = published("paper_gap").query("driver == 'human'")
-    n = int(rows["n"].iloc[0])
-    if name != "gap":
-        row = rows.set_index("term").loc[TESTED[SLOPES[name]][0]]
-        b, se = float(row["b"]), float(row["se"])
-        return Known(_at_its_velocity(name, b, se, n - len(rows), n), remark=PUBLISHED)
-    if {*HUMAN_CONDITIONS} - {*group.trials["condition"]}:
-        problem = "the published human gap is that of all 11 conditions"
-        return Known(replace(NOTHING, n=n), problem)
-    mean = published("paper_ablation_quantitative").query("driver == 'human'")["gap_m"].iloc[0]
-    se = published("human_gap_intercepts")["intercept_m"].std() / len(PAIRS) ** 0.5
-    found = intervals.estimate(float(mean), float(se), len(PAIRS) - 1, n)
-    return Known(found, remark=PUBLISHED)
+def _moved(fit: Regression, group: Group) -> Known:
+    """The largest difference of gaps that relative velocity alone makes in a group's conditions."""
+    moved = fit.moved(group.trials)
+    if moved is None:
+        return Known(replace(NOTHING, n=fit.n), fit.problem or NONE_APART)
+    return Known(Estimate(moved.most, *moved.interval(LEVEL), fit.n))
 
 
 def _collided(group: Group) -> Known:
     """The share of ended trials with a collision by the humans' rule, in percent."""
-    (k, decided), cut_off = counts(group, BOXES), undecided(group, BOXES)
-    if not (n := decided + cut_off):
+    (k, n), cut_off = counts(group, BOXES), undecided(group, BOXES)
+    if not n + cut_off:
         return Known(NOTHING, f"no trial ended: {group.left_out}")
-    found = replace(estimate(group, BOXES), n=n, weight=n)
-    return Known(found, undecided_note(group, BOXES), k=k, undecided=cut_off)
+    return Known(estimate(group, BOXES), undecided_note(group, BOXES), k=k, undecided=cut_off)
 
 
 def _standardised(human: Group, group: Group) -> Known:

@@ -48,12 +48,13 @@ VERDICT_COLUMNS = (
     Optional("k", "k", "count", 0, "trials that collided", "collided_boxes"),
     Optional("undecided", "undecided", "count", 0, "ended by another rule"),
     Column("estimate", "estimate", "number", 2, "in the unit of the measure"),
-    interval("ci", "of the same model"),
+    Optional("ci", "CI", "interval", 2, "95 %; with a margin (I4, I5) at the level of the row"),
     Optional("human", "humans", "number", 2, "in the same conditions"),
     interval("human_ci", "of the humans"),
     Optional("difference", "difference", "number", 2, "driver minus humans"),
-    interval("difference_ci", "of the difference"),
-    Optional("p", "p", "p", 3, "of no difference, by the same model"),
+    Optional("difference_ci", "CI", "interval", 2, "of the difference, at the level of the row"),
+    Optional("level", "level", "number", 1, "of the interval that the verdict rests on, in %"),
+    Optional("p", "p", "p", 3, "of no difference; with a margin (I4, I5) of being within it"),
     Optional("p_holm", "Holm", "p", 3, "corrected over the measures of the driver"),
     Optional("detectable", "detectable", "number", 2, "smallest difference found with power .8"),
     Optional("state", "verdict", meaning="what is shown"),
@@ -102,10 +103,14 @@ def verdicts(study: Study) -> Table:
                 f"{one.name}: {one.trait}, {one.unit}; verdict: {one.rule}"
                 for one in MEASURES.values()
             ),
-            "shown: as in humans; weaker, stronger: shown, and the interval of the difference "
-            "leaves 0 out; unlike: not shown, and it leaves 0 out; inconclusive: neither",
+            "shown: as in humans; weaker, stronger: shown, and the p that is corrected over the "
+            "driver's measures (Holm) is below .05; unlike: not shown, and it is below .05; "
+            "inconclusive: neither. The interval of the difference has the level at which Holm "
+            "tests it, so that it leaves 0 out where the verdict says so",
             "collisions: by the rule of the human experiment, outlines that overlap, looked for at "
-            "20 Hz; the humans' share weighs conditions as the driver's trials do",
+            "20 Hz; Fisher's exact test within conditions, and the melded interval that agrees "
+            "with it; without p where trials are undecided. The humans' share weighs conditions as "
+            "the driver's trials do, and so does their mean gap as its trials with a gap do",
             f"intervals take trials as independent. The {HUMAN_TRIALS} human trials are of nine "
             "pairs who differ, which only the mean gap and imported gaps allow for",
             *(
@@ -130,23 +135,21 @@ def _driver(group: Group, kind: str) -> dict[str, Value]:
 
 
 def _compared(group: Group, kind: str, found: Comparison) -> Row:
-    difference, measure = found.difference, found.measure
+    measure = found.measure
     values: dict[str, Value] = _driver(group, kind) | {
         "measure": measure.name,
         **_known(found.own),
         "human": found.human.estimate.value,
         "human_ci": found.human.estimate.bounds(),
+        "difference": found.difference,
+        "difference_ci": found.interval,
+        "level": None if found.level is None else 100 * found.level,
+        "p": found.p,
+        "p_holm": found.p_holm,
+        "detectable": found.detectable,
         "state": found.state or None,
         "rule": measure.rule,
     }
-    if difference is not None:
-        values |= {
-            "difference": difference.value,
-            "difference_ci": difference.bounds(),
-            "p": difference.p,
-            "p_holm": found.p_holm,
-            "detectable": difference.detectable,
-        }
     return Row(f"{group.id}/{measure.name}", (group.id,), values, found.note, measure.counts)
 
 

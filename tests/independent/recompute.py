@@ -31,8 +31,12 @@ METRICS = (
 MOST_INVALID = 0.2
 
 
-def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
-    """The tables of a database, or of one of its studies."""
+def tables(db: str, study: str = "", held=None) -> dict[str, dict[str, dict]]:
+    """The tables of a database, or of one of its studies.
+
+    I5 is not recomputed: ``held`` has its p by row of the table ``verdicts``, which is corrected
+    together with the others.
+    """
     trials = measured.read(db, study)
     for _, column, *_ in METRICS:
         if column not in trials:
@@ -54,7 +58,7 @@ def tables(db: str, study: str = "") -> dict[str, dict[str, dict]]:
         "indicators": _indicators(who | baselines),
         "contrasts": _prompts(judged, trials.attrs["orders"]),
         "factors": _factors(judged, trials.attrs["orders"]),
-        "verdicts": _beside_humans(judged, who, recorded),
+        "verdicts": _beside_humans(judged, who, recorded, held or {}),
     }
     for rows in found.values():
         rows |= {_id(key): {} for key in groups.keys() - judged.keys()}
@@ -74,7 +78,7 @@ def _is_judged(rows: pd.DataFrame) -> bool:
     return all(invalid <= MOST_INVALID * n for n, invalid in counts.values())
 
 
-def _beside_humans(judged, who, recorded: pd.DataFrame) -> dict[str, dict]:
+def _beside_humans(judged, who, recorded: pd.DataFrame, held) -> dict[str, dict]:
     """The humans and every driver and prompt that is judged, by measure."""
     (human,) = who.values()
     humans = {"who": human, "recorded": None if recorded.empty else recorded}
@@ -82,7 +86,8 @@ def _beside_humans(judged, who, recorded: pd.DataFrame) -> dict[str, dict]:
     for key, trials in judged.items():
         alike = trials[trials["cell"].isin(measured.OUTCOMES)]  # where humans drove
         robust = {name: holds for name, (*_, holds) in _verdicts(alike).items()}
-        for name, row in recompute_verdicts.rows(alike, humans, robust).items():
+        p = held.get(f"{_id(key)}/held")
+        for name, row in recompute_verdicts.rows(alike, humans, robust, p).items():
             rows[f"{_id(key)}/{name}"] = row
     return rows
 
@@ -204,7 +209,12 @@ def _estimate(trials: pd.DataFrame, column: str, kind: str) -> tuple:
         value = None if cut_off else 100 * k / every
         return value, 100 * low, 100 * high, len(values)
     if kind == "mean":
-        return values.mean(), *statistics.mean_interval(values), len(values)
+        pair = trials.loc[trials[column].notna(), "pair"] if "pair" in trials else None
+        ends = statistics.mean_interval(values)
+        if pair is not None and pair.notna().all():
+            cell = trials.loc[pair.index, "cell"]
+            ends = statistics.by_pair_interval(values, cell.to_numpy(), pair.to_numpy())
+        return values.mean(), *ends, len(values)
     return np.median(values), *statistics.median_interval(values), len(values)
 
 

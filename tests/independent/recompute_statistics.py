@@ -99,9 +99,9 @@ class Firth:
         """By the likelihood ratio."""
         return stats.chi2.sf(self.lost(column, 0.0), 1)
 
-    def interval(self, column: int) -> list[float]:
-        """The values that a likelihood-ratio test does not reject at 5 %."""
-        level = stats.chi2.ppf(0.95, 1)
+    def interval(self, column: int, level: float = 0.95) -> list[float]:
+        """The values that a likelihood-ratio test does not reject."""
+        level = stats.chi2.ppf(level, 1)
         b, ends = self.b[column], []
         for sign in (-1, 1):
             far = sign * 2 * self.se[column]
@@ -174,16 +174,17 @@ def by_pairs(fit, x: np.ndarray, y: np.ndarray, pair: np.ndarray) -> np.ndarray 
     return np.column_stack([whole[:, 0], np.sqrt(moved * (len(parts) - 1) / len(parts))])
 
 
-def difference(one: tuple, other: tuple) -> dict:
+def difference(one: tuple, other: tuple, level: float = 0.95) -> dict:
     """Of two estimates (b, se, freedom), by t with Satterthwaite's freedom (1946)."""
     value, se = one[0] - other[0], np.hypot(one[1], other[1])
     spread = sum(part[1] ** 4 / part[2] for part in (one, other))
     freedom = se**4 / spread if spread else np.inf
     t = stats.t(freedom)
+    half = t.ppf((1 + level) / 2) * se
     return {
         "difference": value,
-        "ci_low": value - t.ppf(0.975) * se,
-        "ci_high": value + t.ppf(0.975) * se,
+        "ci_low": value - half,
+        "ci_high": value + half,
         "p": 2 * t.sf(abs(value) / se),
         "freedom": freedom if np.isfinite(freedom) else None,
         "detectable": (t.ppf(0.975) + t.ppf(0.8)) * se,
@@ -202,6 +203,23 @@ def mean_interval(values: np.ndarray) -> tuple[float | None, float | None]:
     if len(values) < 2:
         return None, None
     half = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
+    return values.mean() - half, values.mean() + half
+
+
+def by_pair_interval(values, cell, pair) -> tuple[float | None, float | None]:
+    """The interval of a mean of human trials: a jackknife over pairs, conditions weighing alike."""
+    names, cells = np.unique(pair), pd.Series(cell)
+    if len(names) < 2:
+        return None, None
+    weights = cells.value_counts()
+
+    def weighed(rows):
+        means = pd.Series(values[rows]).groupby(cells[rows].to_numpy()).mean()
+        return float((weights[means.index] * means).sum() / weights[means.index].sum())
+
+    apart = [weighed(pair != name) - values.mean() for name in names]
+    se = np.sqrt(np.square(apart).sum() * (len(names) - 1) / len(names))
+    half = stats.t.ppf(0.975, len(names) - 1) * se
     return values.mean() - half, values.mean() + half
 
 
@@ -243,6 +261,66 @@ def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
         "p": min(1.0, chances[chances <= chances[a.sum() - least] * (1 + 1e-7)].sum()),
         "detectable": detectable_rate(int(n.sum()), int(m.sum()), q),
     }
+
+
+def exact_p(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> float:
+    """Fisher's exact test within the cells that both have, two-sided by probability."""
+    first, second = (
+        v.astype(float).groupby(c).agg(["sum", "size"])
+        for v, c in zip((one, other), cells, strict=True)
+    )
+    both = first.join(second, how="inner", suffixes=("1", "2"))
+    a, n, b, m = (both[name].to_numpy(int) for name in ("sum1", "size1", "sum2", "size2"))
+    # The distribution of the successes of the first, all margins of all cells given.
+    chances, least = np.ones(1), 0
+    for k in range(len(a)):
+        total = a[k] + b[k]
+        there = np.arange(max(0, total - m[k]), min(n[k], total) + 1)
+        chances = np.convolve(chances, stats.hypergeom(n[k] + m[k], total, n[k]).pmf(there))
+        least += there[0]
+    return min(1.0, chances[chances <= chances[a.sum() - least] * (1 + 1e-7)].sum())
+
+
+def agreeing(one: tuple, other: tuple, p: float, level: float = 0.95) -> tuple[float, float]:
+    """The interval of one rate less another, (rate, trials) each, that excludes 0 by this p.
+
+    Each end leaves out (1 - level) / 2 of the melded chances of Fay, Proschan and Brittain (2015):
+    of the lowest belief of one rate less the highest of the other. Where that would contradict p,
+    the end beside 0 leaves out its own share of p.
+    """
+    alpha = 1 - level
+    sides = [_melded(one, other, 0.0), _melded(other, one, 0.0)]
+    parts = [alpha / 2, alpha / 2]
+    near = int(sides[1] < sides[0])
+    by_half, by_p = sides[near] < alpha / 2, p < alpha
+    share = min(alpha * sides[near] / max(p, 1e-300), (1 + sides[near]) / 2)
+    if by_p != by_half or (share > alpha / 2) == by_p:
+        parts[near] = share
+    ends = []
+    for part, pair in zip(parts, ((one, other), (other, one)), strict=True):
+        if _melded(*pair, -1.0) >= part:
+            ends.append(-1.0)
+        else:
+            ends.append(
+                optimize.brentq(lambda at, p=pair, q=part: _melded(*p, at) - q, -1, 1, xtol=1e-12)
+            )
+    return ends[0], -ends[1]
+
+
+def _melded(one: tuple, other: tuple, at: float) -> float:
+    """The chance that the lowest belief of one rate exceeds the highest of the other by so much."""
+    k, n = one[0] * one[1], one[1]
+    missed, m = other[1] * (1 - other[0]), other[1]
+    highest = stats.beta(m - missed + 1, missed) if missed > 1e-9 else None
+    if k < 1e-9:
+        return 1.0 if highest is None else highest.sf(-at)
+    lowest = stats.beta(k, n - k + 1)
+    if highest is None:
+        return lowest.cdf(1 + at)
+    # By parts of equal chance of the other, each with Simpson's rule.
+    u = np.linspace(0.0, 1.0, 20001)
+    y = lowest.cdf(highest.ppf(u) + at)
+    return float((y[0] + y[-1] + 4 * y[1:-1:2].sum() + 2 * y[2:-1:2].sum()) / 3 / 20000)
 
 
 def detectable_rate(n: int, m: int, rate: float) -> float | None:

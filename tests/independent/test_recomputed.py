@@ -74,6 +74,12 @@ def program_tables(db: Path, *options: str) -> dict[str, dict[str, dict[str, str
     return found
 
 
+def held(program) -> dict[str, float]:
+    """The p of I5, which is not recomputed, by row."""
+    rows = program["verdicts"].items()
+    return {name: float(row["p"]) for name, row in rows if name.endswith("/held") and row["p"]}
+
+
 def disagreements(program, own, *, imported: bool):
     """Every row and number in which the program and the recomputation differ."""
     for table, rows in own.items():
@@ -143,11 +149,10 @@ def database(request, tmp_path):
 @pytest.mark.long
 def test_independent_code_finds_the_numbers_of_the_tables(database):
     imported = database.parent.name == "complete_import"
-    found = disagreements(
-        program_tables(database), recompute.tables(str(database)), imported=imported
-    )
-    assert [*found] == []
+    program = program_tables(database)
+    own = recompute.tables(str(database), held=held(program))
+    assert [*disagreements(program, own, imported=imported)] == []
     if (study := database.with_name("study.toml")).exists():
         program = program_tables(database, "--study", study.name)
-        found = disagreements(program, recompute.tables(str(database), study.stem), imported=False)
-        assert [*found] == []
+        own = recompute.tables(str(database), study.stem, held(program))
+        assert [*disagreements(program, own, imported=False)] == []

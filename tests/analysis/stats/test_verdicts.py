@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import product
+
 import numpy as np
 import pytest
 from scipy import optimize, stats
 from scipy.special import expit, log_expit
 
 from merge_runner.config import ScenarioConfig
-from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.stats.intervals import Estimate, newcombe, wilson
+from merge_runner_analysis.data.reference_data import human_counts
+from merge_runner_analysis.data.study import Study, _published_humans
+from merge_runner_analysis.stats.contrasts import corrected
+from merge_runner_analysis.stats.intervals import melded
 from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, who_first_data
-from merge_runner_analysis.stats.verdicts import Known, _of_rates, compared, of_humans
+from merge_runner_analysis.stats.verdicts import (
+    compared,
+    human_fit,
+    human_gap,
+    levels_of,
+    of_humans,
+)
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.verdict_words import (
     MEASURES,
@@ -87,33 +98,152 @@ def test_a_slope_of_who_goes_first_has_the_interval_of_its_profile(tmp_path, nam
         assert lost == pytest.approx(stats.chi2.ppf(0.95, 1), rel=1e-3)
 
 
-def test_a_difference_of_rates_is_newcombes_and_its_p_the_level_that_leaves_0_out():
-    def known(k, n):
-        low, high = wilson(k / n, n)
-        return Known(Estimate(100 * k / n, 100 * low, 100 * high, n, weight=n), k=k)
+def of_collisions(tmp_path, collided: int, n: int):
+    """The row of a driver with so many collisions in so many trials of one condition."""
+    apart, together = ((0.4,) * 9, (-0.4,) * 9), ((0.1,) * 9, (0.1,) * 9)
+    drives = [
+        Drive("o3", "baseline", "N_0_0", rep, *(together if rep <= collided else apart))
+        for rep in range(1, n + 1)
+    ]
+    study = Study(write_study(tmp_path / "t.duckdb", drives, BOXES))
+    found = compared(study, study.models[0])
+    return next(one for one in found if one.measure.name == "collisions")
 
-    found = _of_rates(known(10, 20), known(5, 50))
-    low, high = newcombe([(0.5, 20), (0.1, 50)])
-    assert found.bounds() == pytest.approx((100 * low, 100 * high))
-    z = stats.norm.isf(found.p / 2)
-    assert newcombe([(0.5, 20), (0.1, 50)], z)[0] == pytest.approx(0, abs=1e-9)
-    assert _of_rates(known(4, 20), known(10, 50)).p == 1
+
+@pytest.mark.parametrize(("collided", "n"), [(2, 9), (2, 11), (3, 22), (0, 9)])
+def test_few_collisions_are_tested_exactly_as_by_fisher(tmp_path, collided, n):
+    found = of_collisions(tmp_path, collided, n)
+    humans = human_counts()["N_0_0"]
+    table = [[collided, n - collided], [humans.collided, sum(humans) - humans.collided]]
+    assert found.p == pytest.approx(stats.fisher_exact(table).pvalue)
+    assert (found.own.k, found.own.estimate.n) == (collided, n)
+    low, high = found.interval
+    assert (found.p_holm < 0.05) == (not low <= 0 <= high)
 
 
-def test_interval_and_p_of_a_difference_agree(rows):
+def test_a_melded_interval_agrees_with_fishers_test_at_every_level():
+    for (a, n), (b, m) in product([(0, 9), (2, 9), (7, 110), (9, 9)], [(28, 990), (0, 40), (5, 5)]):
+        p = stats.fisher_exact([[a, n - a], [b, m - b]]).pvalue
+        for level in (0.9, 0.95, 0.99, 1 - 1.01 * p, 1 - 0.99 * p):
+            if not 0.5 < level < 1:
+                continue
+            low, high = melded((a / n, n), (b / m, m), p, level)
+            assert -1 <= low <= a / n - b / m + 1e-9, (a, n, b, m, level)
+            assert a / n - b / m - 1e-9 <= high <= 1, (a, n, b, m, level)
+            assert (low <= 1e-9 and high >= -1e-9) == (p >= 1 - level), (a, n, b, m, level)
+
+
+@pytest.mark.parametrize("rates", [(0.02, 0.03), (0.3, 0.03), (0.5, 0.5), (0.0, 0.03)])
+def test_a_melded_interval_holds_the_true_difference_in_95_percent(rates):
+    """Over all outcomes of 9 trials beside 20."""
+    n, m, covered = 9, 20, 0.0
+    for a in range(n + 1):
+        for b in range(m + 1):
+            chance = stats.binom.pmf(a, n, rates[0]) * stats.binom.pmf(b, m, rates[1])
+            if chance > 1e-6:
+                p = stats.fisher_exact([[a, n - a], [b, m - b]]).pvalue
+                low, high = melded((a / n, n), (b / m, m), p)
+                covered += chance * (low <= rates[0] - rates[1] <= high)
+    assert covered > 0.949
+
+
+def test_the_interval_beside_a_verdict_agrees_with_its_corrected_p_and_names_its_level(rows):
     for name, values in rows.items():
-        if values.get("p") is not None:
-            low, high = values["difference_ci"]
-            assert (values["p"] < 0.05) == (not low <= 0 <= high), name
-            assert values["difference"] == pytest.approx(values["estimate"] - values["human"])
-            assert values["p"] <= values["p_holm"]
+        if values.get("p_holm") is None:
+            continue
+        assert 90 <= values["level"] < 100
+        assert values["p"] <= values["p_holm"]
+        differs_by_p = values["p_holm"] < 0.05
+        assert (values["state"] in {"weaker", "stronger", "unlike"}) == differs_by_p, name
+        margin = MEASURES[values["measure"]].margin
+        if margin is not None:
+            assert (values["ci"][0] > margin) == differs_by_p
+            continue
+        low, high = values["difference_ci"]
+        assert differs_by_p == (not low <= 0 <= high), name
+        assert values["difference"] == pytest.approx(values["estimate"] - values["human"])
+
+
+def test_holms_levels_are_those_of_its_steps():
+    p = {"a": 0.001, "b": 0.04, "c": 0.02, "d": 0.9}
+    holm = dict(zip(p, corrected([*p.values()]), strict=True))
+    # Of four the smallest is below .05 / 4; the next is not below .05 / 3, and ends it.
+    assert levels_of(p, holm) == pytest.approx(
+        {"a": 1 - 0.05 / 4, "b": 1 - 0.05 / 3, "c": 1 - 0.05 / 3, "d": 1 - 0.05 / 3}
+    )
+
+
+def gaps(tmp_path, gap_of, reps=3, scatter=0.02):
+    """A driver's row of I4, and that of its regression, with gaps of this function of h and dv."""
+    study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=reps), BOXES))
+    (group,) = study.models
+    trials = group.trials.copy()
+    headway, velocity = trials[["projected_headway_m", "relative_velocity_mps"]].to_numpy().T
+    gap = gap_of(headway, velocity) + scatter * np.random.default_rng(1).standard_normal(
+        len(trials)
+    )
+    trials["gap_m"] = trials["counted_gap_m"] = gap
+    found = compared(study, replace(group, trials=trials))
+    return next(one for one in found if one.measure.name == "gap-velocity")
+
+
+def test_i4_looks_at_one_quantity_the_largest_predicted_difference(tmp_path):
+    """The signed product alone moves gaps: none where nobody is ahead, 2.2 m where one is by 4."""
+    found = gaps(tmp_path, lambda h, dv: 17 + 0.34 * h * dv)
+    assert found.own.estimate.value == pytest.approx(0.34 * 6.4, abs=0.05)
+    assert found.state == "unlike"
+    assert found.own.estimate.low > 1
+    assert found.p_holm < 0.05
+    assert found.level >= 0.95
+    assert found.human.estimate.value == pytest.approx(6.4 * 0.06)
+
+
+def test_i4_is_shown_where_its_interval_lies_within_the_margin(tmp_path):
+    found = gaps(tmp_path, lambda h, dv: 4 + 0.03 * h * dv)
+    low, high = found.own.estimate.bounds()
+    assert found.state == "shown"
+    assert low <= found.own.estimate.value <= high < 1
+    assert found.level == pytest.approx(0.9)
+
+
+def test_i4_is_open_where_its_interval_holds_the_margin(tmp_path):
+    found = gaps(tmp_path, lambda h, dv: 4 + 0.15 * h * dv, scatter=2.0)
+    low, high = found.own.estimate.bounds()
+    assert found.state == "inconclusive"
+    assert low <= 1 <= high
+
+
+def test_the_published_errors_of_the_gap_follow_from_the_outcomes_and_one_deviation():
+    fit = human_fit(_published_humans())
+    errors = np.sqrt(np.diag(fit.covariance))
+    assert errors == pytest.approx([term.se for term in fit.terms.values()], rel=0.02)
+
+
+def test_humans_leave_their_gap_in_the_conditions_of_the_drivers_finished_trials(tmp_path):
+    """Beside a driver that finished in wide conditions alone, they leave more."""
+    study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=3), BOXES))
+    (group,) = study.models
+    everywhere = human_gap(study.human, study.human).estimate
+    assert everywhere.value == pytest.approx(3.85)
+    wide = group.part(lambda trials: trials["projected_headway_m"].abs() == 4)
+    there = human_gap(study.human, wide).estimate
+    regression = 3.54 + 0.17 * 4 - 0.2 * 0.8 * 2 / 3  # h dv cancels
+    assert there.value == pytest.approx(regression, abs=0.05)
+    assert there.value > human_gap(study.human, group).estimate.value
+    # Conditions in which no trial has a gap do not count.
+    collided = group.trials["projected_headway_m"].abs() != 4
+    lost = group.trials.assign(
+        status=group.trials["status"].mask(collided, "collided"),
+        counted_gap_m=group.trials["counted_gap_m"].mask(collided),
+    )
+    assert human_gap(study.human, replace(group, trials=lost)).estimate == there
 
 
 def test_the_humans_are_the_published_ones(study, rows):
     humans = {name: known.estimate for name, known in of_humans(study).items()}
     assert humans["collisions"].value == pytest.approx(100 * 28 / 990)
     assert humans["gap"].bounds() == pytest.approx((2.88, 4.82), abs=0.005)
-    assert humans["gap-velocity"].value == pytest.approx(-0.2 * 0.8)
+    assert humans["gap-velocity"].value == pytest.approx(0.06 * 6.4)  # L_4_-8 and L_4_8
     assert rows["human/headway"]["n"] == 962
     assert humans["velocity"].low < humans["velocity"].value
 
@@ -139,21 +269,37 @@ def test_sentences_tell_the_states_of_the_rows_and_the_headline_the_surest_diffe
     assert because == f"it {told(surest)}."
 
 
-def test_undecided_trials_leave_both_worst_cases_and_a_verdict_that_holds_in_both(tmp_path):
+def test_with_undecided_trials_there_is_no_p_and_n_is_that_of_the_decided_ones(tmp_path):
     drives = [
         Drive("o3", "baseline", name, rep, (0.1 * rep,) * 9, (0.1 * rep,) * 9)
         for name in ("N_0_0", "L_4_0")
         for rep in range(1, 4)
     ]
     study = Study(write_study(tmp_path / "t.duckdb", drives))
-    (table,) = make_tables(study, ["verdicts"])
+    table, indicators = make_tables(study, ["verdicts", "indicators"])
     row = next(row for row in table.rows if row.id == "o3/baseline/collisions")
+    beside = next(r for r in indicators.rows if r.id == "o3/baseline/collided_boxes_percent")
     assert row.values["estimate"] is None
     assert row.values["undecided"] == 4
+    assert row.values["n"] == beside.values["n"] == 2
     assert "4 of 6 trials are undecided" in row.note
-    low, high = row.values["difference_ci"]
-    assert (row.values["state"] == "unlike") == (low > 0)
-    assert high > 90
+    untested = ("difference", "difference_ci", "level", "p", "p_holm", "detectable")
+    assert {row.values[name] for name in untested} == {None}
+    assert row.values["state"] == "inconclusive"
+    assert "ollisions (33 to 100 % of trials): inconclusive" in sentence(
+        by_group(table.rows)["o3/baseline"]
+    )
+
+
+def test_a_headline_of_several_models_says_how_many_comparisons_it_rests_on(study):
+    (table,) = make_tables(study, ["verdicts"])
+    groups = by_group(table.rows)
+    models = {name: groups[f"{name}/baseline"] for name in ("o3", "wild")}
+    every = [one for of in models.values() for one in of.values()]
+    tested = sum(one["p_holm"] is not None for one in every)
+    found = sum(map(differs, every))
+    assert f"{found} of {tested} comparisons" in " ".join(headline(models))
+    assert "comparisons" not in " ".join(headline({"wild": models["wild"]}))
 
 
 def test_a_replayed_human_is_not_judged(tmp_path):
