@@ -20,11 +20,15 @@ from merge_runner_analysis.stats.intervals import (
     ROUNDING,
     Difference,
     difference,
+    melded,
     newcombe,
     tested,
     two_sided_p,
 )
 from merge_runner_analysis.stats.measures import trials_of, undecided
+
+# Where less of a trial's deviation is left over than this, it alone decides the difference.
+LEVERAGE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +45,23 @@ class Cells:
 
     @property
     def rates(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Both rates with these weights, each with the trials that it is as good as."""
-        weights = self.n * self.m / (self.n + self.m)
-        return weighted(self.a, self.n, weights), weighted(self.b, self.m, weights)
+        """Both rates with these weights, each with the trials that it is as good as.
+
+        These are the more, the less of the spread of outcomes lies within conditions. Rates there
+        are of both together and of one trial more, of the overall rate: none is 0 or 1 for sure.
+        """
+        every = self.n + self.m
+        weights = self.n * self.m / every
+        shares, rates = weights / weights.sum(), (self.a + self.b) / every
+        overall = float(shares @ rates)
+        within = (self.a + self.b + overall) / (every + 1)
+        spread = float(shares @ (within * (1 - within)))
+        gain = max(1.0, overall * (1 - overall) / spread) if spread else 1.0
+        (one, n), (other, m) = (
+            weighted(self.a, self.n, weights),
+            weighted(self.b, self.m, weights),
+        )
+        return (one, gain * n), (other, gain * m)
 
     @property
     def p(self) -> float:
@@ -77,10 +95,10 @@ def shared_cells(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Cel
 
 
 def contrast_cells(both: Cells) -> Difference:
-    """Two rates within conditions: Fisher's exact test, Newcombe's interval of weighted rates."""
-    (one, _), (other, _) = both.rates
-    found = detectable_rate(int(both.n.sum()), int(both.m.sum()), other)
-    return Difference(one - other, *newcombe(both.rates), both.p, found)
+    """Two rates within conditions: Fisher's exact test, and the interval that agrees with it."""
+    first, second = both.rates
+    found = detectable_rate(int(both.n.sum()), int(both.m.sum()), second[0])
+    return Difference(first[0] - second[0], *melded(first, second, both.p), both.p, found)
 
 
 def difference_of_rates(rates: Sequence[tuple[float, float]]) -> Difference:
@@ -131,24 +149,68 @@ def rejected(n: int, m: int) -> NDArray[np.bool_]:
 
 
 def contrast_means(first: pd.DataFrame, second: pd.DataFrame, measure: str) -> Difference | None:
-    """Two means, compared within conditions by least squares.
+    """Two means, compared within the conditions that both have by Welch's test.
 
-    Difference, interval and Student's t are those of a linear model with a level for each
-    condition, so that another mix of conditions, as when one group collides more in some, makes no
-    difference. None where the groups share no condition, or have too few trials for an error.
+    The difference is that of a linear model with a level for each condition, so that another mix of
+    conditions, as when one group collides more in some, makes no difference. Its error holds where
+    groups differ in size and in variance (HC2; MacKinnon and White 1985), and so do its degrees of
+    freedom (Bell and McCaffrey 2002, of two variances). In one condition it is the test of Welch
+    (1947). None where the groups share no condition, or a single trial is all of one.
     """
+    shared = {*first.dropna(subset=[measure])["condition"]}
+    shared &= {*second.dropna(subset=[measure])["condition"]}
     both = pd.concat([first.assign(_first=1.0), second.assign(_first=0.0)]).dropna(subset=[measure])
+    both = both[both["condition"].isin(shared)]
     both = both.assign(_value=both[measure].astype(float))
+    if both.empty:
+        return None
     conditions = both.groupby("condition")[["_first", "_value"]]
     # Of what is left of both within conditions, the slope is that of the whole model (Frisch and
     # Waugh 1933; Lovell 1963).
     group, value = (both[["_first", "_value"]] - conditions.transform("mean")).to_numpy(float).T
-    weight, freedom = float(group @ group), len(both) - conditions.ngroups - 1
-    if weight <= ROUNDING or freedom <= 0:
+    weight = float(group @ group)
+    trials = both.groupby("condition")["_first"].transform("size").to_numpy(float)
+    left_over = 1 - 1 / trials - group**2 / weight
+    if left_over.min() < LEVERAGE:
         return None
     slope = float(group @ value) / weight
-    residual = value - slope * group
-    return tested(slope, float(np.sqrt(residual @ residual / freedom / weight)), float(freedom))
+    squared = (value - slope * group) ** 2 / left_over
+    se = float(np.sqrt((group**2 * squared).sum())) / weight
+    belongs = both["_first"].to_numpy(float)
+    variances = [float(squared[belongs == one].mean()) for one in (0.0, 1.0)]
+    freedom = float(len(both) - conditions.ngroups - 1)
+    if se > ROUNDING:
+        cells = pd.factorize(both["condition"])[0]
+        freedom = _freedom(cells, belongs, group, left_over, np.array(variances))
+    return tested(slope, se, freedom)
+
+
+def _freedom(
+    cells: NDArray[np.int_],
+    belongs: NDArray[np.float64],
+    group: NDArray[np.float64],
+    left_over: NDArray[np.float64],
+    variances: NDArray[np.float64],
+) -> float:
+    """The degrees of freedom of an HC2 error of the first group's effect, by Satterthwaite (1946).
+
+    The error is a quadratic form of the residuals, whose mean and variance follow from the
+    ``variances`` of the second and the first group. Trials of one group and condition are alike, so
+    that only these are compared with each other.
+    """
+    _, at, size = np.unique(np.column_stack([cells, belongs]), axis=0,
+                            return_index=True, return_counts=True)  # fmt: skip
+    cell, x, n = cells[at], group[at], size.astype(float)
+    variance, each = variances[belongs[at].astype(int)], group[at] ** 2 / left_over[at]
+    trials = np.bincount(cells)[cell]
+    fitted = (cell[:, None] == cell) / trials + np.outer(x, x) / float(group @ group)
+    # The covariance of residuals of different trials, and what one has beside that with itself.
+    apart = (fitted * (n * variance)) @ fitted - fitted * (variance[:, None] + variance)
+    own = variance + np.diag(apart)
+    mean = float(n * each @ own)
+    square = float((n * each) @ apart**2 @ (n * each))
+    square += float((n * each**2) @ (own**2 - np.diag(apart) ** 2))
+    return mean**2 / square
 
 
 def contrast(

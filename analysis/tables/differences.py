@@ -62,7 +62,13 @@ VERDICT_COLUMNS = (
 )
 WITHIN = (
     "compared within the {} that both have: rates by the weights of Mantel and Haenszel, with "
-    "Newcombe's interval and Fisher's exact test; means by least squares, with its t test"
+    "Fisher's exact test and the melded interval that agrees with it; means by Welch's test in a "
+    "model with a level for each of them"
+)
+INTERACTION = " × "
+FAMILY = (
+    "Holm: a family is one measure over the levels of one factor, its reference apart; in "
+    "`contrasts` over the prompts of one driver"
 )
 DIFFERENCES = (
     f"Levels are {WITHIN.format('cells')}; medians without a test. The reference is the level that "
@@ -190,8 +196,8 @@ def contrasts(study: Study) -> Table:
             Column("reference", "against"),
             Column("measure", "measure"),
             Column("difference", "difference", "number", 2, "first minus second"),
-            interval("ci", "Newcombe; least squares"),
-            Column("p", "p", "p", 3, "Fisher's exact test or t test"),
+            interval("ci", "of the same test"),
+            Column("p", "p", "p", 3, "Fisher's exact test or Welch's"),
             Column("p_holm", "Holm", "p", 3, "corrected by Holm"),
             Optional("detectable", "detectable", "number", 2, "at p < .05 with power .8"),
             Column("n", "n", "count", 0, "trials of the setting in the shared conditions"),
@@ -200,10 +206,9 @@ def contrasts(study: Study) -> Table:
         ),
         rows,
         (
-            f"{WITHIN.format('conditions')}. A family is one measure of one driver over its "
-            "prompts. Detectable: before correction; of rates by the exact power of Fisher's test "
-            "of all these trials as if of one condition, in the direction in which less is enough, "
-            "of means (t.975 + t.8) times the standard error",
+            f"{WITHIN.format('conditions')}. {FAMILY}. Detectable: before correction; of rates by "
+            "the exact power of Fisher's test of all these trials as if of one condition, in the "
+            "direction in which less is enough, of means (t.975 + t.8) times the standard error",
             RULES_NOTE,
             *_same_as_reference(study),
             *([] if rows else ["there is no pair of judged groups to compare"]),
@@ -284,8 +289,17 @@ def factors(study: Study) -> Table:
         for level in levels
     ]
     rows += _interactions(study, found) if by else []
-    p = {row.id: value for row in rows if isinstance(value := row.values.get("p"), float)}
-    holm = dict(zip(p, corrected([*p.values()]), strict=True))
+    families: dict[tuple[Value, ...], dict[str, float]] = {}
+    for row in rows:
+        if isinstance(value := row.values.get("p"), float):
+            family = tuple(row.values.get(name) for name in ("factor", "drivers", "measure"))
+            family += () if INTERACTION in str(family[0]) else (row.values.get("at"),)
+            families.setdefault(family, {})[row.id] = value
+    holm = {
+        name: p_holm
+        for p in families.values()
+        for name, p_holm in zip(p, corrected([*p.values()]), strict=True)
+    }
     return Table(
         "factors",
         (
@@ -300,7 +314,7 @@ def factors(study: Study) -> Table:
             interval("ci", "of the measure"),
             Optional("difference", "difference", "number", 2, "from the factor's reference"),
             interval("difference_ci", "of the difference"),
-            Optional("p", "p", "p", 3, "exact or t test"),
+            Optional("p", "p", "p", 3, "Fisher's exact test or Welch's"),
             Optional("p_holm", "Holm", "p", 3, "corrected by Holm"),
         ),
         [replace(row, values={**row.values, "p_holm": holm.get(row.id)}) for row in rows],
@@ -308,7 +322,7 @@ def factors(study: Study) -> Table:
             *([] if found else ["the trials of judged drivers differ in no factor"]),
             f"intervals: {INTERVALS}. {DIFFERENCES}",
             *([INTERACTIONS.format(by=by)] if by else []),
-            *([f"Holm: corrected for all {len(p)} p of the table"] if p else []),
+            *([FAMILY] if holm else []),
             *_copies(found),
             *(f"{_name(levels[0])}: {balance(levels)}" for levels in found),
             RULES_NOTE,
@@ -397,7 +411,7 @@ def _interaction(
     different = _difference(study, metric, level, first, twin, base)
     cells = _cells(level, metric) | {
         "at": f"{at} - {base.at.partition('=')[2]}",
-        "factor": f"{level.factor} × {by}",
+        "factor": f"{level.factor}{INTERACTION}{by}",
         "n": estimate(level.pooled, metric).n,
         **different,
     }

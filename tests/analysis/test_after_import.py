@@ -106,7 +106,10 @@ def test_how_like_the_humans_a_driver_is_in_i5_is_a_number(imported):
     assert apart.low > 0.5
     (table,) = make_tables(imported, ["verdicts"])
     row = next(row.values for row in table.rows if row.id == "o3/baseline/held")
-    assert (row["estimate"], row["ci"]) == (apart.value, apart.bounds())
+    assert row["estimate"] == apart.value
+    # At the level at which Holm tests it, wider than the 95 % by itself.
+    assert 0.5 < row["ci"][0] < apart.low < apart.high < row["ci"][1]
+    assert row["level"] > 95
     assert row["state"] == "unlike"
 
 

@@ -347,6 +347,8 @@ def _factors(groups, orders) -> dict[str, dict]:
             for name in names:
                 for metric, column, kind, _ in METRICS:
                     row = _level(pooled[name], pooled[names[0]], column, kind, orders)
+                    if row["p"] is not None:
+                        row["family"] = factor + mark, metric
                     rows[f"{factor}={name}{mark}/{metric}"] = row
     return rows
 
@@ -376,7 +378,7 @@ def _level(trials, reference, column, kind, orders) -> dict:
         return row
     found = _compared(trials, reference, column, kind)
     if found:
-        row |= {"difference": found["difference"], "p": found["p"], "family": "all"}
+        row |= {"difference": found["difference"], "p": found["p"]}
         row |= {f"difference_{end}": found[end] for end in ("ci_low", "ci_high")}
     return row
 

@@ -231,7 +231,7 @@ def median_interval(values: np.ndarray) -> tuple[float | None, float | None]:
 
 
 def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
-    """Two rates in the cells that both have: Mantel and Haenszel, Newcombe, Fisher.
+    """Two rates in the cells that both have: Mantel and Haenszel, Fisher, and the melded interval.
 
     Empty where there is no such cell.
     """
@@ -246,19 +246,19 @@ def rates_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Se
     w = n * m / (n + m)
     w = w / w.sum()
     p, q = w @ (a / n), w @ (b / m)
-    (low1, high1), (low2, high2) = wilson(p, 1 / (w**2 @ (1 / n))), wilson(q, 1 / (w**2 @ (1 / m)))
-    # The distribution of the successes of the first, all margins of all cells given.
-    chances, least = np.ones(1), 0
-    for k in range(len(a)):
-        total = a[k] + b[k]
-        there = np.arange(max(0, total - m[k]), min(n[k], total) + 1)
-        chances = np.convolve(chances, stats.hypergeom(n[k] + m[k], total, n[k]).pmf(there))
-        least += there[0]
+    # What of the spread of outcomes lies within cells makes rates as good as more trials.
+    every, overall = n + m, w @ ((a + b) / (n + m))
+    inside = (a + b + overall) / (every + 1)
+    within = w @ (inside * (1 - inside))
+    more = max(overall * (1 - overall) / within, 1.0) if within else 1.0
+    rates = (p, more / (w**2 @ (1 / n))), (q, more / (w**2 @ (1 / m)))
+    exact = exact_p(one, other, cells)
+    low, high = agreeing(*rates, exact)
     return {
         "difference": 100 * (p - q),
-        "ci_low": 100 * (p - q - np.hypot(p - low1, high2 - q)),
-        "ci_high": 100 * (p - q + np.hypot(high1 - p, q - low2)),
-        "p": min(1.0, chances[chances <= chances[a.sum() - least] * (1 + 1e-7)].sum()),
+        "ci_low": 100 * low,
+        "ci_high": 100 * high,
+        "p": exact,
         "detectable": detectable_rate(int(n.sum()), int(m.sum()), q),
     }
 
@@ -341,23 +341,31 @@ def detectable_rate(n: int, m: int, rate: float) -> float | None:
 
 
 def means_within(one: pd.Series, other: pd.Series, cells: tuple[pd.Series, pd.Series]) -> dict:
-    """Two means by least squares with a level for each cell.
+    """Two means by least squares with a level for each cell that both have, by Welch's test.
 
-    Empty where no cell has both, or no error is left.
+    Errors are HC2's, degrees of freedom those of Bell and McCaffrey (2002) for two variances. Empty
+    where no cell has both, or a single trial is all that decides.
     """
-    y = np.r_[one.to_numpy(float), other.to_numpy(float)]
-    group = np.r_[np.ones(len(one)), np.zeros(len(other))]
-    cell = pd.factorize(pd.concat(cells))[0]
-    levels = (cell[:, None] == np.unique(cell)).astype(float)
-    if len(set(cells[0]) & set(cells[1])) == 0:
+    shared = set(cells[0]) & set(cells[1])
+    if not shared:
         return {}
-    x = np.column_stack([group, levels])
-    bread = np.linalg.inv(x.T @ x)
-    b = bread @ x.T @ y
+    kept = [v[c.isin(shared).to_numpy()] for v, c in zip((one, other), cells, strict=True)]
+    y = np.concatenate([v.to_numpy(float) for v in kept])
+    group = np.repeat([1.0, 0.0], [len(v) for v in kept])
+    cell = pd.factorize(pd.concat([c[c.isin(shared)] for c in cells]))[0]
+    x = np.column_stack([group, cell[:, None] == np.unique(cell)]).astype(float)
+    projection = np.linalg.inv(x.T @ x) @ x.T
+    b = projection @ y
+    left = np.eye(len(y)) - x @ projection
+    if np.diag(left).min() < 1e-9:
+        return {}
+    squared = (left @ y) ** 2 / np.diag(left)
+    se = np.sqrt(projection[0] ** 2 @ squared)
     freedom = len(y) - x.shape[1]
-    if freedom <= 0:
-        return {}
-    se = np.sqrt(bread[0, 0] * ((y - x @ b) ** 2).sum() / freedom)
+    if se > 1e-12:
+        variance = np.where(group == 1, squared[group == 1].mean(), squared[group == 0].mean())
+        form = (projection[0] ** 2 / np.diag(left))[:, None] * ((left * variance) @ left)
+        freedom = np.trace(form) ** 2 / (form * form.T).sum()
     t = stats.t(freedom)
     return {
         "difference": b[0],

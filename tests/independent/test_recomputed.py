@@ -27,6 +27,7 @@ TABLES = (
 # What is projected and not what happened, and I5.
 NOT_RECOMPUTED = ("/conflict_resolution_s", "/held")
 ITERATED = {"b", "se", "z", "t", "p", "firth_b", "firth_se", "firth_p", "detectable"}
+TESTED = ("verdicts", "contrasts", "factors")  # whose intervals are found by iteration, too
 RECORDINGS = ("emulator", "smollm2", "smollm2-free")
 KINDS = (
     "two_studies", "mirrored_chance", "no_valid_reply", "separated", "all_tied", "complete_import",
@@ -93,7 +94,7 @@ def disagreements(program, own, *, imported: bool):
         recompute.correct(rows)
         for name, (said, row) in both.items():
             for column, value in row.items():
-                iterated = column in ITERATED or table == "verdicts"
+                iterated = column in ITERATED or table in TESTED
                 if column in said and not _equal(said[column], value, iterated=iterated):
                     yield f"{table} {name} {column}: {said[column]}, and {value} recomputed"
             if not row and any(said[c] for c in ("n", "p", "value", "difference") if c in said):

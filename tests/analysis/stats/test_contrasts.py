@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
+from statsmodels.regression.linear_model import OLS
 from statsmodels.stats.multitest import multipletests
 
 from merge_runner_analysis.stats import intervals
@@ -62,12 +63,14 @@ RATES = [
 
 
 @pytest.mark.parametrize(("first", "second"), RATES)
-def test_rates_are_compared_by_fishers_test_and_newcombes_interval(first, second):
+def test_rates_are_compared_by_fishers_test_and_the_interval_that_agrees(first, second):
     found = contrast_rates(first, second)
     assert found.value == pytest.approx(first[0] / first[1] - second[0] / second[1])
-    assert (found.low, found.high) == pytest.approx(newcombe(first, second), abs=1e-6)
     assert found.p == pytest.approx(fisher(first, second), rel=1e-6)
     assert found.low <= found.value <= found.high
+    assert (found.p < 0.05) == (not found.low <= 0 <= found.high)
+    low, high = newcombe(first, second)  # of the same width, but for what is exact
+    assert found.high - found.low == pytest.approx(high - low, rel=0.35)
 
 
 # By condition: successes and trials of one group, and of the other.
@@ -90,16 +93,25 @@ def trials(strata) -> tuple[pd.DataFrame, pd.DataFrame]:
 def standardised(strata) -> tuple[tuple[float, float], tuple[float, float]]:
     """Both rates by the weights of Mantel and Haenszel, with the trials that they are as good as.
 
-    Those are the trials with which an unweighted rate had the variance, of equal rates.
+    Those are the trials with which an unweighted rate had the variance, of equal rates; and as many
+    more as the variance within conditions is less than that of all outcomes. Each condition has one
+    trial more, of the overall rate.
     """
     rates, spreads, total = [0.0, 0.0], [0.0, 0.0], 0.0
+    of_both, inside = 0.0, 0.0
     for a, n, b, m in strata.values():
         weight = n * m / (n + m)
         total += weight
+        of_both += weight * (a + b) / (n + m)
         for i, (k, size) in enumerate(((a, n), (b, m))):
             rates[i] += weight * k / size
             spreads[i] += weight**2 / size
-    return tuple((rates[i] / total, total**2 / spreads[i]) for i in (0, 1))
+    overall = of_both / total
+    for a, n, b, m in strata.values():
+        rate = (a + b + overall) / (n + m + 1)
+        inside += n * m / (n + m) / total * rate * (1 - rate)
+    more = max(1.0, overall * (1 - overall) / inside)
+    return tuple((rates[i] / total, more * total**2 / spreads[i]) for i in (0, 1))
 
 
 @pytest.mark.parametrize("strata", STRATA)
@@ -107,7 +119,8 @@ def test_rates_are_compared_within_conditions(strata):
     found = contrast_cells(shared_cells(*trials(strata), "hit"))
     (p, n), (q, m) = standardised(strata)
     assert found.value == pytest.approx(p - q)
-    assert (found.low, found.high) == pytest.approx(newcombe((p * n, n), (q * m, m)), abs=1e-6)
+    assert (found.low, found.high) == pytest.approx(intervals.melded((p, n), (q, m), found.p))
+    assert (found.p < 0.05) == (not found.low <= 0 <= found.high)
     # How likely each sum of the first group is, where each condition has as many successes.
     chances: dict[int, float] = {0: 1.0}
     for a, n, b, m in strata.values():
@@ -158,14 +171,30 @@ def test_an_interaction_of_rates_is_excluded_at_the_level_of_its_p():
 
 
 def test_an_interaction_of_means_is_the_difference_of_both_differences_with_welchs_test():
-    found = intervals.difference(
-        contrast_means(FIRST, SECOND, "gap_m"), contrast_means(SECOND, FIRST, "gap_m")
-    )
-    one = contrast_means(FIRST, SECOND, "gap_m")
+    one, other = contrast_means(FIRST, SECOND, "gap_m"), contrast_means(SECOND, FIRST, "gap_m")
+    found = intervals.difference(one, other)
     assert found.value == pytest.approx(2 * one.value)
-    half = (one.high - one.low) / 2 / stats.t.ppf(0.975, 11 - 2 - 1)
-    width = (found.high - found.low) / 2 / stats.t.ppf(0.975, 2 * (11 - 2 - 1))
-    assert width == pytest.approx(half * sqrt(2))
+    assert found.se == pytest.approx(sqrt(2) * one.se)
+    assert found.freedom == pytest.approx(2 * one.freedom)
+
+
+def test_in_one_condition_means_are_compared_by_welchs_test():
+    """Groups of unequal size and spread, where a pooled variance is wrong."""
+    rng = np.random.default_rng(4)
+    first, second = rng.normal(0, 5, 8), rng.normal(1, 1, 40)
+    found = contrast_means(group(N_0_0=first), group(N_0_0=second), "gap_m")
+    welch = stats.ttest_ind(first, second, equal_var=False)
+    assert (found.p, found.freedom) == pytest.approx((welch.pvalue, welch.df))
+    assert (found.low, found.high) == pytest.approx(tuple(welch.confidence_interval()))
+
+
+def test_a_small_group_that_scatters_differs_by_chance_in_one_of_twenty():
+    rng, found = np.random.default_rng(5), 0
+    for _ in range(400):
+        first = group(N_0_0=rng.normal(2, 4, 3), L_4_8=rng.normal(8, 4, 3))
+        second = group(N_0_0=rng.normal(2, 1, 30), L_4_8=rng.normal(8, 1, 30))
+        found += contrast_means(first, second, "gap_m").p < 0.05
+    assert 0.02 * 400 < found < 0.08 * 400
 
 
 def test_o3s_collisions_do_not_differ_from_the_humans_and_geminis_do():
@@ -229,22 +258,26 @@ def within_conditions(first, second) -> float:
     return total / weights
 
 
-def test_interval_and_test_are_those_of_least_squares_with_a_level_for_each_condition():
+def test_interval_and_test_are_welchs_in_a_model_with_a_level_for_each_condition():
     found = contrast_means(FIRST, SECOND, "gap_m")
     both = pd.concat([FIRST, SECOND])
-    group_of = np.repeat([1.0, 0.0], [len(FIRST), len(SECOND)])
-    x = np.column_stack([group_of, *(both["condition"] == name for name in NAMES)]).astype(float)
+    of_first = np.repeat([True, False], [len(FIRST), len(SECOND)])
+    x = np.column_stack([of_first, *(both["condition"] == name for name in NAMES)]).astype(float)
     y = both["gap_m"].to_numpy()
-    b, residual, _, _ = np.linalg.lstsq(x, y, rcond=None)
-    freedom = len(y) - 3
-    se = sqrt(residual[0] / freedom * np.linalg.inv(x.T @ x)[0, 0])
-    half = stats.t.ppf(0.975, freedom) * se
-    assert found.value == pytest.approx(b[0]) == pytest.approx(within_conditions(FIRST, SECOND))
-    assert (found.low, found.high) == pytest.approx((b[0] - half, b[0] + half))
-    t = stats.t(freedom)
-    assert found.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * se)
-    assert found.p == pytest.approx(2 * t.sf(abs(found.value) / se))
-    assert found.freedom == freedom
+    fit = OLS(y, x).fit(cov_type="HC2")
+    assert found.value == pytest.approx(fit.params[0]) == within_conditions(FIRST, SECOND)
+    assert found.se == pytest.approx(fit.bse[0])
+    # Satterthwaite's degrees of freedom of that quadratic form of residuals, by whole matrices.
+    left = np.eye(len(y)) - x @ np.linalg.pinv(x)
+    squared = (left @ y) ** 2 / np.diag(left)
+    variances = np.where(of_first, squared[of_first].mean(), squared[~of_first].mean())
+    form = np.diag(np.linalg.pinv(x)[0] ** 2 / np.diag(left)) @ left @ np.diag(variances) @ left
+    assert found.freedom == pytest.approx(np.trace(form) ** 2 / np.trace(form @ form))
+    t = stats.t(found.freedom)
+    half = t.ppf(0.975) * found.se
+    assert (found.low, found.high) == pytest.approx((found.value - half, found.value + half))
+    assert found.detectable == pytest.approx((t.ppf(0.975) + t.ppf(0.8)) * found.se)
+    assert found.p == pytest.approx(2 * t.sf(abs(found.value) / found.se))
 
 
 def mixes(shift, seed=2):
