@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import io
 import os
 import sys
 from copy import copy
@@ -68,6 +69,8 @@ def main() -> None:
     """Run the command line and exit with the contract's code."""
     # A trial's objects live until it ends, so frequent garbage collections would find almost none.
     gc.set_threshold(20_000, 10, 100)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # of an encoding that may not know all characters
+        sys.stdout.reconfigure(errors="replace")
     debug = "--debug" in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != "--debug"]
     completing = COMPLETION in os.environ  # a shell asks, whose words are not in argv
