@@ -79,6 +79,15 @@ def test_a_library_that_is_not_there_is_named_in_one_line(tmp_path):
     assert done.err == "error: this needs duckdb, which is not installed: pip install duckdb\n"
 
 
+def test_where_a_module_of_posix_is_missing_the_systems_it_runs_on_are_named(tmp_path):
+    (tmp_path / "fcntl.py").write_text("raise ModuleNotFoundError('no', name='fcntl')")
+    done = run(tmp_path, PROGRAM, "ledger", PYTHONPATH=f"{tmp_path}:{PROJECT}")
+    assert done.code == 2
+    assert (
+        done.err == "error: merge-runner runs on Linux and macOS; on Windows it runs within WSL\n"
+    )
+
+
 def built(kind: str, source: Path, to: Path) -> Path:
     done = run(source, sys.executable, "-c", BUILD.format(kind), to)
     assert done.code == 0, done.err

@@ -90,6 +90,9 @@ def _told(exc: Exception) -> tuple[int, str]:
     match exc:
         case MergeRunnerError():
             return exc.exit_code, f"error: {exc}"
+        case ModuleNotFoundError(name="fcntl" | "resource"):
+            text = "error: merge-runner runs on Linux and macOS; on Windows it runs within WSL"
+            return UsageError.exit_code, text
         case ModuleNotFoundError(name=str(name)) if not name.startswith("merge_runner"):
             text = f"error: this needs {name}, which is not installed: pip install {name}"
             return UsageError.exit_code, text

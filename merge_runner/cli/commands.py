@@ -310,15 +310,19 @@ def recording_export(
 ) -> None:
     """Write what sweeps asked and were answered into one file."""
     from merge_runner.llm.cache import ResponseCache
-    from merge_runner.results.recording import export_recording, provenance_of
+    from merge_runner.results.recording import carried_plugins, export_recording, provenance_of
     from merge_runner.results.store import recorded_sweeps
 
     rows, keys = recorded_sweeps(db, sweeps or ())
     found = " and ".join(row["sweep_id"] for row in rows)
     if not keys:
         raise UsageError(f"the sweep {found} made no call: there is nothing to record")
-    calls = export_recording(file, ResponseCache(cache, read_only=True), keys, provenance_of(rows))
+    provenance = provenance_of(rows)
+    with closing(ResponseCache(cache, read_only=True)) as opened:
+        calls = export_recording(file, opened, keys, provenance)
     say(f"{calls} calls of {found} are in {file}")
+    if plugins := carried_plugins(provenance):
+        say(f"with them the whole source of the study's plug-ins: {', '.join(plugins)}")
 
 
 @recording_app.command("import")
@@ -333,7 +337,8 @@ def recording_import(
     from merge_runner.results.recording import import_recording
 
     take = import_folder if file.is_dir() else import_recording
-    added, there = take(file, ResponseCache(cache))
+    with closing(ResponseCache(cache)) as opened:
+        added, there = take(file, opened)
     say(f"{added} calls added to {cache}, {there} were there already")
 
 

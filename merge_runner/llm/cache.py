@@ -19,7 +19,7 @@ import os
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import islice
@@ -177,18 +177,19 @@ class ResponseCache:
         self,
         folder: Path,
         *,
-        overlay: Callable[[], Mapping[str, CachedCall]] | None = None,
+        overlay: Callable[[], AbstractContextManager[Mapping[str, CachedCall]]] | None = None,
         read_only: bool = False,
     ) -> None:
-        """Open or make the folder; ``overlay`` reads a recording, entries by key.
+        """Open or make the folder; ``overlay`` opens a recording, entries by key.
 
-        What the recording holds comes before what the folder holds. ``read_only`` changes nothing
-        in the folder, which must be there. Raises UsageError for a folder that cannot be used.
+        What the recording holds comes before what the folder holds; both are closed together.
+        ``read_only`` changes nothing in the folder, which must be there. Raises UsageError for a
+        folder that cannot be used.
         """
         self.folder = folder
         self.locks = ModelLocks(folder)
         self.money = LedgerFile(folder)
-        self._read_overlay = overlay
+        self._open_overlay, self._with_overlay = overlay, contextlib.ExitStack()
         self._disk = TextDisk(str(folder))
         self._writer = BatchWriter(self._run_each)
         if read_only and not (folder / FILE).exists():
@@ -208,7 +209,8 @@ class ResponseCache:
 
     @cached_property
     def _overlay(self) -> Mapping[str, CachedCall]:
-        return self._read_overlay() if self._read_overlay else {}
+        opened = self._open_overlay
+        return self._with_overlay.enter_context(opened()) if opened else {}
 
     def get(self, key: str) -> CachedCall | None:
         """Return the entry of a call key; raises RecordingError where it is damaged or made up."""
@@ -338,7 +340,8 @@ class ResponseCache:
         return values(self._overlay.values()) or values(self.entries())
 
     def close(self) -> None:
-        """Close the folder, and free its locks."""
+        """Close the folder and the recording before it, and free its locks."""
+        self._with_overlay.close()
         self.locks.close()
         self.money.close()
         self._reading.close()  # first, since the last one to write ends the journal

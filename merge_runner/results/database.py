@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import logging
 import os
 import re
+import shutil
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
@@ -47,7 +49,6 @@ SETTINGS: Settings = {
     "max_vacuum_tasks": 0,  # see merge_small_groups
     # Of new files: the oldest DuckDB that can open them.
     "storage_compatibility_version": "v1.2.0",
-    "temp_directory": str(Path(tempfile.gettempdir()) / f"merge-runner-{os.getpid()}"),
 }
 REBUILD = (
     "move it away, or name another with --db, and run the same sweep again: it is rebuilt from the "
@@ -74,9 +75,26 @@ def _warn_of_other_measures(path: Path) -> None:
     )
 
 
+@cache
+def _spill_folder(pid: int) -> str:
+    """Make the private folder of a process for what does not fit into memory; it goes with it.
+
+    A name that others can tell beforehand could be a folder of theirs.
+    """
+    folder = tempfile.mkdtemp(prefix="merge-runner-")
+
+    def remove() -> None:
+        if os.getpid() == pid:  # and not a fork of it
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
+    return folder
+
+
 def in_memory(settings: Settings) -> duckdb.DuckDBPyConnection:
-    """A new database in memory."""
-    connection = duckdb.connect(config=settings)
+    """A new database in memory, which spills into a private folder."""
+    spilling: Settings = {"temp_directory": _spill_folder(os.getpid())}
+    connection = duckdb.connect(config=settings | spilling)
     # DuckDB takes `python -c` for an interactive prompt: a slow query would draw into our output.
     # In a notebook without ipywidgets it can draw nothing, and refuses to be told so.
     with contextlib.suppress(duckdb.InvalidInputException):
@@ -101,7 +119,10 @@ class Instance:
         return self._connection.cursor()
 
     def drop(self) -> None:
-        """Make a new instance next time."""
+        """Make a new instance next time; this one ends with the last of its connections.
+
+        Closing it would close those of other threads with it.
+        """
         self._connection = None
 
 

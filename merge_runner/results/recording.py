@@ -16,7 +16,7 @@ import re
 import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from itertools import islice, zip_longest
 from operator import attrgetter
@@ -206,26 +206,32 @@ def read_recording(file: Path) -> Iterator[CachedCall]:
         )
 
 
-class Spilled(Mapping[str, CachedCall]):
-    """The verified entries of recordings by key; SQLite keeps large ones in a temporary file.
+@contextmanager
+def spilled(files: Iterable[Path]) -> Iterator[Mapping[str, CachedCall]]:
+    """Open recordings as their verified entries by key.
 
     Raises RecordingError, also where two recordings hold different replies to one call.
     """
-
-    def __init__(self, files: Iterable[Path]) -> None:
-        self._db = sqlite3.connect("", check_same_thread=False)
-        self._db.execute("CREATE TABLE entries (key TEXT PRIMARY KEY, entry TEXT)")
+    with closing(sqlite3.connect("", check_same_thread=False)) as db:
+        db.execute("CREATE TABLE entries (key TEXT PRIMARY KEY, entry TEXT)")
+        entries = Spilled(db)
         for file in files:
             for entry in read_recording(file):
-                key, before = entry.request.key, self.get(entry.request.key)
+                key, before = entry.request.key, entries.get(entry.request.key)
                 if before and before.attempts[-1].reply != entry.attempts[-1].reply:
                     raise RecordingError(
                         f"{file} holds another reply to the call {key} than a recording named "
                         "before it: replay them one by one, each into a --db of its own"
                     )
-                self._db.execute(
-                    "INSERT OR IGNORE INTO entries VALUES (?, ?)", (key, entry.to_json())
-                )
+                db.execute("INSERT OR IGNORE INTO entries VALUES (?, ?)", (key, entry.to_json()))
+        yield entries
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spilled(Mapping[str, CachedCall]):
+    """Entries by key in a temporary database; SQLite keeps a large one in a file."""
+
+    _db: sqlite3.Connection
 
     def __getitem__(self, key: str) -> CachedCall:
         row = self._db.execute("SELECT entry FROM entries WHERE key = ?", [key]).fetchone()
@@ -254,7 +260,7 @@ def summarise(file: Path) -> dict[str, Any]:
     """Verify a recording and count what it holds: its calls, by model, endpoint and outcome.
 
     Of the calls a mock model answered ``scripted``; ``cost_usd`` is what its replies cost when they
-    were made.
+    were made. ``plugins`` are the files whose source it carries.
     """
     names = ("models_requested", "models_served", "endpoints", "outcomes")
     counts = {name: Counter[str]() for name in names}
@@ -267,7 +273,8 @@ def summarise(file: Path) -> dict[str, Any]:
         told = (request.model, last.model_served or "unknown", request.endpoint, last.outcome)
         for count, value in zip(counts.values(), told, strict=True):
             count[value] += 1
-    return {**numbers, "cost_usd": round(cost_usd, 6), **counts, "provenance": provenance}
+    told_of = {"plugins": carried_plugins(provenance), "provenance": provenance}
+    return {**numbers, "cost_usd": round(cost_usd, 6), **counts, **told_of}
 
 
 def _fingerprint(key: str, attempts: str) -> bytes:
@@ -366,22 +373,43 @@ def read_provenance(file: Path) -> dict[str, str]:
 
 
 def provenance_of(sweeps: list[dict[str, Any]]) -> dict[str, str]:
-    """Return the metadata of the sweeps that a recording is made of."""
+    """Return the metadata of the sweeps that a recording is made of.
+
+    The command line, whose paths tell of people and machines, stays in the database.
+    """
     rows = [
         {name: str(value) for name, value in row.items() if value is not None} for row in sweeps
     ]
+    for row in rows:
+        with suppress(*DAMAGED):
+            config = dict(json.loads(row["config"]))
+            row["config"] = canonical_json({k: v for k, v in config.items() if k != "typed"})
     return rows[0] if len(rows) == 1 else {SWEEPS: canonical_json(rows)}
+
+
+def carried_plugins(provenance: dict[str, str]) -> list[str]:
+    """Return the names of the plug-ins whose source a recording carries, as it says itself."""
+    names = set[str]()
+    for row in _rows_of(provenance):
+        with suppress(*DAMAGED):
+            names.update(map(str, json.loads(row["config"])["study"]["plugins"]))
+    return sorted(names)
 
 
 def described_sweeps(provenance: dict[str, str]) -> list[RecordedSweep]:
     """Return the sweeps as a recording says itself, without those whose configuration is odd."""
-    rows, sweeps = [provenance], []
-    with suppress(*DAMAGED):
-        rows = [*json.loads(provenance[SWEEPS])]
-    for row in rows:
+    sweeps = []
+    for row in _rows_of(provenance):
         with suppress(*DAMAGED):
             sweeps.append(RecordedSweep(**{**json.loads(row["config"]), "name": row["name"]}))
     return sweeps
+
+
+def _rows_of(provenance: dict[str, str]) -> list[Any]:
+    """The rows of sweeps that a recording has, as it says itself."""
+    with suppress(*DAMAGED):
+        return [*json.loads(provenance[SWEEPS])]
+    return [provenance]
 
 
 def recorded_part(

@@ -128,7 +128,7 @@ class Store:
         named = list(specs)
         kinematics = {spec.condition: spec.kinematics for spec in specs.values()}
         columns = "DISTINCT condition, projected_headway_m, relative_velocity_mps"
-        with write_database(self.path) as connection:
+        with read_database(self.path) as connection:
             for name, *numbers in rows_of_trials(connection, columns, "trials", named).fetchall():
                 condition = kinematics[name]
                 if numbers != [condition.projected_headway_m, condition.relative_velocity_mps]:
@@ -151,7 +151,7 @@ class Store:
                 USING (trial_id, spec_hash)
             WHERE list_contains(?, spec_hash) GROUP BY ALL
         """
-        with write_database(self.path) as connection:
+        with read_database(self.path) as connection:
             return connection.execute(sql, [list(spec_hashes)]).fetchall()
 
     def write(

@@ -46,7 +46,7 @@ from merge_runner.records import TrialRecord, TrialSpec, canonical_json
 from merge_runner.registry import using
 from merge_runner.results.database import unreadable_is_usage
 from merge_runner.results.provenance import git_state, versions
-from merge_runner.results.recording import Miss, Spilled, described, explain, recorded_part
+from merge_runner.results.recording import Miss, described, explain, recorded_part, spilled
 from merge_runner.results.store import Store, sweep_facts
 from merge_runner.run.clients import check_batches, live_clients, open_rounds
 from merge_runner.run.cluster import DaskTasks, connected
@@ -479,7 +479,7 @@ async def open_sweep(
     check_batches(plan, options)
     if options.max_cost_usd is None:
         options = replace(options, max_cost_usd=plan.study.file.budget.get("total_usd"))
-    recorded = partial(Spilled, options.recordings) if options.recordings else None
+    recorded = partial(spilled, options.recordings) if options.recordings else None
     with closing(ResponseCache(options.cache, overlay=recorded)) as cache:
         plan = await _with_names(plan, options, cache, say)
         specs = {(spec.trial_id, spec.spec_hash): spec for spec in plan.trial_specs()}

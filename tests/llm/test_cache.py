@@ -611,7 +611,7 @@ def test_a_folder_that_is_a_file_is_an_error_of_ours(folder):
 
 def test_an_overlay_answers_before_the_folder(folder):
     recorded = by_key(*(entry(number, reply=said("overlay")) for number in (1, 2)))
-    cache = ResponseCache(folder, overlay=lambda: recorded)
+    cache = ResponseCache(folder, overlay=lambda: contextlib.nullcontext(recorded))
     cache.put_now([entry(1, reply=said("folder")), entry(3)])
     replies = {n: cache.get(entry(n).request.key) for n in (1, 2, 3, 4)}
     assert replies[1].attempts[0].reply == said("overlay")
@@ -623,7 +623,7 @@ def test_an_overlay_answers_before_the_folder(folder):
 
 
 def test_an_overlay_is_never_written(folder):
-    cache = ResponseCache(folder, overlay=lambda: by_key(entry(1)))
+    cache = ResponseCache(folder, overlay=lambda: contextlib.nullcontext(by_key(entry(1))))
     cache.put_now([entry(2)])
     cache.close()
     plain = ResponseCache(folder)
@@ -636,7 +636,7 @@ def test_an_overlay_is_read_once_and_not_before_it_is_needed(folder):
 
     def overlay():
         readings.append("read")
-        return by_key(entry(2))
+        return contextlib.nullcontext(by_key(entry(2)))
 
     cache = ResponseCache(folder, overlay=overlay)
     cache.put_now([entry(1)])
@@ -649,12 +649,27 @@ def test_an_overlay_is_read_once_and_not_before_it_is_needed(folder):
     cache.close()
 
 
+def test_a_recording_that_was_opened_is_closed_with_the_folder(folder):
+    closed = []
+
+    @contextlib.contextmanager
+    def overlay():
+        yield by_key(entry(2))
+        closed.append("closed")
+
+    cache = ResponseCache(folder, overlay=overlay)
+    assert cache.get(entry(2).request.key)
+    assert closed == []
+    cache.close()
+    assert closed == ["closed"]
+
+
 def test_endpoints_are_listed_per_model_the_folders_where_the_overlay_has_none(folder):
     recorded = by_key(
         entry(8, model="a", endpoint="http://overlay/v1"),
         entry(9, model="c", endpoint="http://overlay/v1"),
     )
-    cache = ResponseCache(folder, overlay=lambda: recorded)
+    cache = ResponseCache(folder, overlay=lambda: contextlib.nullcontext(recorded))
     cache.put_now(
         [
             entry(1, model="a"),

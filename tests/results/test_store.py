@@ -22,10 +22,22 @@ from merge_runner.results.store import Store, query, results_digest, sweep_facts
 from merge_runner.run.local_runner import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
+from tests.harness import environment
 
 SCENARIO = ScenarioConfig()
 SWEEP = {"sweep_id": "s1", "name": "baseline", "started_at": datetime(2026, 1, 1)}  # noqa: DTZ001
 SWEEP |= {"config": "{}", "versions": "{}"}
+SPILL = """
+import os, stat, sys
+from merge_runner.results.database import SETTINGS, in_memory
+with in_memory({**SETTINGS, "memory_limit": "50MB"}) as connection:
+    [(folder,)] = connection.execute("SELECT current_setting('temp_directory')").fetchall()
+    connection.execute(
+        "CREATE TABLE long AS SELECT range AS n, md5(range::VARCHAR) AS text FROM range(3000000)"
+    )
+    assert os.listdir(folder), "nothing was spilled"
+    print(folder, os.getpid(), oct(stat.S_IMODE(os.stat(folder).st_mode)))
+"""
 LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True); input()"
 
 
@@ -305,3 +317,43 @@ def test_a_slow_query_draws_no_bar_on_the_output():
     )
     run = subprocess.run([sys.executable, "-c", asked], capture_output=True, check=True)
     assert run.stdout == b"(False,)\n"
+
+
+@pytest.mark.slow
+def test_what_does_not_fit_into_memory_goes_to_a_private_folder_that_ends_with_the_process(
+    tmp_path,
+):
+    done = subprocess.run(
+        [sys.executable, "-c", SPILL],
+        env=environment(TMPDIR=str(tmp_path)),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    folder, pid, mode = done.stdout.split()
+    assert Path(folder).parent == tmp_path
+    assert pid not in folder
+    assert mode == "0o700"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_only_reads_does_not_open_the_file_for_writing(store, monkeypatch):
+    record = played()
+    store.write("s1", [record], patience_s=1)
+
+    def refuse(*_):
+        raise AssertionError("it is opened for writing")
+
+    monkeypatch.setattr("merge_runner.results.store.write_database", refuse)
+    assert store.ended_trials(keyed(record)) == set(keyed(record))
+    assert store.decisions_by_spec(["another"]) == []
+
+
+def test_an_instance_that_is_dropped_leaves_the_connections_of_others_open():
+    """Closing it would close those of other threads with it; it ends with the last of them."""
+    instance = Instance()
+    with instance.cursor() as of_another_thread:
+        instance.drop()
+        assert of_another_thread.execute("SELECT 1").fetchall() == [(1,)]
+    with instance.cursor() as again:
+        assert again.execute("SELECT 1").fetchall() == [(1,)]

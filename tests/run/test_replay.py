@@ -16,11 +16,14 @@ from pathlib import Path
 import duckdb
 import pytest
 
+from merge_runner.cli import commands
 from merge_runner.errors import RecordingError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.recording import (
+    carried_plugins,
     export_recording,
     import_recording,
+    provenance_of,
     read_recording,
     summarise,
 )
@@ -295,6 +298,31 @@ async def test_recordings_that_contradict_each_other_are_not_replayed_together(
     run = await merge_runner(*replay)
     assert run.code == 1
     assert f"other.parquet holds another reply to the call {good.request.key}" in run.err
+
+
+def test_what_a_recording_says_of_its_plug_ins_may_be_anything():
+    """It may come from anybody."""
+    study = {"study": {"plugins": {"b.py": "1", "a.py": "2"}}}
+    for config in (study, {}, [], {"study": None}, {"study": {"plugins": 1}}, {"typed": ["x"]}):
+        rows = [{"sweep_id": "s", "config": json.dumps(config)}]
+        names = ["a.py", "b.py"] if config == study else []
+        for sweeps in (rows, [*rows, *rows]):
+            told = provenance_of(sweeps)
+            assert carried_plugins(told) == names
+            assert "typed" not in json.dumps(told)
+    assert carried_plugins({"sweeps": "[1, null, {}]"}) == []
+    assert carried_plugins({"config": "no JSON"}) == []
+    assert provenance_of([{"config": "no JSON"}]) == {"config": "no JSON"}
+
+
+async def test_an_export_and_an_import_close_the_cache(merge_runner, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert (await merge_runner("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")).code == 0
+    closed = []
+    monkeypatch.setattr(ResponseCache, "close", lambda cache: closed.append(cache.folder.name))
+    commands.recording_export(tmp_path / "a.parquet")
+    commands.recording_import(tmp_path / "a.parquet", tmp_path / "other")
+    assert closed == ["responses", "other"]
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import json
 import re
 import shlex
 import subprocess
@@ -15,7 +16,7 @@ import pytest
 from merge_runner import Study
 from merge_runner.config import ModelEntry
 from merge_runner.paths import DEFAULT_DB, home_of
-from merge_runner.results.store import results_digest
+from merge_runner.results.store import query, results_digest
 from merge_runner.study.file import TEMPLATE, write_folder
 from tests.harness import PROGRAM, watched
 from tests.mock_server import FaultPlan
@@ -57,6 +58,25 @@ async def test_a_new_study_is_killed_resumed_replayed_and_shown(merge_runner, st
     assert results_digest(study / "again.duckdb") == digest
     tables = await merge_runner("tables", "ablation-quantitative", cwd=study)
     assert "emulator+hesitant [temperature=0.2]/hurry" in tables.out
+
+
+async def test_an_export_names_the_plug_ins_that_it_carries_and_has_no_command_line(
+    merge_runner, study, tmp_path
+):
+    part = ("--only", "temperature=0.2", "--only", "prompt=baseline")
+    played = await merge_runner("sweep", study / "study.toml", *part)
+    assert played.code == 0, played.err
+    places = ("--db", study / "results/merge.duckdb", "--cache", study / "cache/responses")
+    export = await merge_runner("recording", "export", "mine.parquet", *places)
+    assert "the whole source of the study's plug-ins: plugin.py" in export.err
+    told = await merge_runner("recording", "info", "mine.parquet")
+    info = json.loads(told.out)
+    assert info["plugins"] == ["plugin.py"]
+    assert str(tmp_path) not in told.out
+    assert str(tmp_path).encode() not in (tmp_path / "mine.parquet").read_bytes()
+    config = json.loads(info["provenance"]["config"])
+    [(stored,)] = query(study / "results/merge.duckdb", "SELECT config FROM sweeps")[1]
+    assert json.loads(stored).keys() - config.keys() == {"typed"}
 
 
 async def test_results_lie_beside_the_study_wherever_it_is_started(merge_runner, study, tmp_path):
