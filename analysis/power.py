@@ -31,6 +31,7 @@ from merge_runner_analysis.tables.model import Column, Row, Table, Value
 MULTIPLES = (0.5, 1.0, 2.0, 4.0)
 SEED = 260409609
 HUMANS = "humans"
+VERDICTS = "verdicts"  # the table that compares with the humans
 # By question: its table, the number of a truth that it is about, and the unit of that.
 QUESTIONS = {
     "I1": ("who-first", "projected_headway", "per m"),
@@ -186,6 +187,8 @@ def chances(
         at = {m: case.chances(plan.conditions, m, simulations) for m in MULTIPLES}
         for question, effect in case.effects.items():
             table, _, unit = QUESTIONS[question]
+            if case.against == HUMANS:
+                table = VERDICTS
             enough = next((m for m in MULTIPLES if at[m][question] >= POWER), None)
             key = [table, question, ", ".join(labels), case.against, case.own.name]
             shares: list[Value] = [100 * at[m][question] for m in MULTIPLES]
@@ -200,7 +203,9 @@ def power_table(title: str, rows: Sequence[Row]) -> Table:
     notes = (
         f"n: trials of an arm; {', '.join(f'x{m:g}' for m in MULTIPLES)}: the share of simulated "
         "studies with so many times the repetitions that find the effect at p < .05 (I1 to I4: by "
-        "the robust tests); n for 80 %, USD: the smallest of these sizes with this power",
+        "the robust tests; rates by Fisher's exact test within conditions, means by Welch's, as in "
+        "the tables), before any correction for several comparisons; n for 80 %, USD: the smallest "
+        "of these sizes with this power",
         "truth: published humans, the driver as it was played, or what is planted in the emulator, "
         "with the [effect] that the study names; without one, an arm leaves 1 m more than the "
         "first, and collides twice as often",

@@ -14,13 +14,14 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
+from scipy import stats
 
 from merge_runner.records import SIDES
 from merge_runner_analysis.data.driver_words import has_chance
 from merge_runner_analysis.data.reference_data import human_outcomes
 from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study, of_trials
-from merge_runner_analysis.stats.intervals import Estimate, estimate
+from merge_runner_analysis.stats.intervals import LEVEL, Estimate, estimate
 from merge_runner_analysis.stats.regressions import Array, unfit_for_logit, who_first_data
 
 # One row a vehicle: the acceleration of the first step that its driver controls, and the word of
@@ -132,8 +133,8 @@ def _least_squares(rows: pd.DataFrame, design: Array) -> Estimate | None:
 def exchange_rate(rows: pd.DataFrame) -> Estimate | None:
     """Return how many m of headway are worth 1 m/s of relative velocity in the word M.
 
-    It is minus the ratio of two slopes of a logit, with the interval of the delta method; None
-    where the logit has no finite estimate.
+    It is minus the ratio of two slopes of a logit, with the interval of Fieller; None where the
+    logit has no finite estimate.
     """
     spoken = rows[rows["tactical"].notna()]
     points = spoken[["headway_m", "velocity_mps"]].to_numpy(float)
@@ -156,6 +157,25 @@ def _ratio(points: Array, chosen: ArrayLike, cluster: ArrayLike) -> Estimate | N
     groups = np.asarray(cluster)
     fit = Logit(chosen, design).fit(disp=0, cov_type="cluster", cov_kwds={"groups": groups})
     _, headway, velocity = map(float, fit.params)
-    gradient = np.array([0.0, velocity / headway**2, -1 / headway])
-    se = sqrt(float(gradient @ fit.cov_params() @ gradient))
-    return estimate(-velocity / headway, se, len(np.unique(groups)) - 1, len(points))
+    rate, freedom = -velocity / headway, len(np.unique(groups)) - 1
+    ends = fieller(headway, velocity, np.asarray(fit.cov_params())[1:, 1:], freedom)
+    low, high = ends or (None, None)
+    return Estimate(rate, low, high, len(points), freedom=freedom)
+
+
+def fieller(
+    headway: float, velocity: float, covariance: Array, freedom: float
+) -> tuple[float, float] | None:
+    """Return the interval of minus velocity / headway, two slopes with this covariance.
+
+    It holds the ratios r for which velocity + r headway does not differ from 0 (Fieller 1954). None
+    where the slope on headway may be 0 itself: then no ratio is too large.
+    """
+    t = float(stats.t.ppf((1 + LEVEL) / 2, freedom)) ** 2
+    squared = headway**2 - t * float(covariance[0, 0])
+    if squared <= 0:
+        return None
+    middle = velocity * headway - t * float(covariance[0, 1])
+    rest = velocity**2 - t * float(covariance[1, 1])
+    half = sqrt(max(middle**2 - squared * rest, 0.0))
+    return (-middle - half) / squared, (-middle + half) / squared

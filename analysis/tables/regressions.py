@@ -78,6 +78,7 @@ REPEATS = (
     "{name} declares no chance, and does the same first in all repetitions of a situation: each "
     "situation counts once"
 )
+UNBOUNDED = "exchange rate: no finite interval, as the slope on headway may be 0 (Fieller 1954)"
 ONLY_ASKED = (
     "asked without the loop (`merge-runner sweep --first`), in {trials} trials that end before a "
     "second decision"
@@ -97,7 +98,7 @@ FIRST_ACTIONS = (
     Optional("slope_se", "SE", "number", 3, "of the slope, clustered by trial"),
     interval("slope_ci", "of the slope", 3),
     Optional("exchange_rate", "exchange rate", "number", 2, "m of headway that are worth 1 m/s"),
-    interval("exchange_rate_ci", "of the rate, by the delta method"),
+    interval("exchange_rate_ci", "of the rate, by Fieller"),
 )
 
 
@@ -274,6 +275,7 @@ def _first_rows(study: Study, group: Group) -> Iterator[Row]:
         remarks = (
             "" if len(rows) else NO_ACTION,
             REPEATS.format(name=seat.name) if repeats_itself(study, seat) else "",
+            UNBOUNDED if len(rows) and rate and rate.low is None else "",
             ONLY_ASKED.format(trials=len(group.ended)) if group in study.asked else "",
         )
         yield row_of(group, values, *remarks, item=seat.side, counts=ENDED)

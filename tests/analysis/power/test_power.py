@@ -131,6 +131,16 @@ def powered(tmp_path, study, model=(), simulations=20):
     return [row.values for row in chances(plan, expected.cost_usd, [], simulations)]
 
 
+def test_what_is_compared_with_the_humans_is_found_in_the_table_verdicts(tmp_path):
+    (tmp_path / "braver.toml").write_text(
+        'models = ["idm"]\nrepetitions = 1\n[factors]\nprompt = ["baseline", "A1"]\n'
+        "[effect]\nprompt = { collided = 0.4 }\n"
+    )
+    found = powered(tmp_path, str(tmp_path / "braver.toml"), simulations=1)
+    assert {one["table"] for one in found if one["against"] == HUMANS} == {"verdicts"}
+    assert {one["table"] for one in found if one["question"] == "collisions"} >= {"contrasts"}
+
+
 @pytest.mark.slow
 def test_a_planted_study_is_told_by_what_is_planted(tmp_path):
     (tmp_path / "planted.toml").write_text(PLANTED)

@@ -5,11 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 from scipy.special import expit
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.reference_data import published
-from merge_runner_analysis.stats.first_action import exchange_rate, human_exchange_rate, mean, slope
+from merge_runner_analysis.stats.first_action import (
+    exchange_rate,
+    fieller,
+    human_exchange_rate,
+    mean,
+    slope,
+)
 
 SLOPE, SPREAD = -0.34, 0.63
 HEADWAY, VELOCITY = 1.11, -3.30
@@ -53,6 +60,25 @@ def test_the_published_human_rate_is_that_of_the_published_coefficients():
     assert rate.value == pytest.approx(3.304 / 1.111, abs=2e-3)
     assert rate.low < 2.97 < rate.high
     assert 0.3 < rate.high - rate.low < 1.2
+
+
+def test_a_rate_over_a_slope_that_may_be_0_has_no_finite_interval():
+    rng = np.random.default_rng(3)
+    rows = drawn(rng, 44)
+    weak = rows.assign(tactical=np.where(rng.random(len(rows)) < 0.5, "M", "Y"))
+    found = exchange_rate(weak)
+    assert found.value is not None
+    assert found.bounds() is None
+
+
+def test_fiellers_interval_ends_where_the_test_of_a_ratio_does():
+    covariance = np.array([[0.04, 0.02], [0.02, 0.25]])
+    low, high = fieller(1.1, -3.3, covariance, 20)
+    assert low < 3 < high
+    for rate in (low, high):
+        se = np.sqrt(np.array([rate, 1.0]) @ covariance @ np.array([rate, 1.0]))
+        assert abs(-3.3 + rate * 1.1) / se == pytest.approx(stats.t.ppf(0.975, 20))
+    assert fieller(0.3, -3.3, covariance, 20) is None
 
 
 @pytest.mark.slow

@@ -68,6 +68,30 @@ def test_a_table_fits_the_terminal_and_names_the_columns_that_do_not(tables, wid
             assert {*left_out[1].split(", ")} <= {column.name for column in table.columns}
 
 
+def test_a_comparison_has_one_p_and_one_corrected_p_in_every_table(study, tables):
+    (factors,) = make_tables(Study(study.db, by="model"), ["factors"])
+    rows = {row.id: row.values for row in factors.rows}
+    assert tables["contrasts"].rows
+    for row in tables["contrasts"].rows:
+        driver, setting, _, metric = row.id.split("/")
+        there = rows[f"model={driver}/prompt={setting}/{metric}"]
+        assert (row.values["p"], row.values["p_holm"]) == (there["p"], there["p_holm"])
+        assert row.values["ci"] == there["difference_ci"]
+
+
+def test_an_interval_of_a_difference_agrees_with_its_p(study, tables):
+    (by,) = make_tables(Study(study.db, by="model"), ["factors"])
+    for table, name in (
+        (by, "difference_ci"),
+        (tables["factors"], "difference_ci"),
+        (tables["contrasts"], "ci"),
+    ):
+        for row in table.rows:
+            if row.values.get("p") is not None:
+                low, high = row.values[name]
+                assert (row.values["p"] < 0.05) == (not low <= 0 <= high), row.id
+
+
 def test_human_rows_carry_the_golden_numbers(tables):
     table = tables["who-first"]
     found = [
