@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from merge_runner_analysis.data.provenance import provenance
@@ -12,7 +13,7 @@ from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.report.page import alarms
 from merge_runner_analysis.tables import make_tables
-from tests.analysis.studies import changed, write_study, yielding
+from tests.analysis.studies import Drive, changed, write_study, yielding
 
 SAME = "programs play the same trials at both levels"
 PROGRAM = json.dumps({side: {"program": "own", "chance": True} for side in ("left", "right")})
@@ -108,3 +109,49 @@ def test_the_report_says_which_trials_of_programs_are_copies(db):
     found = alarms(Study(db), provenance(db))["Trials repeat earlier ones"]
     assert "one: 44 of 88 trials of programs at different levels of factors are distinct" in found
     assert "o3" not in found
+
+
+def drawn(driver, rng):
+    """Trials of a program: who goes first, and how hard either drives, are drawn for each."""
+    for condition in ("L_4_-8", "N_0_0", "R_-4_8"):
+        for rep in range(1, 7):
+            hard, sign = rng.uniform(0.1, 0.6, 2), rng.choice([-1, 1])
+            yield Drive(
+                driver, "baseline", condition, rep, (sign * hard[0],) * 3, (-sign * hard[1],) * 3
+            )
+
+
+def with_prompts(names):
+    """Statements after which programs played the same trials with other prompts, too."""
+    for name in names:
+        for table in ("trials", "states"):
+            variant = f", '{name}' AS variant" if table == "trials" else ""
+            yield (
+                f"INSERT INTO {table} SELECT * REPLACE (replace(trial_id, 'baseline', '{name}') AS "
+                f"trial_id, replace(spec_hash, 'baseline', '{name}') AS spec_hash{variant}) "
+                f"FROM {table} WHERE trial_id LIKE '%/baseline/%'"
+            )
+        yield f"INSERT INTO specs VALUES ('one-{name}', '{PROGRAM}'), ('two-{name}', '{PROGRAM}')"
+
+
+@pytest.mark.long
+def test_programs_of_one_distribution_differ_in_no_more_studies_than_stated(tmp_path):
+    """Each is played with eight prompts that it does not read, from draws of its own."""
+    rejected, tested = 0, 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        path = tmp_path / f"{seed}.duckdb"
+        write_study(path, [*drawn("one", rng), *drawn("two", rng)])
+        study = changed(
+            path,
+            f"UPDATE specs SET spec = '{PROGRAM}'",
+            "UPDATE trials SET source = 'driver'",
+            *with_prompts([f"A{number}" for number in range(1, 8)]),
+        )
+        (table,) = make_tables(study, ["factors"])
+        rows = [row.values for row in table.rows if row.id.startswith("model=two/")]
+        assert {row["trials"] for row in rows} == {36 // 2}
+        p = [row["p"] for row in rows if row.get("p") is not None]
+        rejected, tested = rejected + sum(value < 0.05 for value in p), tested + len(p)
+    assert tested >= 150
+    assert rejected <= 0.05 * tested

@@ -146,13 +146,27 @@ def test_a_level_is_compared_with_the_first_that_the_study_lists_or_with_its_ref
     assert levels == ["dear", "cheap", "self", "sleepy", "0.2", "1.0"]
 
 
-def test_p_values_are_corrected_for_their_number(study):
-    (table,) = make_tables(study, ["factors"])
-    p = {row.id: row.values["p"] for row in table.rows if row.values.get("p") is not None}
-    holm = multipletests(list(p.values()), method="holm")[1]
-    shown = [row.values["p_holm"] for row in table.rows if row.id in p]
-    assert shown == pytest.approx(holm)
-    assert f"Holm: corrected for all {len(p)} p of the table" in table.notes
+def test_a_comparison_has_one_corrected_p_wherever_it_is_printed(tmp_path):
+    drives = yielding("o3", reps=5)
+    for variant, share in (("A1", 0.5), ("A2", 0.9), ("A3", 1.1)):
+        drives += [
+            replace(d, variant=variant, left=tuple(share * x for x in d.left)) for d in drives[:55]
+        ]
+    contrasted, levels = make_tables(
+        Study(write_study(tmp_path / "t.duckdb", drives)), ["contrasts", "factors"]
+    )
+    families = {}
+    for row in contrasted.rows:
+        _, variant, _, measure = row.id.split("/")
+        same = found(levels, f"prompt={variant}/{measure}")
+        assert same["p"] == pytest.approx(row.values["p"])
+        assert same["p_holm"] == pytest.approx(row.values["p_holm"])
+        assert same["difference_ci"] == pytest.approx(row.values["ci"])
+        families.setdefault(measure, []).append((same["p"], same["p_holm"]))
+    for family in families.values():
+        p, p_holm = zip(*family, strict=True)
+        assert list(p_holm) == pytest.approx(multipletests(p, method="holm")[1])
+    assert {len(family) for family in families.values()} == {3}
 
 
 @pytest.mark.slow

@@ -43,7 +43,7 @@ def tables(db: str, study: str = "", held=None) -> dict[str, dict[str, dict]]:
             trials[column] = None
     recorded = trials[trials["source"] == "human"]
     driven = trials[trials["source"] != "human"]
-    groups = dict([*driven.groupby(["driver", "variant"])])
+    groups = {k: distinct(rows) for k, rows in driven.groupby(["driver", "variant"])}
     judged = {key: rows for key, rows in groups.items() if _is_judged(rows)}
     baselines = {key: rows for key, rows in judged.items() if key[1] == "baseline"}
     humans = {} if recorded.empty else {("human", ""): recorded}
@@ -236,9 +236,24 @@ def _quantities(trials: pd.DataFrame) -> dict:
     return row
 
 
+def distinct(trials: pd.DataFrame) -> pd.DataFrame:
+    """The trials without those of programs that went as an earlier one in the same situation."""
+    keys = pd.Series([*zip(trials["cell"], trials["way"], strict=True)], trials.index)
+    return trials[~keys.duplicated()]
+
+
 def _order(orders) -> dict[str, list[str]]:
-    """The levels of each factor as the study lists them; of several studies none says it."""
-    return next(iter(orders.values())) if len(orders) == 1 else {}
+    """The levels of each factor as the study lists them that lists most of them.
+
+    Whoever lists one alone says nothing of where it stands, unless nobody else lists any.
+    """
+    found: dict[str, list[str]] = {}
+    for factor in {name for order in orders.values() for name in order}:
+        lists = [order[factor] for order in orders.values() if factor in order]
+        if len(lists) > 1:
+            lists = sorted((each for each in lists if len(each) > 1), key=lambda x: -len(x))
+        found[factor] = [*dict.fromkeys(level for each in lists for level in each)]
+    return found
 
 
 def _together(orders, *groups: pd.DataFrame) -> bool:
@@ -247,10 +262,23 @@ def _together(orders, *groups: pd.DataFrame) -> bool:
     return len(orders) < 2 or bool(frozenset.intersection(*every))
 
 
+def _otherwise(one: pd.DataFrame, other: pd.DataFrame) -> list[pd.DataFrame]:
+    """The trials but for cells in which all of one's are copies of the other's."""
+    ways = [trials.groupby("cell")["way"].agg(set).to_dict() for trials in (one, other)]
+    same = {
+        cell
+        for cell in ways[0].keys() & ways[1].keys()
+        if ways[0][cell] <= ways[1][cell] or ways[1][cell] <= ways[0][cell]
+    }
+    return [trials[~trials["cell"].isin(same)] for trials in (one, other)]
+
+
 def _compared(one: pd.DataFrame, other: pd.DataFrame, column: str, kind: str) -> dict:
     if _undecided(one, column) or _undecided(other, column):
         return {}
-    frames = [trials[trials[column].notna()] for trials in (one, other)]
+    frames = _otherwise(*(trials[trials[column].notna()] for trials in (one, other)))
+    if not {*frames[0]["cell"]} & {*frames[1]["cell"]}:
+        return {}
     values = [_values(trials, column, kind) for trials in frames]
     test = statistics.rates_within if kind == "rate" else statistics.means_within
     return test(*values, tuple(trials["cell"] for trials in frames))
@@ -344,6 +372,7 @@ def _factors(groups, orders) -> dict[str, dict]:
                     t for t, each in zip(chosen, levels, strict=True) if each.get(factor) == name
                 ]
                 pooled[name] = _with_other_levels(pd.concat(parts), factor)
+            pooled = _one_cell(pooled)
             for name in names:
                 for metric, column, kind, _ in METRICS:
                     row = _level(pooled[name], pooled[names[0]], column, kind, orders)
@@ -351,6 +380,23 @@ def _factors(groups, orders) -> dict[str, dict]:
                         row["family"] = factor + mark, metric
                     rows[f"{factor}={name}{mark}/{metric}"] = row
     return rows
+
+
+def _one_cell(pooled: dict[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """The trials of each level without copies; cells in which programs do the same are one."""
+    same: dict[tuple, set] = {}
+    for name, trials in pooled.items():
+        for cell, way in zip(trials["cell"], trials["way"], strict=True):
+            same.setdefault((name, cell[0], way), set()).add(cell)
+    parts: list[set] = []
+    for cells in same.values():
+        near = [part for part in parts if part & cells]
+        parts = [part for part in parts if not part & cells] + [cells.union(*near)]
+    named = {cell: min(part) for part in parts for cell in part}
+    return {
+        name: distinct(trials.assign(cell=trials["cell"].map(named)))
+        for name, trials in pooled.items()
+    }
 
 
 def _with_other_levels(trials: pd.DataFrame, factor: str) -> pd.DataFrame:
@@ -370,7 +416,7 @@ def _level(trials, reference, column, kind, orders) -> dict:
     if trials is reference or not _together(orders, trials, reference):
         return row
     if kind == "median":
-        one, other = (each[each[column].notna()] for each in (trials, reference))
+        one, other = _otherwise(*(each[each[column].notna()] for each in (trials, reference)))
         shared = set(one["cell"]) & set(other["cell"])
         if shared:
             a, b = (each[each["cell"].isin(shared)][column].median() for each in (one, other))

@@ -88,8 +88,11 @@ def read(db: str, study: str = "") -> pd.DataFrame:
         }
         sign = -1 if row["ego"] == "right" else 1
         row |= {"h": sign * trial.projected_headway_m, "dv": sign * trial.relative_velocity_mps}
+        row["way"] = (key, trial.status)  # like no other's
         if key in samples and trial.status != "failed":
             row |= _measured(trial, row["ego"], samples[key])
+            if row["programs"]:
+                row["way"] = (_as_seen(row["ego"], samples[key]), trial.status)
         found.append(row)
     every = _with_cells(pd.DataFrame(found))
     every.attrs["orders"] = orders
@@ -108,11 +111,9 @@ def _with_cells(trials: pd.DataFrame) -> pd.DataFrame:
 def _named(trial, spec, factors, own) -> dict:
     """The driver's name, the ego's side, and the levels of the trial."""
     if trial.source == "human":
-        return {"driver": "human", "ego": "left", "levels": {}, "asked": {}}
+        return {"driver": "human", "ego": "left", "levels": {}, "programs": False, "asked": {}}
     models = {"left": trial.model_left, "right": trial.model_right}
     asking = {side: "body" in spec[side] for side in SIDES}
-    if not any(asking.values()) and not any(spec[side].get("chance") for side in SIDES):
-        raise NotImplementedError("equal trials of programs without chance count once")
     ego, opponent = "left", factors.get("opponent")
     if models["left"] != models["right"]:
         if opponent in models.values():
@@ -132,6 +133,7 @@ def _named(trial, spec, factors, own) -> dict:
         "driver": driver,
         "ego": ego,
         "levels": {"model": model, "prompt": trial.variant} | own_factors,
+        "programs": not any(asking.values()),
         "asked": {models[side]: (int(n), int(n - valid)) for side, n, valid in asked.itertuples()},
     }
 
@@ -142,6 +144,13 @@ def _samples(rows: pd.DataFrame) -> dict:
     names = {"s": "position_m", "v": "velocity_mps", "a": "acceleration_mps2"}
     found = {n: {side: sides[side][c].to_numpy(float) for side in SIDES} for n, c in names.items()}
     return {"t": sides["left"]["time_s"].to_numpy(float), **found}
+
+
+def _as_seen(ego: str, at: dict) -> bytes:
+    """All positions and speeds of a trial, those of the ego first."""
+    sides = sorted(SIDES, key=lambda side: side != ego)
+    # Nothing is added to -0.0 to make it 0.0 but here.
+    return b"".join((at[name][side] + 0.0).tobytes() for name in "sv" for side in sides)
 
 
 def _passed(t: np.ndarray, s: np.ndarray, level: float) -> float:
