@@ -321,6 +321,18 @@ class Ledger:
         self._money.write(_OPEN, self.scope, key, number, usd, *place)
         return True
 
+    async def begin(
+        self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
+    ) -> bool:
+        """Make the reservation of an attempt durable; False if that exceeds the cap."""
+        worst = partial(self.reserve, key, number, usd, cap_usd, asked)
+        return not self.scope or bool(await self._money.writer.write(worst))
+
+    def reprice(self, key: str, number: int, usd: float) -> None:
+        """Reserve what an attempt has cost, no longer its worst case; an operation."""
+        sql = "UPDATE open SET usd = ? WHERE scope = ? AND call = ? AND attempt = ?"
+        self._money.write(sql, usd, self.scope, key, number)
+
     async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
         """Settle an attempt at a call; its reservation stays where the cost is unknown."""
         if self.scope:
@@ -355,7 +367,7 @@ class Ledger:
         return self._money.read(_SPENT, self.scope), [row[1:] for row in opened]
 
     def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
-        """Put what a task has spent, and has open, in the place of the share reserved for it."""
+        """Put what a task has spent, and has open, in the place of what is reserved by its name."""
         sql = "DELETE FROM open WHERE scope = ? AND call = ?"
         operations: list[Operation] = [partial(self._money.write, sql, self.scope, name)]
         operations += [partial(self._money.write, _PAY, self.scope, *row) for row in spent]
@@ -402,8 +414,7 @@ class PaidAttempt:
         if not self.queued:  # in a smaller batch than before, or in one of an earlier run
             return
         ledger, cap_usd, number = self.budget.ledger, self.budget.cap_usd, len(attempts) + 1
-        worst = partial(ledger.reserve, self.key, number, self.aside_usd, cap_usd, self.asked)
-        if ledger.scope and not await ledger.cache.money.writer.write(worst):
+        if not await ledger.begin(self.key, number, self.aside_usd, cap_usd, self.asked):
             raise TrialSuspended("another run spends from the same cap, and has used it up")
         self.queued = False
         self.budget.queued_usd -= self.aside_usd

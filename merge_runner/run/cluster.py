@@ -3,7 +3,10 @@
 A task is a chunk of trials with a share of the rate limits and of the cap. Its worker plays it with
 the ordinary runner and a reply folder of its own, and returns records and replies. The coordinator
 keeps them in one transaction before it counts the task as done. A worker that dies loses its
-unfinished task, which is given out again; its share of the cap stays reserved.
+unfinished task, which is given out again.
+
+Before an attempt is sent, the coordinator reserves its worst case durably, under the name of the
+task. What is lost with a worker or a coordinator so counts with what it may have cost, no more.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from collections import Counter, deque
 from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, closing, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from multiprocessing import resource_tracker
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -44,7 +47,6 @@ from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Attempt, TrialRecord, TrialSpec, Usage
 from merge_runner.registry import plugin_sources, using
 from merge_runner.run.clients import live_clients
-from merge_runner.run.estimate import trial_costs
 from merge_runner.run.local_runner import Ended, FirstDecisions, LocalRunner, Room
 from merge_runner.run.plan import Options, Plan
 from merge_runner.study.parts import catalogue_of
@@ -59,6 +61,8 @@ LOOK_EVERY_S = 1.0
 # holds the others up.
 TRIALS_PER_SEAT = 4
 MOST_LOSSES = 3
+# A coordinator that stands still is waited for; one that is gone has no use for what is asked.
+SILENT_S = 300
 _WHERE = re.compile(
     r"local:(?P<workers>[1-9]\d*)|(?P<file>.+\.json)|((tcp|tls)://)?(?!local:)[^\s/]+:[1-9]\d*",
     re.ASCII,
@@ -154,7 +158,8 @@ Recorded = tuple[Sequence[CachedCall], Sequence[tuple[str, tuple[Attempt, ...]]]
 class Task:
     """Trials for one worker, what is recorded of their calls, and its ``share`` of the limits.
 
-    Its share of the cap is reserved under its ``name``. ``urls`` are the coordinator's base URLs.
+    What it spends is reserved under its ``name`` until it ends. ``urls`` are the coordinator's base
+    URLs.
     """
 
     run: str
@@ -195,13 +200,113 @@ def fingerprint() -> str:
 # At a worker, on its event loop
 
 
+@dataclass(slots=True)
+class Told:
+    """What a task tells the coordinator: attempts to reserve, by number, and costs that are known.
+
+    After the last one it is ``done``.
+    """
+
+    asking: dict[int, tuple[float, Asked]] = field(default_factory=dict)
+    costs: dict[int, float] = field(default_factory=dict)
+    done: bool = False
+
+
+class Desk:
+    """Where a task waits until the coordinator has reserved its attempts."""
+
+    def __init__(self) -> None:
+        self.told = Told()
+        self.changed = asyncio.Event()
+        self._begun = 0
+        self._answers: dict[int, asyncio.Future[bool]] = {}
+
+    async def ask(self, usd: float, asked: Asked) -> tuple[int, bool]:
+        """Return an attempt's number and whether there is money for it; raises SweepStopped."""
+        number = self._begun = self._begun + 1
+        answer = self._answers[number] = asyncio.get_running_loop().create_future()
+        self.told.asking[number] = (usd, asked)
+        self.changed.set()
+        try:
+            async with asyncio.timeout(SILENT_S):
+                return number, await answer
+        except TimeoutError as exc:
+            raise SweepStopped(f"the coordinator has said nothing for {SILENT_S} s") from exc
+        finally:
+            del self._answers[number]
+
+    def cost(self, number: int, usd: float) -> None:
+        """Tell what an attempt has cost."""
+        self.told.costs[number] = usd
+        self.changed.set()
+
+    def close(self) -> None:
+        """Tell that the task has ended."""
+        self.told.done = True
+        self.changed.set()
+
+    async def exchange(self, answers: Mapping[int, bool]) -> Told:
+        """Take the coordinator's answers, and return what is new since then."""
+        for number, answer in answers.items():
+            if number in self._answers and not self._answers[number].done():
+                self._answers[number].set_result(answer)
+        await self.changed.wait()
+        self.changed.clear()
+        told, self.told = self.told, Told(done=self.told.done)
+        return told
+
+
+class ToldLedger(Ledger):
+    """A worker's ledger, whose attempts the coordinator reserves before they begin."""
+
+    def __init__(self, cache: ResponseCache, scope: str, desk: Desk) -> None:
+        super().__init__(cache, scope)
+        self._desk = desk
+        self._numbers: dict[tuple[str, int], int] = {}
+
+    async def begin(
+        self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
+    ) -> bool:
+        """Reserve an attempt there, then here; False if either exceeds the cap."""
+        told, is_paid = await self._desk.ask(usd, asked)
+        self._numbers[key, number] = told
+        if is_paid and not await super().begin(key, number, usd, cap_usd, asked):
+            self._desk.cost(told, 0.0)
+            return False
+        return is_paid
+
+    async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
+        """Settle an attempt, and tell what it has cost where that is known."""
+        await super().settle(key, attempt, driver)
+        told = self._numbers.pop((key, attempt.number), None)
+        if told is not None and attempt.cost_usd is not None:
+            self._desk.cost(told, attempt.cost_usd)
+
+
+async def exchange(name: str, answers: Mapping[int, bool], *, dask_worker: Worker) -> Told:
+    """Take the coordinator's answers to a task, and return what it asks and tells next."""
+    desk: Desk = dask_worker.extensions.setdefault(name, Desk())
+    told = await desk.exchange(answers)
+    if told.done:
+        del dask_worker.extensions[name]
+    return told
+
+
 def stop(run: str, *, dask_worker: Worker) -> None:
     """Let the calls of a run's tasks end, and return what there is."""
     dask_worker.extensions.setdefault(run, asyncio.Event()).set()
 
 
-async def play_task(program: str, pickled: bytes, *, dask_worker: Worker) -> Played:
-    """Play a Task, which only a worker with the same ``program`` can read."""
+async def play_task(program: str, pickled: bytes, name: str, *, dask_worker: Worker) -> Played:
+    """Play the Task of a name, which only a worker with the same ``program`` can read."""
+    desk: Desk = dask_worker.extensions.setdefault(name, Desk())
+    try:
+        return await _play_task(program, pickled, dask_worker)
+    finally:
+        desk.close()
+
+
+async def _play_task(program: str, pickled: bytes, dask_worker: Worker) -> Played:
     if fingerprint() != program:
         differs = UsageError(
             f"it has merge-runner {fingerprint()}, and the coordinator {program}: install the same "
@@ -242,7 +347,7 @@ async def _play(task: Task, kept: dict[str, Any]) -> Played:
     async with AsyncExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="merge-runner-")))
         replies = stack.enter_context(closing(ResponseCache(folder)))
-        ledger = Ledger(replies, task.plan.ledger)
+        ledger = ToldLedger(replies, task.plan.ledger, kept.setdefault(task.name, Desk()))
         replies.put_now(*task.recorded)
         ledger.settle_share("", [(driver, 0, 0, ratio) for driver, ratio in task.overruns], [])
         try:
@@ -289,12 +394,13 @@ class DaskTasks:
     _run: str = field(default_factory=secrets.token_hex)
     _groups: deque[list[TrialSpec]] = field(default_factory=deque)
     _given: dict[str, tuple[Task, asyncio.Future[Any]]] = field(default_factory=dict)
+    # By the name of a task under way: what each of its attempts may have cost, or has.
+    _begun: dict[str, dict[int, float]] = field(default_factory=dict)
     _losses: Counter[int] = field(default_factory=Counter)
     _one_by_one: bool = False
 
     def __post_init__(self) -> None:
         self.meters = {name: Meter() for name in self._plan.entries}
-        self._costs = trial_costs(self._plan, self._earlier)
         self._sent = self._plan.model_copy(update={"parts": self._plan.parts.without_code()})
 
     @property
@@ -352,13 +458,13 @@ class DaskTasks:
         recorded = await self._recorded(specs)
         name = f"task {secrets.token_hex(8)}"
         cap_usd = self._options.max_cost_usd
-        if not self._plan.is_free:
-            usd = sum((self._costs(spec.order) for spec in specs), 0.0)
-            if cap_usd is not None:
-                self._ledger.read()
-                usd = cap_usd = max(0.0, cap_usd - self._ledger.committed_usd) / idle
-            asked = Asked(f"Dask worker {address}", specs[0].trial_id, usd)
-            self._ledger.reserve(name, 1, usd, None, asked)
+        if cap_usd is not None:
+            self._ledger.read()
+            kept_usd = sum(
+                max(0.0, (task.options.max_cost_usd or 0.0) - sum(self._begun[task.name].values()))
+                for task, _ in self._given.values()
+            )
+            cap_usd = max(0.0, cap_usd - self._ledger.committed_usd - kept_usd) / idle
         task = Task(
             run=self._run,
             name=name,
@@ -372,11 +478,41 @@ class DaskTasks:
             recorded=recorded,
             overruns=[*self._ledger.read().overruns.items()],
         )
+        self._begun[name] = {}
+        self._given[address] = task, asyncio.create_task(self._work(address, task))
+
+    async def _work(self, address: str, task: Task) -> Any:  # noqa: ANN401 # or what went wrong
+        """Let a worker play a task, and reserve its attempts meanwhile; return what it returns."""
         # Out of Dask's scheduling, which would retry it: the share of the cap is spent once.
-        work = self._client.run(
-            play_task, fingerprint(), pickle.dumps(task), workers=[address], on_error="return"
-        )
-        self._given[address] = task, asyncio.ensure_future(work)
+        run = partial(self._client.run, workers=[address], on_error="return")
+        playing = run(play_task, fingerprint(), pickle.dumps(task), task.name)
+        played, _ = await asyncio.gather(playing, self._attend(address, task))
+        return played[address]
+
+    async def _attend(self, address: str, task: Task) -> None:
+        """Reserve the worst case of each attempt of a task before it is sent, until it ends."""
+        write, begun = self._cache.money.writer.write, self._begun[task.name]
+        cap_usd, answers = self._options.max_cost_usd, dict[int, bool]()
+        while True:
+            told = (
+                await self._client.run(
+                    exchange, task.name, answers, workers=[address], on_error="return"
+                )
+            )[address]
+            if not isinstance(told, Told):
+                return  # lost, as the task is
+            costs = [partial(self._ledger.reprice, task.name, *each) for each in told.costs.items()]
+            worst = [
+                partial(self._ledger.reserve, task.name, number, usd, cap_usd, asked)
+                for number, (usd, asked) in told.asking.items()
+            ]
+            await asyncio.gather(*map(write, costs))
+            paid = await asyncio.gather(*map(write, worst))
+            answers = dict(zip(told.asking, paid, strict=True))
+            begun.update({n: told.asking[n][0] for n, is_paid in answers.items() if is_paid})
+            begun.update(told.costs)
+            if told.done:
+                return
 
     async def _recorded(self, specs: Sequence[TrialSpec]) -> Recorded:
         """What the cache holds of the calls of these trials, up to the first that is missing."""
@@ -402,7 +538,8 @@ class DaskTasks:
         await asyncio.wait(works, timeout=LOOK_EVERY_S, return_when=asyncio.FIRST_COMPLETED)
         for address in [address for address, (_, work) in self._given.items() if work.done()]:
             task, work = self._given.pop(address)
-            played = work.result()[address]
+            played = work.result()
+            del self._begun[task.name]
             if not isinstance(played, Played):
                 self._lose(task, address, played)
                 continue
@@ -430,7 +567,7 @@ class DaskTasks:
                     self.first.count(asked[row.side], row.decision)
 
     def _lose(self, task: Task, address: str, error: Exception) -> None:
-        """Give the trials of a lost task out again; its share of the cap stays reserved."""
+        """Give the trials of a lost task out again; what it has begun stays reserved."""
         self._losses[task.specs[0].order] += 1
         if self._losses[task.specs[0].order] == MOST_LOSSES:
             raise SweepStopped(

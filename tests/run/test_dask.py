@@ -15,6 +15,7 @@ import shutil
 import signal
 import sys
 import time
+from collections import Counter
 from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
@@ -27,7 +28,8 @@ from aiohttp import web
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
-from merge_runner.run.cluster import Task, connected, fingerprint, play_task
+from merge_runner.run import cluster
+from merge_runner.run.cluster import DaskTasks, Task, connected, fingerprint, play_task
 from merge_runner.run.local_runner import FirstDecisions
 from merge_runner.run.plan import Options, make_plan
 from tests.gate import HANGS_S, Gate
@@ -116,12 +118,102 @@ async def test_tokens_of_a_workers_tasks_count_together_in_its_share(tmp_path):
             urls={}, earlier={},
             share=0.5, first=FirstDecisions(), recorded=((), ()), overruns=(),
         )  # fmt: skip
-        played = await play_task(fingerprint(), pickle.dumps(task), dask_worker=worker)
+        played = await play_task(fingerprint(), pickle.dumps(task), task.name, dask_worker=worker)
         assert played.error is None
         (limiter,) = worker.extensions["run 0.5"].values()
         used.append(limiter._tokens_in_window)
     assert limiter._tpm == 5 * 10**5
     assert used[1] > used[0] > 0
+
+
+STUDY = 'models = ["dear"]\nrepetitions = 1\nconditions = ["N_0_0", "L_4_0"]\n'
+DEAR = """
+[dear]
+provider = "emulator"
+format = "openai-chat"
+id = "scripted-driver"
+max_output_tokens = 4000
+price = { input = 1.0, output = 2.0, source = "mine" }
+"""
+
+
+class Cluster:
+    """Two workers within this process; the first one to ``ask`` so often dies of it."""
+
+    def __init__(self, dies_at):
+        self.dies_at = dies_at
+        self.workers = {f"tcp://{n}": self._worker() for n in (1, 2)}
+        self.calls = Counter()
+        self.running = {}
+        self.sent = []
+
+    @staticmethod
+    def _worker():
+        return SimpleNamespace(extensions={}, periodic_callbacks={"profile": Mock()})
+
+    async def nthreads(self):
+        return dict.fromkeys(self.workers, 1)
+
+    async def run(self, function, *arguments, workers, on_error):
+        (address,) = workers
+        worker, lost = self.workers[address], OSError("lost")
+        work = asyncio.ensure_future(function(*arguments, dask_worker=worker))
+        if function is play_task:
+            self.running[address] = work
+        elif function is cluster.exchange:
+            self.calls[address] += 1
+            if self.calls[address] == self.dies_at:
+                self.dies_at = None
+                work.cancel()
+                self.running[address].cancel()
+                await asyncio.wait([self.running[address]])
+                self.workers[address] = self._worker()
+        try:
+            return {address: await work}
+        except asyncio.CancelledError:
+            return {address: lost}
+
+
+@pytest.mark.parametrize("dies_at", [None, 3])
+async def test_what_a_lost_worker_may_have_cost_stays_reserved_and_no_more(
+    tmp_path, monkeypatch, dies_at
+):
+    monkeypatch.delenv("EMULATOR_BASE_URL", raising=False)
+    (tmp_path / "study.toml").write_text(STUDY)
+    (tmp_path / "models.toml").write_text(DEAR)
+    plan, cap = make_plan(str(tmp_path / "study.toml")), 50.0
+    options = Options(tmp_path / "db", tmp_path / "cache", in_flight=2, max_cost_usd=cap)
+    ended, client, attempts, reserve = {}, Cluster(dies_at), [], Ledger.reserve
+
+    def noted(ledger, name, number, usd, cap_usd, asked):
+        if name.startswith("task "):
+            attempts.append(usd)
+        return reserve(ledger, name, number, usd, cap_usd, asked)
+
+    async def room():
+        pass
+
+    monkeypatch.setattr(Ledger, "reserve", noted)
+    with closing(ResponseCache(options.cache)) as cache:
+        ledger = Ledger(cache, plan.ledger)
+        tasks = DaskTasks(client, plan, options, {}, cache, ledger, FirstDecisions())
+        note = lambda spec, record: ended.__setitem__(spec.trial_id, record.status)  # noqa: E731
+        await tasks.play(plan.trial_specs(), note, room)
+        spending = ledger.read()
+        kept = sum(call.attempts[-1].cost_usd for call in cache.entries())
+    assert len(ended) == 2
+    assert set(ended.values()) <= {"finished", "collided"}
+    assert spending.spent_usd == pytest.approx(kept)
+    lost = spending.open_attempts
+    assert (lost > 0) == (dies_at is not None)
+    assert spending.reserved_usd <= lost * max(attempts)
+    assert lost <= 8, "not all that the task would have asked"
+    assert len(attempts) == len(kept_keys(options.cache)) + lost
+
+
+def kept_keys(folder):
+    with closing(ResponseCache(folder, read_only=True)) as cache:
+        return [call.request.key for call in cache.entries()]
 
 
 @pytest.mark.slow
@@ -506,3 +598,35 @@ async def test_the_cost_cap_holds_over_all_workers_and_a_higher_one_goes_on(merg
         assert int(calls.out.split()[1]) == server.requests, "nothing was paid for twice"
     assert done.summary["sweep_cost_usd"] == pytest.approx(usd)
     assert done.summary["set_aside_usd"] == 0
+
+
+@pytest.mark.long
+async def test_after_a_coordinator_is_killed_only_what_was_sent_stays_reserved(
+    merge_runner, started
+):
+    hold = asyncio.Event()
+
+    async def middle(request, handler):
+        if server.requests > 12:
+            await hold.wait()
+        return await handler(request)
+
+    async with watched(middle) as server, asyncio.timeout(HANGS_S):
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        sweep = (*SIX, *PAID, "--max-cost", 50)
+        process = await started(*sweep, "--in-flight", 4, "--dask", "local:2", **env)
+        while server.requests < 16:
+            await asyncio.sleep(0.1)
+        family = psutil.Process(process.pid).children(recursive=True)
+        process.kill()
+        await process.wait()
+        _, alive = psutil.wait_procs(family, timeout=HANGS_S)
+        assert not alive
+        (told,) = json.loads((await merge_runner("ledger", "--json")).out)
+        assert 4 <= told["open_attempts"] <= server.requests
+        # At most 16,000 tokens of output, at 8 USD a million, and a prompt of some thousand.
+        assert 0 < told["reserved_usd"] < 0.15 * told["open_attempts"]
+        hold.set()
+        run = await merge_runner(*sweep, **env)
+    assert run.code == 0, run.err
+    assert run.summary["set_aside_usd"] == pytest.approx(told["reserved_usd"])
