@@ -550,7 +550,8 @@ class DaskTasks:
     def _keep(self, task: Task, played: Played) -> None:
         """Keep what a task has brought: its replies first."""
         self._cache.put_now(*played.recorded)
-        self._ledger.settle_share(task.name, played.spent, played.opened)
+        if not self._plan.is_free:
+            self._ledger.settle_share(task.name, played.spent, played.opened)
         for model, meter in played.meters.items():
             self.meters[model].add(meter)
         arms = self._plan.by_label()
