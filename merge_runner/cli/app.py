@@ -69,7 +69,7 @@ def main() -> None:
     """Run the command line and exit with the contract's code."""
     # A trial's objects live until it ends, so frequent garbage collections would find almost none.
     gc.set_threshold(20_000, 10, 100)
-    if isinstance(sys.stdout, io.TextIOWrapper):  # of an encoding that may not know all characters
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.encoding.lower() != "utf-8":
         sys.stdout.reconfigure(errors="replace")
     debug = "--debug" in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != "--debug"]
