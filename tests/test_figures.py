@@ -112,7 +112,9 @@ async def test_how_the_driver_cei_collides(merge_runner, tmp_path):
         text = httpx.get(f"{address}/trials.csv", timeout=120).text
     trials = csv.DictReader(io.StringIO(text))
     found = Counter(row["account"] for row in trials if row["status"] == "collided")
-    published = list(csv.DictReader((PROJECT / "analysis/data/collision_accounts.csv").open()))
+    published = list(
+        csv.DictReader((PROJECT / "tests/analysis/accounts/collision_accounts.csv").open())
+    )
     humans, model = (
         {row["account"]: row["collisions"] for row in published if row["drivers"] == drivers}
         for drivers in ("humans", "published model")

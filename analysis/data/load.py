@@ -138,8 +138,8 @@ def load(sql: str, db: Path | str = DEFAULT_DB) -> pd.DataFrame:
 def load_trials(db: Path | str = DEFAULT_DB) -> pd.DataFrame:
     """One row a trial, as its ``ego`` sees it: condition, outcome and metrics in SI units.
 
-    See docs/tables.md. A trial whose ego sat on the right is mirrored: its left is the ego's side.
-    First situations that were only asked are left out.
+    See docs/reference/tables.md. A trial whose ego sat on the right is mirrored: its left is the
+    ego's side. First situations that were only asked are left out.
     """
     return load(TRIALS, db)
 

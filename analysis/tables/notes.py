@@ -46,8 +46,8 @@ def _of_trials(table: Table, study: Study) -> Iterator[str]:
         pooled = [f"{name} ({n} trials)" for name, n in sizes.items() if n]
         if len(pooled) > 1:
             yield (
-                f"trials of several studies: {', '.join(pooled)}. No p is given for a difference "
-                "across studies; `--study FILE` keeps the trials of one"
+                f"trials of several studies: {', '.join(pooled)}. A difference "
+                "between trials of different studies has no p; `--study FILE` keeps those of one"
             )
     if study.human in groups:
         yield from _human_notes(study, table)

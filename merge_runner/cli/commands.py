@@ -316,7 +316,9 @@ def recording_export(
     rows, keys = recorded_sweeps(db, sweeps or ())
     found = " and ".join(row["sweep_id"] for row in rows)
     if not keys:
-        raise UsageError(f"the sweep {found} made no call: there is nothing to record")
+        raise UsageError(
+            f"the sweep {found} made no call: there is nothing to record. --sweep ID names another"
+        )
     provenance = provenance_of(rows)
     with closing(ResponseCache(cache, read_only=True)) as opened:
         calls = export_recording(file, opened, keys, provenance)

@@ -168,7 +168,8 @@ def check_batches(plan: Plan, options: Options) -> None:
     """Raise UsageError where a run cannot use batches as it is told to."""
     if not options.batch:
         return
-    in_process = plan.scripted and not os.environ.get("EMULATOR_BASE_URL")
+    is_served = bool(os.environ.get("EMULATOR_BASE_URL"))
+    in_process = plan.scripted and not is_served
     if options.replay or options.dask is not None or not plan.entries or in_process:
         raise UsageError(
             "--batch asks models from this process, and neither programs nor the emulator have a "
@@ -177,7 +178,11 @@ def check_batches(plan: Plan, options: Options) -> None:
     registry = load_models(plan.study.path.parent)
     for name, entry in plan.entries.items():
         if batch_terms(entry) is None:
-            valid = ", ".join(each for each, its in registry.items() if batch_terms(its))
+            valid = ", ".join(
+                each
+                for each, its in registry.items()
+                if batch_terms(its) and (is_served or its.provider != "emulator")
+            )
             raise UsageError(
                 f"{plan.registered[name]} has no batch mode that is known; valid with --batch: "
                 f"{valid}. Leave --batch out, or give the entry in experiments/models.toml `batch "

@@ -495,6 +495,9 @@ def estimate_lines(expected: Estimate) -> Iterator[str]:
     measured = ", as measured before" if expected.measured else ""
     tokens = f"about {expected.input_tokens} in, {expected.output_tokens} out{measured}"
     yield f"driver  {expected.driver}"
+    if not expected.trials:
+        yield "trials  none: all of them are stored"
+        return
     yield f"trials  {expected.trials} that have not ended yet"
     yield f"calls   about {expected.calls} that are not recorded yet"
     yield f"tokens  {tokens}"

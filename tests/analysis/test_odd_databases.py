@@ -50,7 +50,7 @@ SAID = {
         [
             "No language model is judged here.",
             "trials of several studies: ",
-            "No p is given for a difference across studies",
+            "A difference between trials of different studies has no p",
         ],
         [],
     ),

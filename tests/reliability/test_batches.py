@@ -241,6 +241,15 @@ async def test_what_cannot_go_in_batches_is_refused_in_one_line(merge_runner, op
     assert (run.out, run.err.count("error: ")) == ("", 1)
 
 
+async def test_a_refusal_names_no_model_whose_batches_would_be_refused(merge_runner):
+    run = await merge_runner(
+        "sweep", "baseline", "--batch", "--model", "local", LOCAL_MODEL="m", EMULATOR_BASE_URL=""
+    )
+    valid = run.err.partition("valid with --batch: ")[2].partition(". ")[0].split(", ")
+    assert "o3" in valid
+    assert not {"emulator", "random"} & {*valid}
+
+
 async def test_a_dry_run_says_what_batches_cost_beside_single_calls(merge_runner):
     run = await merge_runner(
         "sweep", "baseline", *TWO, "--model", "o3", "--batch", "--dry-run", OPENAI_API_KEY="k"
