@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from merge_runner.results.store import Store
@@ -13,8 +15,11 @@ from merge_runner_analysis.explain import explain
 from merge_runner_analysis.figures.gallery import MAKERS
 from merge_runner_analysis.human.archive import open_files
 from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_analysis.metrics import GAP
 from merge_runner_analysis.stats.indicators import Verdict, gains, less_humans, mean_gain, score
 from merge_runner_analysis.stats.intervals import mean
+from merge_runner_analysis.stats.measures import estimate
+from merge_runner_analysis.stats.verdicts import human_gap
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.recordings import drive, write_folder
 from tests.analysis.studies import write_study, yielding
@@ -111,6 +116,17 @@ def test_how_like_the_humans_a_driver_is_in_i5_is_a_number(imported):
     assert 0.5 < row["ci"][0] < apart.low < apart.high < row["ci"][1]
     assert row["level"] > 95
     assert row["state"] == "unlike"
+
+
+def test_the_humans_mean_gap_is_one_number_in_all_tables(imported):
+    """Also where pairs have other numbers of trials: never a mean of the pairs' means."""
+    human = imported.human
+    of_pair = human.trials["pair"] == human.trials["pair"].iloc[0]
+    kept = ~of_pair | (of_pair.cumsum() <= 4)
+    less = replace(human, trials=human.trials[kept])
+    beside, table = human_gap(less, less).estimate, estimate(less, GAP)
+    assert beside.value == pytest.approx(less.finished[GAP.column].mean())
+    assert (table.value, table.bounds(), table.n) == (beside.value, beside.bounds(), beside.n)
 
 
 def test_the_human_interval_is_over_pairs(imported):

@@ -15,7 +15,10 @@ from tests.analysis.odd_databases import KINDS, made
 
 # What the report of a kind says, and what it must not say.
 SAID = {
-    "two_trials": (["o3/baseline: Collisions: inconclusive."], ["o3 does not drive"]),
+    "two_trials": (
+        ["o3/baseline: Collisions and mean gap: inconclusive."],
+        ["o3 does not drive"],
+    ),
     "stand_in_behind_o3": (
         [
             "A scripted stand-in answered",
@@ -41,7 +44,7 @@ SAID = {
         ["No language model can be compared with humans yet.", "Trials failed"],
         ["o3 does not drive"],
     ),
-    "killed": (["o3/baseline: Collisions: inconclusive."], ["o3 does not drive"]),
+    "killed": (["ollisions: inconclusive."], ["o3 collides"]),
     "word_for_word": (
         ["o3/baseline: 22 of 33 trials are as an earlier one to the last state; each counts"],
         ["they are left out"],
