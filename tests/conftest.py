@@ -12,9 +12,11 @@ from hypothesis import settings
 
 from merge_runner.registry import Catalogue, collecting
 from merge_runner.results.store import results_digest
+from tests import program
 from tests.crossed_study import play
-from tests.harness import PROGRAM, Run, environment
-from tests.zygote import Zygote
+from tests.harness import Run, environment
+from tests.mock_server import FaultPlan, served
+from tests.program import Process
 
 # No agreement is kept: no test must pass because another one agreed.
 os.environ["XDG_STATE_HOME"] = os.devnull
@@ -42,61 +44,39 @@ def shared(tmp_path_factory, worker_id):
 
 
 @pytest.fixture(scope="session")
-def zygote(shared):
-    """What the program is forked from."""
-    with Zygote(shared / "zygote") as forking:
-        yield forking
-
-
-@pytest.fixture(scope="session")
-def emulator_url(zygote, tmp_path_factory):
+def emulator_url():
     """An emulator without faults, for all tests that need no other."""
-    command = ("emulate", "--port", 0)
-    folder = tmp_path_factory.mktemp("emulator")
-    with zygote.serving(command, cwd=folder, env=environment()) as url:
-        yield url.strip() + "/v1"
+    with served(FaultPlan()) as url:
+        yield f"{url}/v1"
 
 
 @pytest.fixture
-def merge_runner(tmp_path, zygote, emulator_url):
+def merge_runner(tmp_path, emulator_url):
     """Runs ``merge-runner`` in an empty folder, beside an emulator.
 
-    With ``EMULATOR_BASE_URL=""`` a sweep has an emulator of its own. ``fork``
-    returns once it has begun, to be signalled; ``start`` does so with a process of its own
-    command line and imports.
+    With ``EMULATOR_BASE_URL=""`` a sweep has an emulator of its own. ``start`` returns once a
+    process of its own has begun, to be signalled.
     """
+    one_at_a_time = asyncio.Lock()
 
     async def run(*arguments: object, cwd: Path = tmp_path, **changes: str) -> Run:
         env = beside(emulator_url, changes)
-        return Run(*await zygote.run(arguments, cwd=cwd, env=env))
+        async with one_at_a_time:
+            return await asyncio.to_thread(program.run, arguments, cwd=cwd, env=env)
 
-    async def fork(*arguments: object, cwd: Path = tmp_path, **changes: str):
-        env = beside(emulator_url, changes)
-        return await zygote.start(arguments, cwd=cwd, env=env)
+    async def start(*arguments: object, cwd: Path = tmp_path, **changes: str) -> Process:
+        return await program.start(arguments, cwd=cwd, env=beside(emulator_url, changes))
 
-    async def start(*arguments: object, cwd: Path = tmp_path, **changes: str):
-        return await asyncio.create_subprocess_exec(
-            PROGRAM,
-            *map(str, arguments),
-            cwd=cwd,
-            env=environment(**changes),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-        )
-
-    run.fork = fork
-    run.start = start
+    run.start = run.fork = start
     return run
 
 
 @pytest.fixture(scope="session")
-def prepare(zygote, emulator_url):
+def prepare(emulator_url):
     """Runs ``merge-runner`` in a folder, for what is made once for several tests."""
 
     def run(folder: Path, *arguments: object, **changes: str) -> Run:
-        env = beside(emulator_url, changes)
-        return Run(*zygote.run_blocking(arguments, cwd=folder, env=env))
+        return program.run(arguments, cwd=folder, env=beside(emulator_url, changes))
 
     return run
 

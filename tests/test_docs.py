@@ -141,15 +141,9 @@ async def at_terminal(command: str, folder: Path, **changes: str) -> tuple[int, 
     return code, out.decode()
 
 
-@pytest.fixture
-def forked(zygote, tmp_path_factory):
-    """Variables under which shells, and make, fork the program: most of its time is imports."""
-    return {**zygote.on_path(tmp_path_factory.mktemp("bin"), PATH), "RUN": "merge-runner"}
-
-
 @pytest.mark.long
 @NEEDS_MAKE
-async def test_every_command_of_the_docs_does_what_it_says(folder, forked):
+async def test_every_command_of_the_docs_does_what_it_says(folder):
     """What stands on the pages twice is run once, where the later pages need nothing of it."""
     done: list[str] = []
     async with watched() as server:
@@ -159,7 +153,7 @@ async def test_every_command_of_the_docs_does_what_it_says(folder, forked):
             for command in commands(page):
                 if command in {"make test", "make check", *done}:
                     continue
-                code, out = await shell(command, folder, **account, **forked)
+                code, out = await shell(command, folder, **account)
                 assert code == 0, f"{page.name}: {command}\n{out}"
                 assert "Traceback" not in out
                 done.append(command)
@@ -191,9 +185,7 @@ async def test_the_page_on_recording_has_the_prices_that_a_dry_run_prints(merge_
     ("model", "base_url", "version"),
     [("o3", "OPENAI_BASE_URL", "/v1"), ("gemini-2.5-pro", "GOOGLE_GEMINI_BASE_URL", "")],
 )
-async def test_the_page_on_recording_leads_to_a_file_that_replays(
-    folder, forked, model, base_url, version
-):
+async def test_the_page_on_recording_leads_to_a_file_that_replays(folder, model, base_url, version):
     registry = folder / "experiments/models.toml"
     registry.write_text(re.sub("typical_latency_s = .*", "", registry.read_text()))
     blocks = re.findall(r"^   ```sh\n(.*?)^   ```", RECORD.read_text(), re.MULTILINE | re.DOTALL)
@@ -202,7 +194,7 @@ async def test_the_page_on_recording_leads_to_a_file_that_replays(
     async with watched() as server:
         account = {"OPENAI_API_KEY": "k", "GEMINI_API_KEY": "k", base_url: server.url + version}
         for command in (line.replace("o3", model) for line in told):
-            code, out = await shell(command, folder, **account, **forked)
+            code, out = await shell(command, folder, **account)
             assert code == 0, f"{command}\n{out}"
             said.append(out)
     assert "The model `emulator` is a scripted stand-in, no language model." in said[0]

@@ -185,9 +185,12 @@ def _play(
 
     def leave(expected: Estimate) -> None:
         lines = "\n".join(progress.estimate_lines(expected))
+        if yes:
+            say(lines)
+            return
         by_asyncio = signal.signal(signal.SIGINT, signal.default_int_handler)
         try:  # Ctrl-C is an answer, too
-            agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
+            agree(lines, "Go ahead?", otherwise="nothing was sent", yes=False)
         finally:
             signal.signal(signal.SIGINT, by_asyncio)
 

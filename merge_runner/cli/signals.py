@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 import stat
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -16,7 +17,11 @@ def on_signal(stop: Callable[[], object] | None, drop: Callable[[], object]) -> 
 
     Where there is nothing to stop, the first signal drops. A terminal that closes sends SIGHUP more
     than once, often with a SIGTERM. Under nohup SIGHUP is ignored, and stays so.
+    Signals reach the main thread alone: in another one nothing is handled.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
     loop = asyncio.get_running_loop()
     handled = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:

@@ -78,8 +78,8 @@ def test_every_kind_is_looked_at():
 
 
 @pytest.fixture
-def forked(prepare, emulator_url, monkeypatch):
-    """Sweeps are forked and ask the emulator of all tests: most of their time is imports."""
+def in_one_process(prepare, emulator_url, monkeypatch):
+    """Sweeps ask the emulator of all tests, without a process of their own."""
 
     def run(db, *arguments, **changes):
         done = prepare(db.parent, *arguments, "--db", db.name, **changes)
@@ -90,7 +90,7 @@ def forked(prepare, emulator_url, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("forked")
+@pytest.mark.usefixtures("in_one_process")
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_report_of_an_odd_database_says_what_is_true_of_it(kind, tmp_path):
     study = Study(made(tmp_path, kind))

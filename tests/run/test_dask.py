@@ -32,11 +32,11 @@ from merge_runner.run import cluster
 from merge_runner.run.cluster import DaskTasks, Task, connected, fingerprint, play_task
 from merge_runner.run.local_runner import FirstDecisions
 from merge_runner.run.plan import Options, make_plan
+from tests import program
 from tests.gate import HANGS_S, Gate
 from tests.harness import FAST, PROJECT, environment, watched
 from tests.llm.test_limiter import fullest_window
 from tests.mock_server import FaultPlan
-from tests.zygote import Zygote
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
 # Six trials of 19 calls each.
@@ -47,20 +47,13 @@ ON_TWO = (*SIX, "--in-flight", 4, "--dask", "local:2")
 PAID = ("--model", "o3", "--yes", *FAST)
 
 
-@pytest.fixture(scope="session")
-def zygote(shared):
-    """What the program is forked from; here it has imported Dask too."""
-    with Zygote(shared / "zygote-dask", "distributed") as forking:
-        yield forking
-
-
 @pytest.fixture
-def started(zygote, tmp_path):
+def started(tmp_path):
     """Starts a sweep on a cluster; what is left of it is killed in the end."""
     families: list[psutil.Process] = []
 
     async def start(*arguments, **env):
-        process = await zygote.start(arguments, cwd=tmp_path, env=environment(**env))
+        process = await program.start(arguments, cwd=tmp_path, env=environment(**env))
         families.append(psutil.Process(process.pid))
         return process
 
@@ -356,7 +349,7 @@ async def test_what_stops_a_sweep_stops_it_at_all_workers_in_one_line(merge_runn
 
 
 @pytest.fixture
-async def scheduler(tmp_path, zygote):
+async def scheduler(tmp_path):
     """A scheduler of its own; called, it adds a worker."""
     file = tmp_path / "scheduler.json"
     to = ("--scheduler-file", file, "--no-dashboard")
@@ -370,7 +363,7 @@ async def scheduler(tmp_path, zygote):
         )  # fmt: skip
         processes.append(psutil.Process(process.pid))
 
-    start.process = await zygote.start(
+    start.process = await program.start(
         ("--port", "0", "--host", "127.0.0.1", *to),
         cwd=tmp_path, env=environment(), module="distributed.cli.dask_scheduler",
     )  # fmt: skip

@@ -14,8 +14,9 @@ import pytest
 from merge_runner.errors import UsageError
 from merge_runner.results.store import query
 from merge_runner_analysis.human.archive import Unreadable, open_files
+from tests import program
 from tests.analysis.recordings import drive, write_folder, write_zip
-from tests.harness import Run, environment
+from tests.harness import environment
 
 GOOD_CSV = drive("L_4_0").csv()
 GOOD = {"a/experiment_4_iter_1.csv": GOOD_CSV}
@@ -33,12 +34,11 @@ class Bomb:
 
 
 @pytest.fixture
-def imported(tmp_path, zygote):
+def imported(tmp_path):
     """Imports a download with the program, in an empty folder."""
 
     def run(path):
-        command = ("human", "import", path)
-        done = Run(*zygote.run_blocking(command, cwd=tmp_path, env=environment()))
+        done = program.run(("human", "import", path), cwd=tmp_path, env=environment())
         assert "Traceback" not in done.err
         return done
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import pytest
 
+from tests import program
 from tests.harness import Run, environment
 
 
 @pytest.fixture
-def human(tmp_path, zygote):
+def human(tmp_path):
     """Runs ``merge-runner human`` in an empty folder."""
 
     def run(*arguments: object) -> Run:
-        return Run(*zygote.run_blocking(("human", *arguments), cwd=tmp_path, env=environment()))
+        return program.run(("human", *arguments), cwd=tmp_path, env=environment())
 
     return run
