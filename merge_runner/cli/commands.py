@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
-import signal
 import sys
 import tempfile
 from contextlib import closing
@@ -185,14 +184,7 @@ def _play(
 
     def leave(expected: Estimate) -> None:
         lines = "\n".join(progress.estimate_lines(expected))
-        if yes:
-            say(lines)
-            return
-        by_asyncio = signal.signal(signal.SIGINT, signal.default_int_handler)
-        try:  # Ctrl-C is an answer, too
-            agree(lines, "Go ahead?", otherwise="nothing was sent", yes=False)
-        finally:
-            signal.signal(signal.SIGINT, by_asyncio)
+        agree(lines, "Go ahead?", otherwise="nothing was sent", yes=yes)
 
     try:
         playing = running.play(plan, options, whole=whole, say=say, agree=leave, stopping=on_signal)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -125,5 +126,10 @@ def agree(what: str, question: str, *, otherwise: str, yes: bool) -> None:
         return
     if not sys.stdin.isatty():
         raise UsageError(f"there is no terminal to ask at, so {otherwise}: add --yes")
-    if not typer.confirm(question, err=True):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:  # Ctrl-C is an answer too, also where asyncio handles it otherwise
+        agreed = typer.confirm(question, err=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if not agreed:
         raise UsageError(otherwise)
