@@ -67,7 +67,7 @@ def merge_runner(tmp_path, emulator_url):
     async def start(*arguments: object, cwd: Path = tmp_path, **changes: str) -> Process:
         return await program.start(arguments, cwd=cwd, env=beside(emulator_url, changes))
 
-    run.start = run.fork = start
+    run.start = start
     return run
 
 

@@ -72,9 +72,8 @@ class Process:
     def __init__(self, process, streams) -> None:
         self._process, self._streams = process, streams
         self.pid = process.pid
-        self.send_signal, self.terminate, self.kill = (
-            *(process.send_signal, process.terminate, process.kill),
-        )
+        self.send_signal = process.send_signal
+        self.terminate, self.kill = process.terminate, process.kill
 
     @property
     def returncode(self) -> int | None:

@@ -20,7 +20,7 @@ async def site(merge_runner, study):
     """A server of its own that has read its trials, and its process."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    process = await merge_runner.fork("view", "--db", study, "--port", port)
+    process = await merge_runner.start("view", "--db", study, "--port", port)
     try:
         async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{port}", timeout=120) as client:
             while not await is_ready(client):

@@ -33,7 +33,7 @@ def run(merge_runner, tmp_path):
     (tmp_path / "experiments/all.toml").write_text(FILE)
 
     async def run(*arguments, **changes) -> Run:
-        process = await merge_runner.fork(*arguments, cwd=tmp_path, **installed, **changes)
+        process = await merge_runner.start(*arguments, cwd=tmp_path, **installed, **changes)
         out, err = await process.communicate()
         done = Run(process.returncode, out.decode(), err.decode())
         assert done.code == 0, f"{arguments}: {done.err}"

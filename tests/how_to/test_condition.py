@@ -19,7 +19,7 @@ async def test_conditions_from_outside_go_through_every_command(merge_runner, tm
     env = plugin(tmp_path / "installed", how_to("add-a-condition"))
 
     async def installed(*arguments):
-        process = await merge_runner.fork(*arguments, **env)
+        process = await merge_runner.start(*arguments, **env)
         out, err = await process.communicate()
         assert process.returncode == 0, err.decode()
         return out.decode()
@@ -62,7 +62,7 @@ async def test_a_condition_that_cannot_be_played_is_refused_before_any_call(
         how_to("add-a-condition") + f"CONDITIONS.register({name!r}, Condition({headway_m}, 0.0))"
     )
     env = plugin(tmp_path / "installed", source)
-    process = await merge_runner.fork("sweep", "baseline", "--conditions", name, **env)
+    process = await merge_runner.start("sweep", "baseline", "--conditions", name, **env)
     _, err = await process.communicate()
     assert process.returncode == 2
     assert reason in err.decode()

@@ -78,7 +78,7 @@ def run(merge_runner, tmp_path):
     (tmp_path / "experiments/short.toml").write_text("[repetitions]\nbaseline = 1\n")
 
     async def run(*arguments, **changes):
-        process = await merge_runner.fork(*arguments, cwd=tmp_path, **installed, **changes)
+        process = await merge_runner.start(*arguments, cwd=tmp_path, **installed, **changes)
         out, err = await process.communicate()
         return Run(process.returncode, out.decode(), err.decode())
 

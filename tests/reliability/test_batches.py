@@ -76,7 +76,7 @@ async def answered(server):
 async def interrupted(merge_runner, server, *command, **env):
     """What a run prints that gets Ctrl-C when a batch waits."""
     before = len(server.paths)
-    process = await merge_runner.fork(*command, **env)
+    process = await merge_runner.start(*command, **env)
     while not any(re.fullmatch(".*/batches/.+", path) for path in server.paths[before:]):
         await asyncio.sleep(0.02)
     process.send_signal(signal.SIGINT)
@@ -139,7 +139,7 @@ async def test_a_sweep_that_is_killed_at_20_instants_pays_nothing_twice(
         env = account(server)
         for number in range(KILLS):
             at = ("before", "after", "anywhere", "anywhere")[number % 4]
-            process = await merge_runner.fork(*sweep, **env)
+            process = await merge_runner.start(*sweep, **env)
             ended = asyncio.create_task(process.wait())
             patience_s = chance.uniform(0.3, 3) if at == "anywhere" else 15
             await asyncio.wait([ended], timeout=patience_s)
@@ -175,7 +175,7 @@ async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path, p
     plan = FaultPlan(latency_s=0.02, batch=BatchPlan(delay_s=0.5))
     async with watched(faults=plan) as server:
         env = account(server)
-        process = await merge_runner.fork(*sweep, "--in-flight", 2, **env)
+        process = await merge_runner.start(*sweep, "--in-flight", 2, **env)
         while server.requests < 20:  # another process asks
             await asyncio.sleep(0.02)
         process.send_signal(signal.SIGINT)

@@ -62,7 +62,7 @@ async def test_a_sweep_that_is_killed_at_20_instants_asks_nothing_answered_again
     async with watched(slots.middle, FaultPlan(latency_s=0.02)) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         for _ in range(KILLS):
-            process = await merge_runner.fork(*SWEEP, **env)
+            process = await merge_runner.start(*SWEEP, **env)
             before, seen = len(slots.asked), set(slots.asked)
             # Some die while they open the files, most of them in the midst of calls.
             asked = asyncio.create_task(slots.until(before + chance.randrange(30)))
@@ -103,7 +103,7 @@ async def test_attempts_of_a_run_that_died_are_found_in_the_next_one(merge_runne
     sweep = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
     async with watched(middle, FaultPlan(rates={"server_error": 0.3}, seed=3)) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await merge_runner.fork(*sweep, **env)
+        process = await merge_runner.start(*sweep, **env)
         await hanging.wait()
         process.terminate()
         release.set()

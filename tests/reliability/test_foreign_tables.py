@@ -54,7 +54,7 @@ async def test_a_name_of_another_kind_of_database_is_that_of_a_file(merge_runner
 
 async def test_ctrl_c_within_a_query_ends_it_in_one_line(merge_runner, db):
     endless = "SELECT count(*) FROM range(1000000) AS a, range(1000000) AS b WHERE a > b"
-    process = await merge_runner.fork("sql", endless, "--db", db)
+    process = await merge_runner.start("sql", endless, "--db", db)
     while psutil.Process(process.pid).cpu_times().user < 1:  # more than it takes to begin
         await asyncio.sleep(0.02)
     process.send_signal(signal.SIGINT)

@@ -151,7 +151,7 @@ async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(me
     sweep = (*SWEEP, "--reps", 2, "--conditions", "L_4_0", "--yes", *FAST)
     async with watched(middle) as server:
         env = account(server)
-        process = await merge_runner.fork(*sweep, **env)
+        process = await merge_runner.start(*sweep, **env)
         await arrived.wait()
         process.kill()
         await process.wait()
@@ -310,7 +310,7 @@ async def test_nothing_is_released_while_another_run_asks(merge_runner):
     arrived = asyncio.Event()
     async with watched(middle) as server:
         sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
-        process = await merge_runner.fork(*sweep, **account(server))
+        process = await merge_runner.start(*sweep, **account(server))
         await arrived.wait()
         told = await merge_runner("ledger")
         refused = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes")

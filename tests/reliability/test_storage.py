@@ -115,7 +115,7 @@ async def test_a_database_that_another_program_holds_for_a_while_is_waited_for(
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         await merge_runner(*SWEEP, "--conditions", "N_0_0", **env)
         other = await notebook(tmp_path / "results/merge.duckdb", "write")
-        sweep = await merge_runner.fork(*SWEEP, "--conditions", "N_0_0,L_4_8", **env)
+        sweep = await merge_runner.start(*SWEEP, "--conditions", "N_0_0,L_4_8", **env)
         await sweep.said(f"(PID {other.pid}) to close results/merge.duckdb")
         other.stdin.close()
         out, err = await sweep.communicate()
@@ -133,7 +133,7 @@ async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_
     async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         assert (await merge_runner(*part, "--reps", 1, **env)).code == 0
-        sweep = await merge_runner.fork(*part, "--reps", 3, **env)
+        sweep = await merge_runner.start(*part, "--reps", 3, **env)
         while not gate.held:
             await asyncio.sleep(0.02)
         holder = await notebook(tmp_path / "results/merge.duckdb", mode)
@@ -145,7 +145,7 @@ async def test_a_notebook_that_holds_the_database_is_named_and_ctrl_c_keeps_the_
         assert sweep.returncode == 130, err
         assert f"(PID {holder.pid}): close it there" in err
         assert "run the same command again" in err
-        again = await merge_runner.fork(*part, "--reps", 3, **env)
+        again = await merge_runner.start(*part, "--reps", 3, **env)
         await again.said(f"(PID {holder.pid})")
         holder.stdin.close()  # what waits for it goes on
         out, err = await again.communicate()
@@ -174,7 +174,7 @@ async def test_a_notebook_that_holds_the_database_all_night_costs_no_trial_and_n
     gate = Gate(30, tmp_path)
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        night = await merge_runner.fork(*sweep, **env)
+        night = await merge_runner.start(*sweep, **env)
         while not gate.held:
             await asyncio.sleep(0.02)
         holder = await notebook(tmp_path / "results/merge.duckdb", "write")
@@ -186,7 +186,7 @@ async def test_a_notebook_that_holds_the_database_all_night_costs_no_trial_and_n
             _, err = await night.communicate()
             assert night.returncode == 130, err
             assert f"(PID {holder.pid}): close it there. When that is fixed, run" in err.decode()
-            night = await merge_runner.fork(*sweep, **env)
+            night = await merge_runner.start(*sweep, **env)
             await night.said(f"(PID {holder.pid})")
         holder.stdin.close()
         out, err = await night.communicate()

@@ -64,7 +64,7 @@ async def test_a_second_live_run_of_a_model_names_the_first_and_asks_nothing(mer
     middle, arrived, released = held_up()
     async with watched(middle) as server:
         env = account(server)
-        first = await merge_runner.fork(*SWEEP, **env)
+        first = await merge_runner.start(*SWEEP, **env)
         await arrived.wait()
         second = await merge_runner(*SWEEP, "--reps", 2, "--db", "second.duckdb", **env)
         dry = await merge_runner(*SWEEP, "--dry-run", **env)
@@ -86,7 +86,7 @@ async def test_the_lock_of_a_run_that_is_killed_is_free(merge_runner):
     middle, arrived, released = held_up()
     async with watched(middle) as server:
         env = account(server)
-        first = await merge_runner.fork(*SWEEP, "--conditions", "L_4_8", **env)
+        first = await merge_runner.start(*SWEEP, "--conditions", "L_4_8", **env)
         await arrived.wait()
         first.kill()
         await first.wait()

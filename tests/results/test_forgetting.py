@@ -83,7 +83,7 @@ async def test_nothing_is_forgotten_without_a_yes_or_under_a_wrong_name(
 
 
 async def test_nothing_is_forgotten_while_a_sweep_is_running(merge_runner, tmp_path, two_sweeps):
-    running = await merge_runner.fork("sweep", *PART, "--reps", 9, "--rpm", 60)
+    running = await merge_runner.start("sweep", *PART, "--reps", 9, "--rpm", 60)
     try:
         folder = tmp_path / "results/merge.duckdb.progress"
         while not list(folder.glob("*.json")):

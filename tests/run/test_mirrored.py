@@ -26,7 +26,7 @@ async def test_a_mirrored_pair_is_killed_resumed_and_replayed_to_the_same_end(
     async with watched(begin, FaultPlan(latency_s=0.02)) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         sweep = ("sweep", *PAIR, "--in-flight", 2, "--json")
-        process = await merge_runner.fork(*sweep, **env)
+        process = await merge_runner.start(*sweep, **env)
         await begun.wait()
         await asyncio.sleep(0.3)
         process.kill()

@@ -118,7 +118,7 @@ async def test_a_killed_run_goes_on_without_asking_anything_again(merge_runner, 
     async with watched(slow) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         ask = (*FIRST, "--reps", 2, "--in-flight", 3, "--json")
-        process = await merge_runner.fork(*ask, **env)
+        process = await merge_runner.start(*ask, **env)
         while server.requests < 12:
             await asyncio.sleep(0.02)
         process.send_signal(signal.SIGKILL)

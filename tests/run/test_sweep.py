@@ -241,7 +241,7 @@ async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(
 ):
     async with watched(faults=FaultPlan(latency_s=0.2)) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await merge_runner.fork(*SMALL, **env)
+        process = await merge_runner.start(*SMALL, **env)
         while server.requests < 60:
             await asyncio.sleep(0.02)
         process.send_signal(signal.SIGINT)
@@ -298,7 +298,7 @@ async def test_a_terminal_that_closes_loses_no_call_that_is_in_flight(
 
 async def test_two_signals_at_once_end_it_as_one_does(merge_runner):
     async with watched(faults=FaultPlan(latency_s=0.2)) as server:
-        process = await merge_runner.fork(*SMALL, EMULATOR_BASE_URL=f"{server.url}/v1")
+        process = await merge_runner.start(*SMALL, EMULATOR_BASE_URL=f"{server.url}/v1")
         while server.requests < 40:
             await asyncio.sleep(0.02)
         process.send_signal(signal.SIGINT)
@@ -319,7 +319,7 @@ async def test_another_process_queries_while_a_sweep_runs(merge_runner, tmp_path
     gate = Gate(200, tmp_path)  # of two trials at a time, of up to 40 calls each
     async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
         sweep = ("sweep", "baseline", "--reps", 2, "--in-flight", 2)
-        process = await merge_runner.fork(*sweep, EMULATOR_BASE_URL=f"{server.url}/v1")
+        process = await merge_runner.start(*sweep, EMULATOR_BASE_URL=f"{server.url}/v1")
         seen = 0
         while not seen:
             query = await merge_runner("sql", "select count(*) n from trials", "--format", "json")
@@ -333,7 +333,7 @@ async def test_another_process_queries_while_a_sweep_runs(merge_runner, tmp_path
 
 async def test_a_locked_database_is_waited_for(merge_runner, tmp_path):
     await merge_runner(*SMALL, "--conditions", "N_0_0")
-    process = await merge_runner.fork(
+    process = await merge_runner.start(
         *SMALL, *TWO, "--reps", 2, "--in-flight", 1, EMULATOR_BASE_URL=""
     )
     await asyncio.sleep(1.2)

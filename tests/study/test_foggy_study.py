@@ -77,7 +77,7 @@ async def test_a_foggy_study_that_is_killed_goes_on_and_replays_sealed_to_the_sa
     sweep = ("sweep", "foggy.toml", "--json", *FAST)
     async with watched(slowly, FaultPlan(latency_s=0.05)) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await merge_runner.fork(*sweep, "--in-flight", 2, **env)
+        process = await merge_runner.start(*sweep, "--in-flight", 2, **env)
         await begun.wait()
         await asyncio.sleep(0.5)
         process.kill()

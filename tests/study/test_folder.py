@@ -41,7 +41,7 @@ async def test_a_new_study_is_killed_resumed_replayed_and_shown(merge_runner, st
     async with watched(begin, FaultPlan(latency_s=0.05)) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         sweep = ("sweep", "study.toml", "--in-flight", 2, "--json")
-        process = await merge_runner.fork(*sweep, cwd=study, **env)
+        process = await merge_runner.start(*sweep, cwd=study, **env)
         await begun.wait()
         await asyncio.sleep(0.3)
         process.kill()

@@ -61,7 +61,7 @@ async def test_a_study_in_one_file_runs_within_its_budget_and_is_shown_by_factor
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         sweep = ("sweep", "study.toml", "--yes", "--json", *FAST)
         with_budget(mine, 1.5)
-        process = await merge_runner.fork(*sweep, "--in-flight", 2, cwd=mine, **env)
+        process = await merge_runner.start(*sweep, "--in-flight", 2, cwd=mine, **env)
         await bill.begun.wait()
         await asyncio.sleep(0.5)
         process.kill()
