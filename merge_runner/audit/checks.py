@@ -57,14 +57,13 @@ JOIN trial_drivers USING (trial_id, spec_hash) SEMI JOIN audited USING (trial_id
 GROUP BY driver, variant, model, spec_hash ORDER BY ALL
 """  # noqa: S608 # constants
 # Of one sweep, or of all.
-PLACES = """
-SELECT rowid FROM calls WHERE $sweep_id IS NULL OR (trial_id, spec_hash) IN
-    (SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = $sweep_id)
-ORDER BY rowid
+AUDITED_CALLS = """
+calls WHERE ($sweep_id IS NULL OR (trial_id, spec_hash) IN
+    (SELECT (trial_id, spec_hash) FROM sweep_trials WHERE sweep_id = $sweep_id))
 """
+PLACES = f"SELECT rowid FROM {AUDITED_CALLS} ORDER BY rowid"  # noqa: S608 # constants
 REPLIES = f"""
-SELECT rowid, reply::VARCHAR FROM calls
-WHERE rowid BETWEEN $first AND $last AND rowid IN ({PLACES})
+SELECT rowid, reply::VARCHAR FROM {AUDITED_CALLS} AND rowid BETWEEN $first AND $last
 """  # noqa: S608 # constants
 OF_CALLS = ("served_findings", "attempt_findings", "exchanged_findings", "shared_findings")
 BATCH = 100

@@ -58,6 +58,7 @@ class LlmDriver:
     known: Known | None = None
     _plan: tuple[float, ...] | None = None
     _executed: int = 0
+    _is_first: bool = True
 
     async def decide(self, observation: Observation, number: int) -> Decision:
         """Ask the model and drive its plan, or go on with the last valid one.
@@ -67,6 +68,7 @@ class LlmDriver:
         scenario, spec = self.seat.scenario, self.spec
         slot = Slot(spec.condition, spec.repetition, self.seat.side, number, spec.sample_set)
         prompt = self._prompt(observation, slot)
+        self._is_first = False
         reply = await self.ask(prompt, slot, spec)
         # A refusal or a truncated answer is an outcome of its own; it is not searched for a plan.
         parsed = (
@@ -112,8 +114,8 @@ class LlmDriver:
             prompt=self.prompt,
             scenario=self.seat.scenario,
         )
-        prompt = render(first=slot.decision == 0)
-        if self._plan is not None or slot.decision == 0 or self.known is None:
+        prompt = render(first=self._is_first)
+        if self._plan is not None or self._is_first or self.known is None:
             return prompt
         older = render(first=True)
         is_older = self.known(older, slot) and not self.known(prompt, slot)

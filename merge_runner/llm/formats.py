@@ -298,7 +298,7 @@ def usage_of(counts: object, *, total: str = "", **places: str) -> Usage:
     if written is not None and reasoned > written:
         written = min(written + reasoned, MOST_TOKENS)
     in_all = as_count(at(counts, total)) if total else None
-    if in_all is not None and read is not None:
+    if in_all is not None and read is not None and in_all > read:
         written = max(written or 0, in_all - read)
     return replace(usage, output_tokens=written)
 

@@ -38,13 +38,16 @@ def chat_reply(text, outcome="ok"):
     return ChatReply(text=text, outcome=outcome, request=REQUEST, attempts=(), earlier=0)
 
 
-async def decide(*replies, seen=SEEN, variant="baseline", known=None, **scenario):
-    """One decision per reply, a text or a ChatReply; ``known`` says what was asked earlier."""
+async def decide(*replies, seen=SEEN, variant="baseline", known=None, begins=0, **scenario):
+    """One decision per reply, a text or a ChatReply; ``known`` says what was asked earlier.
+
+    ``begins`` is the number of the first decision.
+    """
     asked = []
 
     async def ask(prompt, slot, _):
         asked.append((prompt, slot.decision))
-        reply = replies[slot.decision]
+        reply = replies[slot.decision - begins]
         return chat_reply(reply) if isinstance(reply, str) else reply
 
     scenario = ScenarioConfig(**scenario)
@@ -53,9 +56,9 @@ async def decide(*replies, seen=SEEN, variant="baseline", known=None, **scenario
     )
     seat = Seat(scenario, "left", model_pace(scenario), 0)
     driver = LlmDriver(ask, spec, seat, prompt_of(variant), known=known)
-    decisions = [await driver.decide(seen, number) for number in range(len(replies))]
+    decisions = [await driver.decide(seen, begins + n) for n in range(len(replies))]
     assert [prompt for prompt, _ in asked] == [decision.prompt for decision in decisions]
-    assert [number for _, number in asked] == list(range(len(replies)))
+    assert [number - begins for _, number in asked] == list(range(len(replies)))
     return decisions
 
 
@@ -90,8 +93,9 @@ async def test_the_first_prompt_has_no_previous_plan():
     assert remaining(decision) == "none, this is your first decision"
 
 
-async def test_only_the_first_prompt_says_that_it_is_the_first():
-    decisions = await decide(*[INVALID] * 3, valid(PLAN), INVALID)
+@pytest.mark.parametrize("begins", [0, 2])  # 2: a driver that leaves its tunnel later
+async def test_only_the_first_prompt_says_that_it_is_the_first(begins):
+    decisions = await decide(*[INVALID] * 3, valid(PLAN), INVALID, begins=begins)
     assert [remaining(d) for d in decisions[:4]] == [
         "none, this is your first decision",
         *["none"] * 3,

@@ -463,6 +463,8 @@ def test_the_providers_own_word_for_the_end_is_kept():
             for total in ({"total_tokens": 700 + visible + 3000}, {})
         ),
         ("openai-chat", {"prompt_tokens": 7, "total_tokens": 15}, Usage(7, None, 8, None)),
+        # A total without the output says nothing of it, and the worst case counts.
+        ("openai-chat", {"prompt_tokens": 7, "total_tokens": 7}, Usage(7)),
         (
             "openai-chat",
             {"prompt_tokens": 7, "completion_tokens": 8, "total_tokens": 9},
