@@ -483,11 +483,22 @@ class DaskTasks:
 
     async def _work(self, address: str, task: Task) -> Any:  # noqa: ANN401 # or what went wrong
         """Let a worker play a task, and reserve its attempts meanwhile; return what it returns."""
-        # Out of Dask's scheduling, which would retry it: the share of the cap is spent once.
-        run = partial(self._client.run, workers=[address], on_error="return")
-        playing = run(play_task, fingerprint(), pickle.dumps(task), task.name)
-        played, _ = await asyncio.gather(playing, self._attend(address, task))
-        return played[address]
+        attending = asyncio.create_task(self._attend(address, task))
+
+        async def play() -> Any:  # noqa: ANN401
+            # Out of Dask's scheduling, which would retry it: the share of the cap is spent once.
+            arguments = (play_task, fingerprint(), pickle.dumps(task), task.name)
+            played = await self._client.run(*arguments, workers=[address], on_error="return")
+            if not isinstance(played[address], Played):
+                attending.cancel()  # a task that never began would never say that it has ended
+            return played[address]
+
+        async def attend() -> None:
+            with contextlib.suppress(asyncio.CancelledError):
+                await attending
+
+        played, _ = await asyncio.gather(play(), attend())
+        return played
 
     async def _attend(self, address: str, task: Task) -> None:
         """Reserve the worst case of each attempt of a task before it is sent, until it ends."""

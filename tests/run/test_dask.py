@@ -131,10 +131,13 @@ price = { input = 1.0, output = 2.0, source = "mine" }
 
 
 class Cluster:
-    """Two workers within this process; the first one to ``ask`` so often dies of it."""
+    """Two workers within this process; the first one to ``ask`` so often dies of it.
 
-    def __init__(self, dies_at):
-        self.dies_at = dies_at
+    The first ``unread`` tasks never begin, and their workers live on.
+    """
+
+    def __init__(self, dies_at, unread=0):
+        self.dies_at, self.unread = dies_at, unread
         self.workers = {f"tcp://{n}": self._worker() for n in (1, 2)}
         self.calls = Counter()
         self.running = {}
@@ -150,6 +153,9 @@ class Cluster:
     async def run(self, function, *arguments, workers, on_error):
         (address,) = workers
         worker, lost = self.workers[address], OSError("lost")
+        if function is play_task and self.unread:
+            self.unread -= 1
+            return {address: MemoryError("the task cannot be read")}
         work = asyncio.ensure_future(function(*arguments, dask_worker=worker))
         if function is play_task:
             self.running[address] = work
@@ -202,6 +208,26 @@ async def test_what_a_lost_worker_may_have_cost_stays_reserved_and_no_more(
     assert spending.reserved_usd <= lost * max(attempts)
     assert lost <= 8, "not all that the task would have asked"
     assert len(attempts) == len(kept_keys(options.cache)) + lost
+
+
+async def test_a_task_that_never_begins_goes_to_others(tmp_path, monkeypatch):
+    monkeypatch.delenv("EMULATOR_BASE_URL", raising=False)
+    plan = make_plan("baseline", repetitions=1, conditions=["L_4_0", "N_0_0"])
+    options = Options(tmp_path / "db", tmp_path / "cache", in_flight=2)
+    ended = []
+
+    async def room():
+        pass
+
+    with closing(ResponseCache(options.cache)) as cache:
+        ledger = Ledger(cache, plan.ledger)
+        client = Cluster(None, unread=1)
+        tasks = DaskTasks(client, plan, options, {}, cache, ledger, FirstDecisions())
+        async with asyncio.timeout(HANGS_S):
+            await tasks.play(
+                plan.trial_specs(), lambda spec, record: ended.append(spec.trial_id), room
+            )
+    assert len(set(ended)) == len(ended) == 2
 
 
 def kept_keys(folder):
