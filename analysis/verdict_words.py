@@ -18,6 +18,7 @@ HUMANS, LANGUAGE_MODEL, PROGRAM, MOCK = "humans", "language model", "program", "
 # States. A trait is shown by its own test; the others need a difference with a corrected p < .05.
 SHOWN, WEAKER, STRONGER, UNLIKE, OPEN = "shown", "weaker", "stronger", "unlike", "inconclusive"
 DIFFERS = frozenset({WEAKER, STRONGER, UNLIKE})
+ENOUGH = 20  # trials with an outcome; with fewer of them a headline says nothing of likeness
 MOST_COLLISIONS = 25.0  # percent; with more of them collisions come first in a sentence
 
 Values = Mapping[str, Any]
@@ -236,27 +237,66 @@ def differs(values: Values) -> bool:
 def headline(drivers: Mapping[str, Mapping[str, Values]]) -> tuple[str, str]:
     """The answer of language models in two parts: the claim, and what it rests on most.
 
-    ``drivers`` are those that are judged, by name: no mock model and no program. Of several of them
-    it says how many comparisons it rests on.
+    ``drivers`` are those that are judged, by name: no mock model and no program. Of those with
+    too few outcomes it says the counts alone; of several others how many comparisons it rests on.
     """
     if not drivers:
         return "No language model is judged here.", ""
-    compared = [name for name, of in drivers.items() if any(v.get("state") for v in of.values())]
+    compared = {
+        name: of for name, of in drivers.items() if any(v.get("state") for v in of.values())
+    }
     if not compared:
         return "No language model can be compared with humans yet.", ""
+    few = [name for name, of in compared.items() if _outcomes(of) < ENOUGH]
+    enough = {name: of for name, of in compared.items() if name not in few}
+    uncertain = _too_few({name: compared[name] for name in few}) if few else ""
+    if not enough:
+        return uncertain, ""
+    claim, because = _likeness(enough, every=len(enough) == len(drivers))
+    return claim, " ".join(filter(None, [because, uncertain]))
+
+
+def _likeness(drivers: Mapping[str, Mapping[str, Values]], *, every: bool) -> tuple[str, str]:
+    """The two parts of a headline on drivers with trials enough; ``every``: there are no others."""
     unlike = [
         (name, values) for name, of in drivers.items() for values in filter(differs, of.values())
     ]
     count = _count(drivers, len(unlike)) if len(drivers) > 1 else ""
     if not unlike:
-        return f"No difference from humans is shown for {joined(compared)}.", count
+        return f"No difference from humans is shown for {joined([*drivers])}.", count
     name, values = min(unlike, key=lambda one: one[1]["p_holm"])  # the surest one
-    if others := [name for name in compared if name not in dict(unlike)]:
+    if others := [name for name in drivers if name not in dict(unlike)]:
         claim = f"No difference from humans is shown for {joined(others)};"
         return claim, f"but {name} {told(values)}. {count}"
     if len(drivers) == 1:
         return f"{name} does not drive like humans:", f"it {told(values)}."
-    return "No language model here drives like humans:", f"{name} {told(values)}. {count}"
+    claim = "No language model here drives like humans:"
+    if not every:
+        claim = f"{joined([*drivers])} do not drive like humans:"
+    return claim, f"{name} {told(values)}. {count}"
+
+
+def _finished(verdicts: Mapping[str, Values]) -> int:
+    """How many trials finished: each of them has a gap."""
+    return verdicts["gap"]["n"] or 0
+
+
+def _outcomes(verdicts: Mapping[str, Values]) -> int:
+    """How many trials finished, or collided by the humans' rule."""
+    return _finished(verdicts) + (verdicts["collisions"].get("k") or 0)
+
+
+def _too_few(drivers: Mapping[str, Mapping[str, Values]]) -> str:
+    """How many trials of each driver finished, and that these tell nothing of likeness."""
+    counts = []
+    for name, of in drivers.items():
+        finished = _finished(of)
+        ended = (of["collisions"]["n"] or 0) + (of["collisions"].get("undecided") or 0)
+        trials = "finished trial" if finished == 1 else "finished trials"
+        others = f" of {ended}" if ended > finished else ""
+        counts.append(f"{name}: {finished} {trials}{others}")
+    them = "it drives" if len(counts) == 1 else "they drive"
+    return f"{joined(counts)}, too few to say whether {them} like humans."
 
 
 def _count(drivers: Mapping[str, Mapping[str, Values]], unlike: int) -> str:

@@ -42,6 +42,13 @@ opponent = ["self", "projected-order"]
 add = [{ after = "C3.human", text = "You are late, and in a hurry." }]
 """
 OWN = {"endpoint": "openai", "body": {"model": "o3", "messages": [], "reasoning_effort": "medium"}}
+# Programs that draw, crossed with prompts that they do not read.
+CROSSED = """
+models = ["human-odds", "idm"]
+repetitions = 4
+[factors]
+prompt = ["baseline", "A1"]
+"""
 IMPORTED = 129
 BASELINE = ("sweep", "baseline")
 UNLIMITED = ("--rpm", "100000", "--tpm", "1000000000")
@@ -125,6 +132,12 @@ def two_studies(db: Path) -> None:
     _run(db, "sweep", "study.toml")
 
 
+def crossed_programs(db: Path) -> None:
+    """Programs that draw by chance, each with two prompts."""
+    db.with_name("study.toml").write_text(CROSSED)
+    _run(db, "sweep", "study.toml")
+
+
 def mirrored_chance(db: Path) -> None:
     """A pair in which one draws by chance and the other does not, both ways round."""
     _run(db, *BASELINE, "--model", "human-odds+constant", "--mirror", "--reps", "10")
@@ -187,6 +200,7 @@ KINDS: dict[str, Callable[[Path], None]] = {
         killed,
         word_for_word,
         two_studies,
+        crossed_programs,
         mirrored_chance,
         no_valid_reply,
         separated,

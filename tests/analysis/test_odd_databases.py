@@ -15,7 +15,13 @@ from tests.analysis.odd_databases import KINDS, made
 
 # What the report of a kind says, and what it must not say.
 SAID = {
-    "two_trials": (["Collisions: inconclusive."], ["o3 collides"]),
+    "two_trials": (
+        [
+            "o3: 2 finished trials, too few to say whether it drives like humans.",
+            "ollisions: inconclusive.",
+        ],
+        ["o3 does not drive", "o3 collides"],
+    ),
     "stand_in_behind_o3": (
         [
             "A scripted stand-in answered",
@@ -41,7 +47,13 @@ SAID = {
         ["No language model can be compared with humans yet.", "Trials failed"],
         ["o3 does not drive"],
     ),
-    "killed": (["ollisions: inconclusive."], ["o3 collides"]),
+    "killed": (
+        [
+            "o3: 2 finished trials, too few to say whether it drives like humans.",
+            "ollisions: inconclusive.",
+        ],
+        ["o3 does not drive", "o3 collides"],
+    ),
     "word_for_word": (
         ["o3/baseline: 22 of 33 trials are as an earlier one to the last state; each counts"],
         ["they are left out"],
@@ -53,6 +65,14 @@ SAID = {
             "A difference between trials of different studies has no p",
         ],
         [],
+    ),
+    "crossed_programs": (
+        [
+            "human-odds: 44 of 88 trials of programs at different levels of factors are distinct",
+            "idm/baseline: 30 of 44, idm/A1: 30 of 44 trials of programs repeat an earlier one",
+            "No language model is judged here.",
+        ],
+        ["A scripted stand-in answered"],
     ),
     "mirrored_chance": (
         ["13 of 119 trials are undecided, since another collision rule ended them"],

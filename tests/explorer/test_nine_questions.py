@@ -79,7 +79,9 @@ def reader(page):
 
 
 def test_does_it_drive_like_humans(reader):
-    expect(reader.page.locator(".answer")).to_contain_text("does not drive like humans")
+    expect(reader.page.locator(".answer")).to_contain_text(
+        "too few to say whether it drives like humans"
+    )
     row = reader.row("smollm2")
     expect(row).to_contain_text("does not yield as humans do")
     expect(row).to_contain_text("unlike humans")

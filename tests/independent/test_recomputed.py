@@ -30,7 +30,8 @@ ITERATED = {"b", "se", "z", "t", "p", "firth_b", "firth_se", "firth_p", "detecta
 TESTED = ("verdicts", "contrasts", "factors")  # whose intervals are found by iteration, too
 RECORDINGS = ("emulator", "smollm2", "smollm2-free")
 KINDS = (
-    "two_studies", "mirrored_chance", "no_valid_reply", "separated", "all_tied", "complete_import",
+    "two_studies", "crossed_programs", "mirrored_chance", "no_valid_reply", "separated", "all_tied",
+    "complete_import",
 )  # fmt: skip
 
 
@@ -107,7 +108,7 @@ def _of_paper(table: str, row: str, imported: bool) -> bool:
     if table == "indicators" and row.rpartition("/")[2].startswith(("I5", "score")):
         return True
     outcomes = table in ("who-first", "verdicts") or row.endswith(("/I1", "/I2"))
-    return row.startswith("human") and not outcomes and not imported
+    return row.partition("/")[0] == "human" and not outcomes and not imported
 
 
 def _equal(said: str, value, *, iterated: bool) -> bool:

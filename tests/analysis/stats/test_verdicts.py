@@ -269,6 +269,43 @@ def test_sentences_tell_the_states_of_the_rows_and_the_headline_the_surest_diffe
     assert because == f"it {told(surest)}."
 
 
+def test_of_few_finished_trials_a_headline_says_the_counts_alone(study):
+    (table,) = make_tables(study, ["verdicts"])
+    wild = by_group(table.rows)["wild/baseline"]
+
+    def few(finished, ended=0, collided=0):
+        undecided = max(ended - finished - collided, 0)
+        collisions = {"k": collided, "n": finished + collided, "undecided": undecided}
+        return wild | {
+            "gap": {**wild["gap"], "n": finished},
+            "collisions": {**wild["collisions"], **collisions},
+        }
+
+    rest = "too few to say whether it drives like humans."
+    for of, counts in [
+        (few(0, 11), "0 finished trials of 11"),
+        (few(1), "1 finished trial"),
+        (few(7, 22), "7 finished trials of 22"),
+        (few(19), "19 finished trials"),
+        (few(7, 22, 3), "7 finished trials of 22"),
+    ]:
+        assert headline({"gpt": of}) == (f"gpt: {counts}, {rest}", "")
+    # Who collides has an outcome, too.
+    for of in (few(20), few(16, collided=4), few(0, collided=20)):
+        assert headline({"gpt": of})[0] == "gpt does not drive like humans:"
+    both = {"gpt": few(7, 22), "o4": few(2)}
+    assert headline(both)[0] == (
+        "gpt: 7 finished trials of 22 and o4: 2 finished trials, too few to say whether they drive "
+        "like humans."
+    )
+    # Others are judged without them.
+    claim, because = headline({"wild": wild, "gpt": few(2)})
+    alone = headline({"wild": wild})
+    assert (claim, because) == (alone[0], f"{alone[1]} gpt: 2 finished trials, {rest}")
+    assert "No language model" not in " ".join(headline({"a": wild, "b": wild, "gpt": few(2)}))
+    assert headline({"a": wild, "b": wild})[0] == "No language model here drives like humans:"
+
+
 def test_with_undecided_trials_there_is_no_p_and_n_is_that_of_the_decided_ones(tmp_path):
     drives = [
         Drive("o3", "baseline", name, rep, (0.1 * rep,) * 9, (0.1 * rep,) * 9)
