@@ -53,6 +53,7 @@ from merge_runner.llm.ledger import (
 )
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import (
+    ANSWERS,
     SCRIPTED_HEADER,
     Attempt,
     ChatReply,
@@ -340,10 +341,14 @@ class LlmClient:
             meter.stand_ins += is_scripted(reply.request, last)
 
     def _read(self, recorded: CachedCall, earlier: int) -> ChatReply:
-        last = recorded.attempts[-1]
+        """Read an answer anew, as an audit does: an earlier version may have read it otherwise."""
+        attempts, last = recorded.attempts, recorded.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
-        text = read_reply(self._wire, payload).text
-        return ChatReply(text, last.outcome, recorded.request, recorded.attempts, earlier)
+        reading = read_reply(self._wire, payload)
+        if payload and reading.outcome in ANSWERS and reading.outcome != last.outcome:
+            last = replace(last, outcome=reading.outcome)
+            attempts = (*attempts[:-1], last)
+        return ChatReply(reading.text, last.outcome, recorded.request, attempts, earlier)
 
     def _start(self, request: ChatRequest, order: int) -> Call:
         # An upper bound: no tokeniser makes more tokens than bytes.

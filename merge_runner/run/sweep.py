@@ -103,7 +103,7 @@ async def play(
     agree: Callable[[Estimate], None],
     stopping: Stopping = NEVER,
 ) -> dict[str, Any]:
-    """Play what is not stored yet of a plan, and return the summary (``summary.as_dict``).
+    """Play what is not stored yet of a plan, and return the summary (``progress.as_dict``).
 
     A replay without a recording, or replies of the models in the cache, is of the recording that
     ships with the program; one that is not ``whole`` plays what its recordings hold. ``agree`` gets

@@ -15,12 +15,12 @@ from merge_runner.errors import (
     TrialSuspended,
     UsageError,
 )
-from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.client import LlmClient, Meter
 from merge_runner.llm.http_outcome import RawReply, TransportFailure
 from merge_runner.llm.ledger import Asked, Budget, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
-from merge_runner.records import Slot
+from merge_runner.records import Attempt, Slot
 from tests.virtual_time import in_virtual_time, now_s
 
 
@@ -673,6 +673,23 @@ async def test_a_sealed_replay_misses_what_is_not_recorded(make):
     with pytest.raises(ReplayMiss) as caught:
         await client.ask("prompt", slot(2))
     assert caught.value.request.slot == slot(2)
+
+
+@pytest.mark.parametrize(
+    ("body", "outcome"),
+    [(answer("<think>M [1"), "truncated"), (answer("M", finish="MAX_TOKENS"), "truncated")],
+)
+async def test_an_answer_that_an_earlier_version_kept_is_read_by_the_rules_of_now(
+    make, cache, body, outcome
+):
+    sealed = make(None)
+    sealed.transport = None
+    with pytest.raises(ReplayMiss) as missed:
+        await sealed.ask("p", slot())
+    kept = Attempt(1, "ok", http_status=200, reply=body.body)
+    cache.put_now([CachedCall(missed.value.request, (kept,))], [])
+    reply = await sealed.ask("p", slot())
+    assert (reply.outcome, reply.attempts[-1].outcome) == (outcome, outcome)
 
 
 @in_virtual_time
