@@ -196,8 +196,7 @@ class LedgerFile:
     def read(self, sql: str, *values: object) -> Rows:
         """Return the rows of a query; raises UsageError for a damaged file, and CacheFailed."""
         with self._told(), self._one_query:
-            # Its first transaction makes all tables: until then it is empty.
-            if not self._connections and not (self._file.exists() and self._file.stat().st_size):
+            if not (self._connections or self._has_tables()):
                 return []
             return self._connection("ro").execute(sql, values).fetchall()
 
@@ -237,6 +236,16 @@ class LedgerFile:
         """Close the file."""
         while self._connections:
             self._connections.popitem()[1].close()
+
+    def _has_tables(self) -> bool:
+        """Return whether there is a file with tables: its first transaction makes them all."""
+        if not self._file.exists():
+            return False
+        if self._file.with_name(f"{FILE}-journal").exists():
+            # Of a process that was killed in it: who may only read cannot take its pages back.
+            with contextlib.closing(connect(self._file, "rw")) as recovering:
+                recovering.execute("SELECT 1 FROM sqlite_schema").fetchall()
+        return self._file.stat().st_size > 0
 
     def _connection(self, mode: str) -> sqlite3.Connection:
         """Return a connection of its own to read or write: the event loop reads while one syncs."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import shutil
+import sqlite3
 import tempfile
 from pathlib import Path
 
@@ -14,7 +16,7 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.ledger import Asked, Budget, Ledger
+from merge_runner.llm.ledger import FILE, TABLES, Asked, Budget, Ledger, Spending, scopes
 from merge_runner.records import Attempt, Slot, make_request
 from tests.harness import each
 
@@ -375,6 +377,28 @@ async def test_nobody_reads_the_ledger_s_file_before_its_tables_are_there(tmp_pa
         await asyncio.sleep(0)
     assert ledger.read().reserved_usd == 0.25
     cache.close()
+
+
+@pytest.mark.parametrize("after", ["", "COMMIT;"])
+async def test_a_kill_while_the_ledger_s_file_is_made_is_recovered_from(tmp_path, after):
+    made, killed = tmp_path / "made", tmp_path / "killed"
+    made.mkdir()
+    opened = sqlite3.connect(made / FILE, isolation_level=None)
+    with contextlib.closing(opened), contextlib.closing(ResponseCache(killed)) as cache:
+        opened.execute("PRAGMA cache_size = 1")  # pages go to the file before the end
+        tables, commit, _ = TABLES.partition("COMMIT;")
+        opened.executescript(tables + (after and f"{commit} BEGIN; DELETE FROM spent;"))
+        rows = ((f"a study {number}", "m", 0, 0, 0) for number in range(1_000))
+        opened.executemany("INSERT INTO spent VALUES (?, ?, ?, ?, ?)", rows)
+        for file in made.iterdir():
+            shutil.copy(file, killed)
+        assert {FILE, f"{FILE}-journal"} <= {file.name for file in killed.iterdir()}
+        assert (killed / FILE).stat().st_size
+        ledger = Ledger(cache, "a study")
+        assert scopes(cache) == []
+        assert ledger.read() == Spending()
+        assert await ledger.begin("key", 1, 2.0, None, asked(2.0))
+        assert ledger.read().committed_usd == 2.0
 
 
 def test_a_ledger_that_cannot_be_written_is_no_damaged_one(tmp_path):
