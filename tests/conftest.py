@@ -64,8 +64,11 @@ def merge_runner(tmp_path, emulator_url):
         async with one_at_a_time:
             return await asyncio.to_thread(program.run, arguments, cwd=cwd, env=env)
 
-    async def start(*arguments: object, cwd: Path = tmp_path, **changes: str) -> Process:
-        return await program.start(arguments, cwd=cwd, env=beside(emulator_url, changes))
+    async def start(
+        *arguments: object, cwd: Path = tmp_path, module: str = "", **changes: str
+    ) -> Process:
+        env = beside(emulator_url, changes)
+        return await program.start(arguments, cwd=cwd, env=env, module=module)
 
     run.start = start
     return run

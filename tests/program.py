@@ -81,8 +81,8 @@ class Process:
 
     async def said(self, words: str) -> None:
         """Wait until it has written these words to its standard error."""
-        while words.encode() not in os.pread(self._streams[1].fileno(), 2**20, 0):
-            assert self.returncode is None
+        while words.encode() not in (told := os.pread(self._streams[1].fileno(), 2**20, 0)):
+            assert self.returncode is None, told.decode()
             await asyncio.sleep(0.01)
 
     async def communicate(self) -> tuple[bytes, ...]:

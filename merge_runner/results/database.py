@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import atexit
 import contextlib
 import logging
@@ -10,12 +11,14 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar, copy_context
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import Any, TypeVar
 
 import duckdb
 
@@ -40,6 +43,7 @@ SELECT greatest(max(stats(request).max_string_length), max(stats(reply).max_stri
 FROM (SELECT request, reply FROM calls LIMIT 1)
 """
 LOG = logging.getLogger(__name__)
+ResultT = TypeVar("ResultT")
 Settings = dict[str, str | bool | int | float | list[str]]
 SETTINGS: Settings = {
     # The defaults are shares of the machine's, and most of that memory would cache the file. A
@@ -126,6 +130,53 @@ class Instance:
         self._connection = None
 
 
+class Reading:
+    """What a thread does with databases, which another thread may end."""
+
+    def __init__(self) -> None:
+        self.is_over = False
+        self._connection: duckdb.DuckDBPyConnection | None = None
+        self._one_at_a_time = Lock()  # a connection that is interrupted is not closed meanwhile
+
+    def uses(self, connection: duckdb.DuckDBPyConnection | None) -> None:
+        """Note the connection that is open; None before it is closed."""
+        with self._one_at_a_time:
+            self._connection = connection
+
+    def end(self) -> None:
+        """End the query that runs, and what waits for a file; one that begins later goes on."""
+        with self._one_at_a_time:
+            self.is_over = True
+            if self._connection is not None:
+                self._connection.interrupt()
+
+
+_READING: ContextVar[Reading | None] = ContextVar("reading", default=None)
+
+
+async def in_thread(read: Callable[[], ResultT]) -> ResultT:
+    """Read databases in a thread; a task that is cancelled ends the reading before it ends."""
+    reading = Reading()
+
+    def reads() -> ResultT:
+        _READING.set(reading)  # in the thread's own context
+        return read()
+
+    # No task: Ctrl-C may cancel all tasks of the loop, and the thread would go on unseen.
+    loop = asyncio.get_running_loop()
+    thread = loop.run_in_executor(None, copy_context().run, reads)
+    try:
+        await asyncio.wait([thread])
+    except asyncio.CancelledError:
+        while not thread.done():
+            reading.end()  # again, where it was between two queries
+            with contextlib.suppress(asyncio.CancelledError):
+                await asyncio.wait([thread], timeout=LOCK_RETRY_S)
+        thread.exception()  # nobody wants it any more
+        raise
+    return thread.result()
+
+
 SHARED = Instance()
 OURS = "merge_runner_"  # begins the names under which files are attached here
 # Another process holds the file; another connection of this one does.
@@ -137,12 +188,14 @@ def open_database(
     path: Path, *, read_only: bool, patience_s: float, instance: Instance = SHARED
 ) -> Iterator[duckdb.DuckDBPyConnection]:
     """Open the database, waiting until others close it; raises StoreError."""
-    connection = instance.cursor()
+    connection, reading = instance.cursor(), _READING.get()
     name = f"{OURS}{id(connection)}"  # of no other file that is open
     mode = "READ_ONLY" if read_only else f"READ_WRITE, ROW_GROUP_SIZE {ROWS_OF_A_GROUP}"
     # A name such as md:x or :memory: names a file, too.
     _attach(connection, f"{quoted(path.absolute())} AS {name} ({mode})", path, patience_s, instance)
     try:
+        if reading is not None:
+            reading.uses(connection)
         # Whoever used the instance before may have limited it; see limit_memory.
         connection.execute(
             f"USE {name}; SET memory_limit = '{SETTINGS['memory_limit']}'; "
@@ -160,6 +213,8 @@ def open_database(
             LOG.warning("the database was not closed in order: %s", first_line(exc))
             instance.drop()
     finally:
+        if reading is not None:
+            reading.uses(None)
         connection.close()
 
 
@@ -171,7 +226,7 @@ def _attach(
     instance: Instance,
 ) -> None:
     """Attach a file, again and again while another one holds it."""
-    began, told = time.monotonic(), False
+    began, told, reading = time.monotonic(), False, _READING.get()
     while True:
         try:
             connection.execute(f"ATTACH {file}")
@@ -187,7 +242,7 @@ def _attach(
                     f"{path} is open in this process (PID {os.getpid()}) too, as by "
                     "duckdb.connect: close that connection"
                 ) from exc
-            if waited_s >= patience_s:
+            if waited_s >= patience_s or (reading is not None and reading.is_over):
                 raise StoreLocked(f"{path} is held by {_holder(exc)}: close it there") from exc
             if waited_s > 1 and not told:
                 told = True

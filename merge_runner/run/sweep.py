@@ -44,7 +44,7 @@ from merge_runner.llm.ledger import Ledger, scopes
 from merge_runner.paths import SHIPPED_RECORDINGS
 from merge_runner.records import TrialRecord, TrialSpec, canonical_json
 from merge_runner.registry import using
-from merge_runner.results.database import unreadable_is_usage
+from merge_runner.results.database import in_thread, unreadable_is_usage
 from merge_runner.results.provenance import git_state, versions
 from merge_runner.results.recording import Miss, described, explain, recorded_part, spilled
 from merge_runner.results.store import Store, sweep_facts
@@ -447,8 +447,8 @@ class Sweep:
         ended_with, checked = self.exit_code, None
         audited = partial(audit_sweep, store.path, sweep_id, keys, finished=self.exit_code == 0)
         try:
-            facts = await asyncio.to_thread(sweep_facts, store.path, sweep_id)
-            audit = await asyncio.to_thread(audited)
+            facts = await in_thread(partial(sweep_facts, store.path, sweep_id))
+            audit = await in_thread(audited)
             checked = facts, audit
             if not (self.exit_code or self._options.sends_nothing or self._options.keep_going):
                 for line in first.without_a_valid_one():

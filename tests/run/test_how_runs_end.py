@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import signal
 from contextlib import closing
 from dataclasses import replace
 
@@ -19,7 +21,7 @@ from merge_runner.run.local_runner import LocalRunner
 from merge_runner.run.plan import Options, make_plan
 from merge_runner.run.progress import Progress
 from tests.gate import HANGS_S
-from tests.harness import run_sweep
+from tests.harness import PROJECT, run_sweep
 
 CONDITIONS = ["L_4_0", "N_0_0", "R_-4_8"]
 
@@ -130,6 +132,33 @@ async def test_the_audit_at_the_end_holds_up_nobody(options, monkeypatch):
     monkeypatch.setattr(sweep, "audit_sweep", audited)
     summary = await run(options, "constant")
     assert (summary["exit_code"], went_on) == (0, [True])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["QUERIES", "WAITS"])
+async def test_ctrl_c_ends_the_audit_at_the_end(merge_runner, tmp_path, what):
+    db = tmp_path / "results/merge.duckdb"
+    program = await merge_runner.start(
+        *("sweep", "baseline", "--model", "constant", "--conditions", "N_0_0", "--reps", 1),
+        module="tests.run.audited_for_ever",
+        PYTHONPATH=str(PROJECT),
+        **{what: "1"},
+    )
+    async with asyncio.timeout(HANGS_S):
+        await program.said("the audit begins")
+        with contextlib.ExitStack() as held:
+            while what == "WAITS":
+                with contextlib.suppress(duckdb.IOException):  # it is just being audited
+                    held.enter_context(duckdb.connect(str(db)))
+                    await program.said("waiting up to 60 s")
+                    break
+                await asyncio.sleep(0)
+            program.send_signal(signal.SIGINT)
+            _, told = await program.communicate()
+    assert (program.returncode, told.count(b"interrupted: run the same command again")) == (130, 1)
+    assert b"Traceback" not in told
+    with duckdb.connect(str(db), read_only=True) as connection:
+        assert connection.execute("SELECT exit_code FROM sweeps").fetchall() == [(0,)]
 
 
 async def test_what_breaks_in_the_progress_is_not_lost(options, monkeypatch):
