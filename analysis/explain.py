@@ -48,7 +48,7 @@ class Explanation(NamedTuple):
     command: str
 
     def lines(self) -> list[str]:
-        """The explanation for a reader."""
+        """The explanation for a reader; the trials that a value counts come first."""
         lines = [f"{self.cell} = {self.value}", self.meaning]
         if self.note:
             lines.append(f"note: {self.note}")
@@ -58,7 +58,8 @@ class Explanation(NamedTuple):
             if source.query:
                 lines.append(f'{self.command} "{source.query}"')
             counted = set(source.numerator)
-            lines += [f"{'*' if trial in counted else ' '} {trial}" for trial in source.trials]
+            lines += [f"* {trial}" for trial in source.trials if trial in counted]
+            lines += [f"  {trial}" for trial in source.trials if trial not in counted]
         return lines
 
 

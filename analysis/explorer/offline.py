@@ -39,7 +39,8 @@ _ICON = re.compile(r'<link rel="icon"[^>]*>\n')
 def offline(text: str, study: str, policy: str, address: Callable[[str], str]) -> str:
     """Return a served page as one without a server.
 
-    ``address`` returns where a link leads then; what leads nowhere is text.
+    ``address`` returns where a link leads then. What leads nowhere is text, or nothing where it
+    only names another page (``data-page``).
     """
 
     def link(found: re.Match[str]) -> str:

@@ -294,17 +294,28 @@ FROM (SELECT count(*) AS stored FROM linked SEMI JOIN trials USING (trial_id, sp
     (SELECT count(DISTINCT reply_id) AS "reply ids"
     FROM reply_ids SEMI JOIN audited USING (trial_id, spec_hash));
 
+-- Trials that a run did not play, since earlier ones had: its own, of the same name and drivers, which
+-- it goes on from, or those of other sweeps.
+CREATE OR REPLACE TEMP VIEW played_before AS
+SELECT DISTINCT trial_id, spec_hash, own.sweep_id, earlier.sweep_id AS earlier,
+    regexp_replace(own.sweep_id, '-[^-]*$', '') = regexp_replace(earlier.sweep_id, '-[^-]*$', '')
+        AS resumed
+FROM linked JOIN sweep_trials USING (trial_id, spec_hash) JOIN sweeps AS earlier USING (sweep_id),
+    subject JOIN sweeps AS own ON own.sweep_id = subject.sweep_id
+WHERE earlier.started_at < own.started_at;
+
 CREATE OR REPLACE TEMP VIEW notes AS
 SELECT format('unfinished: {} of {} trials are missing, {} failed; the same command again plays them',
     missing, (SELECT count(*) FROM planned), failed) AS text
 FROM counts, subject WHERE NOT finished AND missing + failed > 0
+UNION ALL SELECT format('{} goes on from {}: {} of its trials were stored before', sweep_id,
+    if(count(DISTINCT earlier) = 1, any_value(earlier),
+        format('{} earlier runs, the first {}', count(DISTINCT earlier), min(earlier))),
+    count(DISTINCT (trial_id, spec_hash)))
+FROM played_before WHERE resumed GROUP BY sweep_id
 UNION ALL FROM (
-    -- Trials that it did not play, since earlier ones had.
-    SELECT format('{} and {} share {} trials', subject.sweep_id, earlier.sweep_id, count(*))
-    FROM linked JOIN (SELECT DISTINCT * FROM sweep_trials) AS links USING (trial_id, spec_hash)
-    JOIN sweeps AS earlier USING (sweep_id), subject JOIN sweeps AS own ON own.sweep_id = subject.sweep_id
-    WHERE earlier.started_at < own.started_at
-    GROUP BY subject.sweep_id, earlier.sweep_id ORDER BY ALL
+    SELECT format('{} and {} share {} trials', sweep_id, earlier, count(*))
+    FROM played_before WHERE NOT resumed GROUP BY sweep_id, earlier ORDER BY ALL
 )
 UNION ALL SELECT format('{} of its trials were played by another sweep', count(*))
 FROM unplayed WHERE elsewhere HAVING count(*) > 0

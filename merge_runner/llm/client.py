@@ -136,6 +136,7 @@ class Call:
 class Meter:
     """Counts of calls, attempts and cost.
 
+    ``calls_shared`` are those of ``calls_cached`` that this run has asked, for another trial.
     ``stand_ins`` counts the answers that a scripted stand-in gave in the model's name;
     ``underpriced`` those that cost more than the registry knows, by service tier; ``damaged`` are
     the keys of recorded replies that could not be read.
@@ -143,6 +144,7 @@ class Meter:
 
     calls_live: int = 0
     calls_cached: int = 0
+    calls_shared: int = 0
     cost_usd: float = 0.0
     cost_unknown: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
@@ -200,6 +202,7 @@ class LlmClient:
     _wire: WireFormat = field(init=False)
     _own_names: frozenset[str | None] = field(init=False)
     money: Budget = field(init=False)
+    _answered: set[str] = field(default_factory=set, init=False)  # keys of calls of this run
     _refused: int = 0
     _alone: asyncio.Lock = field(default_factory=asyncio.Lock)
     _stopping: bool = False
@@ -335,6 +338,7 @@ class LlmClient:
         last, meter = reply.attempts[-1], self.meter
         meter.calls_cached += reply.cached
         meter.calls_live += not reply.cached
+        meter.calls_shared += reply.cached and reply.request.key in self._answered
         if last.model_served not in self._own_names:
             meter.mismatches[f"{self.entry.id} -> {last.model_served}"] += 1
         if self.entry.provider != "emulator":
@@ -560,6 +564,7 @@ class LlmClient:
         error = error or self._error(call, outcome)
         if error is None:
             kept = await paid.keep(CachedCall(call.request, tuple(call.attempts)))
+            self._answered.add(call.request.key)
             return self._read(
                 kept, call.earlier
             )  # not what was sent here where an import was first

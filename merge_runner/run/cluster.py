@@ -130,6 +130,8 @@ async def connected(where: str) -> AsyncIterator[Client]:
                     n_workers=int(named["workers"]),
                     threads_per_worker=1,
                     dashboard_address=None,
+                    # Its server of HTTP is started all the same: at any port that is free.
+                    scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
                     silence_logs=logging.CRITICAL,
                     asynchronous=True,
                 )

@@ -171,23 +171,32 @@ class Progress:
     unstored: Callable[[], str] = str  # says why trials are not stored; empty: nothing is wrong
     batches: Callable[[], list[str]] = list  # says which batches are waited for
 
+    def meter(self) -> Meter:
+        """What the meters of all models have counted."""
+        whole = Meter()
+        for each in self.runner.meters.values():
+            whole.add(each)
+        return whole
+
     def standing(self, sweep_id: str) -> Standing:
         """Where the sweep stands now."""
-        meters = self.runner.meters.values()
+        meter = self.meter()
         now = datetime.now(UTC)
         elapsed_s = (now - self.began_at).total_seconds()
         failed = self.outcome_counts["failed"]
         ended = self.outcome_counts.total() - self.outcome_counts["suspended"] - failed
-        live, cached = (sum(m.calls_live for m in meters), sum(m.calls_cached for m in meters))
-        cost_usd = sum(meter.cost_usd for meter in meters)
         batches = first_of(self.batches(), "others")
         # How long a batch takes nobody knows.
-        left_s = None if batches else self._left_s(elapsed_s, ended + failed, live + cached)
+        left_s = (
+            None
+            if batches
+            else self._left_s(elapsed_s, ended + failed, meter.calls_live + meter.calls_cached)
+        )
         before = f" (+{self.stored} stored before)" if self.stored else ""
         workers = "" if self.runner.workers is None else f" on {self.runner.workers} workers"
         running = f"{self.runner.running} running{workers}"
         trials = f"{ended + failed}/{self.planned - self.stored} ended{before}, {running}"
-        cost = f"{cost_usd:.2f} USD"
+        cost = f"{meter.cost_usd:.2f} USD"
         if self.cap_usd is not None:
             cost += f", {self.ledger.committed_usd:.2f} of {self.cap_usd:g} over all runs"
         left = "" if left_s is None else f", about {left_s:.0f} s left"
@@ -195,7 +204,7 @@ class Progress:
             *dict.fromkeys(("WARNING", text) for text in self._warnings()),
             ("trials", trials),
             ("failed", str(failed)),
-            ("calls", f"{live} live, {cached} from recordings"),
+            ("calls", _calls(meter.calls_live, meter.calls_cached, meter.calls_shared)),
             ("cost", cost),
             *(("waiting", text) for text in batches + [CLOSE_IT] * bool(batches) + self._waits()),
             ("time", f"{elapsed_s:.0f} s{left}"),
@@ -206,7 +215,7 @@ class Progress:
             doing=self.doing,
             ended=self.stored + ended,
             failed=failed,
-            cost_usd=cost_usd,
+            cost_usd=meter.cost_usd,
             left_s=left_s,
             rows=tuple((name, printable(text)) for name, text in rows),
         )
@@ -344,9 +353,7 @@ def as_dict(
     ``checked`` is what the database holds of the sweep. From ``decisions`` on, values are there
     where anything is stored. ``told`` goes into it.
     """
-    plan, spending, meter = progress.plan, progress.ledger.spending, Meter()
-    for each in progress.runner.meters.values():
-        meter.add(each)
+    plan, spending, meter = progress.plan, progress.ledger.spending, progress.meter()
     playing_s = ((progress.ended_at or progress.began_at) - progress.began_at).total_seconds()
     summary: dict[str, Any] = {
         **told,
@@ -361,6 +368,7 @@ def as_dict(
             "suspended": progress.outcome_counts["suspended"],
         },
         "calls": {"live": meter.calls_live, "cached": meter.calls_cached},
+        "calls_shared": meter.calls_shared,
         "attempts": meter.outcomes,
         "cost_usd": round(meter.cost_usd, 6),
         "calls_of_unknown_cost": meter.cost_unknown,
@@ -432,13 +440,17 @@ def _results(summary: dict[str, Any]) -> Iterator[str]:
     )
 
 
+def _calls(live: int, cached: int, shared: int) -> str:
+    """How many calls were asked, and how many had an answer: ``shared`` of them by this run."""
+    text = f"{live} live, {cached - shared} from recordings"
+    return f"{text}, {shared} shared with another trial" if shared else text
+
+
 def _costs(summary: dict[str, Any]) -> Iterator[str]:
     number = summary["calls_of_unknown_cost"]
     unknown = f" and {number} calls of unknown cost" if number else ""
-    yield (
-        f"calls: {summary['calls']['live']} live, {summary['calls']['cached']} from recordings; "
-        f"cost {summary['cost_usd']:.4f} USD{unknown}"
-    )
+    calls = _calls(summary["calls"]["live"], summary["calls"]["cached"], summary["calls_shared"])
+    yield (f"calls: {calls}; cost {summary['cost_usd']:.4f} USD{unknown}")
     if (expected := summary["estimate"]) is not None:
         usd = _about(expected["cost_usd"])
         yield f"estimated before: {expected['calls']} calls, {usd}"

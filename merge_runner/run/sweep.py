@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import (
     AbstractContextManager,
@@ -60,7 +61,7 @@ from merge_runner.run.local_runner import (
     LocalRunner,
 )
 from merge_runner.run.plan import Options, Plan, usual_prompts
-from merge_runner.run.progress import Progress, as_dict, show_progress, write_standing
+from merge_runner.run.progress import Progress, as_dict, first_of, show_progress, write_standing
 
 INTERRUPTED = 130
 GO_ON = "Run the same command again to go on."
@@ -340,12 +341,14 @@ class Sweep:
         """
         runner, counts, suspended = progress.runner, progress.outcome_counts, ""
         misses: list[Miss] = []
+        waiting = Counter[str](dict.fromkeys(map(_played_as, self.todo), 0))
         progress.unstored = lambda: flusher.problem
 
         def ended(spec: TrialSpec, record: TrialRecord | TrialSuspended) -> None:
             nonlocal suspended
             if isinstance(record, TrialSuspended):
                 counts["suspended"] += 1
+                waiting[_played_as(spec)] += 1
                 suspended = str(record)
             else:
                 counts[record.status] += 1
@@ -383,8 +386,9 @@ class Sweep:
             if suspended:
                 self._fail(
                     TrialSuspended.exit_code,
-                    f"{counts['suspended']} trials wait for money: {suspended}. Their replies are "
-                    "kept: raise --max-cost, or the study's budget, and run the same command again",
+                    f"{counts['suspended']} trials wait for money{_unbalanced(waiting)}: "
+                    f"{suspended}. Their replies are kept: raise --max-cost, or the study's "
+                    "budget, and run the same command again",
                 )
         finally:
             progress.ended_at = datetime.now(UTC)
@@ -581,6 +585,20 @@ def _others_under_the_cap(
     if spent_usd := sum(Ledger(cache, scope).read().committed_usd for scope in others):
         say(f"{spent_usd:.4f} USD of {', '.join(others)} count against the budget, too")
     return others
+
+
+def _played_as(spec: TrialSpec) -> str:
+    """The drivers and the prompt of a trial, as its name begins."""
+    name = spec.trial_id.rsplit("/", 2)[0]
+    return name.removeprefix("seat/") if spec.source == "seat" else name
+
+
+def _unbalanced(waiting: Counter[str]) -> str:
+    """How many trials of each arm wait, where they are not as many of each."""
+    if len({*waiting.values()}) <= 1:
+        return ""
+    parts = first_of([f"{number} of {name}" for name, number in waiting.items()], "others")
+    return f" ({', '.join(parts)}: what has ended is not balanced)"
 
 
 async def unsent(

@@ -593,7 +593,9 @@ def test_what_another_sweep_has_played_since_is_not_missing(db):
     found = audit("--db", db)
     assert found.code == 0
     assert "7 of its trials were played by another sweep" in found.notes
-    assert f"{found.audits[1]['subject']} and {stopped} share 1 trials" in found.notes
+    own = found.audits[1]["subject"]
+    assert f"{own} goes on from {stopped}: 1 of its trials were stored before" in found.notes
+    assert f"{own} and {stopped}" not in found.notes
 
 
 def caching(kept: dict[str, dict], **changes: object):

@@ -128,3 +128,23 @@ def test_a_name_that_hides_something_is_neutral_on_every_page_of_an_export(
         assert not any({"\u202e", "\u200b"} & set(text) for text in said)
     lists = [(tmp_path / "pages/index.html"), *files.glob("trials-page-*.html")]
     assert sum("o3[U+202E]gpj[U+200B]" in page.read_text() for page in lists) == 1
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (
+            {"outcome": "crashed"},
+            "Of outcome there is no crashed; there are left first, right first.",
+        ),
+        ({"model": "o4"}, "Of driver there is no o4; there are human, o3, "),
+        ({"factor.hurry": "yes"}, "Of hurry there is no yes."),
+        ({"q": "nowhere"}, "No trial matches. Show all"),
+        ({"outcome": "left first", "variant": "A1"}, "No trial matches. Show all"),
+    ],
+)
+def test_an_empty_list_names_the_values_that_no_trial_has(client, asked, said):
+    text = client.get("/trials", params=asked).text
+    empty = re.search(r'<p class="empty">.*?</p>', text, re.DOTALL)[0]
+    assert said in " ".join("".join(Texts(empty).said).split())
+    assert "trials.csv" not in text

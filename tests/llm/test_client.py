@@ -148,9 +148,11 @@ async def test_a_second_ask_is_answered_from_the_cache(make):
     assert first.attempts == second.attempts
     assert len(client.transport.sent) == 1
     assert (client.meter.calls_live, client.meter.calls_cached) == (1, 1)
+    assert client.meter.calls_shared == 1
     later = make(answer("second"))
     assert (await later.ask("prompt", slot())).text == "first"
     assert later.transport.sent == []
+    assert (later.meter.calls_cached, later.meter.calls_shared) == (1, 0)
 
 
 @in_virtual_time
@@ -161,6 +163,7 @@ async def test_two_who_ask_the_same_at_once_share_one_call(make):
     assert [reply.cached for reply in replies] == [False, True]
     assert len(client.transport.sent) == 1
     assert (client.meter.calls_live, client.meter.calls_cached) == (1, 1)
+    assert client.meter.calls_shared == 1
 
 
 @in_virtual_time

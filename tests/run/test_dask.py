@@ -13,6 +13,7 @@ import os
 import pickle
 import shutil
 import signal
+import socket
 import sys
 import time
 from collections import Counter
@@ -314,6 +315,17 @@ async def test_the_host_s_logging_and_environment_are_as_before(monkeypatch, cap
     assert (seen, logging.root.manager.disable) == (["1"], 0)
     logging.getLogger("merge_runner").warning("later")
     assert [each.message for each in caplog.records] == ["ours"] * (error is None) + ["later"]
+
+
+@pytest.mark.long
+async def test_a_cluster_of_this_machine_needs_no_port_that_another_program_may_hold(recwarn):
+    with socket.socket() as held:
+        with contextlib.suppress(OSError):  # somebody holds it already
+            held.bind(("127.0.0.1", 8787))
+            held.listen()
+        async with connected("local:1"):
+            pass
+    assert [str(each.message) for each in recwarn] == []
 
 
 def level_of_loggers():

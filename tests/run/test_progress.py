@@ -19,7 +19,7 @@ def rows(shown):
 
 
 def test_every_figure_is_that_of_the_meters():
-    meters = [Meter(calls_live=30, calls_cached=12), Meter(calls_live=4)]
+    meters = [Meter(calls_live=30, calls_cached=20, calls_shared=8), Meter(calls_live=4)]
     meters[0].count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
     meters[1].count_attempt(Attempt(1, "timeout"))
     meters[1].mismatches["o3 -> gpt-4o"] = 2
@@ -31,7 +31,7 @@ def test_every_figure_is_that_of_the_meters():
     assert fields["trials"] == "3/10 ended (+7 stored before), 5 running"
     assert fields["failed"] == "1"
     assert fields["WARNING"] == "another model answers: o3 -> gpt-4o"
-    assert fields["calls"] == "34 live, 12 from recordings"
+    assert fields["calls"] == "34 live, 12 from recordings, 8 shared with another trial"
     assert fields["cost"] == "1.50 USD, 4.25 of 20 over all runs"
     # 3 of 10 trials have ended but only 46 of 210 calls are made: the larger share tells.
     assert fields["time"] == "60 s, about 140 s left"

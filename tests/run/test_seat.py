@@ -195,6 +195,19 @@ async def test_no_more_is_spent_than_the_cap_and_more_money_goes_on(merge_runner
     assert "mine/paid/set0/first" in (await merge_runner("ledger")).out
 
 
+async def test_a_cap_that_leaves_more_of_one_prompt_than_of_another_says_so(merge_runner, tmp_path):
+    (tmp_path / "models.toml").write_text(PRICED)
+    (tmp_path / "mine.toml").write_text(
+        'repetitions = 2\nconditions = ["N_0_0"]\n[factors]\nprompt = ["baseline", "A1"]\n'
+    )
+    ask = ("sweep", "mine.toml", "--first", "--model", "paid", "--yes", "--in-flight", 1, *FAST)
+    async with watched() as server:
+        run = await merge_runner(*ask, "--max-cost", 2.1, EMULATOR_BASE_URL=f"{server.url}/v1")
+    assert run.code == 3, run.err
+    waiting = "(1 of paid/baseline, 2 of paid/A1: what has ended is not balanced)"
+    assert f"3 trials wait for money {waiting}: " in run.err
+
+
 async def test_a_study_with_a_budget_pays_for_its_situations_from_it(merge_runner, tmp_path):
     (tmp_path / "mine.toml").write_text("repetitions = 1\n[budget]\ntotal_usd = 5\n")
     for first in (True, False):

@@ -33,9 +33,9 @@ SCOPED = {
 EXAMPLES = {
     "Who merged first, and how often did they collide?": """\
 select model_left, variant, condition, count(*) as trials,
-    count_if(merged_first = 'left') as left_first,
-    count_if(merged_first = 'right') as right_first,
-    count_if(status = 'collided') as collided
+    count(*) filter (where merged_first = 'left') as left_first,
+    count(*) filter (where merged_first = 'right') as right_first,
+    count(*) filter (where status = 'collided') as collided
 from trials
 group by all order by all""",
     "Gap at the merge point, speed deviation, and joint contribution per variant": """\

@@ -61,7 +61,18 @@ def trials_page(site: Site, asked: Mapping[str, str]) -> str:
         page=page,
         last_page=last,
         sparkline=sparkline,
+        unknown=[] if rows else _unknown(site, chosen),
     )
+
+
+def _unknown(site: Site, chosen: Wanted) -> list[tuple[str, str, list[str]]]:
+    """Facets, as they are called, with a chosen value that no trial has, and the values there."""
+    known = site.catalogue.facets({})
+    return [
+        (HEADINGS.get(name, name.removeprefix(FACTOR)), value, [there for there, _ in values])
+        for name, value in chosen.items()
+        if name != "q" and value not in dict(values := known.get(name, []))
+    ]
 
 
 def export_filter(site: Site, asked: Mapping[str, str]) -> Wanted:
