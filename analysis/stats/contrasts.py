@@ -259,7 +259,7 @@ def trials_by_cell(
 def copied_cells(frames: Sequence[pd.DataFrame]) -> set[object]:
     """The cells in which all trials of one group are copies of another's: programs play them.
 
-    They differ by nothing, by construction, so that nothing can be tested there.
+    What they differ by is how often each was drawn, so that nothing can be tested there.
     """
     ways = [frame.groupby("condition")["way"].agg(set) for frame in frames]
     return {
@@ -270,10 +270,10 @@ def copied_cells(frames: Sequence[pd.DataFrame]) -> set[object]:
     }
 
 
-def same_trials(frames: Sequence[pd.DataFrame]) -> bool:
-    """Whether groups share cells, and all of these are copied ones."""
+def copied_of_shared(frames: Sequence[pd.DataFrame]) -> tuple[int, int]:
+    """How many of the cells that groups share are copied ones, and how many they share."""
     shared = set.intersection(*({*frame["condition"]} for frame in frames))
-    return bool(shared) and shared <= copied_cells(frames)
+    return len(shared & copied_cells(frames)), len(shared)
 
 
 def corrected(p: list[float]) -> list[float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import isnan
 
@@ -12,7 +12,7 @@ from merge_runner.text_safety import quoted
 from merge_runner_analysis.data.remember import remembered
 from merge_runner_analysis.data.study import Group, Study, levels_of
 from merge_runner_analysis.metrics import Metric
-from merge_runner_analysis.stats.contrasts import same_trials, trials_by_cell
+from merge_runner_analysis.stats.contrasts import trials_by_cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,16 +114,10 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
     return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)
 
 
-def copied(levels: Sequence[Level], metric: Metric) -> bool:
-    """Whether levels hold the same trials of programs in all cells that they share."""
-    return same_trials(
-        [
-            level.pooled.trials.dropna(subset=[metric.column]).assign(
-                condition=lambda rows: rows["cell"]
-            )
-            for level in levels
-        ]
-    )
+def by_cell(*levels: Level) -> list[pd.DataFrame]:
+    """The trials of each level, with their cell as ``condition``."""
+    every = [level.pooled.trials for level in levels]
+    return [trials.assign(condition=trials["cell"]) for trials in every]
 
 
 def difference_of_medians(study: Study, metric: Metric, level: Level, first: Level) -> float | None:

@@ -5,10 +5,12 @@ Headlines, sentences, the report and the pages read the table ``verdicts`` and n
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 from math import isinf
+
+import pandas as pd
 
 from merge_runner.records import SIDES
 from merge_runner.registry import require
@@ -18,15 +20,20 @@ from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
 from merge_runner_analysis.data.study import Group, Study, levels_of
 from merge_runner_analysis.metrics import INTERVALS, METRICS, RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.names import HUMAN
-from merge_runner_analysis.stats.contrasts import contrast, corrected, same_trials
+from merge_runner_analysis.stats.contrasts import (
+    contrast,
+    copied_of_shared,
+    corrected,
+    trials_by_cell,
+)
 from merge_runner_analysis.stats.factors import (
     Level,
     balance,
-    copied,
+    by_cell,
     difference_of_medians,
     levels_by_factor,
 )
-from merge_runner_analysis.stats.measures import estimate, trials_of, undecided_note
+from merge_runner_analysis.stats.measures import estimate, undecided_note
 from merge_runner_analysis.stats.verdicts import Comparison, Known, compared, of_humans
 from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
 from merge_runner_analysis.verdict_words import (
@@ -85,7 +92,7 @@ NO_INTERACTION = (
     "trials or the same ones at two levels"
 )
 SAME_TRIALS = (
-    "programs play the same trials at both levels: the difference is 0 by construction, no test"
+    "programs play no trial at one of both levels that they do not play at the other: no test"
 )
 
 
@@ -219,17 +226,16 @@ def contrasts(study: Study) -> Table:
 def _same_as_reference(study: Study) -> Iterator[str]:
     """Which prompts have no row, since programs do not read them."""
     own = {g.driver: g for g in study.models if g.setting == study.reference}
-    same = [
-        group.id
-        for group in study.models
-        if (other := own.get(group.driver)) not in (None, group)
-        and same_trials([group.trials, other.trials])
-    ]
+    same = []
+    for group in study.models:
+        other = own.get(group.driver)
+        if other in (None, group):
+            continue
+        copies, shared = copied_of_shared([group.trials, other.trials])
+        if copies and copies == shared:
+            same.append(group.id)
     if same:
-        yield (
-            f"{', '.join(same)}: programs play the same trials as with the prompt "
-            f"{study.reference}: the difference is 0 by construction, no test"
-        )
+        yield f"{', '.join(same)}, beside {study.reference}: {SAME_TRIALS}"
 
 
 def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
@@ -245,10 +251,10 @@ def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
     for (group, difference), p_holm in zip(found.items(), holm, strict=True):
         assert other is not None
         first, second = (
-            trials_of(one, metric).dropna(subset=[metric.column])["condition"]
-            for one in (group, other)
+            frame["condition"]
+            for frame in trials_by_cell(study, (group, other), metric, "condition", shared=True)
         )
-        named = ", ".join(quoted(name) for name in sorted({*first} & {*second}))
+        named = ", ".join(quoted(name) for name in sorted({*first}))
         factor, least = 100 if metric.rate else 1, difference.detectable
         values: dict[str, Value] = {
             "driver": group.label,
@@ -260,18 +266,32 @@ def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
             "p": difference.p,
             "p_holm": p_holm,
             "detectable": None if least is None else factor * least,
-            "n": int(first.isin(second).sum()),
-            "n_reference": int(second.isin(first).sum()),
+            "n": len(first),
+            "n_reference": len(second),
             "freedom": None if isinf(difference.freedom) else difference.freedom,
         }
         few = f"{metric.heading}: so few trials can show no difference, however large"
+        note = [few if least is None else "", _left_out((group.trials, other.trials), metric)]
         yield Row(
             f"{group.id}/{other.setting}/{metric.name}",
             (group.id, other.id),
             values,
-            few if least is None else "",
+            "; ".join(filter(None, note)),
             f"{metric.counts} AND condition IN ({named})",
         )
+
+
+def _left_out(frames: Sequence[pd.DataFrame], metric: Metric) -> str:
+    """What is not compared, since programs play the same trials there."""
+    copies, shared = copied_of_shared([frame.dropna(subset=[metric.column]) for frame in frames])
+    if not copies:
+        return ""
+    if copies == shared:
+        return SAME_TRIALS
+    return (
+        f"{metric.heading}: the difference leaves out {copies} of {shared} shared cells, in which "
+        "programs play the same trials"
+    )
 
 
 def factors(study: Study) -> Table:
@@ -289,6 +309,7 @@ def factors(study: Study) -> Table:
         for level in levels
     ]
     rows += _interactions(study, found) if by else []
+    # A test that the table does not print counts all the same, as `contrasts` may print it.
     families: dict[tuple[Value, ...], dict[str, float]] = {}
     for row in rows:
         if isinstance(value := row.values.get("p"), float):
@@ -300,6 +321,7 @@ def factors(study: Study) -> Table:
         for p in families.values()
         for name, p_holm in zip(p, corrected([*p.values()]), strict=True)
     }
+    rows = [_corrected(row, holm.get(row.id)) for row in rows]
     return Table(
         "factors",
         (
@@ -317,17 +339,25 @@ def factors(study: Study) -> Table:
             Optional("p", "p", "p", 3, "Fisher's exact test or Welch's"),
             Optional("p_holm", "Holm", "p", 3, "corrected by Holm"),
         ),
-        [replace(row, values={**row.values, "p_holm": holm.get(row.id)}) for row in rows],
+        rows,
         (
             *([] if found else ["the trials of judged drivers differ in no factor"]),
             f"intervals: {INTERVALS}. {DIFFERENCES}",
             *([INTERACTIONS.format(by=by)] if by else []),
-            *([FAMILY] if holm else []),
+            *([FAMILY] if any(row.values["p_holm"] is not None for row in rows) else []),
             *_copies(found),
             *(f"{_name(levels[0])}: {balance(levels)}" for levels in found),
             RULES_NOTE,
         ),
     )
+
+
+def _corrected(row: Row, p_holm: float | None) -> Row:
+    """The row with its corrected p, and without both where a level lacks cells."""
+    values = {name: value for name, value in row.values.items() if name != "balanced"}
+    if not row.values.get("balanced", True):
+        return replace(row, values=values | {"p": None, "p_holm": None})
+    return replace(row, values=values | {"p_holm": p_holm})
 
 
 def _copies(found: list[list[Level]]) -> Iterator[str]:
@@ -357,7 +387,7 @@ def _level_row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
     elif level is not first:
         cells |= _difference(study, metric, level, first)
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
-    same = SAME_TRIALS if level is not first and copied([level, first], metric) else ""
+    same = "" if level is first else _left_out(by_cell(level, first), metric)
     note = "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric), same)))
     return Row(f"{level.id}/{metric.name}", level.groups, cells, note, _counts(level, metric))
 
@@ -379,7 +409,7 @@ def _cells(level: Level, metric: Metric) -> dict[str, Value]:
 
 
 def _difference(study: Study, metric: Metric, *levels: Level) -> dict[str, Value]:
-    """A difference of levels; no p where some of them lack cells that others have."""
+    """A difference of levels, and whether all of them have the same cells."""
     found = contrast(study, [level.pooled for level in levels], metric, "cell")
     if found is None:
         return {}
@@ -387,7 +417,8 @@ def _difference(study: Study, metric: Metric, *levels: Level) -> dict[str, Value
     return {
         "difference": unit * found.value,
         "difference_ci": found.bounds(unit),
-        "p": found.p if len(cells) == 1 else None,
+        "p": found.p,
+        "balanced": len(cells) == 1,
     }
 
 

@@ -15,7 +15,7 @@ from merge_runner_analysis.report.page import alarms
 from merge_runner_analysis.tables import make_tables
 from tests.analysis.studies import Drive, changed, write_study, yielding
 
-SAME = "programs play the same trials at both levels"
+SAME = "programs play no trial at one of both levels"
 PROGRAM = json.dumps({side: {"program": "own", "chance": True} for side in ("left", "right")})
 
 
@@ -86,8 +86,36 @@ def test_no_test_is_made_of_copies_and_the_rows_say_so(db):
         assert SAME in row.note
     table, rows = made("contrasts", db)
     assert {row.partition("/")[0] for row in rows} == {"o3"}
-    (note,) = [note for note in table.notes if "programs play the same trials" in note]
-    assert note.startswith("one/A1, two/A1: ")
+    (note,) = [note for note in table.notes if SAME in note]
+    assert note.startswith("one/A1, two/A1, beside baseline: ")
+
+
+def test_a_row_says_in_how_many_cells_it_compares_and_counts_the_trials_there(tmp_path):
+    """A program whose setting changes what it does in five of eleven conditions."""
+    drives = yielding("one", reps=4)
+    heeded = {*sorted({drive.condition for drive in drives})[:5]}
+    other = [
+        braking([drive], 0.8)[0] if drive.condition in heeded else drive
+        for drive in yielding("one", "A1", 4)
+    ]
+    study = changed(
+        write_study(tmp_path / "t.duckdb", [*drives, *other]),
+        f"UPDATE specs SET spec = '{PROGRAM}'",
+        "UPDATE trials SET source = 'driver'",
+    )
+    contrasts, factors = make_tables(study, ["contrasts", "factors"])
+    row = next(row for row in contrasts.rows if row.id.endswith("/gap_m"))
+    played = {(trial.condition, trial.way) for trial in study.models[0].trials.itertuples()}
+    there = sum(condition in heeded for condition, _ in played)
+    assert (row.values["n"], row.values["n_reference"]) == (there, there)
+    said = "gap (m): the difference leaves out 6 of 11 shared cells"
+    assert row.note.startswith(said)
+    assert (
+        sum(len(source.trials) for source in explain(study, contrasts, f"{row.id}:n").sources)
+        == 2 * there
+    )
+    (level,) = [row for row in factors.rows if row.id == "prompt=A1/gap_m"]
+    assert level.note.startswith(said)
 
 
 def test_what_a_prompt_changes_rests_on_who_reads_it(db):

@@ -169,6 +169,27 @@ def test_a_comparison_has_one_corrected_p_wherever_it_is_printed(tmp_path):
     assert {len(family) for family in families.values()} == {3}
 
 
+def test_a_p_that_is_not_printed_counts_in_its_family(tmp_path):
+    """A level that lacks a condition has no p in `factors`, and has one in `contrasts`."""
+    drives = yielding("o3", reps=5)
+    for variant, share in (("A1", 0.5), ("A2", 0.9)):
+        drives += [
+            replace(d, variant=variant, left=tuple(share * x for x in d.left))
+            for d in drives[:55]
+            if (variant, d.condition) != ("A2", "N_0_0")
+        ]
+    contrasted, levels = make_tables(
+        Study(write_study(tmp_path / "t.duckdb", drives)), ["contrasts", "factors"]
+    )
+    printed = [row.id for row in levels.rows if row.values.get("p") is not None]
+    assert not any("prompt=A2" in name for name in printed)
+    for row in contrasted.rows:
+        _, variant, _, measure = row.id.split("/")
+        if variant == "A1":
+            same = found(levels, f"prompt=A1/{measure}")
+            assert same["p_holm"] == pytest.approx(row.values["p_holm"])
+
+
 @pytest.mark.slow
 def test_factors_are_shown_at_each_level_of_another_one_with_interactions(played):
     made = played.run("tables", "factors", "--by", "opponent", "--json")

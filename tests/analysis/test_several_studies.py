@@ -67,7 +67,7 @@ def test_a_study_that_is_named_is_shown_by_its_own_trials_alone(db, folder, prep
     for metric in ("left_first_percent", "collided_percent"):
         row = known[f"prompt=A1/{metric}"]
         assert (row["trials"], row["difference"], row["p"]) == (8, None, None)
-        assert "programs play the same trials at both levels" in row["note"]
+        assert "programs play no trial at one of both levels" in row["note"]
     assert "memory_s" not in {row["factor"] for row in table["rows"]}
     assert "several studies" not in json.dumps(table["notes"])
 
