@@ -345,7 +345,9 @@ def _prompts(groups, orders) -> dict[str, dict]:
         for name, column, kind, shown in METRICS:
             found = _compared(trials, reference, column, kind) if shown else {}
             if found:
-                sizes = [int(one[column].notna().sum()) for one in (trials, reference)]
+                frames = _otherwise(*(t[t[column].notna()] for t in (trials, reference)))
+                shared = {*frames[0]["cell"]} & {*frames[1]["cell"]}
+                sizes = [int(one["cell"].isin(shared).sum()) for one in frames]
                 found |= {"n": sizes[0], "n_reference": sizes[1], "family": (driver, name)}
                 rows[f"{driver}/{variant}/{listed[0]}/{name}"] = found
     return rows
