@@ -7,6 +7,7 @@ import os
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import duckdb
 import pytest
@@ -19,6 +20,7 @@ from merge_runner.prompts.blocks import VARIANTS, Variant
 from merge_runner.registry import NO_STUDY, in_use
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
+from merge_runner.study import parts
 from merge_runner_analysis import table
 from merge_runner_analysis.metrics import METRICS, Metric
 from tests.harness import CONFIGURING
@@ -130,6 +132,21 @@ async def test_a_cell_that_runs_again_changes_nothing_of_its_study_that_runs(fol
     assert all("History of" not in text for text in outcome.decisions()["prompt"])
     assert all("Road type" in text for text in outcome.decisions()["prompt"])
     assert set(outcome.trials()["projected_headway_m"]) <= {2.0}
+
+
+def test_a_driver_finds_the_modules_of_its_plug_in_while_its_study_is_planned_again(
+    folder, monkeypatch
+):
+    mine, found, run_plugin = study("a"), [], parts._run_plugin
+    braking = mine.plan().parts.programs["mine"].driver(SimpleNamespace(held=lambda action: action))
+
+    def run(*arguments):
+        found.append(asyncio.run(braking.decide(None, 0)))
+        run_plugin(*arguments)
+
+    monkeypatch.setattr(parts, "_run_plugin", run)
+    mine.plan()
+    assert found == [BRAKING["a"]] * 2
 
 
 @pytest.mark.slow

@@ -241,11 +241,8 @@ def _run_plugins(sources: Mapping[str, str]) -> None:
     }
     if len(named) < len(sources):
         raise UsageError(f"plug-ins need different names: {', '.join(sources)}")
-    with _importing:  # nobody finds half of a package
-        for name in named:
-            sys.modules.pop(name, None)
-        sys.modules[package] = ModuleType(package)
-        sys.modules[package].__path__ = []
+    with _importing:
+        sys.modules.setdefault(package, ModuleType(package)).__path__ = []
         for name, (file, source) in named.items():
             _run_plugin(name, file, source)
 
@@ -254,9 +251,12 @@ def _run_plugin(name: str, file: str, source: str) -> None:
     loader = _Source(file, source)
     spec = spec_from_loader(name, loader)
     assert spec is not None
-    module = sys.modules[name] = module_from_spec(spec)
+    module = module_from_spec(spec)
+    # The one before stays until this one is complete: a driver that runs may import from it.
+    sys.modules.setdefault(name, module)
     try:
         loader.exec_module(module)
+        sys.modules[name] = module
     except (UsageError, AssertionError, *FAULTS) as exc:
         lines = [f.lineno for f in extract_tb(exc.__traceback__) if f.filename == file]
         line = lines[-1] if lines else getattr(exc, "lineno", None)
