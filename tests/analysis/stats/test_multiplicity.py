@@ -12,8 +12,8 @@ from scipy.special import expit
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M, human_counts, published
 from merge_runner_analysis.data.study import Group, _published_humans
+from merge_runner_analysis.stats import verdicts
 from merge_runner_analysis.stats.regressions import gap_design
-from merge_runner_analysis.stats.verdicts import decided, tests_of
 from merge_runner_analysis.verdict_words import DIFFERS
 
 COPIES = 200
@@ -64,7 +64,8 @@ def drawn(rng: np.random.Generator, trials: int, *, pairs: bool, of_velocity: fl
 
 @np.errstate(divide="ignore")
 def states(groups: Iterator[Group]) -> list[dict[str, str]]:
-    return [decided(tests_of(group, _published_humans(), None))[0] for group in groups]
+    tests = (verdicts.tests_of(group, _published_humans(), None) for group in groups)
+    return [verdicts.decided(test)[0] for test in tests]
 
 
 @pytest.mark.long
