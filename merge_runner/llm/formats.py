@@ -38,6 +38,8 @@ SPENT = re.compile(
 )
 # A limit of a day, as OpenAI, Groq and OpenRouter name it.
 PER_DAY = re.compile(r"per[-_ ]?day\b|\b[rt]pd\b|\bdaily\b", re.IGNORECASE)
+# An error that also names one of these may list all limits, and be of a shorter one.
+SHORTER = re.compile(r"per[-_ ]?(min|sec|hour)|\b[rt]pm\b", re.IGNORECASE)
 # What ends an answer of Gemini that was refused.
 REFUSALS = (
     *("SAFETY", "RECITATION", "LANGUAGE", "OTHER", "BLOCKLIST", "PROHIBITED_CONTENT", "SPII"),
@@ -245,8 +247,9 @@ def read_error(status: int, headers: Mapping[str, str], body: str, payload: obje
 
 
 def is_per_day(error: ServerError) -> bool:
-    """Return whether an error speaks of a limit of a day, in whose words Gemini's does not."""
-    return error.status == 429 and any(map(PER_DAY.search, (error.message, *error.names)))
+    """Return whether an error speaks of a limit of a day alone, as Gemini's words do not."""
+    words = " ".join((error.message, *error.names))
+    return bool(error.status == 429 and PER_DAY.search(words) and not SHORTER.search(words))
 
 
 def known_meaning(error: ServerError) -> str | None:
@@ -262,6 +265,7 @@ def known_meaning(error: ServerError) -> str | None:
         # Azure's content filter, and OpenRouter's moderation.
         (400, "content_filter" in names, "refusal"),
         (403, "flagged_input" in error.body, "refusal"),
+        (400, "invalid_prompt" in names, "bad_prompt"),  # first, since it may quote the prompt
         # OpenRouter's want of credit while other requests run: it passes when they end.
         (402, in_flight, "rate_limited"),
         (error.status, bool(names & QUOTA), "quota_exhausted"),
@@ -270,7 +274,6 @@ def known_meaning(error: ServerError) -> str | None:
         (429, per_day or is_per_day(error), "quota_exhausted"),
         *((each, "model_not_found" in names, "unknown_model") for each in (400, 401, 403, 404)),
         (429, words.startswith("Request too large"), "request_too_large"),
-        (400, "invalid_prompt" in names, "bad_prompt"),
         (400, "API_KEY_INVALID" in names, "not_allowed"),
     )
     told = (meaning for status, is_so, meaning in cases if is_so and status == error.status)

@@ -335,6 +335,14 @@ ERRORS = [
     ("openai-chat", 400, [gemini(400, "INVALID_ARGUMENT")], {}, "fail", "bad_request"),
     (
         "openai-chat",
+        400,
+        openai("Invalid prompt: 'an insufficient balance of speed'", "x", "invalid_prompt"),
+        {},
+        "fail",
+        "bad_prompt",
+    ),
+    (
+        "openai-chat",
         429,
         [gemini(429, "RESOURCE_EXHAUSTED", "m", violations(PER_DAY))],
         {},
@@ -365,6 +373,14 @@ LIMITS = [
         3,
     ),
     ("openai-chat", 429, HTML, {"retry-after": "3"}, 3),
+    # A limit of a day is only listed.
+    *(
+        ("openai-chat", 429, openai(words, "requests"), {}, delay_s)
+        for words, delay_s in (
+            ("Limit of 60 requests per minute reached (daily limit: 10000). Try again in 3s", 3),
+            ("Rate limit reached. Limits: 3 RPM, 200 RPD. Please try again in 20s.", 20),
+        )
+    ),
     # Per minute, with the words of a quota; the RetryInfo is believed before the message.
     (
         "gemini",
