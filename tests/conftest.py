@@ -60,8 +60,8 @@ def merge_runner(tmp_path, emulator_url):
     one_at_a_time = asyncio.Lock()
 
     async def run(*arguments: object, cwd: Path = tmp_path, **changes: str) -> Run:
-        env = beside(emulator_url, changes)
         async with one_at_a_time:
+            env = beside(emulator_url, changes)
             return await asyncio.to_thread(program.run, arguments, cwd=cwd, env=env)
 
     async def start(

@@ -3,27 +3,37 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import gc
 import io
+import logging
 import os
 import subprocess
 import sys
 import tempfile
 import threading
 import traceback
-from contextlib import ExitStack, redirect_stderr, redirect_stdout
+import warnings
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from unittest.mock import patch
 
+from merge_runner.results import database
 from merge_runner_analysis.commands import main
+from merge_runner_analysis.data import derived_cache
 from tests.harness import PROGRAM, Run
 
 # A folder, an environment and streams are those of the whole process.
 _alone = threading.Lock()
+# What Python shows to nobody who runs a program.
+UNTOLD = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
 
 
 def invoke(arguments, *, cwd: Path, env: dict[str, str]) -> Run:
-    """Run the program in this process, with a folder, an environment and streams of its own."""
+    """Run the program in this process, with a folder, an environment and streams of its own.
+
+    It sees nothing that the test has registered, and tells what it has told to an earlier run.
+    """
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in "oe")
     with _alone, ExitStack() as changed:
         before = Path.cwd()
@@ -34,9 +44,31 @@ def invoke(arguments, *, cwd: Path, env: dict[str, str]) -> Run:
         changed.enter_context(patch.object(sys, "stdin", io.StringIO()))
         changed.enter_context(redirect_stdout(out))
         changed.enter_context(redirect_stderr(err))
+        changed.enter_context(_as_a_process_tells_them(err))
+        for told_once in (database._warn_of_other_measures, derived_cache._say_once):
+            told_once.cache_clear()
         os.chdir(cwd)
-        code = _to_its_end()
+        code = contextvars.Context().run(_to_its_end)
     return Run(code, *(stream.buffer.getvalue().decode() for stream in (out, err)))
+
+
+@contextmanager
+def _as_a_process_tells_them(err):
+    """Write to ``err`` what the program logs and warns of, which pytest would keep for itself."""
+    others = {thread.ident for thread in threading.enumerate()} - {threading.get_ident()}
+
+    def warn(message, category, filename, lineno, file=None, line=None):
+        if threading.get_ident() not in others:
+            err.write(warnings.formatwarning(message, category, filename, lineno, line))
+
+    handler = logging.StreamHandler(err)
+    handler.setLevel(logging.WARNING)
+    handler.addFilter(lambda record: record.thread not in others)
+    with warnings.catch_warnings(), patch.object(logging.root, "handlers", [handler]):
+        warnings.showwarning = warn
+        for category in UNTOLD:
+            warnings.simplefilter("ignore", category)
+        yield
 
 
 def _to_its_end() -> int:
@@ -53,7 +85,8 @@ def _to_its_end() -> int:
 
 def run(arguments, *, cwd: Path, env: dict[str, str]) -> Run:
     """Run the program to its end: as a process where it has packages or workers of its own."""
-    if not ("PYTHONPATH" in env or "--dask" in arguments):
+    own = {name for name in env if name.startswith("PYTHON") and env[name] != os.environ.get(name)}
+    if not (own or "--dask" in arguments):
         return invoke(arguments, cwd=cwd, env=env)
     done = subprocess.run(
         [PROGRAM, *map(str, arguments)],
