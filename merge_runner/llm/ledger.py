@@ -337,11 +337,6 @@ class Ledger:
         worst = partial(self.reserve, key, number, usd, cap_usd, asked)
         return not self.scope or bool(await self._money.writer.write(worst))
 
-    def reprice(self, key: str, number: int, usd: float) -> None:
-        """Reserve what an attempt has cost, no longer its worst case; an operation."""
-        sql = "UPDATE open SET usd = ? WHERE scope = ? AND call = ? AND attempt = ?"
-        self._money.write(sql, usd, self.scope, key, number)
-
     async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
         """Settle an attempt at a call; its reservation stays where the cost is unknown."""
         if self.scope:
@@ -349,16 +344,24 @@ class Ledger:
             self.read()
 
     def _settled(self, key: str, attempt: Attempt, driver: str) -> None:
-        usd, over = attempt.cost_usd, (0.0, 0.0)
-        if usd is None:  # it may have been charged
+        if attempt.cost_usd is None:  # it may have been charged
             self._money.write(_KEEP, attempt.outcome, key, attempt.number)
-            return
-        closed = self._money.write(_CLOSE, key, attempt.number)
+        else:
+            self.pay(key, attempt.number, attempt.cost_usd, driver)
+
+    def pay(self, key: str, number: int, usd: float, driver: str) -> tuple[str, float, float]:
+        """Count what an attempt has cost as spent, no longer its worst case; an operation.
+
+        Returns the driver, the cost, and by how much that exceeds the worst case.
+        """
+        over = (0.0, 0.0)
+        closed = self._money.write(_CLOSE, key, number)
         # None: a user has released it. That of a line is of the sweep that has submitted its batch.
         scope, aside_usd, honest_usd = closed[0] if closed else (self.scope, usd, usd)
         if usd > aside_usd + TOLERANCE_USD:
             over = (usd - aside_usd, usd / max(honest_usd, TOLERANCE_USD))
         self._money.write(_PAY, scope, driver, usd, *over)
+        return driver, usd, over[0]
 
     def settle_kept(self, drivers: Collection[str]) -> None:
         """Settle what was kept right before a run of these drivers was killed; none goes on."""
@@ -376,7 +379,7 @@ class Ledger:
         return self._money.read(_SPENT, self.scope), [row[1:] for row in opened]
 
     def settle_share(self, name: str, spent: Rows, opened: Rows) -> None:
-        """Put what a task has spent, and has open, in the place of what is reserved by its name."""
+        """Count what a task has spent and has open, no longer what is reserved by its name."""
         sql = "DELETE FROM open WHERE scope = ? AND call = ?"
         operations: list[Operation] = [partial(self._money.write, sql, self.scope, name)]
         operations += [partial(self._money.write, _PAY, self.scope, *row) for row in spent]

@@ -398,6 +398,8 @@ class DaskTasks:
     _given: dict[str, tuple[Task, asyncio.Future[Any]]] = field(default_factory=dict)
     # By the name of a task under way: what each of its attempts may have cost, or has.
     _begun: dict[str, dict[int, float]] = field(default_factory=dict)
+    # What of that is counted as spent already, as rows for ``settle_share``.
+    _paid: dict[str, Rows] = field(default_factory=dict)
     _losses: Counter[int] = field(default_factory=Counter)
     _one_by_one: bool = False
 
@@ -480,7 +482,7 @@ class DaskTasks:
             recorded=recorded,
             overruns=[*self._ledger.read().overruns.items()],
         )
-        self._begun[name] = {}
+        self._begun[name], self._paid[name] = {}, []
         self._given[address] = task, asyncio.create_task(self._work(address, task))
 
     async def _work(self, address: str, task: Task) -> Any:  # noqa: ANN401 # or what went wrong
@@ -503,9 +505,13 @@ class DaskTasks:
         return played
 
     async def _attend(self, address: str, task: Task) -> None:
-        """Reserve the worst case of each attempt of a task before it is sent, until it ends."""
-        write, begun = self._cache.money.writer.write, self._begun[task.name]
+        """Reserve each attempt of a task before it is sent, and book what it costs, until it ends.
+
+        What is spent stays so, whatever becomes of the worker.
+        """
+        write, begun, ledger = self._cache.money.writer.write, self._begun[task.name], self._ledger
         cap_usd, answers = self._options.max_cost_usd, dict[int, bool]()
+        drivers = dict[int, str]()
         while True:
             told = (
                 await self._client.run(
@@ -514,12 +520,16 @@ class DaskTasks:
             )[address]
             if not isinstance(told, Told):
                 return  # lost, as the task is
-            costs = [partial(self._ledger.reprice, task.name, *each) for each in told.costs.items()]
+            drivers.update({number: asked.driver for number, (_, asked) in told.asking.items()})
+            costs = [
+                partial(ledger.pay, task.name, number, usd, drivers[number])
+                for number, usd in told.costs.items()
+            ]
             worst = [
-                partial(self._ledger.reserve, task.name, number, usd, cap_usd, asked)
+                partial(ledger.reserve, task.name, number, usd, cap_usd, asked)
                 for number, (usd, asked) in told.asking.items()
             ]
-            await asyncio.gather(*map(write, costs))
+            self._paid[task.name] += await asyncio.gather(*map(write, costs))
             paid = await asyncio.gather(*map(write, worst))
             answers = dict(zip(told.asking, paid, strict=True))
             begun.update({n: told.asking[n][0] for n, is_paid in answers.items() if is_paid})
@@ -553,18 +563,20 @@ class DaskTasks:
             task, work = self._given.pop(address)
             played = work.result()
             del self._begun[task.name]
+            paid = self._paid.pop(task.name)
             if not isinstance(played, Played):
                 self._lose(task, address, played)
                 continue
-            self._keep(task, played)
+            self._keep(task, played, paid)
             if (error := played.error) is not None:
                 raise type(error)(f"{error} (told by the Dask worker {address})")
 
-    def _keep(self, task: Task, played: Played) -> None:
-        """Keep what a task has brought: its replies first."""
+    def _keep(self, task: Task, played: Played, paid: Rows) -> None:
+        """Keep what a task has brought, its replies first; what is ``paid`` is counted once."""
         self._cache.put_now(*played.recorded)
         if not self._plan.is_free:
-            self._ledger.settle_share(task.name, played.spent, played.opened)
+            counted = [(driver, -usd, -over_usd, 0.0) for driver, usd, over_usd in paid]
+            self._ledger.settle_share(task.name, [*counted, *played.spent], played.opened)
         for model, meter in played.meters.items():
             self.meters[model].add(meter)
         arms = self._plan.by_label()
@@ -581,7 +593,7 @@ class DaskTasks:
                     self.first.count(asked[row.side], row.decision)
 
     def _lose(self, task: Task, address: str, error: Exception) -> None:
-        """Give the trials of a lost task out again; what it has begun stays reserved."""
+        """Give the trials of a lost task out again; its attempts without a cost stay reserved."""
         self._losses[task.specs[0].order] += 1
         if self._losses[task.specs[0].order] == MOST_LOSSES:
             raise SweepStopped(

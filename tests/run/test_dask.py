@@ -174,8 +174,8 @@ class Cluster:
             return {address: lost}
 
 
-@pytest.mark.parametrize("dies_at", [None, 3])
-async def test_what_a_lost_worker_may_have_cost_stays_reserved_and_no_more(
+@pytest.mark.parametrize("dies_at", [None, 6])
+async def test_what_a_lost_worker_has_cost_is_spent_and_what_it_may_have_stays_reserved(
     tmp_path, monkeypatch, dies_at
 ):
     monkeypatch.delenv("EMULATOR_BASE_URL", raising=False)
@@ -184,6 +184,7 @@ async def test_what_a_lost_worker_may_have_cost_stays_reserved_and_no_more(
     plan, cap = make_plan(str(tmp_path / "study.toml")), 50.0
     options = Options(tmp_path / "db", tmp_path / "cache", in_flight=2, max_cost_usd=cap)
     ended, client, attempts, reserve = {}, Cluster(dies_at), [], Ledger.reserve
+    pay, lose, paid, lost_tasks = Ledger.pay, DaskTasks._lose, [], []
 
     def noted(ledger, name, number, usd, cap_usd, asked):
         if name.startswith("task "):
@@ -193,22 +194,36 @@ async def test_what_a_lost_worker_may_have_cost_stays_reserved_and_no_more(
     async def room():
         pass
 
+    def noted_cost(ledger, name, number, usd, driver):
+        if name.startswith("task "):
+            paid.append((name, usd))
+        return pay(ledger, name, number, usd, driver)
+
+    def noted_loss(tasks, task, *more):
+        lost_tasks.append(task.name)
+        lose(tasks, task, *more)
+
     monkeypatch.setattr(Ledger, "reserve", noted)
+    monkeypatch.setattr(Ledger, "pay", noted_cost)
+    monkeypatch.setattr(DaskTasks, "_lose", noted_loss)
     with closing(ResponseCache(options.cache)) as cache:
         ledger = Ledger(cache, plan.ledger)
         tasks = DaskTasks(client, plan, options, {}, cache, ledger, FirstDecisions())
         note = lambda spec, record: ended.__setitem__(spec.trial_id, record.status)  # noqa: E731
         await tasks.play(plan.trial_specs(), note, room)
         spending = ledger.read()
+        ledger.release()
+        assert ledger.read().committed_usd == spending.spent_usd, "what was spent is released"
         kept = sum(call.attempts[-1].cost_usd for call in cache.entries())
     assert len(ended) == 2
     assert set(ended.values()) <= {"finished", "collided"}
-    assert spending.spent_usd == pytest.approx(kept)
+    lost_usd = [usd for name, usd in paid if name in lost_tasks]
+    assert spending.spent_usd == pytest.approx(kept + sum(lost_usd))
     lost = spending.open_attempts
-    assert (lost > 0) == (dies_at is not None)
+    assert (lost > 0, sum(lost_usd) > 0) == (dies_at is not None,) * 2
     assert spending.reserved_usd <= lost * max(attempts)
     assert lost <= 8, "not all that the task would have asked"
-    assert len(attempts) == len(kept_keys(options.cache)) + lost
+    assert len(attempts) == len(kept_keys(options.cache)) + len(lost_usd) + lost
 
 
 async def test_a_task_that_never_begins_goes_to_others(tmp_path, monkeypatch):
