@@ -521,6 +521,8 @@ class LlmClient:
             # make a token, and the whole output cap.
             estimate = (call.worst.input_tokens or 0) // 4 + self.entry.max_output_tokens
             settle = await self.limiter.acquire(estimate, order=call.order)
+        with self._waiting(call, "for the coordinator, which shares --max-cost out"):
+            await paid.ask()
         await paid.begin(call.attempts)
         began, clock_s = datetime.now(UTC), asyncio.get_running_loop().time
         began_s, timeout_s = clock_s(), min(self.entry.timeout_s, call.left_s)

@@ -52,6 +52,7 @@ PATIENCE_S = 90.0
 GENAI_PRICES_PROVIDER = {"gemini": "google"}
 PER_MILLION = Decimal(1_000_000)
 Rows = list[tuple[Any, ...]]
+USED_UP = "others under the same cap have used it up"
 # Sums of what is spent, since a sum over all attempts at each reservation would take ever longer.
 TABLES = """
 BEGIN IMMEDIATE;
@@ -330,6 +331,13 @@ class Ledger:
         self._money.write(_OPEN, self.scope, key, number, usd, *place)
         return True
 
+    async def ask(self, key: str, usd: float, asked: Asked) -> bool:
+        """Return whether there is money for an attempt where others share the cap out."""
+        return True
+
+    def withdraw(self, key: str) -> None:
+        """Say there that the attempt at a call is not sent."""
+
     async def begin(
         self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
     ) -> bool:
@@ -421,13 +429,21 @@ class PaidAttempt:
         self.budget.queued_usd += self.aside_usd if self.queued else 0.0
         self.budget.charge(self.trial, self.aside_usd)
 
+    async def ask(self) -> None:
+        """Wait for whoever shares the cap out, as a cluster's coordinator; raises TrialSuspended.
+
+        Nothing is sent or durable here yet, so that this can be given up.
+        """
+        if self.queued and not await self.budget.ledger.ask(self.key, self.aside_usd, self.asked):
+            raise TrialSuspended(USED_UP)
+
     async def begin(self, attempts: Sequence[Attempt]) -> None:
         """Make the reservation durable, since the attempt is sent now; raises TrialSuspended."""
         if not self.queued:  # in a smaller batch than before, or in one of an earlier run
             return
         ledger, cap_usd, number = self.budget.ledger, self.budget.cap_usd, len(attempts) + 1
         if not await ledger.begin(self.key, number, self.aside_usd, cap_usd, self.asked):
-            raise TrialSuspended("another run spends from the same cap, and has used it up")
+            raise TrialSuspended(USED_UP)
         self.queued = False
         self.budget.queued_usd -= self.aside_usd
 
@@ -452,6 +468,7 @@ class PaidAttempt:
         if self.queued:
             self.budget.queued_usd -= self.aside_usd
             self.cost_usd = 0.0
+            self.budget.ledger.withdraw(self.key)
         if self.cost_usd is not None:
             self.budget.charge(self.trial, self.cost_usd - self.aside_usd)
         self.budget.wake()

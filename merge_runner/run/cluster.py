@@ -234,6 +234,10 @@ class Desk:
                 return number, await answer
         except TimeoutError as exc:
             raise SweepStopped(f"the coordinator has said nothing for {SILENT_S} s") from exc
+        except asyncio.CancelledError:
+            if self.told.asking.pop(number, None) is None:  # the coordinator may have reserved it
+                self.cost(number, 0.0)
+            raise
         finally:
             del self._answers[number]
 
@@ -264,23 +268,24 @@ class ToldLedger(Ledger):
     def __init__(self, cache: ResponseCache, scope: str, desk: Desk) -> None:
         super().__init__(cache, scope)
         self._desk = desk
-        self._numbers: dict[tuple[str, int], int] = {}
+        self._numbers: dict[str, int] = {}  # by key of a call, which has one attempt at a time
 
-    async def begin(
-        self, key: str, number: int, usd: float, cap_usd: float | None, asked: Asked
-    ) -> bool:
-        """Reserve an attempt there, then here; False if either exceeds the cap."""
-        told, is_paid = await self._desk.ask(usd, asked)
-        self._numbers[key, number] = told
-        if is_paid and not await super().begin(key, number, usd, cap_usd, asked):
-            self._desk.cost(told, 0.0)
-            return False
+    async def ask(self, key: str, usd: float, asked: Asked) -> bool:
+        """Let the coordinator reserve an attempt; False if that exceeds the cap."""
+        number, is_paid = await self._desk.ask(usd, asked)
+        if is_paid:
+            self._numbers[key] = number
         return is_paid
+
+    def withdraw(self, key: str) -> None:
+        """Tell that an attempt that may be reserved is not sent."""
+        if (number := self._numbers.pop(key, None)) is not None:
+            self._desk.cost(number, 0.0)
 
     async def settle(self, key: str, attempt: Attempt, driver: str) -> None:
         """Settle an attempt, and tell what it has cost where that is known."""
         await super().settle(key, attempt, driver)
-        told = self._numbers.pop((key, attempt.number), None)
+        told = self._numbers.pop(key, None)
         if told is not None and attempt.cost_usd is not None:
             self._desk.cost(told, attempt.cost_usd)
 

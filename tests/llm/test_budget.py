@@ -146,7 +146,7 @@ async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, ca
     # Neither knows of the other's yet.
     paid = [await set_aside(budget, trial, 0.75) for trial, budget in enumerate(both)]
     await paid[0].begin([])
-    with pytest.raises(TrialSuspended, match="another run"):
+    with pytest.raises(TrialSuspended, match="others under the same cap"):
         await paid[1].begin([])
     assert both[1].ledger.read().committed_usd == 0.75
 

@@ -21,6 +21,7 @@ from merge_runner.llm.http_outcome import RawReply, TransportFailure
 from merge_runner.llm.ledger import Asked, Budget, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.records import Attempt, Slot
+from merge_runner.run.cluster import Desk, ToldLedger
 from tests.virtual_time import in_virtual_time, now_s
 
 
@@ -473,6 +474,29 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make, cache):
     assert now_s() == 0
     with pytest.raises(CallFailed, match="stopped"):
         await client.ask("prompt", slot(3))
+
+
+@in_virtual_time
+@pytest.mark.parametrize("told", [False, True])
+@pytest.mark.parametrize("drains", [False, True])
+async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache, drains, told):
+    client, desk = make(answer(), price=PRICE), Desk()
+    client.money.ledger = ToldLedger(cache, "test", desk)
+    asked = asyncio.create_task(client.ask("prompt", slot()))
+    await ticks()
+    if told:
+        assert (await desk.exchange({})).asking.keys() == {1}
+    (waits,) = client.waits
+    assert "coordinator" in waits.what
+    if drains:
+        await client.drain()
+    else:
+        asked.cancel()
+    await asyncio.wait([asked])
+    await ticks()
+    assert (client.transport.sent, client.waits, client.money.queued_usd) == ([], [], 0)
+    assert (desk.told.asking, desk.told.costs) == ({}, {1: 0.0} if told else {})
+    assert client.money.ledger.read().open_attempts == 0
 
 
 @in_virtual_time

@@ -38,7 +38,7 @@ from merge_runner.errors import (
 from merge_runner.llm.batch.providers import BatchFailed, BatchService, BatchStatus
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import AttemptOutcome, backoff_s, judge
-from merge_runner.llm.ledger import PaidAttempt
+from merge_runner.llm.ledger import USED_UP, PaidAttempt
 from merge_runner.records import ChatRequest
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ class Rounds:
         while True:
             await asyncio.shield(batch.work or self._start(batch))
             if call.request.key not in batch.note.lines:
-                raise TrialSuspended("another run spends from the same cap, and has used it up")
+                raise TrialSuspended(USED_UP)
             end = batch.ends.pop(call.request.key, batch.rest)
             if end is None and not self.submits:
                 end = _no_answer("not_created", "the run ended before", charged=False)
