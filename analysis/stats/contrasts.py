@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import permutations
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
@@ -29,6 +29,8 @@ from merge_runner_analysis.stats.measures import trials_of, undecided
 
 # Where less of a trial's deviation is left over than this, it alone decides the difference.
 LEVERAGE = 1e-9
+# A condition, or a condition and a level of each other factor.
+Cell = str | tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,36 +246,48 @@ def trials_by_cell(
 ) -> list[pd.DataFrame]:
     """The trials of each group with a measure, their cell as ``condition``, perhaps as all have.
 
-    Copied cells are left out. Nothing where the groups are of several studies or have undecided
-    trials.
+    Cells of programs that do not heed what the groups differ in are left out. Nothing where the
+    groups are of several studies or have undecided trials.
     """
     if not in_one_study(study, *groups) or any(undecided(group, metric) for group in groups):
         return []
     every = [trials_of(group, metric).dropna(subset=[metric.column]) for group in groups]
     every = [frame.assign(condition=frame[cell]) for frame in every]
     kept = (set.intersection if shared else set.union)(*(set(one["condition"]) for one in every))
-    kept -= copied_cells(every)
+    kept -= copied_cells(groups, cell)
     return [frame[frame["condition"].isin(kept)] for frame in every]
 
 
-def copied_cells(frames: Sequence[pd.DataFrame]) -> set[object]:
-    """The cells in which all trials of one group are copies of another's: programs play them.
+def copied_cells(groups: Sequence[Group], cell: str) -> set[Cell]:
+    """The cells of programs that do not heed what the groups differ in.
 
-    What they differ by is how often each was drawn, so that nothing can be tested there.
+    With the same other levels, all trials of one of two groups are copies of the other's there, in
+    every condition that both have. What they differ by is how often each was drawn, so that nothing
+    can be tested. Conditions are never left out one by one: which of them stay would depend on
+    what happened there.
     """
-    ways = [frame.groupby("condition")["way"].agg(set) for frame in frames]
-    return {
-        cell
-        for one, other in permutations(ways, 2)
-        for cell in one.index.intersection(other.index)
-        if one[cell] <= other[cell]
-    }
+    ways = [group.ended.groupby(cell)["way"].agg(set).to_dict() for group in groups]
+    copied: set[Cell] = set()
+    for one, other in combinations(ways, 2):
+        shared = one.keys() & other.keys()
+        heeded = {
+            _other_levels(each)
+            for each in shared
+            if not (one[each] <= other[each] or other[each] <= one[each])
+        }
+        copied |= {each for each in shared if _other_levels(each) not in heeded}
+    return copied
 
 
-def copied_of_shared(frames: Sequence[pd.DataFrame]) -> tuple[int, int]:
+def _other_levels(cell: Cell) -> Sequence[str]:
+    """Those of a cell of factors; a condition alone has none."""
+    return () if isinstance(cell, str) else cell[1:]
+
+
+def copied_of_shared(groups: Sequence[Group], cell: str) -> tuple[int, int]:
     """How many of the cells that groups share are copied ones, and how many they share."""
-    shared = set.intersection(*({*frame["condition"]} for frame in frames))
-    return len(shared & copied_cells(frames)), len(shared)
+    shared = set.intersection(*({*group.ended[cell]} for group in groups))
+    return len(shared & copied_cells(groups, cell)), len(shared)
 
 
 def corrected(p: list[float]) -> list[float]:

@@ -114,12 +114,6 @@ def _without_copies(level: Level, first: Callable[[tuple[str, ...]], tuple[str, 
     return replace(level, groups=tuple(kept["group"].unique()), pooled=pooled)
 
 
-def by_cell(*levels: Level) -> list[pd.DataFrame]:
-    """The trials of each level, with their cell as ``condition``."""
-    every = [level.pooled.trials for level in levels]
-    return [trials.assign(condition=trials["cell"]) for trials in every]
-
-
 def difference_of_medians(study: Study, metric: Metric, level: Level, first: Level) -> float | None:
     """A level's median minus that of the first one, in the cells that both have."""
     groups = (level.pooled, first.pooled)

@@ -5,12 +5,10 @@ Headlines, sentences, the report and the pages read the table ``verdicts`` and n
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 from math import isinf
-
-import pandas as pd
 
 from merge_runner.records import SIDES
 from merge_runner.registry import require
@@ -29,7 +27,6 @@ from merge_runner_analysis.stats.contrasts import (
 from merge_runner_analysis.stats.factors import (
     Level,
     balance,
-    by_cell,
     difference_of_medians,
     levels_by_factor,
 )
@@ -231,8 +228,7 @@ def _same_as_reference(study: Study) -> Iterator[str]:
         other = own.get(group.driver)
         if other in (None, group):
             continue
-        copies, shared = copied_of_shared([group.trials, other.trials])
-        if copies and copies == shared:
+        if copied_of_shared((group, other), "condition")[0]:
             same.append(group.id)
     if same:
         yield f"{', '.join(same)}, beside {study.reference}: {SAME_TRIALS}"
@@ -271,26 +267,25 @@ def _family(study: Study, driver: str, metric: Metric) -> Iterator[Row]:
             "freedom": None if isinf(difference.freedom) else difference.freedom,
         }
         few = f"{metric.heading}: so few trials can show no difference, however large"
-        note = [few if least is None else "", _left_out((group.trials, other.trials), metric)]
         yield Row(
             f"{group.id}/{other.setting}/{metric.name}",
             (group.id, other.id),
             values,
-            "; ".join(filter(None, note)),
+            few if least is None else "",
             f"{metric.counts} AND condition IN ({named})",
         )
 
 
-def _left_out(frames: Sequence[pd.DataFrame], metric: Metric) -> str:
-    """What is not compared, since programs play the same trials there."""
-    copies, shared = copied_of_shared([frame.dropna(subset=[metric.column]) for frame in frames])
+def _left_out(level: Level, first: Level) -> str:
+    """What is not compared, since programs play the same trials at both levels."""
+    copies, shared = copied_of_shared((level.pooled, first.pooled), "cell")
     if not copies:
         return ""
     if copies == shared:
         return SAME_TRIALS
     return (
-        f"{metric.heading}: the difference leaves out {copies} of {shared} shared cells, in which "
-        "programs play the same trials"
+        f"the difference leaves out {copies} of {shared} shared cells, those of programs that play "
+        "the same trials at both levels"
     )
 
 
@@ -387,7 +382,7 @@ def _level_row(study: Study, level: Level, first: Level, metric: Metric) -> Row:
     elif level is not first:
         cells |= _difference(study, metric, level, first)
     nothing = "" if found.n or found.bounds() else f"{metric.heading}: no trial with this measure"
-    same = "" if level is first else _left_out(by_cell(level, first), metric)
+    same = "" if level is first else _left_out(level, first)
     note = "; ".join(filter(None, (nothing, undecided_note(level.pooled, metric), same)))
     return Row(f"{level.id}/{metric.name}", level.groups, cells, note, _counts(level, metric))
 

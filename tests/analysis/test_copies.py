@@ -90,8 +90,8 @@ def test_no_test_is_made_of_copies_and_the_rows_say_so(db):
     assert note.startswith("one/A1, two/A1, beside baseline: ")
 
 
-def test_a_row_says_in_how_many_cells_it_compares_and_counts_the_trials_there(tmp_path):
-    """A program whose setting changes what it does in five of eleven conditions."""
+def test_a_program_that_heeds_a_level_in_some_conditions_is_compared_in_all(tmp_path):
+    """Conditions in which it does not heed it belong to the difference, too."""
     drives = yielding("one", reps=4)
     heeded = {*sorted({drive.condition for drive in drives})[:5]}
     other = [
@@ -105,17 +105,27 @@ def test_a_row_says_in_how_many_cells_it_compares_and_counts_the_trials_there(tm
     )
     contrasts, factors = make_tables(study, ["contrasts", "factors"])
     row = next(row for row in contrasts.rows if row.id.endswith("/gap_m"))
-    played = {(trial.condition, trial.way) for trial in study.models[0].trials.itertuples()}
-    there = sum(condition in heeded for condition, _ in played)
-    assert (row.values["n"], row.values["n_reference"]) == (there, there)
-    said = "gap (m): the difference leaves out 6 of 11 shared cells"
-    assert row.note.startswith(said)
-    assert (
-        sum(len(source.trials) for source in explain(study, contrasts, f"{row.id}:n").sources)
-        == 2 * there
-    )
     (level,) = [row for row in factors.rows if row.id == "prompt=A1/gap_m"]
-    assert level.note.startswith(said)
+    first, second = (
+        group.finished.groupby("condition")["gap_m"].agg(["mean", "size"]) for group in study.models
+    )
+    assert len(first) == len(second) == 11
+    weights = first["size"] * second["size"] / (first["size"] + second["size"])
+    within = abs(((first["mean"] - second["mean"]) * weights).sum() / weights.sum())
+    assert within > 0.1
+    for shown in (row.values["difference"], level.values["difference"]):
+        assert abs(shown) == pytest.approx(within)
+    assert (row.values["n"], row.values["n_reference"]) == (44, 44)
+    assert not row.note
+    assert not level.note
+
+
+def test_a_row_says_in_how_many_cells_of_programs_nothing_is_compared(db):
+    _, rows = made("factors", db)
+    assert rows["prompt=A1/gap_m"].note == (
+        "the difference leaves out 22 of 33 shared cells, those of programs that play the same "
+        "trials at both levels"
+    )
 
 
 def test_what_a_prompt_changes_rests_on_who_reads_it(db):

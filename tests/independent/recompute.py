@@ -263,20 +263,30 @@ def _together(orders, *groups: pd.DataFrame) -> bool:
 
 
 def _otherwise(one: pd.DataFrame, other: pd.DataFrame) -> list[pd.DataFrame]:
-    """The trials but for cells in which all of one's are copies of the other's."""
-    ways = [trials.groupby("cell")["way"].agg(set).to_dict() for trials in (one, other)]
-    same = {
-        cell
-        for cell in ways[0].keys() & ways[1].keys()
-        if ways[0][cell] <= ways[1][cell] or ways[1][cell] <= ways[0][cell]
-    }
+    """The trials but for those of programs that do the same in both: all of one are the other's.
+
+    A program is told by its other levels, and does the same only if it does so in every condition.
+    """
+    ways: list[dict] = [{}, {}]
+    for known, trials in zip(ways, (one, other), strict=True):
+        for cell, way, status in zip(trials["cell"], trials["way"], trials["status"], strict=True):
+            if status != "failed":
+                known.setdefault(cell, set()).add(way)
+    by_others: dict = {}
+    for cell in ways[0].keys() & ways[1].keys():
+        by_others.setdefault(cell[1:] if isinstance(cell, tuple) else None, []).append(cell)
+    same = set()
+    for cells in by_others.values():
+        mine, its = ([known[cell] for cell in cells] for known in ways)
+        if all(a <= b or b <= a for a, b in zip(mine, its, strict=True)):
+            same |= {*cells}
     return [trials[~trials["cell"].isin(same)] for trials in (one, other)]
 
 
 def _compared(one: pd.DataFrame, other: pd.DataFrame, column: str, kind: str) -> dict:
     if _undecided(one, column) or _undecided(other, column):
         return {}
-    frames = _otherwise(*(trials[trials[column].notna()] for trials in (one, other)))
+    frames = [trials[trials[column].notna()] for trials in _otherwise(one, other)]
     if not {*frames[0]["cell"]} & {*frames[1]["cell"]}:
         return {}
     values = [_values(trials, column, kind) for trials in frames]
@@ -345,7 +355,7 @@ def _prompts(groups, orders) -> dict[str, dict]:
         for name, column, kind, shown in METRICS:
             found = _compared(trials, reference, column, kind) if shown else {}
             if found:
-                frames = _otherwise(*(t[t[column].notna()] for t in (trials, reference)))
+                frames = [t[t[column].notna()] for t in _otherwise(trials, reference)]
                 shared = {*frames[0]["cell"]} & {*frames[1]["cell"]}
                 sizes = [int(one["cell"].isin(shared).sum()) for one in frames]
                 found |= {"n": sizes[0], "n_reference": sizes[1], "family": (driver, name)}
@@ -418,7 +428,7 @@ def _level(trials, reference, column, kind, orders) -> dict:
     if trials is reference or not _together(orders, trials, reference):
         return row
     if kind == "median":
-        one, other = _otherwise(*(each[each[column].notna()] for each in (trials, reference)))
+        one, other = (t[t[column].notna()] for t in _otherwise(trials, reference))
         shared = set(one["cell"]) & set(other["cell"])
         if shared:
             a, b = (each[each["cell"].isin(shared)][column].median() for each in (one, other))
