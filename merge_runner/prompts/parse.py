@@ -40,20 +40,25 @@ _SIGN_APART = re.compile(r"^([+-])\s+")
 _COMMENT = re.compile(r"#[^\n]*")
 _TOKEN_LINE = re.compile(
     r"[\W_]*(?:(?:tactical|decision|choice|plan|token|letter)[\W_]+)*([MY])(?![^\W_])[\W_]*"
-    r"(?:merge first|merge|yield)?[\W_]*",
+    r"(merge first|merge|yield)?[\W_]*",
     re.IGNORECASE,
 )
-_LABEL = r"(?:(?:my )?(?:tactical|decision|choice)[\W_]++(?:is[\W_]++)?(?:to[\W_]++)?)"
+_LABEL = (
+    r"(?:(?:my )?(?:tactical|decision|choice)(?: ?\((?:M ?(?:/|or) ?Y|merge first or yield)\))?"
+    r"[\W_]++(?:is[\W_]++)?(?:to[\W_]++)?)"
+)
+_MERGE = r"merge first|go first|merge(?![^\w.]*(?:behind|after|second)(?![^\W_]))"
 _CHOICE = (
-    r"(?:(?P<letter>[MY])(?![^\W_])(?:[\W_]++(?:merge first|merge|yield)(?![^\W_]))?"
-    r"|(?:(?P<merge>merge first|go first|merge)|yield(?: to the other (?:car|driver|vehicle))?)"
-    r"(?![^\W_])(?:[\W_]++(?P<same>[MY])(?![^\W_]))?)"
+    r"(?:(?P<letter>[MY])(?![^\W_])(?:[\W_]++(?P<word>merge first|merge|yield)(?![^\W_]))?+"
+    rf"|(?:(?P<merge>{_MERGE})|yield(?: to the other (?:car|driver|vehicle))?)"
+    r"(?![^\W_])(?:[\W_]++(?P<same>[MY])(?![^\W_]))?+)"
 )
 # Some replies number their parts as the output format does; a brace begins a JSON object.
 _HEAD = r"(?:[^\w{]|_)*+(?:1[\W_]++)?"
 _CHOICE_LINE = re.compile(rf"{_HEAD}(?P<label>{_LABEL}*+){_CHOICE}[\W_]*+", re.IGNORECASE)
 _CHOICE_WITH_REASON = re.compile(
-    rf"{_HEAD}{_LABEL}++{_CHOICE}[*_`\"')\]]*+ ?(?:[.,:;(\u2013\u2014-]|(?=because|since)) ?",
+    rf"{_HEAD}{_LABEL}++{_CHOICE}[*_`\"')\]]*+ ?"
+    r"(?P<reason>[.,:;(\u2013\u2014-]|(?=because|since)) ?",
     re.IGNORECASE,
 )
 _HEADING = re.compile(rf"{_HEAD}{_LABEL}++", re.IGNORECASE)
@@ -62,6 +67,11 @@ _MEMBER = re.compile(
     rf"""["']{_CHOICE}["']""",
     re.IGNORECASE,
 )
+# What follows a choice and takes it back: another one, as in "M, Y" and "yield; no, merge first".
+_CONTRARY = {
+    "M": re.compile(r"[,;]\W*(?:(?:no|or)\W+)?(?:Y|yield)(?![^\W_])", re.IGNORECASE),
+    "Y": re.compile(r"[,;]\W*(?:(?:no|or)\W+)?(?:M|merge first|go first)(?![^\W_])", re.IGNORECASE),
+}
 # A line with a choice is short; the limit also bounds the time that a hostile line can take.
 _LONGEST_LINE = 80
 _LEADING_TOKEN = re.compile(r"[*_`#>\s\"'(\[]{0,20}([MY])(?=[\s*_`\"'):.,;\]\u2013\u2014-]|$)")
@@ -155,10 +165,10 @@ def _tactical(prose: str) -> tuple[Tactical | None, str]:
     """The M/Y token at the head of the reply, and the prose without it."""
     first_line, _, rest = prose.partition("\n")
     whole = _TOKEN_LINE.fullmatch(first_line) if len(first_line) <= _LONGEST_LINE else None
-    if whole:
+    if whole and (whole[2] or whole[1])[0].upper() == _token(whole):
         return _token(whole), rest.strip()
-    leading = _LEADING_TOKEN.match(first_line)
-    if leading:
+    leading = None if whole else _LEADING_TOKEN.match(first_line)
+    if leading and not _CONTRARY[_token(leading)].match(first_line, leading.end()):
         return _token(leading), prose[leading.end() :].lstrip(
             "*_`\"'):.,;] \n\u2013\u2014-"
         ).strip()
@@ -177,7 +187,8 @@ def _in_words(prose: str, text: str) -> tuple[Tactical | None, str]:
         return choice, "\n".join(lines[count:]).strip()
     begin = _CHOICE_WITH_REASON.match(prose[: 2 * _LONGEST_LINE])
     if begin and (choice := _choice(begin)):
-        return choice, prose[begin.end() :].strip()
+        is_taken_back = _CONTRARY[choice].match(prose, begin.start("reason"))
+        return (None, prose) if is_taken_back else (choice, prose[begin.end() :].strip())
     labelled = [found for line in short if (found := _CHOICE_LINE.fullmatch(line))]
     choices = {*map(_choice, [found for found in labelled if found["label"]])}
     choices = choices or {*map(_choice, _MEMBER.finditer(text))}
@@ -186,8 +197,11 @@ def _in_words(prose: str, text: str) -> tuple[Tactical | None, str]:
 
 def _choice(match: re.Match[str]) -> Tactical | None:
     """The choice of a match; None where its words and its letter disagree."""
-    if match["letter"]:
-        return "M" if match["letter"].upper() == "M" else "Y"
+    if letter := match["letter"]:
+        letter = letter.upper()
+        if (match["word"] or letter)[0].upper() != letter:
+            return None
+        return "M" if letter == "M" else "Y"
     choice: Tactical = "M" if match["merge"] else "Y"
     return choice if (match["same"] or choice).upper() == choice else None
 
