@@ -78,6 +78,8 @@ def _to_its_end() -> int:
         if isinstance(exc.code, int | None):
             return exc.code or 0
         sys.stderr.write(f"{exc.code}\n")
+    except KeyboardInterrupt:  # it is meant for the tests
+        raise
     except BaseException:  # noqa: BLE001 # as the interpreter does at the end of a program
         traceback.print_exc()
     return 1
