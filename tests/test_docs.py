@@ -216,7 +216,8 @@ async def test_the_tutorial_shows_what_its_commands_say(checkout):
     for kind, block in blocks:
         if kind == "text":
             for line in unspaced(block).splitlines():
-                assert line in unspaced(said).splitlines()
+                # The page leaves out the last columns of wide tables.
+                assert any(told.startswith(line) for told in unspaced(said).splitlines()), line
             said = ""
             continue
         for command in lines_of(block):
