@@ -254,7 +254,7 @@ class LlmClient:
         return reply
 
     def has_asked(self, prompt: str, slot: Slot) -> bool:
-        """Return whether a call is recorded, be it damaged or without an answer."""
+        """Return whether an answer is recorded, be it damaged; one that cannot be asked counts."""
         try:
             return self.cache.get(self._request(prompt, slot).key) is not None
         except (RecordingError, CallFailed):
@@ -349,8 +349,8 @@ class LlmClient:
         attempts, last = recorded.attempts, recorded.attempts[-1]
         payload = reply_object(last.reply or "{}") if last.http_status == 200 else {}
         reading = read_reply(self._wire, payload)
-        if payload and reading.outcome in ANSWERS and reading.outcome != last.outcome:
-            last = replace(last, outcome=reading.outcome)
+        if payload and reading.outcome in ANSWERS:
+            last = replace(last, outcome=reading.outcome, usage=reading.usage)
             attempts = (*attempts[:-1], last)
         return ChatReply(reading.text, last.outcome, recorded.request, attempts, earlier)
 
@@ -412,7 +412,7 @@ class LlmClient:
         last = f"after {call.last_failure}" if call.own_attempts else "nothing has come yet"
         self.meter.notes.append(
             f"{self.driver}: {call.asked.slot}: the first call of this run waits for its answer "
-            f"until {datetime.now(UTC) + left:%H:%M:%S} UTC at the latest, {last}"
+            f"until {datetime.now(UTC) + left:%H:%M:%S} UTC, {last}"
         )
 
     async def _resume(self, call: Call) -> None:

@@ -125,7 +125,8 @@ REASONS = {
 UNSURE = frozenset({"other_error", "text", "unreadable_reply", "proxy_refused"})
 # A part of a path that follows itself, as in /v1/v1/messages.
 _TWICE = re.compile(r"(/\w.*)\1(/|$)")
-_EVENTS = re.compile(r"\s*(data|event|id|retry)?:", re.ASCII)
+# After comments and other fields, since a plain text may begin with "id:", too.
+_EVENTS = re.compile(r"\s*(?:(?:id|retry)?:[^\n]*\n\s*)*(?:data|event):", re.ASCII)
 
 _UNIT_S = {"ms": 0.001, "milli": 0.001, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 # 1.574s and 6m0s, but also 5 minutes.
@@ -401,8 +402,10 @@ def reason_of(outcome: AttemptOutcome, url: str) -> str | None:
     if outcome.action == "retry" and raw.status == 200 and is_told and not raw.error.names:
         return "other_error"
     message = as_dict(at(raw.payload, "choices.0.message"))
-    thoughts = (as_text(message.get(n)) or "" for n in ("reasoning_content", "reasoning"))
-    return "reasoning_alone" if name == "empty" and any(map(str.strip, thoughts)) else None
+    # Thoughts within the text are the model's choice, not the server's.
+    is_apart = message and not as_text(message.get("content"))
+    is_alone = name == "empty" and is_apart and outcome.reading.reasoning.strip()
+    return "reasoning_alone" if is_alone else None
 
 
 def why_refused(reason: str, name: str, entry: ModelEntry, outcome: AttemptOutcome) -> str:

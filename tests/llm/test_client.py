@@ -20,7 +20,7 @@ from merge_runner.llm.client import LlmClient, Meter
 from merge_runner.llm.http_outcome import RawReply, TransportFailure
 from merge_runner.llm.ledger import Asked, Budget, Ledger
 from merge_runner.llm.limiter import Limiter, Pause
-from merge_runner.records import Attempt, Slot
+from merge_runner.records import Attempt, Slot, Usage
 from merge_runner.run.cluster import Desk, ToldLedger
 from tests.virtual_time import in_virtual_time, now_s
 
@@ -717,6 +717,7 @@ async def test_an_answer_that_an_earlier_version_kept_is_read_by_the_rules_of_no
     cache.put_now([CachedCall(missed.value.request, (kept,))], [])
     reply = await sealed.ask("p", slot())
     assert (reply.outcome, reply.attempts[-1].outcome) == (outcome, outcome)
+    assert reply.attempts[-1].usage == Usage(10, output_tokens=5), "it was kept without"
 
 
 @in_virtual_time

@@ -516,6 +516,9 @@ KINDS = [
     (200, "data: {}\n\n", {}, "stream"),
     (200, ": OPENROUTER PROCESSING\n\ndata: {}", {}, "stream"),
     (200, "", {"content-type": "text/event-stream; charset=utf-8"}, "stream"),
+    (200, "id: 1\nretry: 10\nevent: end\ndata: {}", {}, "stream"),
+    (200, "id: no such", {}, "text"),
+    (200, ": no such", {}, "text"),
     (200, HTML, {"content-type": "text/html"}, "page"),
     (200, '{"status": "up"}', {}, "other_format"),
     (200, '{"detail": "Not Found"}', {}, "other_format"),
@@ -565,6 +568,9 @@ def test_an_answer_that_is_nothing_but_reasoning_is_told(member):
     cut = {"choices": [{"message": message, "finish_reason": "length"}]}
     assert reason_of(judged("openai-chat", 200, cut), "") is None
     assert reason_of(judged("openai-chat", 200, choice("")), "") is None
+    parts = [{"type": "thinking", "thinking": [{"type": "text", "text": "M"}]}]
+    assert reason_of(judged("openai-chat", 200, choice(parts)), "") == "reasoning_alone"
+    assert reason_of(judged("openai-chat", 200, choice("<think>M</think>")), "") is None
 
 
 # A body of status 200: format, body, and what is to be done.

@@ -26,7 +26,7 @@ import psutil
 import pytest
 from aiohttp import web
 
-from merge_runner.errors import UsageError
+from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.run import cluster
@@ -38,6 +38,7 @@ from tests.gate import HANGS_S, Gate
 from tests.harness import FAST, PROJECT, environment, watched
 from tests.llm.test_limiter import fullest_window
 from tests.mock_server import FaultPlan
+from tests.virtual_time import in_virtual_time, now_s
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
 # Six trials of 19 calls each.
@@ -224,6 +225,13 @@ async def test_what_a_lost_worker_has_cost_is_spent_and_what_it_may_have_stays_r
     assert spending.reserved_usd <= lost * max(attempts)
     assert lost <= 8, "not all that the task would have asked"
     assert len(attempts) == len(kept_keys(options.cache)) + len(lost_usd) + lost
+
+
+@in_virtual_time
+async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
+    with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
+        await cluster.Desk().ask(1.0, Asked())
+    assert now_s() == 300
 
 
 async def test_a_task_that_never_begins_goes_to_others(tmp_path, monkeypatch):
