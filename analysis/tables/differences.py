@@ -76,8 +76,7 @@ FAMILY = (
 )
 DIFFERENCES = (
     f"Levels are {WITHIN.format('cells')}; medians without a test. The reference is the level that "
-    "stands first; a cell is a condition with one level of each other factor. Where a level lacks "
-    "cells, there is no p"
+    "stands first; a cell is a condition with one level of each other factor"
 )
 INTERACTIONS = (
     "an interaction (×) is the difference at that level minus the one at the first level of {by}, "
@@ -304,7 +303,6 @@ def factors(study: Study) -> Table:
         for level in levels
     ]
     rows += _interactions(study, found) if by else []
-    # A test that the table does not print counts all the same, as `contrasts` may print it.
     families: dict[tuple[Value, ...], dict[str, float]] = {}
     for row in rows:
         if isinstance(value := row.values.get("p"), float):
@@ -316,7 +314,7 @@ def factors(study: Study) -> Table:
         for p in families.values()
         for name, p_holm in zip(p, corrected([*p.values()]), strict=True)
     }
-    rows = [_corrected(row, holm.get(row.id)) for row in rows]
+    rows = [replace(row, values=row.values | {"p_holm": holm.get(row.id)}) for row in rows]
     return Table(
         "factors",
         (
@@ -345,14 +343,6 @@ def factors(study: Study) -> Table:
             RULES_NOTE,
         ),
     )
-
-
-def _corrected(row: Row, p_holm: float | None) -> Row:
-    """The row with its corrected p, and without both where a level lacks cells."""
-    values = {name: value for name, value in row.values.items() if name != "balanced"}
-    if not row.values.get("balanced", True):
-        return replace(row, values=values | {"p": None, "p_holm": None})
-    return replace(row, values=values | {"p_holm": p_holm})
 
 
 def _copies(found: list[list[Level]]) -> Iterator[str]:
@@ -404,16 +394,15 @@ def _cells(level: Level, metric: Metric) -> dict[str, Value]:
 
 
 def _difference(study: Study, metric: Metric, *levels: Level) -> dict[str, Value]:
-    """A difference of levels, and whether all of them have the same cells."""
+    """A difference of levels, or of differences, in the cells that all of them have."""
     found = contrast(study, [level.pooled for level in levels], metric, "cell")
     if found is None:
         return {}
-    unit, cells = 100 if metric.rate else 1, {frozenset(level.cells) for level in levels}
+    unit = 100 if metric.rate else 1
     return {
         "difference": unit * found.value,
         "difference_ci": found.bounds(unit),
         "p": found.p,
-        "balanced": len(cells) == 1,
     }
 
 
