@@ -309,9 +309,15 @@ def _count(drivers: Mapping[str, Mapping[str, Values]], unlike: int) -> str:
 
 
 def told(values: Values) -> str:
-    """The sentence of one difference: ``collides in 68 % [47, 84] of trials, ... (n = 22)``."""
+    """The sentence of one difference: ``collides in 68 [47, 84] % of trials, ... (n = 22)``.
+
+    The interval of a measure with a margin has the level of its row, which is named if not 95 %.
+    """
     measure = MEASURES[str(values["measure"])]
     of = with_interval(values["estimate"], values["ci"], measure.decimals)
+    level = values.get("level") if measure.margin is not None and values["ci"] else None
+    if level is not None and f"{level:.4g}" != "95":
+        of += f" (at {level:.4g} %)"
     humans = with_interval(values["human"], values["human_ci"], measure.decimals)
     return f"{measure.told.format(of=of, humans=humans)} (n = {values['n']})"
 

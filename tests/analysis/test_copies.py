@@ -174,7 +174,10 @@ def with_prompts(names):
 
 @pytest.mark.long
 def test_programs_of_one_distribution_differ_in_no_more_studies_than_stated(tmp_path):
-    """Each is played with eight prompts that it does not read, from draws of its own."""
+    """Each is played with eight prompts that it does not read, from draws of its own.
+
+    A study's tests are correlated, so that 8 % is allowed for a true rate of 5 %.
+    """
     rejected, tested = 0, 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -192,4 +195,4 @@ def test_programs_of_one_distribution_differ_in_no_more_studies_than_stated(tmp_
         p = [row["p"] for row in rows if row.get("p") is not None]
         rejected, tested = rejected + sum(value < 0.05 for value in p), tested + len(p)
     assert tested >= 150
-    assert rejected <= 0.05 * tested
+    assert rejected <= 0.08 * tested

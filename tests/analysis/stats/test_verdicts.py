@@ -269,6 +269,17 @@ def test_sentences_tell_the_states_of_the_rows_and_the_headline_the_surest_diffe
     assert because == f"it {told(surest)}."
 
 
+@pytest.mark.parametrize("measure", ["gap-velocity", "held"])
+def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percent(measure):
+    values = {"measure": measure, "estimate": 2.18, "ci": (1.03, 3.11), "n": 14,
+              "human": 0.38, "human_ci": None}  # fmt: skip
+    for level, said in ((98.75, "3.1] (at 98.75 %)"), (100 * (1 - 0.05 / 7), "3.1] (at 99.29 %)")):
+        assert f"2.2 [1.0, {said} " in told({**values, "level": level})
+    for level in (95.0, 100 * 0.95, None):
+        assert "(at" not in told({**values, "level": level})
+    assert "(at" not in told({**values, "measure": "gap", "level": 98.75})
+
+
 def test_of_few_finished_trials_a_headline_says_the_counts_alone(study):
     (table,) = make_tables(study, ["verdicts"])
     wild = by_group(table.rows)["wild/baseline"]
