@@ -311,15 +311,14 @@ def _count(drivers: Mapping[str, Mapping[str, Values]], unlike: int) -> str:
 def told(values: Values) -> str:
     """The sentence of one difference: ``collides in 68 [47, 84] % of trials, ... (n = 22)``.
 
-    The interval of a measure with a margin has the level of its row, which is named if not 95 %.
+    A driver's interval beside a margin has the level of its row, which is named if not 95 %.
     """
     measure = MEASURES[str(values["measure"])]
     of = with_interval(values["estimate"], values["ci"], measure.decimals)
     level = values.get("level") if measure.margin is not None and values["ci"] else None
-    if level is not None and f"{level:.4g}" != "95":
-        of += f" (at {level:.4g} %)"
+    own = "" if level is None or f"{level:.4g}" == "95" else f"; its interval at {level:.4g} %"
     humans = with_interval(values["human"], values["human_ci"], measure.decimals)
-    return f"{measure.told.format(of=of, humans=humans)} (n = {values['n']})"
+    return f"{measure.told.format(of=of, humans=humans)} (n = {values['n']}{own})"
 
 
 def with_interval(value: float | None, ci: Sequence[float] | None, decimals: int) -> str:

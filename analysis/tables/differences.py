@@ -314,7 +314,7 @@ def factors(study: Study) -> Table:
         for p in families.values()
         for name, p_holm in zip(p, corrected([*p.values()]), strict=True)
     }
-    rows = [replace(row, values=row.values | {"p_holm": holm.get(row.id)}) for row in rows]
+    rows = [replace(row, values={**row.values, "p_holm": holm.get(row.id)}) for row in rows]
     return Table(
         "factors",
         (

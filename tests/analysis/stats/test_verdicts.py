@@ -273,11 +273,12 @@ def test_sentences_tell_the_states_of_the_rows_and_the_headline_the_surest_diffe
 def test_an_interval_beside_a_margin_names_its_level_where_that_is_not_95_percent(measure):
     values = {"measure": measure, "estimate": 2.18, "ci": (1.03, 3.11), "n": 14,
               "human": 0.38, "human_ci": None}  # fmt: skip
-    for level, said in ((98.75, "3.1] (at 98.75 %)"), (100 * (1 - 0.05 / 7), "3.1] (at 99.29 %)")):
-        assert f"2.2 [1.0, {said} " in told({**values, "level": level})
+    for level, said in ((98.75, "98.75"), (100 * (1 - 0.05 / 7), "99.29"), (90.0, "90")):
+        text = told({**values, "level": level})
+        assert text.endswith(f"(n = 14; its interval at {said} %)")
     for level in (95.0, 100 * 0.95, None):
-        assert "(at" not in told({**values, "level": level})
-    assert "(at" not in told({**values, "measure": "gap", "level": 98.75})
+        assert told({**values, "level": level}).endswith("(n = 14)")
+    assert told({**values, "measure": "gap", "level": 98.75}).endswith("(n = 14)")
 
 
 def test_of_few_finished_trials_a_headline_says_the_counts_alone(study):
