@@ -483,7 +483,7 @@ async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, sche
     assert again.code == 0, again.err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
     merge_runner, started, tmp_path
 ):
