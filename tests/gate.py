@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from contextlib import closing
 from pathlib import Path
 
@@ -30,12 +31,14 @@ deadline_s = {HANGS_S}
 class Gate:
     """Lets a number of requests through, and holds the next ones until it opens.
 
-    A sweep in ``folder`` waits as long for the emulator.
+    Of each driver it lets only the first ``decisions`` through. A sweep in ``folder`` waits as long
+    for the emulator.
     """
 
-    def __init__(self, passing: int, folder: Path) -> None:
+    def __init__(self, passing: float, folder: Path, *, decisions: float = math.inf) -> None:
         (folder / "models.toml").write_text(PATIENT)
         self.passing = passing
+        self.decisions = decisions
         self.asked: list[str] = []
         self.held: dict[str, int] = {}  # slot to the asking port
         self._open = asyncio.Event()
@@ -43,7 +46,8 @@ class Gate:
     async def middle(self, request, handler):
         slot = request.headers[SLOT_HEADER]
         self.asked.append(slot)
-        if len(self.asked) > self.passing and not self._open.is_set():
+        late = json.loads(slot)["decision"] >= self.decisions
+        if (late or len(self.asked) > self.passing) and not self._open.is_set():
             self.held[slot] = request.get_extra_info("peername", ("", 0))[1]
             await self._open.wait()
         return await handler(request)

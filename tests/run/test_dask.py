@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import math
 import os
 import pickle
 import shutil
@@ -43,8 +44,6 @@ from tests.virtual_time import in_virtual_time, now_s
 SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
 # Six trials of 19 calls each.
 SIX = ("sweep", "baseline", "--reps", 2, "--conditions", "L_4_0,N_0_0,R_-4_8", "--json")
-# Fewer than the calls of two trials: no worker can end two before another one has begun.
-PASSING = 30
 ON_TWO = (*SIX, "--in-flight", 4, "--dask", "local:2")
 PAID = ("--model", "o3", "--yes", *FAST)
 
@@ -483,11 +482,11 @@ async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, sche
     assert again.code == 0, again.err
 
 
-@pytest.mark.long
+@pytest.mark.slow
 async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
     merge_runner, started, tmp_path
 ):
-    gate = Gate(PASSING, tmp_path)
+    gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)
@@ -530,7 +529,7 @@ def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
 async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
     merge_runner, started, tmp_path
 ):
-    gate = Gate(PASSING, tmp_path)
+    gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*SIX, "--in-flight", 3, "--dask", "local:3", **env)
@@ -582,7 +581,7 @@ def kept_calls(folder) -> int:
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, number, tmp_path):
-    gate = Gate(PASSING, tmp_path)
+    gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
     async with watched(gate.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         process = await started(*ON_TWO, **env)
