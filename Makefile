@@ -34,8 +34,8 @@ view: .venv/runtime ## the explorer in a browser: ARGS=
 sql: .venv/runtime ## a query over the results: Q="select ...", ARGS=
 	@$(RUN) sql "$$Q" $(ARGS)
 
-test: .venv/dev ## the quick tests, or those of ARGS=
-	@$(PYTEST) $(or $(ARGS),-m "not slow and not long")
+test: .venv/dev ## the unit tests, or those of ARGS=
+	@$(PYTEST) $(or $(ARGS),tests/unit)
 
 lint: .venv/dev ## formatting, lint, types, import contract
 	@.venv/bin/ruff format --check .
@@ -43,10 +43,10 @@ lint: .venv/dev ## formatting, lint, types, import contract
 	@.venv/bin/mypy
 	@.venv/bin/lint-imports
 
-check: lint ## what a change must pass: formatting, lint, types, import contract and all tests but the long ones
-	@$(PYTEST) -m "not long" $(ARGS)
+check: lint ## what a change must pass: formatting, lint, types, import contract, unit and integration tests
+	@$(PYTEST) -m "not long" tests/unit tests/integration $(ARGS)
 
-check-all: check ## what an hour may find: the long tests too, and the wheel on every Python that is here
+check-all: check ## what an hour may find: the weekly tests too, and the wheel on every Python that is here
 	@MERGE_RUNNER_BROWSER=required $(PYTEST) -m long $(ARGS)
 	@.ci/installed everywhere
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from tests.analysis.recordings import drive, write_zip
+from tests.support.recordings import drive, write_zip
 
 PAIRS, RUNS = 9, 10
 

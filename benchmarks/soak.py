@@ -30,7 +30,7 @@ from benchmarks.processes import PROJECT, RUNNER
 from merge_runner.emulator.server import HOST
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot, call_key
 from merge_runner.results.store import results_digest
-from tests.mock_server import FaultPlan, application, transient_faults
+from tests.support.mock_server import FaultPlan, application, transient_faults
 
 FAULT_RATE, SEED = 0.2, 15
 LOOK_S = 0.2

@@ -12,11 +12,11 @@ from hypothesis import settings
 
 from merge_runner.registry import Catalogue, collecting
 from merge_runner.results.store import results_digest
-from tests import program
-from tests.crossed_study import play
-from tests.harness import Run, environment
-from tests.mock_server import FaultPlan, served
-from tests.program import Process
+from tests.support import program
+from tests.support.crossed_study import play
+from tests.support.harness import Run, environment
+from tests.support.mock_server import FaultPlan, served
+from tests.support.program import Process
 
 # No agreement is kept: no test must pass because another one agreed.
 os.environ["XDG_STATE_HOME"] = os.devnull
@@ -94,7 +94,7 @@ def quiet(prepare, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def played(prepare, tmp_path_factory):
-    """A study with several factors and models; see ``tests.crossed_study``."""
+    """A study with several factors and models; see ``tests.support.crossed_study``."""
     return play(tmp_path_factory.mktemp("mine"), prepare)
 
 

@@ -1,0 +1,148 @@
+"""Several studies in one database: each can be read alone, and nothing is tested across them.
+
+The driver is a program whose trials depend on the slot alone, so that no prompt changes anything.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+
+from merge_runner.errors import UsageError
+from merge_runner_analysis.data.load import load
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.report.page import design
+from merge_runner_analysis.tables import make_tables
+from tests.support.studies import changed
+
+MOOD = """
+description = "Does the mood matter?"
+models = ["human-odds"]
+repetitions = 4
+conditions = ["L_4_0", "R_-4_0"]
+[factors]
+prompt = ["baseline", "A1"]
+"""
+# Of the same name, in another folder.
+OTHER_MOOD = MOOD.replace("Does", "Why does").replace(
+    '["baseline", "A1"]', '["A1"]\nmemory_s = [1.0, 2.0]'
+)
+
+
+@pytest.fixture(scope="module")
+def folder(prepare, tmp_path_factory):
+    """The database of a sweep in all conditions, and of two studies of one name in two of them."""
+    folder = tmp_path_factory.mktemp("several")
+    (folder / "other").mkdir()
+    (folder / "mood.toml").write_text(MOOD)
+    (folder / "other/mood.toml").write_text(OTHER_MOOD)
+    for study in ("baseline", "mood.toml", "other/mood.toml"):
+        sweep = ("sweep", study, "--model", "human-odds", "--reps", 4, "--db", "t.duckdb")
+        run = prepare(folder, *sweep)
+        assert run.code == 0, run.err
+    return folder
+
+
+@pytest.fixture(scope="module")
+def db(folder):
+    return folder / "t.duckdb"
+
+
+def rows(study, name):
+    (table,) = make_tables(study, [name])
+    return {row.id: row.values for row in table.rows}, table
+
+
+@pytest.mark.slow
+def test_a_study_that_is_named_is_shown_by_its_own_trials_alone(db, folder, prepare):
+    found = prepare(
+        folder, "tables", "factors", "--study", "mood.toml", "--db", db, "--format", "json"
+    )
+    (table,) = json.loads(found.out)["tables"]
+    known = {row["row"]: row for row in table["rows"]}
+    assert known["prompt=baseline/left_first_percent"]["trials"] == 8
+    for metric in ("left_first_percent", "collided_percent"):
+        row = known[f"prompt=A1/{metric}"]
+        assert (row["trials"], row["difference"], row["p"]) == (8, None, None)
+        assert "programs play no trial at one of both levels" in row["note"]
+    assert "memory_s" not in {row["factor"] for row in table["rows"]}
+    assert "several studies" not in json.dumps(table["notes"])
+
+
+@pytest.mark.slow
+def test_without_a_choice_tables_say_what_they_pool_and_test_nothing_across_studies(db):
+    study = Study(db)
+    known, table = rows(study, "factors")
+    level = known["prompt=A1/left_first_percent"]
+    assert known["prompt=baseline/left_first_percent"]["trials"] == 44
+    assert level["trials"] == 8, "three times the same 8 trials"
+    assert {level.get(name) for name in ("difference", "difference_ci", "p", "p_holm")} == {None}
+    (note,) = (note for note in table.notes if note.startswith("trials of several studies"))
+    for named in ("baseline (44 trials)", "mood (16 trials)", "mood (memory_s) (16 trials)"):
+        assert named in note
+    contrasted, _ = rows(study, "contrasts")
+    assert not any("/A1/baseline/" in name for name in contrasted)
+
+
+def test_a_second_study_changes_no_reference(db, tmp_path):
+    copy = tmp_path / "t.duckdb"
+    copy.write_bytes(db.read_bytes())
+    levels = {"perception": ["perfect", "foggy"], "prompt": ["A1"], "model": ["human-odds"]}
+    study = changed(
+        copy,
+        "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'perception', "
+        "if(rep % 2 = 0, 'foggy', 'perfect') FROM trials",
+        f"UPDATE sweeps SET config = json_merge_patch(config, '{json.dumps({'levels': levels})}') "
+        "WHERE started_at = (SELECT max(started_at) FROM sweeps)",
+    )
+    known, _ = rows(study, "factors")
+    assert [name for name in known if name.endswith("=perfect/gap_m") or "=foggy/gap" in name] == [
+        "perception=perfect/gap_m",
+        "perception=foggy/gap_m",
+    ]
+    assert study.reference == "baseline", "a study of one prompt lists it first, and says nothing"
+
+
+@pytest.mark.slow
+def test_the_trials_behind_a_cell_are_those_of_the_study(db, folder):
+    study = Study(db, file=str(folder / "mood.toml"))
+    _, table = rows(study, "factors")
+    (source,) = explain(study, table, "prompt=baseline/left_first_percent:trials").sources
+    assert len(source.trials) == 8
+    assert design(study)[0] == ["Does the mood matter?"]
+    assert load(source.query, db)["trial_id"].tolist() == list(source.trials)
+
+
+@pytest.mark.slow
+def test_tables_that_are_kept_are_those_of_their_study(db, folder, prepare):
+    for study, n in (("mood.toml", 8), ("baseline", 44), ("mood.toml", 8)):
+        found = prepare(folder, "tables", "attempts", "--study", study, "--db", db)
+        assert re.search(rf"human-odds +Baseline +{n} ", found.out), found.out
+
+
+def test_a_study_that_was_not_played_is_named_beside_those_that_were(db):
+    with pytest.raises(UsageError, match="no trial of the study ablations; it holds those of: "):
+        Study(db, file="ablations")
+
+
+@pytest.mark.slow
+def test_a_run_of_the_same_study_is_no_other_study(db, folder, prepare, tmp_path):
+    copy = tmp_path / "t.duckdb"
+    copy.write_bytes(db.read_bytes())
+    (tmp_path / "mood.toml").write_text(MOOD.replace('"A1"]', '"A1", "A2"]'))
+    sweep = ("sweep", "mood.toml", "--only", "prompt=A2", "--db", copy)
+    assert prepare(tmp_path, *sweep).code == 0
+    known, _ = rows(Study(copy, file=str(tmp_path / "mood.toml")), "factors")
+    assert [known[f"prompt={name}/gap_m"]["trials"] for name in ("baseline", "A1", "A2")] == [8] * 3
+
+
+def test_trials_of_no_sweep_are_of_no_study(db, tmp_path):
+    copy = tmp_path / "t.duckdb"
+    copy.write_bytes(db.read_bytes())
+    study = changed(copy, "DELETE FROM sweep_trials", "DELETE FROM sweeps")
+    known, table = rows(study, "factors")
+    assert known["prompt=A1/left_first_percent"]["trials"] == 8
+    assert not any("several studies" in note for note in table.notes)

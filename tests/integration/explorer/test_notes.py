@@ -1,0 +1,249 @@
+"""What readers note: who may, where it is kept and what is shown of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import pytest
+from playwright.sync_api import expect
+from starlette.testclient import TestClient
+
+from merge_runner.errors import UsageError
+from merge_runner_analysis.explorer.app import MOST_NOTED, explorer
+from merge_runner_analysis.explorer.notes import LONGEST_NAME, LONGEST_TEXT, Notes, reader_of
+from merge_runner_analysis.explorer.site import Site
+from tests.integration.explorer.test_listing import HOST, Texts
+from tests.support.axe import serious
+from tests.support.exporting import export, export_with_a_table
+from tests.support.hostile import HOSTILE
+from tests.support.serving import served
+
+TRIAL = "emulator/baseline/N_0_0/rep01"
+OURS = {"origin": f"http://{HOST}"}
+
+
+@pytest.fixture
+def db(study, tmp_path):
+    """A copy of the study, with nothing noted."""
+    return shutil.copy(study, tmp_path / "study.duckdb")
+
+
+def asking(db, reader="anna"):
+    app = explorer(Site(db, reader=reader))
+    return TestClient(app, base_url=f"http://{HOST}", headers=OURS, follow_redirects=False)
+
+
+def noted(client, **given):
+    return client.post("/notes", data={"trial": TRIAL, **given})
+
+
+def lines(db):
+    path = Notes(db).path
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def test_a_note_is_a_line_beside_the_database_and_the_database_stays_as_it_was(db):
+    before = db.read_bytes()
+    reply = noted(asking(db), text="It hesitates. #Late", side="left", decision="2")
+    assert reply.status_code == 303
+    (line,) = lines(db)
+    assert line["spec_hash"]
+    assert {name: line[name] for name in ("reader", "trial_id", "side", "decision")} == {
+        "reader": "anna", "trial_id": TRIAL, "side": "left", "decision": 2
+    }  # fmt: skip
+    assert line["text"] == "It hesitates. #Late"
+    assert [tag for _, _, tag in Notes(db).kept().tags] == ["late"]
+    assert db.read_bytes() == before
+    assert Notes(db).path == db.with_name("study.notes.jsonl")
+
+
+def test_notes_are_shown_on_the_trial_in_the_list_and_on_a_page_of_their_own(db):
+    client = asking(db)
+    noted(client, text="It hesitates. #late")
+    assert "It hesitates." in client.get(f"/trials/{TRIAL}").text
+    assert "It hesitates." not in client.get("/trials/emulator/baseline/N_0_0/rep02").text
+    assert "It hesitates." in client.get("/notes").text
+    listed = client.get("/trials?tag=late").text
+    assert "<strong>1</strong> trials" in listed
+    assert TRIAL in listed
+    assert '<option value="late">late (1)</option>' in client.get("/trials").text
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": f"http://{HOST}", "sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"},
+        {"origin": f"http://{HOST}", "sec-fetch-site": "same-site"},
+        {"origin": "http://evil.example:8700", "host": "evil.example:8700"},
+        {"referer": f"http://{HOST}/"},
+    ],
+)
+def test_only_a_page_of_ours_writes(db, headers):
+    client = asking(db)
+    client.headers.pop("origin")
+    reply = client.post("/notes", data={"trial": TRIAL, "text": "x"}, headers=headers)
+    assert reply.status_code == (400 if "host" in headers else 403)
+    assert lines(db) == []
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"text": "  "}, "up to 4,000 characters"),
+        ({"text": "x" * (LONGEST_TEXT + 1)}, "up to 4,000 characters"),
+        ({"text": "x", "side": "left"}, "a decision"),
+        ({"text": "x", "side": "up", "decision": "1"}, "a decision"),
+        ({f"field{number}": "x" for number in range(11)}, "fields"),
+    ],
+)
+def test_what_is_no_note_is_told_and_not_kept(db, given, told):
+    reply = noted(asking(db), **given)
+    assert reply.status_code == 400
+    assert told in reply.text
+    assert lines(db) == []
+
+
+def test_a_form_is_bounded_and_a_trial_must_be_there(db):
+    client = asking(db)
+    assert noted(client, text="x" * MOST_NOTED).status_code == 413
+    assert client.post("/notes", data={"trial": "no/such", "text": "x"}).status_code == 404
+    assert lines(db) == []
+
+
+def test_what_a_reader_wrote_is_text_everywhere(db):
+    client = asking(db, HOSTILE[:LONGEST_NAME])
+    noted(client, text=f"{HOSTILE} #<b>\u202e #b")
+    for address in (f"/trials/{TRIAL}", "/notes", "/trials"):
+        text = client.get(address).text
+        assert "<script>document" not in text
+        assert "\u202e" not in "".join(Texts(text).said)
+
+
+@pytest.mark.parametrize("damage", [b'{"at": "1', b"\xff\xfe", b'{"reader": 3}', b"null", b""])
+def test_a_damaged_line_is_told_and_skipped_and_kept(db, damage):
+    client = asking(db)
+    noted(client, text="before")
+    with Notes(db).path.open("ab") as file:
+        file.write(damage)  # as by a process that died amid a line
+    noted(client, text="after")
+    text = client.get("/notes").text
+    assert "before" in text
+    assert "after" in text
+    assert ("line 2 of study.notes.jsonl is damaged" in text) == bool(damage)
+    assert damage in Notes(db).path.read_bytes()
+
+
+def test_where_nothing_can_be_written_a_line_says_so(db):
+    Notes(db).path.mkdir()
+    client = asking(db)
+    reply = noted(client, text="x")
+    assert reply.status_code == 400
+    assert "nothing was noted" in reply.text
+    assert "study.notes.jsonl cannot be read" in client.get("/notes").text
+    assert client.get(f"/trials/{TRIAL}").status_code == 200
+
+
+def _write(db, reader):
+    notes = Notes(db, reader)
+    for number in range(100):
+        notes.add(TRIAL, "spec", "", None, f"#t{number} {'x' * 3000}")
+
+
+@pytest.mark.long
+def test_two_explorers_that_write_at_once_lose_nothing(tmp_path):
+    db = tmp_path / "t.duckdb"
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        list(pool.map(_write, [db, db], ["anna", "ben"]))
+    kept = Notes(db).kept()
+    assert kept.damage == ()
+    assert sorted((note.reader, note.text.split()[0]) for note in kept.notes) == sorted(
+        (reader, f"#t{number}") for reader in ("anna", "ben") for number in range(100)
+    )
+
+
+def test_notes_fit_a_copy_of_the_study_and_tell_where_a_trial_is_not_in_it(db, tmp_path):
+    noted(asking(db), text="It hesitates.")
+    copy = tmp_path / "copy" / "other.duckdb"
+    copy.parent.mkdir()
+    shutil.copy(db, copy)
+    line = Notes(db).path.read_text()
+    Notes(copy).path.write_text(line + line.replace(TRIAL, "gone/rep01"))
+    text = asking(copy, "ben").get("/notes").text
+    assert f"{TRIAL}</a>" in text
+    assert "gone/rep01 <small>not in this database" in text
+
+
+def test_a_reader_has_a_name():
+    assert reader_of(" Anna  B ") == "Anna B"
+    assert reader_of(None)
+    for odd in ("", " ", "x" * (LONGEST_NAME + 1)):
+        with pytest.raises(UsageError, match="--reader needs a name"):
+            reader_of(odd)
+
+
+# ---- in a browser
+
+
+@pytest.fixture
+def site(db):
+    """An explorer of this test's own copy."""
+    with served(db) as address:
+        yield address
+
+
+def test_notes_are_written_from_the_keyboard(page, db):
+    page.goto(f"/trials/{TRIAL}")
+    page.keyboard.press("n")
+    expect(page.locator("#note-text")).to_be_focused()
+    page.keyboard.type("The whole trial")
+    page.keyboard.press("Enter")
+    expect(page.locator("#noted")).to_contain_text("The whole trial")
+    page.keyboard.press("]")
+    page.keyboard.press("n")
+    expect(page.locator("#note-about")).to_have_text("on the left decision 0")
+    page.keyboard.type("#late and #odd")
+    page.keyboard.press("Enter")
+    expect(page.locator("#noted")).to_contain_text("#late and #odd")
+    assert [(line["side"], line["decision"], line["text"]) for line in lines(db)] == [
+        (None, None, "The whole trial"),
+        ("left", 0, "#late and #odd"),
+    ]
+    page.keyboard.press("n")
+    page.keyboard.press("Escape")
+    expect(page.locator("#note-text")).not_to_be_focused()
+    assert serious(page) == []
+    page.keyboard.press("]")
+    page.locator("#noted a").click()
+    expect(page.locator(".decision-panel h2")).to_contain_text("left decision 0")
+    page.goto("/notes")
+    assert serious(page) == []
+    expect(page.locator(".all-notes tbody tr")).to_have_count(2)
+
+
+@pytest.mark.long
+def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(page, db, tmp_path):
+    client = asking(db)
+    noted(client, text="It hesitates. #late", side="left", decision="1")
+    other = "emulator/baseline/L_4_0/rep01"
+    noted(asking(db, "ben"), trial=other, text="not of these trials")
+    files = export_with_a_table(db, tmp_path / "pages")
+    page.goto(f"file://{files}/notes.html")
+    expect(page.locator(".all-notes tbody tr")).to_have_count(2)
+    page.locator(".all-notes tbody a").last.click()
+    expect(page.locator("#noted")).to_contain_text("It hesitates.")
+    expect(page.locator("#note")).to_have_count(0)
+    files = export(db, tmp_path / "few", ["emulator/baseline/N_0_0/*"])
+    pages = {path.name: path.read_text() for path in files.glob("*.html")}
+    assert "It hesitates." in pages["trials-emulator-baseline-N_0_0-rep01.html"]
+    assert "not of these trials" not in "".join(pages.values())
+    assert "notes.html" not in pages
+    noted(client, text="sk-proj-abcdefghijklmnop0123")
+    with pytest.raises(UsageError, match="looks like a key"):
+        export(db, tmp_path / "more", ["emulator/baseline/N_0_0/*"])
+    assert not (tmp_path / "more").exists()

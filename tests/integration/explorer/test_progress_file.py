@@ -1,0 +1,152 @@
+"""What a running sweep tells other processes in the file beside its database."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+
+import pytest
+
+from merge_runner.llm.ledger import Spending
+from merge_runner.run.local_runner import LocalRunner
+from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.progress import (
+    Progress,
+    clear_dead,
+    read_standing,
+    remove_standing,
+    write_standing,
+)
+from tests.support.gate import HANGS_S
+from tests.support.harness import run_sweep
+
+NO_PROCESS = 2**22 + 1  # above the largest that Linux gives
+LONG_AGO = datetime(2026, 1, 1, tzinfo=UTC)
+LEDGER = SimpleNamespace(spending=Spending())
+SWEEP = ("sweep", "baseline", "--reps", 2, "--conditions", "N_0_0,L_4_0", "--rpm", 100)
+
+
+def standing(sweep_id="s", **changes):
+    plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0"])
+    plain = Progress(plan, 2, LocalRunner(plan, {}, 0), LEDGER).standing(sweep_id)
+    return plain.model_copy(update=changes)
+
+
+async def begun(db):
+    """The one sweep of a database, as soon as some of its calls are answered and others wait."""
+    async with asyncio.timeout(HANGS_S):
+        while True:
+            for path in db.parent.glob("*.progress/*.json"):
+                found = read_standing(db, path.stem)
+                if found and any("rate limits" in text for _, text in found.rows):
+                    return found, path
+            await asyncio.sleep(0.1)
+
+
+@pytest.mark.slow
+async def test_a_sweep_says_where_it_stands_until_it_is_killed_and_the_next_one_tidies_up(
+    merge_runner, tmp_path, emulator_url
+):
+    db = tmp_path / "m.duckdb"
+    process = await merge_runner.start(*SWEEP, "--db", db, EMULATOR_BASE_URL=emulator_url)
+    try:
+        found, path = await begun(db)
+        text, alive = path.read_text(), found.alive
+    finally:
+        process.kill()
+        await process.communicate()
+    assert found.pid == process.pid
+    assert dict(found.rows)["trials"] == "0/4 ended, 4 running"
+    assert str(tmp_path) not in text
+    assert (alive, read_standing(db, found.sweep_id).alive) == (True, False)
+    assert (await merge_runner("sweep", "baseline", "--model", "constant", "--db", db)).code == 0
+    assert not path.parent.exists()
+
+
+async def test_the_last_word_of_a_sweep_is_that_it_checks_its_trials(tmp_path, monkeypatch):
+    said = []
+    for module in ("progress", "sweep"):
+        name = f"merge_runner.run.{module}.write_standing"
+        monkeypatch.setattr(name, lambda _, standing: said.append(standing))
+    plan = make_plan("baseline", "constant", repetitions=2, conditions=["N_0_0", "L_4_0"])
+    await run_sweep(plan, Options(tmp_path / "m.duckdb", tmp_path / "c"), say=print)
+    first, last = said[0], said[-1]
+    assert (first.doing, last.doing) == ("playing", "checking")
+    assert (first.ended, last.ended, last.failed) == (0, 4, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "age_s", "alive"),
+    [
+        ({}, 9, True),
+        ({}, 11, False),  # frozen
+        ({"doing": "checking"}, 9, True),
+        ({"doing": "checking"}, 11, False),
+        ({"doing": "checking", "pid": NO_PROCESS}, 1, False),
+        ({"pid": NO_PROCESS}, 1, False),
+        ({"pid": NO_PROCESS, "machine": "another"}, 1, True),  # its ids mean nothing here
+    ],
+)
+def test_a_sweep_is_dead_when_its_process_is_gone_or_silent(changes, age_s, alive):
+    updated_at = datetime.now(UTC) - timedelta(seconds=age_s)
+    assert standing(updated_at=updated_at, **changes).alive == alive
+
+
+def test_a_living_sweep_of_the_same_database_keeps_its_file(tmp_path):
+    db = tmp_path / "m.duckdb"
+    write_standing(db, standing("a"))
+    write_standing(db, standing("b", updated_at=LONG_AGO))
+    clear_dead(db)
+    assert (read_standing(db, "a").alive, read_standing(db, "b")) == (True, None)
+
+
+def test_only_what_a_killed_sweep_wrote_is_tidied_up(tmp_path):
+    """A folder from elsewhere may lead to one of the user's, or hold files of other programs."""
+    db, documents = tmp_path / "m.duckdb", tmp_path / "documents"
+    write_standing(db, standing("a", updated_at=LONG_AGO))
+    (tmp_path / "m.duckdb.progress").rename(documents)
+    for name in ("notes.json", "thesis.tmp"):
+        (documents / name).write_text("{}")
+        os.utime(documents / name, (0, 0))
+    before = sorted(documents.iterdir())
+    (tmp_path / "m.duckdb.progress").symlink_to(documents)
+    clear_dead(db)
+    assert sorted(documents.iterdir()) == before
+    (tmp_path / "m.duckdb.progress").unlink()
+    documents.rename(tmp_path / "m.duckdb.progress")
+    clear_dead(db)
+    left = {path.name for path in (tmp_path / "m.duckdb.progress").iterdir()}
+    assert left == {"notes.json", "thesis.tmp"}
+
+
+def test_the_name_of_a_sweep_leads_out_of_no_folder(tmp_path):
+    db, name = tmp_path / "m.duckdb", "../outside"
+    write_standing(db, standing("a"))
+    (tmp_path / "outside.json").write_text(standing(name).model_dump_json())
+    assert read_standing(db, name) is None
+    remove_standing(db, name)
+    assert (tmp_path / "outside.json").exists()
+
+
+def test_a_disk_that_takes_no_file_fails_nothing(tmp_path):
+    (tmp_path / "m.duckdb.progress").write_text("a file where the folder should be")
+    write_standing(tmp_path / "m.duckdb", standing())
+    remove_standing(tmp_path / "m.duckdb", "s")
+    clear_dead(tmp_path / "m.duckdb")
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"sweep_id": "s"}', "\x00" * 9, "[" * 10_000])
+def test_a_file_that_is_none_of_ours_says_nothing(tmp_path, text):
+    (tmp_path / "m.duckdb.progress").mkdir()
+    (tmp_path / "m.duckdb.progress/s.json").write_text(text)
+    assert read_standing(tmp_path / "m.duckdb", "s") is None
+
+
+def test_what_was_stored_before_has_ended_and_what_failed_has_not():
+    plan = make_plan("baseline", "constant")
+    progress = Progress(plan, 3, LocalRunner(plan, {}, 1), LEDGER, stored=1)
+    progress.outcome_counts.update(collided=1, failed=1, suspended=1)
+    standing = progress.standing("s")
+    assert (standing.ended, standing.failed) == (2, 1)

@@ -1,0 +1,181 @@
+"""Search in what drivers said: what is found, what is shown of it, and what else chooses."""
+
+from __future__ import annotations
+
+import re
+from html import unescape
+
+import duckdb
+import pytest
+from playwright.sync_api import expect
+from starlette.testclient import TestClient
+
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.search import PAGE
+from merge_runner_analysis.explorer.site import Site
+from tests.integration.explorer.test_listing import HOST, Texts
+from tests.support.axe import serious
+from tests.support.serving import held
+from tests.support.studies import Drive, Said, write_study
+
+TALKING = Drive(
+    "o3", "baseline", "L_4_0", 1, (0.1,) * 9, (-0.1,) * 9, {3: Said(failure="no_array")}
+)
+OTHER = [Drive("o4", "A1", "N_0_0", rep, (0.1,) * 9, (-0.1,) * 9, {}) for rep in (1, 2, 3)]
+SILENT = Drive("idm", "baseline", "N_0_0", 1, (0.1,) * 9, (-0.1,) * 9)
+# What the left driver of the first trial says, by decision: an answer and a rationale.
+SAID = {
+    0: ("M", "I am AHEAD, so I merge first."),
+    1: (None, "No brake. The gap\nis small."),
+    2: ("Y", "We are on a collision course & I <b>brake</b> hard; Straße İz \u202e."),
+    3: ("Y", "Braking on."),
+}
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    path = tmp_path_factory.mktemp("words") / "t.duckdb"
+    write_study(path, [TALKING, *OTHER, SILENT])
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE decisions SET rationale = 'The road is clear.', tactical = 'M'")
+        connection.executemany(
+            "UPDATE decisions SET tactical = ?, rationale = ? "
+            "WHERE trial_id LIKE 'o3/%' AND side = 'left' AND decision = ?",
+            [(tactical, text, number) for number, (tactical, text) in SAID.items()],
+        )
+    return path
+
+
+@pytest.fixture(scope="module")
+def client(db):
+    with TestClient(explorer(Site(db)), base_url=f"http://{HOST}") as client:
+        yield client
+
+
+def found(client, **asked):
+    """The decisions on a page of results, as trial, side and number."""
+    text = client.get("/words", params=asked).text
+    links = re.findall(r'<th scope="row"><a href="([^"]+)"', text)
+    parts = [re.search(r"/trials/([^?]+)\?.*side=(\w+)&decision=(\d+)", unescape(a)) for a in links]
+    return [(part[1].partition("/")[0], part[2], int(part[3])) for part in parts]
+
+
+@pytest.mark.parametrize(
+    ("query", "numbers"),
+    [
+        ("brake", [1, 2]),
+        ("BRAK", [1, 2, 3]),
+        ("brake course", [2]),
+        ("course brake", [2]),
+        ('"collision course"', [2]),
+        ('"course collision"', []),
+        ('"gap is small"', [1]),
+        ("strasse", []),
+        ("STRAßE", [2]),
+        ("ahead, merge", [0]),
+        ("%", []),
+        ("' OR true --", []),
+    ],
+)
+def test_a_decision_is_found_by_all_words_of_a_query_and_no_others(client, query, numbers):
+    assert found(client, q=query) == [("o3", "left", number) for number in numbers]
+
+
+def test_matches_are_marked_and_what_a_model_wrote_stays_text(client):
+    text = client.get("/words", params={"q": "brake"}).text
+    assert "<mark>brake</mark>" in text
+    assert "&amp; I &lt;b&gt;<mark>brake</mark>&lt;/b&gt; hard" in text
+    assert "[U+202E]" in "".join(Texts(text).said)
+    assert "\u202e" not in text
+
+
+def test_facets_choose_among_what_is_found_and_count_it(client):
+    assert found(client, tactical="none", model="o3") == [("o3", "left", 1)]
+    assert found(client, failure="no_array") == [("o3", "left", 3)]
+    # Between them nothing was said about who goes first: it is a change of mind all the same.
+    assert found(client, switch="M to Y") == [("o3", "left", 2)]
+    assert found(client, switch="Y to M") == [("o3", "left", 4)]
+    assert {trial for trial, *_ in found(client, condition="N_0_0", q="clear")} == {"o4"}
+    text = client.get("/words", params={"q": "brak"}).text
+    assert re.findall(r'value="(M|Y|none)"[^>]*>([^<]+)<', text) == [
+        ("Y", "Y (2)"),
+        ("none", "none (1)"),
+    ]
+
+
+def test_what_is_said_is_chosen_beside_what_is_planned_and_driven(db, tmp_path):
+    path = tmp_path / "t.duckdb"
+    path.write_bytes(db.read_bytes())
+    with duckdb.connect(str(path)) as connection:
+        connection.execute(
+            "UPDATE decisions SET plan = [0.5, 0.1], applied = [-0.2] WHERE trial_id LIKE 'o3/%' "
+            "AND side = 'left' AND decision = 2; UPDATE decisions SET plan = [0.0], applied = [0.0]"
+            " WHERE trial_id NOT LIKE 'o3/%'"
+        )
+    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
+        assert found(client, tactical="Y", planned="go") == [("o3", "left", 2)]
+        assert found(client, driven="brake", planned="go") == [("o3", "left", 2)]
+        assert found(client, tactical="Y", planned="hold") == []
+        assert {trial for trial, *_ in found(client, planned="hold", model="o4")} == {"o4"}
+        assert found(client, planned_from="0.25", planned_to="0.35") == [("o3", "left", 2)]
+        assert found(client, planned_from="0.35", model="o3", tactical="Y") == []
+        text = client.get("/words", params={"model": "o3", "tactical": "Y"}).text
+        shares = re.findall(
+            r'href="([^"]*planned=(?:go|brake|hold)[^"]*)">(\d+)</a>\s*<small>', text
+        )
+        assert shares
+        for link, count in shares:
+            assert f"<strong>{count}</strong> decisions" in client.get(unescape(link)).text
+
+
+def test_a_program_says_nothing(client):
+    assert "idm" not in {trial for trial, *_ in found(client, condition="N_0_0")}
+
+
+def test_what_is_found_comes_in_pages(client, db):
+    with duckdb.connect(str(db), read_only=True) as connection:
+        every = connection.execute(
+            "SELECT split_part(trial_id, '/', 1), side, decision FROM decisions "
+            "WHERE trial_id NOT LIKE 'idm/%' ORDER BY trial_id, spec_hash, decision, side"
+        ).fetchall()
+    assert len(every) > PAGE
+    assert found(client) == every[:PAGE]
+    assert found(client, page=2) == every[PAGE:]
+    assert found(client, page=99) == every[PAGE:]
+
+
+def test_words_of_new_trials_are_found_and_those_of_removed_ones_are_not(db, tmp_path):
+    path = tmp_path / "t.duckdb"
+    path.write_bytes(db.read_bytes())
+    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
+        assert len(found(client, q="brake")) == 2
+        with duckdb.connect(str(path)) as connection:
+            connection.execute("DELETE FROM trials WHERE trial_id LIKE 'o3/%'")
+        assert found(client, q="brake") == []
+        write_study(path, [Drive("o5", "baseline", "N_0_0", 1, (0.1,), (-0.1,), {})])
+        with duckdb.connect(str(path)) as connection:
+            connection.execute(
+                "UPDATE decisions SET rationale = 'I brake.' WHERE trial_id LIKE 'o5/%'"
+            )
+        assert {trial for trial, *_ in found(client, q="brake")} == {"o5"}
+
+
+def test_while_another_program_holds_the_database_what_was_read_is_searched(db, tmp_path):
+    path = tmp_path / "t.duckdb"
+    path.write_bytes(db.read_bytes())
+    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
+        assert len(found(client, q="brake")) == 2
+        with held(path):
+            assert len(found(client, q="brake")) == 2
+
+
+def test_words_are_searched_from_the_keyboard_and_lead_to_the_decision(page):
+    page.goto("/words")
+    page.keyboard.press("/")
+    page.keyboard.type("SCRIPT")
+    expect(page.locator("mark").first).to_have_text("script")
+    expect(page).to_have_url(re.compile("q=SCRIPT"))
+    assert serious(page) == []
+    page.locator(".hits tbody a").first.click()
+    expect(page.locator(".decision-panel")).to_contain_text("<script>document.title='owned'")
+    assert "owned" not in page.title()

@@ -1,0 +1,492 @@
+"""A cap that holds whatever happens, and money that ends trials instead of beginning many."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import shutil
+import sqlite3
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
+from merge_runner.llm.cache import CachedCall, ResponseCache
+from merge_runner.llm.ledger import FILE, TABLES, Asked, Budget, Ledger, Spending, scopes
+from merge_runner.records import Attempt, Slot, make_request
+from tests.support.harness import each
+
+CAP = 100
+calls = st.lists(
+    st.tuples(
+        st.integers(0, 8),  # the trial
+        st.integers(0, 120),  # the worst case
+        st.none() | st.integers(0, 100),  # the share of it that is spent, None if unknown
+        st.integers(0, 4),  # how long it is in flight
+        st.sampled_from("mn"),  # the model
+    ),
+    max_size=25,
+)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    opened = ResponseCache(tmp_path_factory.mktemp("responses"))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def ledger(cache, request):
+    return Ledger(cache, request.node.name)
+
+
+def asked(worst, driver=""):
+    return Asked(driver, "", worst)
+
+
+def tried(actual, outcome="server_error"):
+    return [Attempt(1, outcome, cost_usd=actual)]
+
+
+async def attempt(budget, trial, worst, actual, turns=0, model="m"):
+    """Spend on one attempt as a client does."""
+    await budget.admit(trial)
+    paid = await budget.set_aside(trial, f"key {model}", asked(worst))
+    with contextlib.closing(paid):
+        await paid.begin([])
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await paid.settle(tried(actual))
+
+
+def set_aside(budget, trial, worst, driver=""):
+    return budget.set_aside(trial, f"key {trial}", asked(worst, driver))
+
+
+async def soon(job):
+    """A job under way, after everybody could run."""
+    task = asyncio.create_task(job)
+    for _ in range(5):
+        await asyncio.sleep(0)
+    return task
+
+
+@settings(deadline=None, max_examples=30)
+@given(calls, st.integers(0, 60))
+def test_what_is_spent_and_set_aside_never_exceeds_the_cap(plan, trial_usd):
+    async def all_calls(ledger):
+        budget = Budget(ledger, CAP, each(trial_usd))
+        reserve = ledger.reserve
+
+        def watched(*arguments):
+            begun = reserve(*arguments)
+            assert ledger.spending.committed_usd <= CAP + 1e-6
+            return begun
+
+        ledger.reserve = watched
+
+        async def call(trial, worst, share, turns, model):
+            actual = None if share is None else worst * share / 100
+            try:
+                await attempt(budget, trial, worst, actual, turns, model)
+            finally:
+                budget.leave(trial)
+
+        # The limit only ends a test in which somebody waits for ever.
+        async with asyncio.timeout(20):
+            return await asyncio.gather(*(call(*each) for each in plan), return_exceptions=True)
+
+    with tempfile.TemporaryDirectory() as folder:
+        cache = ResponseCache(Path(folder))
+        ledger = Ledger(cache, "all")
+        results = asyncio.run(all_calls(ledger))
+        cache.close()
+    assert [
+        each for each in results if not (each is None or isinstance(each, TrialSuspended))
+    ] == []
+    assert ledger.spending.open_attempts == sum(
+        result is None and share is None
+        for (_, _, share, _, _), result in zip(plan, results, strict=True)
+    )
+
+
+async def test_spending_is_that_of_all_runs(ledger, cache):
+    await attempt(Budget(ledger, 1.0), 1, 0.5, 0.4)
+    again = Budget(Ledger(cache, ledger.scope), 1.0)
+    with pytest.raises(TrialSuspended, match=r"0\.4000 of 1 USD"):
+        await attempt(again, 1, 0.7, 0.7)
+    await attempt(again, 1, 0.6, 0.6)
+
+
+async def test_an_attempt_of_unknown_cost_counts_with_its_worst_case_for_ever(ledger):
+    budget = Budget(ledger, 1.0)
+    await attempt(budget, 1, 0.75, None)
+    with pytest.raises(TrialSuspended):
+        await attempt(budget, 1, 0.5, 0.5)
+    await attempt(budget, 1, 0.25, 0.25)
+    assert (ledger.spending.reserved_usd, ledger.spending.open_attempts) == (0.75, 1)
+
+
+async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
+    dead = Budget(ledger, 1.0)
+    paid = await set_aside(dead, 1, 0.75)
+    await paid.begin([])
+    assert [a.outcome for a in cache.unanswered("key 1")] == ["unknown"]
+    with pytest.raises(TrialSuspended):
+        await set_aside(Budget(ledger, 1.0), 1, 0.5)
+
+
+async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, cache):
+    both = [Budget(Ledger(cache, "shared"), 1.0) for _ in range(2)]
+    # Neither knows of the other's yet.
+    paid = [await set_aside(budget, trial, 0.75) for trial, budget in enumerate(both)]
+    await paid[0].begin([])
+    with pytest.raises(TrialSuspended, match="others under the same cap"):
+        await paid[1].begin([])
+    assert both[1].ledger.read().committed_usd == 0.75
+
+
+async def test_a_reservation_waits_for_what_is_in_flight(ledger):
+    budget = Budget(ledger, 1.0)
+    paid = await set_aside(budget, 1, 0.75)
+    waiting = await soon(set_aside(budget, 2, 0.5))
+    assert not waiting.done()
+    paid.close()
+    await waiting
+
+
+async def test_a_trial_begins_only_where_it_could_end_within_the_cap(ledger):
+    budget = Budget(ledger, 10.0, each(4.0))
+    for trial in (1, 2):
+        await attempt(budget, trial, 1.0, 0.5)
+    third = await soon(attempt(budget, 3, 1.0, 0.5))
+    # 1 USD is spent and 3 + 3 are allowed: another 4 do not fit.
+    assert not third.done()
+    await attempt(budget, 1, 1.0, 0.5)
+    await asyncio.sleep(0.01)
+    assert not third.done()
+    budget.leave(1)
+    await third
+
+
+async def test_attempts_that_cost_nothing_do_not_use_up_an_allowance(ledger):
+    budget = Budget(ledger, 5.0, each(4.0))
+    for _ in range(10):
+        await attempt(budget, 1, 1.0, 0.0)
+    other = await soon(budget.admit(2))
+    assert not other.done()
+    await attempt(budget, 1, 4.0, 4.0)
+    budget.leave(1)
+    with pytest.raises(TrialSuspended):
+        await other
+
+
+async def test_the_oldest_trial_may_spend_what_is_kept_for_younger_ones(ledger):
+    budget = Budget(ledger, 6.0, each(2.0))
+    for trial in (1, 2, 3):
+        await budget.admit(trial)
+    for _ in range(5):
+        await attempt(budget, 1, 1.0, 1.0)
+    waiting = await soon(attempt(budget, 3, 1.0, 1.0))
+    assert not waiting.done(), "1 USD is left, and the second trial is older"
+    await attempt(budget, 2, 1.0, 0.0)
+    budget.leave(2)
+    await waiting
+
+
+async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_for_its_own(
+    ledger, monkeypatch
+):
+    monkeypatch.setattr("merge_runner.llm.ledger.PATIENCE_S", 0.01)
+    budget = Budget(ledger, 4.0, each(2.0))
+    await budget.admit(1)
+    await budget.admit(2)
+    await attempt(budget, 2, 3.0, 3.0)
+
+
+async def test_trials_begin_in_their_order_and_the_first_is_never_overtaken(ledger):
+    budget = Budget(ledger, 5.0, each(4.0))
+    begun = []
+
+    async def trial(order):
+        await budget.admit(order)
+        begun.append(order)
+
+    await trial(1)
+    waiting = [await soon(trial(order)) for order in (4, 3, 2)]
+    for order in (1, 2, 3):
+        budget.leave(order)
+        await asyncio.sleep(0.01)
+    await asyncio.gather(*waiting)
+    assert begun == [1, 2, 3, 4]
+
+
+async def test_without_money_for_a_whole_trial_the_first_one_alone_begins(ledger):
+    budget = Budget(ledger, 3.0, each(4.0))
+    await budget.admit(1)  # or it would never be known that a trial costs less
+    other = await soon(budget.admit(2))
+    assert not other.done()
+    await attempt(budget, 1, 1.0, 1.0)
+    budget.leave(1)
+    with pytest.raises(TrialSuspended, match=r"a whole trial may cost 4\.00 USD"):
+        await other
+
+
+async def test_a_trial_that_ends_without_asking_leaves_the_first_that_asks_its_turn(ledger):
+    budget = Budget(ledger, 3.0, each(4.0))
+    await budget.admit(1)
+    budget.leave(1)  # its replies were all recorded
+    await budget.admit(2)
+
+
+async def test_a_begun_trial_is_paid_before_another_begins(ledger):
+    budget = Budget(ledger, 5.0, each(4.0))
+    await budget.admit(1)
+    other = await soon(set_aside(budget, 2, 2.0))  # 4 of 5 USD are the first trial's
+    assert not other.done()
+    await attempt(budget, 1, 4.0, 4.0)
+    budget.leave(1)
+    with pytest.raises(TrialSuspended):
+        await other
+
+
+async def test_a_trial_that_needs_more_than_its_allowance_is_suspended_at_the_cap(ledger):
+    budget = Budget(ledger, 4.0, each(3.0))
+    for _ in range(4):
+        await attempt(budget, 1, 1.0, 1.0)
+    with pytest.raises(TrialSuspended):
+        await attempt(budget, 1, 1.0, 1.0)
+
+
+async def test_without_a_cap_everything_passes_and_is_recorded(ledger):
+    budget = Budget(ledger)
+    for trial in range(3):
+        await attempt(budget, trial, 10.0**9, 10.0**6)
+    assert ledger.read().spent_usd == 3 * 10.0**6
+
+
+async def test_a_call_that_goes_on_after_its_trial_gets_no_money(ledger):
+    budget = Budget(ledger, 5.0, each(4.0))
+    await budget.admit(1)
+    budget.leave(1)
+    with pytest.raises(TrialSuspended):
+        await budget.admit(1)
+    await asyncio.wait_for(budget.admit(2), 1)
+
+
+async def test_a_damaged_record_of_spending_is_told_and_not_believed(tmp_path):
+    cache = ResponseCache(tmp_path)
+    await attempt(Budget(Ledger(cache, "s")), 1, 0.5, 0.25)
+    cache.close()
+    (tmp_path / "ledger.db").write_bytes(b"no database" * 1_000)
+    with pytest.raises(UsageError, match="so that no cap could hold"):
+        Ledger(cache, "s").read()
+
+
+@pytest.mark.parametrize("usd", [-9.0, -math.inf])
+async def test_spending_that_nobody_can_have_spent_is_not_believed(ledger, cache, usd):
+    await attempt(Budget(ledger), 1, 0.5, 0.25)
+    cache.money.run_now([lambda: cache.money.write("UPDATE spent SET usd = ?", usd)])
+    with pytest.raises(UsageError, match="so that no cap could hold"):
+        ledger.read()
+    cache.money.run_now([lambda: cache.money.write("DELETE FROM spent")])
+
+
+O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
+
+
+async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
+    for key, outcome in (("a", "timeout"), ("b", "timeout"), ("c", "server_error")):
+        ledger.reserve(key, 1, 0.25, None, O3)
+        await ledger.settle(key, *tried(None, outcome), O3.driver)
+    ledger.reserve("d", 1, 0.125, None, O3)
+    ledger.reserve("paid", 1, 0.25, None, O3)
+    await ledger.settle("paid", *tried(0.1), O3.driver)
+    reasons = ledger.reasons()
+    assert [(r["outcome"], r["attempts"], r["usd"]) for r in reasons] == [
+        ("timeout", 2, 0.5),
+        ("server_error", 1, 0.25),
+        ("in flight", 1, 0.125),
+    ]
+    assert sum(r["usd"] for r in reasons) == pytest.approx(ledger.read().reserved_usd)
+    assert {(r["driver"], r["slot"]) for r in reasons} == {(O3.driver, O3.slot)}
+    assert reasons[0]["first"] <= reasons[0]["last"]
+
+
+async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
+    for number, outcome in enumerate(("timeout", "connection_lost", "bad_body"), 1):
+        ledger.reserve("key", number, 0.25, None, O3)
+        actual = 0.0 if outcome == "connection_lost" else None
+        last = Attempt(number, outcome, cost_usd=actual)
+        await ledger.settle("key", last, O3.driver)
+    assert {r["outcome"]: r["attempts"] for r in ledger.reasons()} == {"timeout": 1, "bad_body": 1}
+
+
+async def test_what_is_released_counts_no_longer(ledger, cache):
+    await attempt(Budget(ledger, 1.0), 1, 0.75, None)
+    with pytest.raises(TrialSuspended):
+        await set_aside(Budget(ledger, 1.0), 1, 0.5)
+    ledger.release()
+    again = Ledger(cache, ledger.scope)
+    assert (again.spending.committed_usd, again.reasons()) == (0, [])
+    await set_aside(Budget(again, 1.0), 1, 0.5)
+
+
+async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledger, tmp_path):
+    cache = ResponseCache(tmp_path)
+    task = Ledger(cache, "task")
+    for key in ("a", "b"):
+        task.reserve(key, 1, 0.25, None, O3)
+    await task.settle("a", *tried(0.5), O3.driver)
+    ledger.reserve("task 1", 1, 2.0, None, O3)
+    ledger.settle_share("task 1", *task.rows())
+    assert ledger.read() == task.read()
+    assert (ledger.spending.spent_usd, ledger.spending.reserved_usd) == (0.5, 0.25)
+    assert ledger.spending.overruns[O3.driver] == 2
+    cache.close()
+
+
+async def test_an_answer_that_was_kept_right_before_a_kill_is_settled_by_the_next_run(
+    ledger, cache
+):
+    slot = Slot("N_0_0", 1, "left", 0, 0)
+    request = make_request(
+        provider="openai", endpoint="e", model="m", path="/p", headers={}, body={}, slot=slot
+    )
+    for key in (request.key, "another"):
+        ledger.reserve(key, 1, 0.25, None, O3)
+    await cache.put(CachedCall(request, (Attempt(1, "ok", 200, cost_usd=0.125, reply="{}"),)))
+    ledger.settle_kept({"another driver"})
+    assert ledger.read().spent_usd == 0
+    ledger.settle_kept({O3.driver})
+    spending = ledger.read()
+    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.125, 0.25, 1)
+
+
+async def test_nobody_reads_the_ledger_s_file_before_its_tables_are_there(tmp_path):
+    cache = ResponseCache(tmp_path)
+    ledger = Ledger(cache, "sweep")
+    reserving = asyncio.create_task(asyncio.to_thread(ledger.reserve, "key", 1, 0.25, None, O3))
+    while not reserving.done():
+        ledger.read()
+        await asyncio.sleep(0)
+    assert ledger.read().reserved_usd == 0.25
+    cache.close()
+
+
+@pytest.mark.parametrize("after", ["", "COMMIT;"])
+async def test_a_kill_while_the_ledger_s_file_is_made_is_recovered_from(tmp_path, after):
+    made, killed = tmp_path / "made", tmp_path / "killed"
+    made.mkdir()
+    opened = sqlite3.connect(made / FILE, isolation_level=None)
+    with contextlib.closing(opened), contextlib.closing(ResponseCache(killed)) as cache:
+        opened.execute("PRAGMA cache_size = 1")  # pages go to the file before the end
+        tables, commit, _ = TABLES.partition("COMMIT;")
+        opened.executescript(tables + (after and f"{commit} BEGIN; DELETE FROM spent;"))
+        rows = ((f"a study {number}", "m", 0, 0, 0) for number in range(1_000))
+        opened.executemany("INSERT INTO spent VALUES (?, ?, ?, ?, ?)", rows)
+        for file in made.iterdir():
+            shutil.copy(file, killed)
+        assert {FILE, f"{FILE}-journal"} <= {file.name for file in killed.iterdir()}
+        assert (killed / FILE).stat().st_size
+        ledger = Ledger(cache, "a study")
+        assert scopes(cache) == []
+        assert ledger.read() == Spending()
+        assert await ledger.begin("key", 1, 2.0, None, asked(2.0))
+        assert ledger.read().committed_usd == 2.0
+
+
+def test_a_ledger_that_cannot_be_written_is_no_damaged_one(tmp_path):
+    cache = ResponseCache(tmp_path)
+    ledger = Ledger(cache, "sweep")
+    ledger.reserve("key", 1, 0.25, None, O3)
+    cache.money.write("PRAGMA max_page_count = 1")
+
+    def fill():
+        for number in range(1_000):
+            ledger.reserve(f"key {number}", 1, 0.25, None, O3)
+
+    with pytest.raises(CacheFailed, match="cannot be written: database or disk is full"):
+        fill()
+    cache.close()
+
+
+async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_aside(ledger, cache):
+    budget = Budget(ledger, 10.0)
+    with contextlib.closing(await budget.set_aside(1, "key", O3)) as paid:
+        await paid.begin([])
+        await paid.settle(tried(0.75))
+    assert (ledger.spending.spent_usd, ledger.spending.overrun_usd) == (0.75, 0.5)
+    assert ledger.spending.dearest == "o3 at gateway up to 3.00 times as much"
+    next_run = Budget(Ledger(cache, ledger.scope), 10.0)
+    assert (await set_aside(next_run, 2, 0.25, "another driver")).aside_usd == 0.25
+    with contextlib.closing(await next_run.set_aside(1, "other", O3)) as paid:
+        assert paid.aside_usd == 0.75
+        await paid.begin([])
+        # A reply within what is now set aside does not count as another overrun of it.
+        await paid.settle(tried(0.5))
+    assert ledger.spending.overruns[O3.driver] == 3
+
+
+async def test_several_are_in_flight_only_while_twice_their_worst_cases_fit(ledger):
+    budget = Budget(ledger, 1.0)
+    paid = await set_aside(budget, 1, 0.25)
+    await set_aside(budget, 2, 0.25)  # 2 x 0.5 fit
+    third = await soon(set_aside(budget, 3, 0.25))
+    assert not third.done()
+    paid.close()
+    await third
+    third.result()
+
+
+async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):
+    budget = Budget(ledger, 5.0, each(2.0))
+    await attempt(budget, 1, 1.0, 0.5)
+    await attempt(budget, 1, 0.5, None)
+    await budget.admit(2)
+    with pytest.raises(TrialSuspended) as caught:
+        await set_aside(budget, 1, 5.0)
+    assert str(caught.value) == (
+        "the next call may cost 5.0000 USD, and 1.0000 of 5 USD are spent or set aside (0.5000 "
+        "spent, 0.5000 set aside for 1 attempts whose cost is not known: `merge-runner ledger`); "
+        "3.0000 more are kept for the trials that have begun"
+    )
+
+
+ENDS = {
+    "cancelled before it was sent": (False, [], asyncio.CancelledError, (1.0, 0.0, 0.0)),
+    "refused before it was sent": (False, [], UsageError, (1.0, 0.0, 0.0)),
+    "dropped in flight": (True, [], asyncio.CancelledError, (0.5, 0.5, 0.0)),
+    "of unknown cost": (True, tried(None), TrialSuspended, (0.5, 0.5, 0.0)),
+    "free": (True, tried(0.0), TrialSuspended, (1.0, 0.0, 0.0)),
+    "charged": (True, tried(0.25), TrialSuspended, (0.75, 0.0, 0.25)),
+}
+
+
+@pytest.mark.parametrize(("begun", "attempts", "error", "money"), ENDS.values(), ids=list(ENDS))
+async def test_however_an_attempt_ends_its_money_ends_in_the_right_place(
+    ledger, begun, attempts, error, money
+):
+    """``money``: what is allowed to the trial, set aside for ever, and spent."""
+    budget = Budget(ledger, 1.0, each(1.0))
+    await budget.admit(1)
+
+    async def ended():
+        with contextlib.closing(await budget.set_aside(1, "key", asked(0.5))) as paid:
+            if begun:
+                await paid.begin([])
+            if attempts:
+                await paid.settle(attempts)
+            raise error("whatever")
+
+    with pytest.raises(error):
+        await ended()
+    spending = budget.ledger.read()
+    allowed_usd = budget.trial_usd(1) - budget._charged_usd[1]
+    assert (allowed_usd, spending.reserved_usd, spending.spent_usd) == money
+    assert (budget.in_flight, budget.queued_usd) == (0, 0)

@@ -1,0 +1,308 @@
+import asyncio
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.errors import UsageError
+from merge_runner.llm.limiter import Limiter, Pause
+from tests.support.virtual_time import in_virtual_time, now_s
+
+MINUTE = 60.0
+
+
+class Queue:
+    """Asks a limiter for turns and notes who was served when."""
+
+    def __init__(self, limiter):
+        self.limiter = limiter
+        self.tasks = []
+        self.names = []
+        self.times = []
+        self.tokens = []
+
+    def ask(self, name="", tokens=0, order=0):
+        task = asyncio.create_task(self._ask(name, tokens, order))
+        self.tasks.append(task)
+        return task
+
+    async def _ask(self, name, tokens, order):
+        settle = await self.limiter.acquire(tokens, order=order)
+        self.names.append(name)
+        self.times.append(now_s())
+        self.tokens.append(tokens)
+        return settle
+
+    async def settled(self):
+        """Let everybody run who can without time passing."""
+        for _ in range(20):
+            await asyncio.sleep(0)
+
+    async def all_served(self):
+        await asyncio.gather(*self.tasks)
+
+
+def fullest_window(times, weights, length=MINUTE):
+    """The largest total weight in any window of this length, up to the rounding of its edges."""
+    largest = total = first = 0
+    for time, weight in zip(times, weights, strict=True):
+        total += weight
+        while times[first] <= time - length + 1e-9:
+            total -= weights[first]
+            first += 1
+        largest = max(largest, total)
+    return largest
+
+
+@in_virtual_time
+async def test_no_limits_pass_everybody_at_once():
+    queue = Queue(Limiter())
+    for number in range(50):
+        queue.ask(number, tokens=10**9)
+    await queue.all_served()
+    assert queue.names == list(range(50))
+    assert set(queue.times) == {0.0}
+
+
+@pytest.mark.parametrize("limits", [{}, {"rpm": 600}, {"tpm": 100}], ids=str)
+@in_virtual_time
+async def test_the_lowest_order_goes_first_and_within_it_the_first_come(limits):
+    limiter = Limiter(**limits)
+    limiter.pause(1)
+    queue = Queue(limiter)
+    orders = [number % 5 for number in range(200)]
+    random.Random(1).shuffle(orders)
+    for arrival, order in enumerate(orders):
+        queue.ask((order, arrival), tokens=1, order=order)
+    await queue.all_served()
+    assert queue.names == sorted(queue.names)
+
+
+@in_virtual_time
+async def test_a_late_arrival_of_an_older_trial_goes_first():
+    queue = Queue(Limiter(rpm=1))
+    for name in ("first", "second", "third"):
+        queue.ask(name, order=5)
+    await asyncio.sleep(1)
+    queue.ask("oldest", order=1)
+    await queue.all_served()
+    assert queue.names == ["first", "oldest", "second", "third"]
+
+
+@pytest.mark.parametrize("rpm", [1, 7, 50, 245, 500])
+@in_virtual_time
+async def test_no_window_holds_more_requests_than_the_limit(rpm):
+    queue = Queue(Limiter(rpm=rpm))
+    for number in range(int(rpm * 1.1) + 2):
+        queue.ask(number)
+    await queue.all_served()
+    assert fullest_window(queue.times, [1] * len(queue.times)) <= rpm
+
+
+@pytest.mark.parametrize("rpm", [60, 500])
+@in_virtual_time
+async def test_requests_flow_evenly_and_not_a_window_at_once(rpm):
+    queue = Queue(Limiter(rpm=rpm))
+    for number in range(rpm // 3):
+        queue.ask(number)
+    await queue.all_served()
+    assert fullest_window(queue.times, [1] * len(queue.times), length=1.0) <= 2 * rpm / 60
+
+
+@in_virtual_time
+async def test_an_idle_limiter_saves_up_no_requests():
+    queue = Queue(Limiter(rpm=10))
+    queue.ask()
+    await queue.all_served()
+    await asyncio.sleep(10 * MINUTE)
+    for _ in range(30):
+        queue.ask()
+    await queue.all_served()
+    assert fullest_window(queue.times, [1] * 31) <= 10
+
+
+@in_virtual_time
+async def test_a_turn_that_a_pause_holds_up_is_not_one_too_many_after_it():
+    limiter = Limiter(rpm=4)
+    queue = Queue(limiter)
+    queue.ask()
+    await queue.settled()
+    for _ in range(8):
+        queue.ask()
+    await asyncio.sleep(5)
+    limiter.pause(30)
+    await queue.all_served()
+    assert fullest_window(queue.times, [1] * 9) <= 4
+
+
+@in_virtual_time
+async def test_short_windows_work_alike():
+    queue = Queue(Limiter(rpm=20, tpm=100, window_s=0.3))
+    for _ in range(50):
+        queue.ask(tokens=7)
+    await queue.all_served()
+    assert fullest_window(queue.times, [1] * 50, 0.3) <= 20
+    assert fullest_window(queue.times, queue.tokens, 0.3) <= 100
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 100), st.integers(0, 3), st.integers(0, 30)), max_size=30))
+@in_virtual_time
+async def test_no_window_holds_more_tokens_than_the_limit(asked):
+    queue = Queue(Limiter(tpm=100))
+    for number, (tokens, order, pause) in enumerate(asked):
+        queue.ask(number, tokens, order)
+        await asyncio.sleep(pause)
+    await queue.all_served()
+    assert len(queue.names) == len(asked)
+    assert fullest_window(queue.times, queue.tokens) <= 100
+
+
+@in_virtual_time
+async def test_tokens_come_back_after_a_window():
+    queue = Queue(Limiter(tpm=100))
+    for _ in range(4):
+        queue.ask(tokens=50)
+    await queue.all_served()
+    assert queue.times == [0, 0, MINUTE, MINUTE]
+
+
+@in_virtual_time
+async def test_a_heavy_request_at_the_head_is_not_overtaken():
+    queue = Queue(Limiter(tpm=100))
+    for name, tokens in [("filling", 60), ("heavy", 100), ("light", 1), ("lighter", 0)]:
+        queue.ask(name, tokens)
+    await queue.settled()
+    assert queue.names == ["filling"]
+    await queue.all_served()
+    assert queue.names == ["filling", "heavy", "light", "lighter"]
+
+
+@in_virtual_time
+async def test_settling_lower_frees_tokens_for_those_who_wait():
+    queue = Queue(Limiter(tpm=100))
+    settle = await queue.ask("first", 90)
+    waiting = queue.ask("second", 50)
+    await queue.settled()
+    assert not waiting.done()
+    settle(50)
+    await queue.all_served()
+    assert queue.times == [0, 0]
+
+
+@in_virtual_time
+async def test_settling_higher_holds_others_back():
+    queue = Queue(Limiter(tpm=100))
+    settle = await queue.ask("first", 10)
+    settle(80)
+    queue.ask("second", 50)
+    await queue.all_served()
+    assert queue.times == [0, MINUTE]
+
+
+@in_virtual_time
+async def test_settling_after_the_window_changes_nothing():
+    queue = Queue(Limiter(tpm=100))
+    settle = await queue.ask("first", 50)
+    await asyncio.sleep(MINUTE)
+    await queue.ask("second", 50)
+    settle(0)
+    settle(100)
+    queue.ask("third", 50)
+    queue.ask("fourth", 1)
+    await queue.all_served()
+    assert queue.times == [0, MINUTE, MINUTE, 2 * MINUTE]
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100), st.integers(0, 90)), max_size=20)
+)
+@in_virtual_time
+async def test_settled_tokens_are_what_counts(asked):
+    """With every request settled at once, the actual tokens alone fill the window."""
+    queue = Queue(Limiter(tpm=100))
+    times, actual = [], []
+    for estimate, share, pause in asked:
+        settle = await queue.ask(tokens=estimate)
+        used = estimate * share // 100
+        settle(used)
+        times.append(now_s())
+        actual.append(used)
+        await asyncio.sleep(pause)
+    assert fullest_window(times, actual) <= 100
+
+
+@in_virtual_time
+async def test_who_has_given_up_is_skipped_and_takes_no_place():
+    queue = Queue(Limiter(rpm=1))
+    tasks = [queue.ask(number) for number in range(5)]
+    await queue.settled()
+    for number in (1, 3):
+        tasks[number].cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    assert queue.names == [0, 2, 4]
+    assert queue.times[-1] < 2.1 * MINUTE
+
+
+@in_virtual_time
+async def test_who_has_given_up_holds_back_nobody_with_its_tokens():
+    queue = Queue(Limiter(tpm=100))
+    queue.ask("first", 90)
+    heavy = queue.ask("heavy", 50)
+    light = queue.ask("light", 10)
+    await asyncio.sleep(1)
+    heavy.cancel()
+    await light
+    assert queue.times == [0, 1]
+
+
+@in_virtual_time
+async def test_a_pause_holds_everybody():
+    limiter = Limiter()
+    queue = Queue(limiter)
+    limiter.pause(30)
+    queue.ask(0)
+    await asyncio.sleep(10)
+    queue.ask(1)
+    await queue.all_served()
+    assert queue.times == [30, 30]
+
+
+@in_virtual_time
+async def test_a_shorter_pause_does_not_end_a_longer_one():
+    limiter = Limiter()
+    limiter.pause(30)
+    limiter.pause(5)
+    queue = Queue(limiter)
+    queue.ask()
+    await asyncio.sleep(20)
+    limiter.pause(20)
+    await queue.all_served()
+    assert queue.times == [40]
+
+
+@in_virtual_time
+async def test_a_pause_is_shared_by_all_limiters_of_one_key():
+    shared = Pause()
+    one, other, stranger = (
+        Queue(Limiter(pause=shared)),
+        Queue(Limiter(pause=shared)),
+        Queue(Limiter()),
+    )
+    one.limiter.pause(30)
+    for queue in (one, other, stranger):
+        queue.ask()
+        await queue.settled()
+    for queue in (one, other, stranger):
+        await queue.all_served()
+    assert [queue.times for queue in (one, other, stranger)] == [[30], [30], [0]]
+
+
+@in_virtual_time
+async def test_a_request_above_the_token_limit_is_refused_with_advice():
+    limiter = Limiter(tpm=100)
+    with pytest.raises(UsageError, match=r"101 tokens.*100 tokens.*--tpm"):
+        await limiter.acquire(101)
+    await limiter.acquire(100)

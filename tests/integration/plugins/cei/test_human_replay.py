@@ -1,0 +1,244 @@
+"""Imported human trials that are driven again: what they were, to the last digit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import duckdb
+import pytest
+from starlette.testclient import TestClient
+
+from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.errors import UsageError
+from merge_runner.records import SIDES
+from merge_runner.results.store import Store, query
+from merge_runner.run.plan import make_plan
+from merge_runner.run.stored_replay import audit_database
+from merge_runner.trial import play_trial
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.site import Site
+from merge_runner_analysis.human.load import import_trials, sort_files
+from merge_runner_cei.human_replay import HUMAN_REPLAY
+from tests.support.recordings import drive, file
+
+HUMAN = '\nrepetitions = 1\nconditions = ["L_4_0"]\n[scenario]\nresistance = "human"\n'
+FILES = {
+    "experiment_4_iter_1.csv": drive("L_4_0"),
+    "experiment_4_iter_2.csv": drive("L_4_0", yields="nobody"),
+    "experiment_5_iter_1.csv": drive("L_4_0", yields="left"),
+    "experiment_5_iter_2.csv": drive("R_-4_0", yields="left"),
+}
+
+
+@pytest.fixture
+def db(tmp_path):
+    """A database with four human trials, one of which collided."""
+    path = tmp_path / "results/merge.duckdb"
+    download = sort_files(file(name, trial.csv()) for name, trial in FILES.items())
+    assert import_trials(download, Store(path)).added == 4
+    return path
+
+
+@pytest.fixture
+def plan_of(tmp_path, db):
+    def plan(models, text=HUMAN, db=db, **asked):
+        (tmp_path / "mine.toml").write_text(text)
+        return make_plan(str(tmp_path / "mine.toml"), models, db=db, **asked)
+
+    return plan
+
+
+async def played(plan, number=0):
+    spec, (arm, *_), programs = plan.trial_specs()[number], plan.arms, plan.parts.programs
+    drivers = {side: programs[arm.sides[side]].make(arm.scenario, spec, side) for side in SIDES}
+    return await play_trial(spec, arm.scenario, drivers)
+
+
+def humans_of(plan):
+    return plan.parts.programs[HUMAN_REPLAY].data
+
+
+def recorded(db, trial_id):
+    """Positions and speeds of a human trial by time and side, from the start of control on."""
+    sql = f"SELECT time_s, side, position_m, velocity_mps FROM states WHERE trial_id = '{trial_id}'"
+    return {(t, side): each for t, side, *each in query(db, f"{sql} AND step >= 0")[1]}
+
+
+def driven(trial, sides=SIDES):
+    return {
+        (row.time_s, row.side): [row.position_m, row.velocity_mps]
+        for row in trial.states
+        if row.side in sides
+    }
+
+
+@pytest.mark.parametrize("resistance", ["human", "none"])
+async def test_two_replayed_sides_of_a_trial_are_the_trial(db, plan_of, resistance):
+    trial = await played(plan_of(HUMAN_REPLAY, HUMAN.replace('"human"', f'"{resistance}"')))
+    wanted = recorded(db, "human/pair1/L_4_0/iter001")
+    found = driven(trial)
+    assert found.keys() == wanted.keys()
+    assert all(found[at] == pytest.approx(wanted[at], abs=1e-6) for at in wanted)
+    assert (trial.status, trial.merged_first) == ("finished", "left")
+
+
+async def test_a_replayed_human_declares_no_chance_and_is_the_same_with_any_seed(plan_of):
+    one, other = [await played(plan_of(HUMAN_REPLAY, sample_set=n)) for n in (0, 1)]
+    assert one.states == other.states
+    assert not PROGRAMS[HUMAN_REPLAY].chance
+
+
+@pytest.mark.parametrize("side", SIDES)
+async def test_a_replayed_human_keeps_its_trace_beside_a_free_driver(db, plan_of, side):
+    pair = f"{HUMAN_REPLAY}+idm" if side == "left" else f"idm+{HUMAN_REPLAY}"
+    trial = await played(plan_of(pair))
+    wanted, found = recorded(db, "human/pair1/L_4_0/iter001"), driven(trial, (side,))
+    shared = wanted.keys() & found.keys()
+    assert len(shared) > 100
+    assert all(found[at] == pytest.approx(wanted[at], abs=1e-6) for at in shared)
+    # The free one starts where that human's partner did.
+    other = next(each for each in SIDES if each != side)
+    assert driven(trial, (other,))[0, other] == wanted[0, other]
+
+
+BLURRED = """
+[factors]
+perception = ["blurred"]
+[perception.blurred]
+speed_sd_mps = 0.5
+own = true
+"""
+
+
+async def test_a_human_who_is_told_a_wrong_own_speed_keeps_its_trace(db, plan_of):
+    trial = await played(plan_of(HUMAN_REPLAY, HUMAN + BLURRED))
+    wanted, found = recorded(db, "human/pair1/L_4_0/iter001"), driven(trial)
+    assert found.keys() == wanted.keys()
+    assert all(found[at] == pytest.approx(wanted[at], abs=1e-6) for at in wanted)
+
+
+async def test_the_pairs_take_turns_and_a_trial_that_collided_is_left_out(db, plan_of):
+    plan = plan_of(HUMAN_REPLAY, repetitions=2)
+    second = await played(plan, 1)
+    wanted = recorded(db, "human/pair2/L_4_0/iter001")
+    assert driven(second)[0.0, "left"] == wanted[0.0, "left"]
+    assert second.merged_first == "right"
+    with pytest.raises(UsageError, match="has 2 trials of L_4_0 to replay, and 3 repetitions"):
+        plan_of(HUMAN_REPLAY, repetitions=3)
+
+
+async def test_a_human_keeps_its_speed_once_its_trace_has_ended(plan_of):
+    text = HUMAN + '[drivers.weak]\nprogram = "idm"\ndesired_speed_factor = 0.5\n'
+    plan = plan_of("weak+human-replay", text)
+    trial = await played(plan)
+    traced = humans_of(plan).trials[0].speeds_mps["right"]
+    after = [row for row in trial.states if row.side == "right"][len(traced) :]
+    assert len(after) > 20
+    assert {round(row.velocity_mps, 6) for row in after} == {round(traced[-1], 6)}
+
+
+def test_the_trials_that_are_replayed_determine_the_spec(db, plan_of):
+    before = plan_of(HUMAN_REPLAY).trial_specs()[0].spec_hash
+    more = sort_files([file("experiment_6_iter_1.csv", drive("L_4_0").csv())])
+    import_trials(more, Store(db))
+    assert plan_of(HUMAN_REPLAY).trial_specs()[0].spec_hash != before
+
+
+async def test_another_database_that_is_read_meanwhile_changes_no_trial_of_a_plan(
+    db, plan_of, tmp_path
+):
+    plan = plan_of(HUMAN_REPLAY)
+    hashes, wanted = plan.specs().keys(), await played(plan)
+    other = tmp_path / "other.duckdb"
+    trials = sort_files([file("experiment_6_iter_1.csv", drive("L_4_0", yields="left").csv())])
+    import_trials(trials, Store(other))
+    second = plan_of(HUMAN_REPLAY, db=other)
+    assert (await played(plan)).states == wanted.states != (await played(second)).states
+    assert plan.specs().keys() == hashes != second.specs().keys()
+
+
+async def test_a_study_names_the_pair(db, plan_of):
+    text = HUMAN + '[drivers.second]\nprogram = "human-replay"\npair = "pair2"\n'
+    plan = plan_of("second", text)
+    assert (await played(plan)).merged_first == "right"
+    assert json.loads(plan.spec(plan.arms[0], "L_4_0"))["left"]["based_on"] == HUMAN_REPLAY
+    for text_, said in (
+        (
+            text.replace("pair2", "pair7"),
+            "unknown pair of human-replay 'pair7'; valid: all, pair1, pair2",
+        ),
+        (text + "clock = 1.0\n", "takes no clock"),
+        (text + "[factors]\nstep_s = [0.025]\n", "needs a world of step_s = 0.05"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            plan_of("second", text_)
+
+
+def test_a_trial_that_was_imported_in_two_ways_is_replayed_once(db, plan_of):
+    once = humans_of(plan_of(HUMAN_REPLAY)).trials
+    with duckdb.connect(str(db)) as connection:
+        for table in ("trials", "states"):
+            connection.execute(
+                f"INSERT INTO {table} SELECT * REPLACE ('another' AS spec_hash) FROM {table}"
+            )
+    assert humans_of(plan_of(HUMAN_REPLAY)).trials == once
+
+
+def test_without_an_import_it_says_what_to_type(tmp_path, plan_of):
+    with pytest.raises(UsageError, match=r"holds none: merge-runner human import PATH"):
+        plan_of(HUMAN_REPLAY, db=tmp_path / "other.duckdb")
+
+
+def test_what_a_vehicle_cannot_do_is_not_replayed(db, plan_of):
+    plan = plan_of(HUMAN_REPLAY)
+    humans, config = humans_of(plan), plan.arms[0].scenario
+    weak = config.model_copy(update={"max_acceleration_mps2": 1.0})
+    assert humans.usable(config, "L_4_0", "all")
+    assert not humans.usable(weak, "L_4_0", "all")
+    (first, *_), before = humans.trials, humans.digest
+    humans.keep((replace(first, pair="pair9"), *humans.trials[1:]))
+    assert humans.digest != before
+
+
+async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
+    merge_runner, tmp_path, db
+):
+    (tmp_path / "mine.toml").write_text(HUMAN)
+    command = ("mine.toml", "--model", "human-replay+idm", "--json")
+    assert (await merge_runner("sweep", *command)).summary["exit_code"] == 0
+    (first, *_) = audit_database(db)
+    assert not first.findings
+    assert not [note for note in first.notes if "not replayed" in note]
+    tables = await merge_runner("tables", "ablation-quantitative")
+    cautioned = "human-replay+idm: the human on the left is replayed and does not react"
+    assert cautioned in " ".join(tables.out.split())
+    explored = TestClient(explorer(Site(db)), base_url="http://127.0.0.1:1")
+    said = "the human on the left is replayed and does not react"
+    assert explored.get("/trials").text.count(said) == 1, "of five trials one"
+    assert f",{said}," in explored.get("/trials.csv").text
+    page = explored.get("/trials/human-replay+idm/baseline/L_4_0/rep01").text
+    assert f"Note: {said}." in page
+    assert "baseline: no prompt, since only programs drive." in page
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("DELETE FROM trials WHERE source = 'human'")
+    (first, *_) = audit_database(db)
+    assert [note for note in first.notes if "other data: left.data" in note]
+
+
+async def test_a_replay_needs_the_same_import_and_says_so(merge_runner, tmp_path, db):
+    (tmp_path / "mine.toml").write_text(HUMAN)
+    command = ("mine.toml", "--model", "human-replay+idm", "--json")
+    again = await merge_runner("replay", *command)
+    assert again.summary["trials"] == {**again.summary["trials"], "failed": 0}
+    elsewhere = await merge_runner("replay", *command, "--db", "none.duckdb")
+    assert elsewhere.code == 2
+    assert "merge-runner human import PATH" in elsewhere.err
+
+
+async def test_imported_humans_are_asked_what_they_do_first(merge_runner, db, tmp_path):
+    (tmp_path / "mine.toml").write_text(HUMAN)
+    ask = ("mine.toml", "--model", "human-replay+idm", "--reps", 1, "--conditions", "L_4_0")
+    run = await merge_runner("sweep", *ask, "--first", "--json")
+    assert run.code == 0, run.err
+    assert {look["model"] for look in run.summary["first_looks"]} == {"human-replay", "idm"}

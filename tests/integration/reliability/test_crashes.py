@@ -1,0 +1,121 @@
+"""kill -9 at any instant: what was answered is used, and the end is that of a quiet run."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import random
+import signal
+import sqlite3
+
+import pytest
+
+from merge_runner.records import SLOT_HEADER
+from merge_runner.results.store import results_digest
+from tests.support.harness import watched
+from tests.support.mock_server import FaultPlan
+
+SWEEP = ("sweep", "baseline", "--reps", 2, "--in-flight", 8, "--json")
+KILLS = 20
+
+
+class Slots:
+    """What the server was asked, and what it answered, in their order."""
+
+    def __init__(self):
+        self.asked = []
+        self.something = asyncio.Event()
+
+    async def middle(self, request, handler):
+        slot = request.headers[SLOT_HEADER]
+        self.asked.append(slot)
+        self.something.set()
+        return await handler(request)
+
+    async def until(self, requests):
+        while len(self.asked) < requests:
+            self.something.clear()
+            await self.something.wait()
+
+
+def kept(folder):
+    """The slots with a durable reply."""
+    with contextlib.closing(sqlite3.connect(f"file:{folder}/cache.db?mode=ro", uri=True)) as cache:
+        rows = cache.execute("SELECT value FROM Cache WHERE length(key) = 64").fetchall()
+    entries = [json.loads(text[text.index("{") :])["entry"] for (text,) in rows]
+    return {
+        json.dumps(entry["request"]["slot"], sort_keys=True, separators=(",", ":"))
+        for entry in entries
+    }
+
+
+@pytest.mark.slow
+async def test_a_sweep_that_is_killed_at_20_instants_asks_nothing_answered_again(
+    merge_runner, tmp_path
+):
+    chance = random.Random(4)
+    slots = Slots()
+    killed = 0
+    again = []  # how many slots each run asked again
+    durable = []  # after each kill: the requests up to then, and the slots with a reply on disk
+    async with watched(slots.middle, FaultPlan(latency_s=0.02)) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        for _ in range(KILLS):
+            process = await merge_runner.start(*SWEEP, **env)
+            before, seen = len(slots.asked), set(slots.asked)
+            # Some die while they open the files, most of them in the midst of calls.
+            asked = asyncio.create_task(slots.until(before + chance.randrange(30)))
+            ended = asyncio.create_task(process.wait())
+            await asyncio.wait([asked, ended], return_when=asyncio.FIRST_COMPLETED)
+            asked.cancel()
+            await asyncio.sleep(chance.uniform(0, 0.05))
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            killed += await ended == -signal.SIGKILL
+            again.append(len(seen.intersection(slots.asked[before:])))
+            durable.append((len(slots.asked), kept(tmp_path / "cache/responses")))
+        last = await merge_runner(*SWEEP, **env)
+    assert killed == KILLS
+    assert last.code == 0, last.err
+    for position, answered in durable:
+        assert answered.isdisjoint(slots.asked[position:]), "an answered call was made again"
+    # Both drivers of at most eight trials are in flight when the process dies.
+    assert max(again) <= 16
+    used = last.summary["calls"]["live"] + last.summary["calls"]["cached"]
+    assert used <= len(set(slots.asked)) < len(slots.asked)
+    quiet = await merge_runner(*SWEEP, "--db", "quiet", "--cache", "new")
+    assert quiet.code == 0, quiet.err
+    digest = results_digest(tmp_path / "results/merge.duckdb")
+    assert digest == results_digest(tmp_path / "quiet")
+    assert digest[1] == 22
+
+
+@pytest.mark.long
+async def test_attempts_of_a_run_that_died_are_found_in_the_next_one(merge_runner):
+    async def middle(request, handler):
+        if "L_4_0" in request.headers.get(SLOT_HEADER, "") and not release.is_set():
+            hanging.set()
+            await release.wait()
+        return await handler(request)
+
+    hanging, release = asyncio.Event(), asyncio.Event()
+    sweep = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
+    async with watched(middle, FaultPlan(rates={"server_error": 0.3}, seed=3)) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await merge_runner.start(*sweep, **env)
+        await hanging.wait()
+        process.terminate()
+        release.set()
+        await process.wait()
+        done = await merge_runner(*sweep, **env)
+    assert done.code == 0, done.err
+    attempts = await merge_runner(
+        "sql",
+        "select count(*) as n, count(distinct (side, decision, attempt)) as distinct_n, "
+        "count(*) filter (fate = 'retried') as retried from attempts",
+        "--format", "json",
+    )  # fmt: skip
+    (told,) = json.loads(attempts.out)
+    assert told["n"] == told["distinct_n"] == server.requests
+    assert told["retried"] > 0

@@ -1,0 +1,108 @@
+"""Databases that lie elsewhere, hold more or less than ours, or cannot take what is written."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+
+import duckdb
+import psutil
+import pytest
+
+from merge_runner.errors import UsageError
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.results.recording import export_recording
+from merge_runner.run.stored_replay import audit_database
+from tests.support.harness import PROGRAM
+from tests.support.studies import write_study, yielding
+
+
+@pytest.fixture
+def db(tmp_path):
+    (tmp_path / "real").mkdir()
+    return write_study(tmp_path / "real" / "m.duckdb", yielding("m", reps=1))
+
+
+@pytest.mark.slow
+async def test_a_link_to_a_database_is_read_as_it_is(merge_runner, db, tmp_path):
+    (tmp_path / "link.duckdb").symlink_to(db)
+    for command in (("digest",), ("tables", "who-first"), ("sql", "from sweeps")):
+        run = await merge_runner(*command, "--db", "link.duckdb")
+        assert run.code == 0, run.err
+
+
+async def test_a_table_that_is_not_there_is_told_in_one_line(merge_runner, db):
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("ALTER TABLE states RENAME TO others")
+    for command in (("digest",), ("tables", "gap"), ("audit",)):
+        run = await merge_runner(*command, "--db", db)
+        assert run.code == 2, command
+        (line,) = run.err.splitlines()
+        assert "Table with name states does not exist" in line
+
+
+@pytest.mark.slow
+async def test_a_name_of_another_kind_of_database_is_that_of_a_file(merge_runner, tmp_path):
+    sweep = ("baseline", "--model", "constant", "--reps", 1, "--conditions", "N_0_0")
+    for name in ("md:x", ":memory:"):
+        run = await merge_runner("sweep", *sweep, "--db", name)
+        assert run.code == 0, run.err
+        assert (tmp_path / name).is_file()
+
+
+async def test_ctrl_c_within_a_query_ends_it_in_one_line(merge_runner, db):
+    endless = "SELECT count(*) FROM range(1000000) AS a, range(1000000) AS b WHERE a > b"
+    process = await merge_runner.start("sql", endless, "--db", db)
+    while psutil.Process(process.pid).cpu_times().user < 1:  # more than it takes to begin
+        await asyncio.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, err = await process.communicate()
+    assert (process.returncode, "Traceback" in err.decode()) == (130, False), err
+
+
+def test_an_output_that_cannot_be_written_is_one_line(db):
+    with open("/dev/full", "w") as full:
+        run = subprocess.run(
+            [PROGRAM, "sql", "FROM sweeps", "--db", str(db)],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert run.returncode == 1
+    assert run.stderr == "error: the output cannot be written: No space left on device\n"
+
+
+async def test_a_pipe_is_no_database(merge_runner, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    run = await merge_runner("replay", "baseline", "--db", "pipe")
+    assert run.code == 2
+    assert "pipe is not a file" in run.err
+
+
+def test_a_position_that_is_no_number_is_a_finding(db):
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("UPDATE states SET position_m = 'nan' WHERE step > 20")
+    kinds = {finding.kind for audit in audit_database(db) for finding in audit.findings}
+    assert {"gap", "outcome"} & kinds
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("report", "--out"), ("view", "--trials", "*", "--single")],
+    ids=" ".join,
+)
+async def test_nothing_is_written_over_what_is_of_another_kind(merge_runner, db, command):
+    before = db.read_bytes()
+    run = await merge_runner(*command, db, "--db", db)
+    assert run.code == 2
+    assert f"{db} is there, and is no" in run.err
+    assert db.read_bytes() == before
+
+
+def test_a_recording_is_written_over_nothing_but_a_recording(tmp_path):
+    cache = ResponseCache(tmp_path / "c")
+    for _ in range(2):
+        export_recording(tmp_path / "r.parquet", cache, [], {})
+    with pytest.raises(UsageError, match="is there, and is no recording"):
+        export_recording(tmp_path / "c/cache.db", cache, [], {})
+    cache.close()

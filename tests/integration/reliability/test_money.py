@@ -1,0 +1,329 @@
+"""What is spent is known and bounded, over all runs of a sweep, also where a process dies."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import shutil
+
+import pytest
+from aiohttp import web
+
+from tests.support.harness import FAST, PROJECT, as_a_model, watched
+
+pytestmark = pytest.mark.slow
+
+SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
+# o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and none can
+# cost more than 3.4 USD (2 x 12 prompts to the timeout, 16,000 tokens of output each).
+SHORT = "[repetitions]\nbaseline = 18\n[scenario]\ntimeout_s = 12\n"
+ROOM_FOR_SOME = 3.9
+
+
+@pytest.fixture(autouse=True)
+def experiments(tmp_path):
+    """Trials that end after 12 s at the latest."""
+    folder = tmp_path / "experiments"
+    shutil.copytree(PROJECT / "experiments", folder)
+    (folder / "baseline.toml").write_text(SHORT)
+    return folder
+
+
+def account(server):
+    return {
+        "OPENAI_API_KEY": "a-dummy-key",
+        "OPENAI_BASE_URL": f"{server.url}/v1",
+    }
+
+
+class Bill:
+    """What the server charges: the price of every answer that it counts."""
+
+    def __init__(self):
+        self.usd = 0.0
+
+    async def middle(self, request, handler):
+        reply = await handler(request)
+        usage = json.loads(reply.body)["usage"]
+        self.usd += (2 * usage["prompt_tokens"] + 8 * usage["completion_tokens"]) / 1e6
+        return reply
+
+
+async def sql(merge_runner, query):
+    return json.loads((await merge_runner("sql", query, "--format", "json")).out)
+
+
+async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner):
+    bill = Bill()
+    async with watched(bill.middle) as server:
+        env = account(server)
+        sweep = (*SWEEP, "--reps", 18, "--yes", *FAST)
+        run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)
+        assert run.code == 3, run.err
+        assert 0 < bill.usd <= ROOM_FOR_SOME
+        assert run.summary["cost_usd"] == pytest.approx(bill.usd)
+        assert run.summary["trials"]["suspended"] > 0
+        assert f"{bill.usd:.2f} of {ROOM_FOR_SOME} over all runs" in run.err.splitlines()[-2]
+        assert "raise --max-cost, or the study's budget, and run the same command" in run.err
+        # What is finished is balanced: no condition is far ahead of another one.
+        counts = await sql(
+            merge_runner, "select condition, count(*) as n from trials group by all order by n"
+        )
+        assert len(counts) == 3
+        assert counts[-1]["n"] - counts[0]["n"] <= 2
+        spent = bill.usd
+        # The same cap again: nothing is left to begin a trial with.
+        again = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **env)
+        assert (again.code, bill.usd) == (3, spent)
+        assert again.summary["sweep_cost_usd"] == pytest.approx(spent)
+        done = await merge_runner(*sweep, "--max-cost", 50, **env)
+        assert done.code == 0, done.err
+        (calls,) = await sql(merge_runner, "select count(*) as n from calls")
+        assert calls["n"] == server.requests, "nothing was paid for twice"
+        caps = await sql(
+            merge_runner,
+            "select (config->>'max_cost_usd')::double as cap from sweeps order by started_at",
+        )
+        assert [row["cap"] for row in caps] == [ROOM_FOR_SOME, ROOM_FOR_SOME, 50]
+    assert done.summary["sweep_cost_usd"] == pytest.approx(bill.usd)
+    assert done.summary["set_aside_usd"] == 0
+    (costs,) = await sql(merge_runner, "select sum(cost_usd) as usd from trial_costs")
+    assert costs["usd"] == pytest.approx(bill.usd)
+    (whole,) = await sql(
+        merge_runner, "select cost_usd as usd from sweep_costs order by sweep_id desc limit 1"
+    )
+    assert whole["usd"] == pytest.approx(bill.usd)
+
+
+async def test_one_cap_holds_over_several_sweeps(merge_runner, experiments):
+    (experiments / "baseline.toml").write_text(SHORT.replace("18", "2"))
+    (experiments / "other.toml").write_text(SHORT.replace("baseline", "A1"))
+    bill = Bill()
+    async with watched(bill.middle) as server:
+        sweep = ("sweep", "baseline", "other", *SWEEP[2:], "--yes", *FAST)
+        run = await merge_runner(*sweep, "--max-cost", ROOM_FOR_SOME, **account(server))
+    first, other = (json.loads(line) for line in run.out.splitlines())
+    assert (run.code, first["trials"]["suspended"]) == (3, 0), run.err
+    assert other["trials"]["suspended"] > 0
+    assert other["sweep_cost_usd"] < bill.usd <= ROOM_FOR_SOME
+    assert "USD of baseline/o3/set0 count against the budget, too" in run.err
+
+
+@pytest.mark.long
+async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(merge_runner):
+    numbers = itertools.count()
+
+    async def middle(request, handler):
+        number = next(numbers)
+        reply = await handler(request)
+        body = json.loads(reply.body)
+        # Every answer costs as much as it can, and every third one is cut, at an unknown cost.
+        body["usage"]["completion_tokens"] = 16_000
+        if number % 3 == 2:
+            raise web.HTTPOk(text='{"cut')
+        return web.json_response(body)
+
+    async with watched(middle) as server:
+        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
+        env = account(server)
+        run = await merge_runner(*sweep, "--max-cost", 3.35, **env)
+        assert run.code == 3, run.err
+        assert run.summary["trials"]["suspended"] == 1
+        assert run.summary["sweep_cost_usd"] + run.summary["set_aside_usd"] <= 3.35
+        assert run.summary["set_aside_usd"] > 0.1
+        first = server.requests
+        assert first > 15
+        done = await merge_runner(*sweep, "--max-cost", 30, **env)
+    assert done.code == 0, done.err
+    assert done.summary["calls"]["cached"] >= first - run.summary["attempts_of_unknown_cost"] - 1
+
+
+async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(merge_runner):
+    async def middle(request, handler):
+        if 1 < server.requests <= 4:  # the first one goes alone
+            if server.requests == 4:
+                arrived.set()
+            await asyncio.Event().wait()
+        return await handler(request)
+
+    arrived = asyncio.Event()
+    sweep = (*SWEEP, "--reps", 2, "--conditions", "L_4_0", "--yes", *FAST)
+    async with watched(middle) as server:
+        env = account(server)
+        process = await merge_runner.start(*sweep, **env)
+        await arrived.wait()
+        process.kill()
+        await process.wait()
+        run = await merge_runner(*sweep, **env)
+    assert run.code == 0, run.err
+    assert run.summary["attempts_of_unknown_cost"] == 3
+    assert 0.38 < run.summary["set_aside_usd"] < 0.45
+    fates = await sql(
+        merge_runner,
+        "select outcome, fate, cached, count(*) as n from attempts where outcome = 'unknown' "
+        "group by all",
+    )
+    assert fates == [{"outcome": "unknown", "fate": "retried", "cached": True, "n": 3}]
+
+
+async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner):
+    async with watched(as_a_model, honest=False) as server:
+        env = account(server)
+        sweep = (*SWEEP, "--reps", 1, *FAST)
+        assert not (await merge_runner(*sweep, "--dry-run", **env)).summary["measured"]
+        first = await merge_runner(*sweep, "--yes", **env)
+        more = (*SWEEP, "--reps", 2, *FAST)
+        dry = (await merge_runner(*more, "--dry-run", **env)).summary
+        assert dry["trials"] == 3
+        assert dry["calls"] == 3 * 21
+        assert dry["measured"]
+        per_call = first.summary["cost_usd"] / first.summary["calls"]["live"]
+        assert dry["cost_usd"] == pytest.approx(dry["calls"] * per_call, rel=0.02)
+        second = await merge_runner(*more, "--yes", **env)
+        assert second.summary["calls"]["live"] == server.requests - first.summary["calls"]["live"]
+        assert second.summary["estimate"]["calls"] == dry["calls"]
+        words = [word for word in SWEEP if word != "--json"]
+        one = ("--conditions", "L_4_0", "--reps", 3)
+        text = await merge_runner(*words, *one, "--yes", *FAST, **env)
+        assert "estimated before: " in text.out
+        replay = await merge_runner("replay", *SWEEP[1:], "--reps", 2, "--db", "other", **env)
+    assert replay.summary["cost_usd"] == 0
+    assert replay.summary["calls"]["live"] == 0
+    (paid,) = await sql(merge_runner, "select sum(paid_usd) as usd from trial_costs")
+    assert paid["usd"] > 0
+    other = await merge_runner("sql", "select sum(paid_usd) from trial_costs", "--db", "other")
+    assert other.out.split()[-1] == "0.0"
+
+
+async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, experiments):
+    (experiments / "models.toml").write_text(
+        '[mine]\nprovider = "openai"\nformat = "openai-chat"\nid = "nobody-knows"\n'
+        "max_output_tokens = 1000\n"
+    )
+    async with watched() as server:
+        env = account(server)
+        sweep = ("sweep", "baseline", "--model", "mine", "--conditions", "L_4_0", "--json", *FAST)
+        asked = await merge_runner(*sweep, **env)
+        assert asked.code == 2
+        assert "an unknown price" in asked.err
+        assert "--yes" in asked.err
+        capped = await merge_runner(*sweep, "--yes", "--max-cost", 1, **env)
+        assert capped.code == 2
+        assert "--max-cost cannot hold" in capped.err
+        assert server.requests == 0
+        run = await merge_runner(*sweep, "--yes", **env)
+    assert run.code == 0, run.err
+    assert run.summary["calls_of_unknown_cost"] == server.requests
+
+
+async def test_runs_of_two_models_under_one_cap_never_pass_it_and_both_end(
+    merge_runner, experiments
+):
+    (experiments / "baseline.toml").write_text(f"[budget]\ntotal_usd = 7\n{SHORT}")
+    with (experiments / "models.toml").open("a") as registry:
+        registry.write(
+            '[twin]\nprovider = "openai"\nformat = "openai-chat"\nid = "o3-twin"\n'
+            'max_output_tokens = 16000\nprice = { input = 2.0, output = 8.0, source = "here" }\n'
+        )
+    bill = Bill()
+    async with watched(bill.middle) as server:
+        env = account(server)
+        sweep = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--reps", 3, "--yes")
+        runs = await asyncio.gather(
+            *(merge_runner(*sweep, *FAST, "--model", model, **env) for model in ("o3", "twin"))
+        )
+    assert {run.code for run in runs} <= {0, 3}, [run.err for run in runs]
+    assert 0 < bill.usd <= 7
+    (calls,) = await sql(merge_runner, "select count(distinct call_key) as n from calls")
+    assert calls["n"] <= server.requests
+
+
+async def test_a_gateways_error_may_be_charged_whatever_its_form(merge_runner, experiments):
+    async def middle(request, handler):
+        if server.requests % 2:
+            return web.Response(status=502, text="<html>502 Bad Gateway</html>")
+        return web.json_response({"error": {"message": "Overloaded."}}, status=503)
+
+    (experiments / "models.toml").write_text(
+        '[brief]\nprovider = "openai"\nformat = "openai-chat"\nid = "o3"\ndeadline_s = 2\n'
+        "max_output_tokens = 16000\n"
+    )
+    async with watched(middle) as server:
+        run = await merge_runner(
+            "sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--model", "brief",
+            "--yes", "--json", **account(server),
+        )  # fmt: skip
+    assert run.code == 1
+    attempts = run.summary["attempts"]
+    assert attempts["server_error"] > 0 < attempts["overloaded"]
+    unknown = attempts["server_error"] + attempts["overloaded"]
+    assert run.summary["attempts_of_unknown_cost"] == unknown
+    assert run.summary["set_aside_usd"] == pytest.approx(0.137 * unknown, rel=0.1)
+
+
+async def test_a_dry_run_makes_no_file(merge_runner, tmp_path):
+    before = sorted(path.name for path in tmp_path.rglob("*"))
+    assert (await merge_runner(*SWEEP, "--dry-run")).code == 0
+    assert sorted(path.name for path in tmp_path.rglob("*")) == before
+
+
+@pytest.mark.long
+async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(merge_runner):
+    async def middle(request, handler):
+        if server.requests in (3, 5):
+            return web.Response(status=502, text="<html>502 Bad Gateway</html>")
+        return await handler(request)
+
+    async with watched(middle) as server:
+        env = account(server)
+        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
+        assert (await merge_runner(*sweep, **env)).code == 0
+    told = await merge_runner("ledger")
+    driver = f"o3 at {server.url.removeprefix('http://')}"
+    assert "\nbaseline/o3/set0  0." in told.out
+    assert f"\nbaseline/o3/set0  {driver}  server_error  2         0." in told.out
+    assert "  L_4_0 rep 1 " in told.out
+    (account_before,) = json.loads((await merge_runner("ledger", "--json")).out)
+    assert account_before["open_attempts"] == account_before["reasons"][0]["attempts"] == 2
+    asked = await merge_runner("ledger", "--release", "baseline/o3/set0")
+    assert asked.code == 2
+    assert "--max-cost may be passed by as much" in asked.err
+    assert "add --yes" in asked.err
+    unknown = await merge_runner("ledger", "--release", "other/o3/set0", "--yes")
+    assert (unknown.code, "valid: baseline/o3/set0" in unknown.err) == (2, True)
+    released = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes", "--json")
+    (after,) = json.loads(released.out)
+    assert (after["reserved_usd"], after["open_attempts"]) == (0, 0)
+    assert after["spent_usd"] == account_before["spent_usd"]
+    shown = await merge_runner("ledger")
+    assert "server_error" not in shown.out
+
+
+async def test_nothing_is_released_while_another_run_asks(merge_runner):
+    async def middle(request, handler):
+        if server.requests > 1:
+            arrived.set()
+            await asyncio.Event().wait()
+        return await handler(request)
+
+    arrived = asyncio.Event()
+    async with watched(middle) as server:
+        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
+        process = await merge_runner.start(*sweep, **account(server))
+        await arrived.wait()
+        told = await merge_runner("ledger")
+        refused = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes")
+        process.kill()
+        await process.wait()
+    assert "  in flight  1  " in told.out
+    assert refused.code == 2
+    assert "another merge-runner works with" in refused.err
+    done = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes")
+    assert (done.code, "in flight" in done.out) == (0, False)
+
+
+async def test_a_folder_without_a_cache_has_no_ledger(merge_runner, tmp_path):
+    run = await merge_runner("ledger", "--cache", tmp_path / "none")
+    assert (run.code, "there is no cache" in run.err) == (2, True)
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,357 @@
+"""A provider that is down, another model behind a name, and waits that are told."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from unittest.mock import ANY
+
+import pytest
+from aiohttp import web
+
+from merge_runner.records import SLOT_HEADER
+from tests.support.harness import FAST, watched
+
+pytestmark = pytest.mark.slow
+
+MODELS = """
+[patient]
+provider = "emulator"
+format = "openai-chat"
+id = "scripted-driver"
+max_output_tokens = 2000
+price = "free"
+timeout_s = 2
+deadline_s = {deadline_s}
+"""
+
+
+def configured(folder, deadline_s):
+    """A copy of the baseline sweep with a model that is given up soon."""
+    (folder / "experiments").mkdir(exist_ok=True)
+    (folder / "experiments/models.toml").write_text(MODELS.format(deadline_s=deadline_s))
+    (folder / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 10\n")
+    return ("sweep", "baseline", "--model", "patient", "--json")
+
+
+class Service:
+    """Answers while it works, and one call more: a run's first one, which goes alone."""
+
+    def __init__(self, *, working):
+        self.working = working
+        self.one_more = True
+
+    async def middle(self, request, handler):
+        if self.working or self.one_more:
+            self.one_more = self.working
+            return await handler(request)
+        return down(request)
+
+
+def down(request):
+    return web.json_response({"error": {"message": "The engine is down."}}, status=503)
+
+
+async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tmp_path):
+    async def middle(request, handler):
+        slot = json.loads(request.headers[SLOT_HEADER])
+        broken = slot["condition"] == "L_4_8" and slot["side"] == "left" and slot["decision"] == 2
+        return down(request) if broken and not mended else await handler(request)
+
+    mended = False
+    sweep = configured(tmp_path, deadline_s=1.2)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, **env)
+        assert run.code == 1
+        assert run.summary["trials"]["finished"] == 10
+        ((trial, error),) = run.summary["failed"].items()
+        assert trial == "patient/baseline/L_4_8/rep01"
+        assert "no answer within 1 s (HTTP 503: The engine is down.), 2 attempts" in error
+        before = server.requests
+        mended = True
+        again = await merge_runner(*sweep, "--reps", 1, **env)
+        assert again.code == 0, again.err
+    # The attempts in vain are not forgotten, and what had been answered was not asked again.
+    told = await merge_runner(
+        "sql",
+        "select fate, count(*) as n from attempts where outcome = 'overloaded' group by all",
+        "--format", "json",
+    )  # fmt: skip
+    assert json.loads(told.out) == [{"fate": "retried", "n": 2}]
+    assert server.requests - before < 20
+    assert again.summary["trials"]["stored_before"] == 10
+
+
+async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_path):
+    service = Service(working=False)
+    sweep = (*configured(tmp_path, deadline_s=0.6), "--reps", 3)
+    async with watched(service.middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--in-flight", 4, **env)
+        assert run.code == 1, run.err
+        assert (
+            "the last 10 trials with patient failed and no call was answered in between" in run.err
+        )
+        assert "run the same command to go on" in run.err
+        assert run.summary["trials"]["failed"] <= 14
+        # Two sides of at most 14 of 33 trials, with two or three attempts each.
+        assert server.requests <= 2 * 14 * 3
+        service.working = True
+        configured(tmp_path, deadline_s=60)
+        again = await merge_runner(*sweep, "--in-flight", 20, **env)
+    assert again.code == 0, again.err
+    assert again.summary["trials"]["finished"] + again.summary["trials"]["collided"] == 33
+
+
+STREAM = ('data: {"choices": [{"delta": {"content": "M"}}]}\n\ndata: [DONE]\n', "text/event-stream")
+DAY = {
+    "message": "Rate limit exceeded: free-models-per-day",
+    "code": 429,
+    "metadata": {"headers": {"X-RateLimit-Remaining": "0", "X-RateLimit-Reset": "1999999999000"}},
+}
+USED_UP = "You have reached your specified API usage limits. You will regain access on 2027-01-01."
+
+
+def as_reply(body, status=200):
+    """A reply of JSON, or of a text and its type."""
+    if isinstance(body, tuple):
+        return web.Response(text=body[0], content_type=body[1], status=status)
+    return web.json_response(body, status=status)
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "code", "words"),
+    [
+        (200, STREAM, 2, ["events (SSE)", 'charset=utf-8: data: {"choices"']),
+        (
+            200,
+            ("<html>Welcome</html>", "text/html"),
+            2,
+            ["is a web page", "charset=utf-8: <html>W"],
+        ),
+        (200, {"status": "up"}, 2, ["does not speak openai-chat", '{"status": "up"}']),
+        (200, {"error": "Unexpected endpoint."}, 2, ["EMULATOR_BASE_URL", "Unexpected endpoint."]),
+        (200, {"error": DAY}, 3, ["free-models-per-day", "again at 2033-05-18 03:33 UTC"]),
+        (429, {"error": DAY}, 3, ["free-models-per-day", "again at 2033-05-18 03:33 UTC"]),
+        (400, {"error": {"message": USED_UP, "type": "x"}}, 3, [USED_UP]),
+        (200, {"base_resp": {"status_code": 1008, "status_msg": "no money"}}, 3, ["no money"]),
+    ],
+    ids=["SSE", "page", "JSON", "LM Studio", "day in a 200", "day", "usage limits", "MiniMax"],
+)
+async def test_what_no_call_would_fare_better_with_ends_the_run_at_its_first_call(
+    merge_runner, tmp_path, status, body, code, words
+):
+    async def middle(request, handler):
+        return as_reply(body, status)
+
+    sweep = configured(tmp_path, deadline_s=600)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, **env)
+    assert run.code == code, run.err
+    last = run.err.splitlines()[-1]
+    assert all(each in last for each in words), last
+    assert run.summary["trials"]["failed"] == 0
+    assert server.requests <= 3
+
+
+async def test_a_quota_that_is_used_up_in_the_midst_fails_no_trial(merge_runner, tmp_path):
+    async def middle(request, handler):
+        if server.requests > 5:
+            return as_reply({"error": {"message": USED_UP, "type": "invalid_request_error"}}, 400)
+        return await handler(request)
+
+    sweep = configured(tmp_path, deadline_s=600)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, **env)
+    assert run.code == 3, run.err
+    assert USED_UP in run.err
+    assert run.summary["trials"]["failed"] == 0
+
+
+async def test_errors_within_a_200_and_odd_bodies_in_the_midst_of_a_run_cost_no_trial(
+    merge_runner, tmp_path
+):
+    odd = [
+        {"error": {"type": "overloaded_error", "message": "Overloaded"}},
+        {"error": {"type": "api_error", "message": "m"}},
+        {"error": {"message": "m", "code": 529}},
+        {"error": "Model unloaded."},
+        STREAM,
+        {"status": "up"},
+    ]
+
+    async def middle(request, handler):
+        if server.requests > 3 and odd and server.requests % 3 == 0:
+            return as_reply(odd.pop())
+        return await handler(request)
+
+    sweep = configured(tmp_path, deadline_s=600)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, "--conditions", "L_4_8,N_0_0", **env)
+    assert run.code == 0, run.err
+    assert not odd
+
+
+async def test_nobody_listens(merge_runner, tmp_path):
+    sweep = configured(tmp_path, deadline_s=0.6)
+    run = await merge_runner(*sweep, EMULATOR_BASE_URL="http://127.0.0.1:9/v1")
+    assert run.code == 1
+    assert "Traceback" not in run.err
+    assert "the first call of this run: no answer within 1 s" in run.err
+    assert run.summary["attempts"].keys() == {"no_connection"}
+    assert run.summary["trials"]["failed"] == 0
+
+
+@pytest.mark.long
+async def test_waits_are_told(merge_runner, tmp_path):
+    async def middle(request, handler):
+        if server.requests > 1:
+            return await handler(request)
+        return web.json_response(
+            {"error": {"message": "Slow down."}}, status=429, headers={"retry-after": "7"}
+        )
+
+    sweep = configured(tmp_path, deadline_s=60)
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--reps", 1, "--conditions", "L_4_8", **env)
+    assert run.code == 0
+    told = [text for text in run.err.splitlines() if "UTC" in text]
+    assert any(
+        "L_4_8 rep 1" in text and "decision 0 waits until" in text and "HTTP 429" in text
+        for text in told
+    )
+    assert any("waiting: " in text for text in run.err.splitlines())
+
+
+async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
+    async def middle(request, handler):
+        reply = await handler(request)
+        body = json.loads(reply.body)
+        if server.requests > 5:
+            body["model"] = "o3-mini"
+        return web.json_response(body)
+
+    sweep = ("sweep", "baseline", "--reps", 2, "--model", "o3", "--yes", "--json", *FAST)
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--in-flight", 2, "--strict-model", **env)
+        assert run.code == 1
+        assert "o3-mini answered where o3-2025-04-16 was asked for" in run.err
+        stopped_at = server.requests
+        assert stopped_at < 20
+        # Its replies are kept: the same command stops at once, and without the option it goes on.
+        again = await merge_runner(*sweep, "--strict-model", "--in-flight", 2, **env)
+        assert again.code == 1
+        loose = await merge_runner(*sweep, "--conditions", "L_4_0", **env)
+        assert loose.code == 0
+    assert loose.summary["model_mismatches"]
+
+
+async def test_one_dead_model_of_a_pair_stops_the_sweep(merge_runner, tmp_path):
+    dead_service = Service(working=False)
+
+    async def middle(request, handler):
+        dead = (await request.json())["model"] == "dead"
+        return await (dead_service.middle(request, handler) if dead else handler(request))
+
+    configured(tmp_path, deadline_s=0.6)
+    dead = MODELS.format(deadline_s=0.6).replace("[patient]", "[bad]")
+    registry = tmp_path / "experiments/models.toml"
+    registry.write_text(registry.read_text() + dead.replace("scripted-driver", "dead"))
+    async with watched(middle) as server:
+        run = await merge_runner(
+            "sweep", "baseline", "--model", "patient+bad", "--in-flight", 4, "--json",
+            EMULATOR_BASE_URL=f"{server.url}/v1",
+        )  # fmt: skip
+    assert run.code == 1
+    assert "the last 10 trials with bad failed" in run.err
+    assert run.summary["trials"]["failed"] <= 14
+
+
+async def test_recorded_trials_do_not_hide_an_outage(merge_runner, tmp_path):
+    service = Service(working=True)
+    sweep = configured(tmp_path, deadline_s=0.6)
+    async with watched(service.middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        part = ("--reps", 2, "--conditions", "L_4_0,L_4_8,N_0_0")
+        assert (await merge_runner(*sweep, *part, "--in-flight", 3, **env)).code == 0
+        service.working = False
+        run = await merge_runner(*sweep, "--reps", 4, "--in-flight", 3, "--db", "new", **env)
+    assert run.code == 1
+    assert "no call was answered in between" in run.err
+    assert run.summary["trials"]["failed"] <= 13
+    assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] <= 6
+
+
+def refused(status, message, **error):
+    return web.json_response({"error": {"message": message, **error}}, status=status)
+
+
+@pytest.mark.parametrize(
+    ("reply", "advice"),
+    [
+        (lambda: refused(401, "Incorrect API key", code="invalid_api_key"), "set OPENAI_API_KEY"),
+        (lambda: refused(404, "No such model", code="model_not_found"), "`merge-runner models`"),
+        (
+            lambda: refused(400, "Unsupported value", param="reasoning_effort"),
+            "look at [o3] in experiments/models.toml",
+        ),
+        (
+            lambda: web.Response(text="<!DOCTYPE html><p>Welcome!", content_type="text/html"),
+            "does not speak openai-chat: set OPENAI_BASE_URL",
+        ),
+        (
+            lambda: web.json_response({"status": "up"}),
+            "does not speak openai-chat: set OPENAI_BASE",
+        ),
+        (lambda: web.Response(status=405, text="Not allowed"), "set OPENAI_BASE_URL"),
+    ],
+)
+async def test_what_is_configured_wrongly_ends_the_run_at_its_first_call(
+    merge_runner, reply, advice
+):
+    async def middle(request, handler):
+        return reply()
+
+    sweep = ("sweep", "baseline", "--reps", 2, "--model", "o3", "--yes", "--json", *FAST)
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--max-cost", 20, **env)
+    assert (run.code, server.requests) == (2, 1), run.err
+    assert advice in run.summary["messages"][0]
+    assert run.summary["set_aside_usd"] == (0 if "does not speak" not in advice else ANY)
+    assert run.summary["trials"]["failed"] == 0
+
+
+@pytest.mark.long
+async def test_two_sweeps_on_one_key_go_on_after_the_servers_429(merge_runner):
+    times, refused = [], []
+
+    async def middle(request, handler):
+        now = time.monotonic()
+        if sum(now - at < 1 for at in times) >= 12:
+            refused.append(now)
+            limit = {"message": "Rate limit reached", "code": "rate_limit_exceeded"}
+            return web.json_response({"error": limit}, status=429, headers={"retry-after": "1"})
+        times.append(now)
+        return await handler(request)
+
+    sweep = ("sweep", "baseline", "--reps", 1, "--model", "o3", "--yes", "--json", "--rpm", 600)
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        runs = await asyncio.gather(
+            *(
+                merge_runner(*sweep, "--tpm", 10**9, "--conditions", name, "--cache", name,
+                             "--db", f"{name}.duckdb", **env)
+                for name in ("L_4_0", "N_0_0")
+            )
+        )  # fmt: skip
+    assert [run.code for run in runs] == [0, 0], [run.err for run in runs]
+    assert refused, "each keeps to a limit of its own"
+    assert sum(run.summary["calls"]["live"] for run in runs) == len(times)

@@ -1,0 +1,120 @@
+"""Two runs at once on one cache: two models share it, and one model is asked by one run."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+import pytest
+
+from merge_runner.errors import UsageError
+from merge_runner.llm.durable import ModelLocks
+from tests.support.harness import FAST, watched
+from tests.support.mock_server import FaultPlan
+
+pytestmark = pytest.mark.slow
+
+SWEEP = ("sweep", "baseline", "--reps", 1, "--yes", "--json", *FAST)
+O3 = "o3 at openai"
+
+
+def account(server):
+    """Where both the emulator and o3 are asked."""
+    return {
+        "EMULATOR_BASE_URL": f"{server.url}/v1",
+        "OPENAI_API_KEY": "a-dummy-key",
+        "OPENAI_BASE_URL": f"{server.url}/v1",
+    }
+
+
+def held_up():
+    """A middle that lets the first call through, and holds the others until it is released."""
+    arrived, released = asyncio.Event(), asyncio.Event()
+
+    async def middle(request, handler):
+        if arrived.is_set() and not released.is_set():
+            await released.wait()
+        arrived.set()
+        return await handler(request)
+
+    return middle, arrived, released
+
+
+@pytest.mark.long
+async def test_runs_of_two_models_share_a_cache_and_lose_no_row(merge_runner):
+    async with watched(faults=FaultPlan(latency_s=0.05)) as server:
+        env = account(server)
+        models = ("emulator", "o3")
+        runs = await asyncio.gather(*(merge_runner(*SWEEP, "--model", m, **env) for m in models))
+    assert [run.code for run in runs] == [0, 0], [run.err for run in runs]
+    assert sum(run.summary["calls"]["live"] for run in runs) == server.requests
+    counted = await merge_runner(
+        "sql",
+        "select count(*) as rows, count(distinct (trial_id, side, decision, attempt)) as calls, "
+        "(select count(*) from trials) as trials, "
+        "(select count(*) from sweep_trials) as linked from calls",
+        "--format", "json",
+    )  # fmt: skip
+    assert json.loads(counted.out) == [
+        {"rows": server.requests, "calls": server.requests, "trials": 22, "linked": 22}
+    ]
+
+
+async def test_a_second_live_run_of_a_model_names_the_first_and_asks_nothing(merge_runner):
+    middle, arrived, released = held_up()
+    async with watched(middle) as server:
+        env = account(server)
+        first = await merge_runner.start(*SWEEP, **env)
+        await arrived.wait()
+        second = await merge_runner(*SWEEP, "--reps", 2, "--db", "second.duckdb", **env)
+        dry = await merge_runner(*SWEEP, "--dry-run", **env)
+        replayed = await merge_runner("replay", "baseline", "--reps", 1, "--db", "r.duckdb", **env)
+        read = await merge_runner("ledger", **env)
+        released.set()
+        assert await first.wait() == 0
+        after = await merge_runner(*SWEEP, "--reps", 2, "--db", "second.duckdb", **env)
+        assert set(server.asked.values()) == {1}
+    (line,) = second.err.splitlines()[-1:]
+    assert (second.code, second.out) == (2, "")
+    assert f"another merge-runner (PID {first.pid} on " in line
+    assert "asks scripted-driver at emulator with the cache cache/responses" in line
+    assert (dry.code, read.code, after.code) == (0, 0, 0), (dry.err, read.err, after.err)
+    assert replayed.code == 4, "what is not recorded yet is no business of the first run"
+
+
+async def test_the_lock_of_a_run_that_is_killed_is_free(merge_runner):
+    middle, arrived, released = held_up()
+    async with watched(middle) as server:
+        env = account(server)
+        first = await merge_runner.start(*SWEEP, "--conditions", "L_4_8", **env)
+        await arrived.wait()
+        first.kill()
+        await first.wait()
+        released.set()
+        run = await merge_runner(*SWEEP, "--conditions", "L_4_8", **env)
+    assert run.code == 0, run.err
+    assert run.summary["trials"]["finished"] == 1
+
+
+def test_nothing_is_locked_while_another_run_asks_one_of_the_models(tmp_path):
+    one, other = ModelLocks(tmp_path), ModelLocks(tmp_path)
+    one.take([O3])
+    with pytest.raises(UsageError, match=O3):
+        other.take(["gemini-2.5-pro at gemini", O3])
+    one.take(["gemini-2.5-pro at gemini"])
+    one.close()
+    other.take([O3])
+
+
+def test_no_run_begins_while_all_are_locked_and_all_are_not_while_one_runs(tmp_path):
+    one, other = ModelLocks(tmp_path), ModelLocks(tmp_path)
+    one.take([O3])
+    assert not other.take_all()
+    one.close()
+    assert other.take_all()
+
+
+def test_a_folder_without_locks_is_refused_before_anything_is_asked(tmp_path):
+    (tmp_path / "live.lock").mkdir()
+    with pytest.raises(UsageError, match=r"live\.lock cannot be locked .*--cache"):
+        ModelLocks(tmp_path).take([O3])

@@ -1,0 +1,359 @@
+"""The results database: whole trials, one version, read-only queries, and patience with locks."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import duckdb
+import pytest
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.errors import StoreLocked, UsageError
+from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.results.database import Instance, open_database
+from merge_runner.results.store import Store, query, results_digest, sweep_facts
+from merge_runner.run.local_runner import Flusher
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.trial import play_trial
+from tests.support.harness import environment
+
+SCENARIO = ScenarioConfig()
+SWEEP = {"sweep_id": "s1", "name": "baseline", "started_at": datetime(2026, 1, 1)}  # noqa: DTZ001
+SWEEP |= {"config": "{}", "versions": "{}"}
+SPILL = """
+import os, stat, sys
+from merge_runner.results.database import SETTINGS, in_memory
+with in_memory({**SETTINGS, "memory_limit": "50MB"}) as connection:
+    [(folder,)] = connection.execute("SELECT current_setting('temp_directory')").fetchall()
+    connection.execute(
+        "CREATE TABLE long AS SELECT range AS n, md5(range::VARCHAR) AS text FROM range(3000000)"
+    )
+    assert os.listdir(folder), "nothing was spilled"
+    print(folder, os.getpid(), oct(stat.S_IMODE(os.stat(folder).st_mode)))
+"""
+LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True); input()"
+
+
+def spec(condition="L_4_0", repetition=1, spec_hash="h"):
+    trial_id = f"m/baseline/{condition}/rep{repetition:02d}"
+    return TrialSpec(
+        trial_id,
+        spec_hash,
+        "driver",
+        "m",
+        "m",
+        "baseline",
+        condition,
+        repetition,
+        0,
+        0,
+        kinematics=CONDITIONS[condition],
+    )
+
+
+def keyed(record: TrialRecord) -> dict:
+    return {(record.spec.trial_id, record.spec.spec_hash): record.spec}
+
+
+def played(condition="L_4_0", *, driver="projected-order", **of_spec) -> TrialRecord:
+    trial = spec(condition, **of_spec)
+    drivers = {side: PROGRAMS[driver].make(SCENARIO, trial, side) for side in ("left", "right")}
+    return asyncio.run(play_trial(trial, SCENARIO, drivers))
+
+
+def failed(record: TrialRecord) -> TrialRecord:
+    return TrialRecord(record.spec, "failed", None, 1.0, "it broke", record.states[:4], ())
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "deep/results.duckdb"
+
+
+@pytest.fixture
+def store(path):
+    made = Store(path)
+    made.begin_sweep(SWEEP, {"h": "{}"}, [])
+    return made
+
+
+def rows(path, sql):
+    return query(path, sql)[1]
+
+
+def test_a_trial_is_stored_whole_and_once(store, path):
+    record = played()
+    store.write("s1", [record], patience_s=1)
+    store.write("s1", [record], patience_s=1)
+    assert rows(path, "select count(*) from trials") == [(1,)]
+    assert rows(path, "select count(*) from states") == [(len(record.states),)]
+    assert rows(path, "select count(*), count_if(valid) from decisions") == [
+        (len(record.decisions), len(record.decisions))
+    ]
+    stored = rows(path, "select step, side, position_m, velocity_mps from states order by all")
+    assert stored == sorted((s.step, s.side, s.position_m, s.velocity_mps) for s in record.states)
+
+
+def test_a_failed_trial_is_replaced_and_an_ended_one_never(store, path):
+    record = played()
+    store.write("s1", [failed(record)], patience_s=1)
+    assert store.ended_trials(keyed(record)) == set()
+    assert sweep_facts(path, "s1")["failed"] == [("m/baseline/L_4_0/rep01", "it broke")]
+    store.write("s1", [record], patience_s=1)
+    assert store.write("s1", [failed(record)], patience_s=1) == {}
+    assert rows(path, "select status, error from trials") == [("finished", None)]
+    assert rows(path, "select count(*) from states") == [(len(record.states),)]
+
+
+def test_a_trial_that_ends_otherwise_than_the_stored_one_is_named_and_not_stored(store, path):
+    record = played()
+    assert store.write("s1", [record], patience_s=1) == {}
+    assert store.write("s1", [record], patience_s=1) == {}
+    other = replace(played("L_4_8"), spec=record.spec)
+    assert store.write("s1", [other], patience_s=1).keys() == {"m/baseline/L_4_0/rep01"}
+    plan = record.decisions[3].decision
+    swerve = replace(record.decisions[3], decision=replace(plan, applied=(0.5,) * 5))
+    decided = replace(record, decisions=(*record.decisions[:3], swerve, *record.decisions[4:]))
+    assert store.write("s1", [decided], patience_s=1) == {
+        "m/baseline/L_4_0/rep01": ["decisions.applied"]
+    }
+    assert rows(path, "select count(*) from states") == [(len(record.states),)]
+
+
+def test_two_specs_of_one_trial_stay_apart(store, path):
+    one, other = played(), played(spec_hash="g")
+    store.write("s1", [one, other], patience_s=1)
+    named = keyed(other) | {(one.spec.trial_id, "x"): one.spec}
+    assert store.ended_trials(named) == {(one.spec.trial_id, "g")}
+    assert results_digest(path)[1] == 2
+
+
+def test_the_digest_sees_every_result_and_no_order(tmp_path):
+    records = [played(c) for c in ("L_4_0", "N_0_0", "R_0_8")]
+
+    def digest(name, order):
+        store = Store(tmp_path / name)
+        store.begin_sweep(SWEEP, {}, [])
+        for record in order:
+            store.write("s1", [record], patience_s=1)
+        return results_digest(tmp_path / name)[0]
+
+    base = digest("a", records)
+    assert digest("b", records[::-1]) == base
+    for table, change in (
+        ("states", "velocity_mps = velocity_mps + 1e-15 * velocity_mps"),
+        ("trials", "merged_first = 'nobody'"),
+        ("decisions", "plan[1] = plan[1]"),
+    ):
+        name = f"changed-{table}"
+        digest(name, records)
+        with duckdb.connect(str(tmp_path / name)) as connection:
+            if table == "decisions":
+                connection.execute("UPDATE decisions SET applied = [0.125]")
+            else:
+                connection.execute(f"UPDATE {table} SET {change}")
+        assert results_digest(tmp_path / name)[0] != base, table
+
+
+def test_the_metrics_are_those_computed_by_hand(store, path):
+    record = played("L_4_-8")
+    store.write("s1", [record, played("N_0_0", driver="constant")], patience_s=1)
+    left = [s for s in record.states if s.side == "left"]
+    right = [s for s in record.states if s.side == "right"]
+    first = next(k for k in range(len(left)) if max(left[k].position_m, right[k].position_m) >= 100)
+    leader = left if left[first].position_m >= 100 else right
+    part = (100 - leader[first - 1].position_m) / (
+        leader[first].position_m - leader[first - 1].position_m
+    )
+
+    def at_merge(trace):
+        before, after = trace[first - 1].position_m, trace[first].position_m
+        return before + part * (after - before)
+
+    def rmse(trace, initial_mps):
+        squares = [(s.velocity_mps - initial_mps) ** 2 for s in trace[: first + 1]]
+        return math.sqrt(sum(squares) / len(squares))
+
+    expected = {
+        "gap_m": abs(at_merge(left) - at_merge(right)) - 4.5,
+        "rmse_left_mps": rmse(left, CONDITIONS["L_4_-8"].speeds_mps[0]),
+        "rmse_right_mps": rmse(right, CONDITIONS["L_4_-8"].speeds_mps[1]),
+        "time_to_merge_s": left[first - 1].time_s + part * 0.2,
+    }
+    columns = ", ".join(expected)
+    finished, collided = rows(path, f"select {columns} from trial_metrics order by trial_id")
+    assert finished == pytest.approx(tuple(expected.values()))
+    assert collided[:3] == (None, None, None), "a collided trial has no gap and no deviation"
+
+
+def test_a_name_means_another_file_in_another_folder(tmp_path, monkeypatch):
+    digests = []
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        Store(Path("merge.duckdb")).begin_sweep(SWEEP, {"h": "{}"}, [])
+        digests.append(results_digest(Path("merge.duckdb")))
+    assert digests[0] == digests[1]
+
+
+def test_a_changed_condition_needs_another_name(store, path):
+    record = played()
+    store.write("s1", [record], patience_s=1)
+    key = (record.spec.trial_id, record.spec.spec_hash)
+    assert store.ended_trials({key: record.spec}) == {key}
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE trials SET projected_headway_m = 3")
+    with pytest.raises(UsageError, match=r"is stored with a headway of 3 m .* a new name"):
+        store.ended_trials({key: record.spec})
+
+
+def test_a_query_changes_nothing_and_reads_no_file(store, path, tmp_path):
+    (tmp_path / "secret.csv").write_text("a\n1\n")
+    for sql in (
+        "delete from trials",
+        f"select * from '{tmp_path / 'secret.csv'}'",
+        f"copy trials to '{tmp_path / 'out.csv'}'",
+        "set enable_external_access = true",
+        "select nothing",
+    ):
+        with pytest.raises(UsageError):
+            query(path, sql)
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_another_program_s_database_and_a_broken_one_are_refused(tmp_path):
+    foreign = tmp_path / "foreign.duckdb"
+    with duckdb.connect(str(foreign)) as connection:
+        connection.execute("CREATE TABLE mine (a INTEGER)")
+    with pytest.raises(UsageError, match="not a database of merge-runner"):
+        Store(foreign)
+    broken = tmp_path / "broken.duckdb"
+    broken.write_bytes(b"not a database at all" * 1000)
+    with pytest.raises(UsageError, match="cannot be opened"):
+        Store(broken)
+
+
+def test_the_file_itself_says_what_its_columns_mean(store, path):
+    with duckdb.connect(str(path), read_only=True) as connection:
+        said = connection.execute(
+            "SELECT comment FROM duckdb_columns() WHERE (table_name, column_name) IN "
+            "(('trials', 'status'), ('trial_metrics', 'joint')) ORDER BY ALL"
+        ).fetchall()
+    assert said == [
+        ("finished, collided, timeout, failed",),
+        ("whether both are at least 0.5 m/s",),
+    ]
+
+
+@pytest.fixture
+def holder(path):
+    """Another process that holds the database until its standard input closes."""
+
+    def hold():
+        process = subprocess.Popen(
+            [sys.executable, "-c", LOCK, str(path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout.readline() == "held\n"
+        return process
+
+    return hold
+
+
+async def test_trials_wait_in_memory_while_the_database_is_locked(store, path, holder):
+    record = await asyncio.to_thread(played)
+    process = holder()
+    said = []
+    waiting = Flusher(store, "s1", said.append)
+    waiting.add(record)
+    closing = asyncio.create_task(waiting.close())
+    while not said:
+        await asyncio.sleep(0.05)
+    process.communicate("")
+    await closing
+    assert f"1 trials wait to be stored: {path} is held by python" in said[0]
+    assert f"(PID {process.pid}): close it there" in said[0]
+    assert rows(path, "select count(*) from trials") == [(1,)]
+
+
+def test_a_database_that_this_process_holds_itself_is_named_at_once(store, path, monkeypatch):
+    def sleep(_):
+        pytest.fail("it was waited for")
+
+    monkeypatch.setattr("merge_runner.results.database.time.sleep", sleep)
+    own = "is open in this process .* as by duckdb.connect: close that connection"
+    with duckdb.connect(path):
+        with pytest.raises(StoreLocked, match=own):
+            query(path, "SELECT 1")
+        with pytest.raises(StoreLocked, match=own):
+            store.write("s1", [])
+    assert rows(path, "select 1") == [(1,)]
+
+
+def test_a_database_that_we_hold_in_this_process_is_waited_for(store, path, monkeypatch):
+    waited = []
+    monkeypatch.setattr("merge_runner.results.database.time.sleep", waited.append)
+    opened = open_database(path, read_only=True, patience_s=1, instance=Instance())
+    with opened, pytest.raises(StoreLocked, match="held by another program"):
+        store.write("s1", [], patience_s=0.01)
+    assert waited
+
+
+def test_a_slow_query_draws_no_bar_on_the_output():
+    # DuckDB takes -c for a person at a prompt.
+    asked = (
+        "from merge_runner.results.database import in_memory; query = "
+        "\"SELECT current_setting('enable_progress_bar')\"; "
+        "print(in_memory({}).execute(query).fetchone())"
+    )
+    run = subprocess.run([sys.executable, "-c", asked], capture_output=True, check=True)
+    assert run.stdout == b"(False,)\n"
+
+
+@pytest.mark.slow
+def test_what_does_not_fit_into_memory_goes_to_a_private_folder_that_ends_with_the_process(
+    tmp_path,
+):
+    done = subprocess.run(
+        [sys.executable, "-c", SPILL],
+        env=environment(TMPDIR=str(tmp_path)),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    folder, pid, mode = done.stdout.split()
+    assert Path(folder).parent == tmp_path
+    assert pid not in folder
+    assert mode == "0o700"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_only_reads_does_not_open_the_file_for_writing(store, monkeypatch):
+    record = played()
+    store.write("s1", [record], patience_s=1)
+
+    def refuse(*_):
+        raise AssertionError("it is opened for writing")
+
+    monkeypatch.setattr("merge_runner.results.store.write_database", refuse)
+    assert store.ended_trials(keyed(record)) == set(keyed(record))
+    assert store.decisions_by_spec(["another"]) == []
+
+
+def test_an_instance_that_is_dropped_leaves_the_connections_of_others_open():
+    """Closing it would close those of other threads with it; it ends with the last of them."""
+    instance = Instance()
+    with instance.cursor() as of_another_thread:
+        instance.drop()
+        assert of_another_thread.execute("SELECT 1").fetchall() == [(1,)]
+    with instance.cursor() as again:
+        assert again.execute("SELECT 1").fetchall() == [(1,)]

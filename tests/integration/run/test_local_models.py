@@ -1,0 +1,193 @@
+"""A server of one's own: what it serves, and what is said where nobody listens."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+import duckdb
+import pytest
+from aiohttp import web
+
+from merge_runner.errors import UsageError
+from merge_runner.llm.models import load_models
+from merge_runner.run.sweep import _served_name
+from tests.support.gate import HANGS_S
+from tests.support.harness import watched
+from tests.support.virtual_time import in_virtual_time
+
+ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0", "--json")
+LOCAL = (*ONE, "--model", "local")
+NAMED = (*ONE, "--model", "named")
+REGISTRY = """
+[local]
+provider = "local"
+format = "openai-chat"
+max_output_tokens = 4000
+price = "free"
+
+[named]
+provider = "local"
+format = "openai-chat"
+id = "qwen3"
+max_output_tokens = 4000
+price = "free"
+"""
+# Nothing listens at this port, which is one of the system's.
+DEAD = "http://127.0.0.1:9/v1"
+
+
+def serving(*names, status=200):
+    """A middleware: the server lists these models."""
+    body = {"object": "list", "data": [{"id": name, "object": "model"} for name in names]}
+
+    async def middle(request, handler):
+        if request.path == "/v1/models":
+            return web.json_response(body, status=status)
+        return await handler(request)
+
+    return middle
+
+
+@pytest.fixture
+def registry(tmp_path):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/models.toml").write_text(REGISTRY)
+    (tmp_path / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 1\n")
+
+
+def models_asked(folder):
+    with duckdb.connect(folder / "results/merge.duckdb", read_only=True) as db:
+        found = db.execute("SELECT DISTINCT model_requested FROM calls").fetchall()
+    return [name for (name,) in found]
+
+
+@pytest.mark.long
+async def test_the_one_model_that_a_server_lists_is_asked_and_found_again_in_a_replay(
+    merge_runner, tmp_path
+):
+    async with watched(serving("qwen3-8b")) as server:
+        at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*LOCAL, **at)
+        assert run.code == 0, run.err
+        assert "serves qwen3-8b, which is asked\n" in run.err
+        chats = [json.loads(body) for body in server.asked if body]
+    assert {chat["model"] for chat in chats} == {"qwen3-8b"}
+    assert models_asked(tmp_path) == ["qwen3-8b"]
+    exported = await merge_runner("recording", "export", "local.parquet")
+    assert exported.code == 0, exported.err
+    played = await merge_runner("digest")
+    for db, *source in (
+        ("cached.duckdb",),
+        ("recorded.duckdb", "--recording", "local.parquet", "--cache", "empty"),
+    ):
+        replayed = await merge_runner("replay", *LOCAL[1:], "--db", db, *source)
+        assert replayed.code == 0, replayed.err
+        assert (await merge_runner("digest", "--db", db)).out == played.out
+
+
+@pytest.mark.long
+async def test_of_several_models_one_must_be_chosen(merge_runner, tmp_path):
+    async with watched(serving("qwen3-8b", "llama3.2:latest")) as server:
+        at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*LOCAL, **at)
+        assert run.code == 2
+        assert "serves qwen3-8b, llama3.2:latest: name one with LOCAL_MODEL, or" in run.err
+        assert not any(server.asked), "no prompt was sent"
+        # Ollama knows a model by its name without the usual tag, too.
+        for chosen in ("qwen3-8b", "llama3.2"):
+            assert (await merge_runner(*LOCAL, **at, LOCAL_MODEL=chosen)).code == 0
+    assert sorted(models_asked(tmp_path)) == ["llama3.2", "qwen3-8b"]
+    replay = ("replay", *LOCAL[1:], "--db", "again.duckdb")
+    assert (await merge_runner(*replay)).code == 4
+    assert (await merge_runner(*replay, LOCAL_MODEL="qwen3-8b")).code == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("takes_s", "waits"), [(4, []), (9, ["local has not listed its models"])])
+@in_virtual_time
+async def test_a_server_that_is_slow_to_list_its_models_is_waited_for_with_a_line(
+    monkeypatch, takes_s, waits
+):
+    async def listed(endpoint):
+        await asyncio.sleep(takes_s)
+        return ["m"]
+
+    monkeypatch.setattr("merge_runner.llm.http.listed_models", listed)
+    said = []
+    assert await _served_name("local", load_models()["local"], say=said.append) == "m"
+    await asyncio.sleep(9)
+    *told, last = said
+    assert [line.partition(" yet")[0] for line in told] == waits
+    assert last == "local serves m, which is asked"
+
+
+async def test_a_server_without_a_list_needs_a_name(merge_runner, registry):
+    async with watched(serving(status=404)) as server:
+        at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
+        assert (await merge_runner(*NAMED, **at)).code == 0
+        run = await merge_runner(*LOCAL, **at)
+        assert run.code == 2
+        assert "models that it does not list (HTTP 404" in run.err
+        assert "name one with LOCAL_MODEL" in run.err
+
+
+@pytest.mark.long
+async def test_where_nothing_listens_the_run_ends_within_seconds_with_what_to_start(
+    merge_runner, tmp_path
+):
+    async with asyncio.timeout(HANGS_S):
+        run = await merge_runner(*LOCAL, LOCAL_BASE_URL=DEAD)
+    assert run.code == 1
+    (line,) = run.err.splitlines()
+    assert f"nothing listens at {DEAD}: start a server (docs/how-to/local-models.md)" in line
+    assert "or set LOCAL_BASE_URL" in line
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("where", [(), ("--dask", "local:1")])
+async def test_no_trial_has_failed_where_nothing_was_ever_answered(
+    merge_runner, registry, tmp_path, where
+):
+    run = await merge_runner(*NAMED, *where, LOCAL_BASE_URL=DEAD)
+    assert run.code == 1
+    assert run.err.count("start a server (docs/how-to/local-models.md)") == 1
+    assert run.summary["trials"]["failed"] == 0
+    async with watched(serving("qwen3")) as server:
+        again = await merge_runner(*NAMED, *where, LOCAL_BASE_URL=f"{server.url}/v1")
+        assert again.code == 0, again.err
+        # And when all has been played, no server is needed.
+    stored = await merge_runner(*NAMED, LOCAL_BASE_URL=f"{server.url}/v1")
+    assert stored.code == 0, stored.err
+    assert stored.summary["trials"]["stored_before"] == 1
+
+
+@pytest.mark.long
+async def test_a_host_that_there_is_not_is_named(merge_runner):
+    run = await merge_runner(*LOCAL, LOCAL_BASE_URL="http://gpu.invalid:8000/v1")
+    assert run.code == 1
+    assert "http://gpu.invalid:8000/v1 cannot be reached (" in run.err
+    assert "start a server" in run.err
+
+
+async def test_a_dry_run_asks_nobody_for_a_name(merge_runner):
+    async with watched(serving("qwen3-8b")) as server:
+        run = await merge_runner(*LOCAL, "--dry-run", LOCAL_BASE_URL=f"{server.url}/v1")
+        assert server.requests == 0
+    assert run.code == 0, run.err
+    assert run.summary["trials"] == 1
+
+
+async def test_the_emulator_lists_its_model_as_real_servers_do(merge_runner, emulator_url):
+    run = await merge_runner(*LOCAL, LOCAL_BASE_URL=emulator_url)
+    assert run.code == 0, run.err
+    assert "serves scripted-driver, which is asked" in run.err
+
+
+def test_only_a_server_of_ones_own_can_be_asked_for_a_name(tmp_path):
+    text = REGISTRY.replace('id = "qwen3"\n', "")
+    (tmp_path / "models.toml").write_text(text)
+    assert load_models(tmp_path)["named"].id == "default"
+    (tmp_path / "models.toml").write_text(text.replace('"local"', '"openai"'))
+    with pytest.raises(UsageError, match="`id` is missing"):
+        load_models(tmp_path)

@@ -1,0 +1,502 @@
+"""Sealed replay and portable recordings."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import os
+import re
+import shutil
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import duckdb
+import pytest
+
+from merge_runner.cli import commands
+from merge_runner.errors import RecordingError
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.results.recording import (
+    carried_plugins,
+    export_recording,
+    import_recording,
+    provenance_of,
+    read_recording,
+    summarise,
+)
+from merge_runner.results.store import results_digest
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.text_safety import quoted
+from tests.support.harness import FAST, PROJECT, RECORDING, environment, watched
+from tests.support.mock_server import FaultPlan
+
+# The digests of the committed recordings: results, and so these texts, never change by themselves.
+GOLDEN = {
+    model: (PROJECT / f"tests/golden/{model}-baseline.digest").read_text()
+    for model in ("emulator", "smollm2", "smollm2-free")
+}
+# An archive: the bytes of a recording are never converted, whatever program reads them.
+ARCHIVED = {
+    "emulator": "05a244b0d396a0a994e388c877dba2cdeb5161f2083a703544cc0bbb4d1cd23d",
+    "smollm2": "254f9ad68590c423818d3f640c9ba0388e368df7c789219cd5c30fc9d0ca4647",
+    "smollm2-free": "c164b61d2c9a04e56232db244b79a65d2e2c76e1400fbcf533acec4edf6557cf",
+}
+SEALED = """
+import socket, sys
+real = socket.socket
+class Sealed(real):
+    def __init__(self, family=-1, *rest, **more):
+        assert family == socket.AF_UNIX, "a network socket was opened"
+        super().__init__(family, *rest, **more)
+socket.socket = Sealed
+sys.argv = ["merge-runner", *sys.argv[1:]]
+from merge_runner.cli import main
+main()
+"""
+REPLAY = ("replay", "baseline", "--recording", RECORDING, "--json")
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """The first repetition of the committed recording: eleven trials."""
+    folder = tmp_path_factory.mktemp("small")
+    entries = [e for e in read_recording(RECORDING) if e.request.slot.repetition == 1]
+    cache = ResponseCache(folder / "cache")
+    cache.put_now(entries)
+    keys = [entry.request.key for entry in entries]
+    export_recording(folder / "small.parquet", cache, keys, {"experiment": "baseline"})
+    cache.close()
+    return folder / "small.parquet"
+
+
+def test_the_recordings_that_ship_are_as_they_were_made():
+    for model, sha256 in ARCHIVED.items():
+        file = RECORDING.with_name(f"{model}-baseline.parquet")
+        assert hashlib.sha256(file.read_bytes()).hexdigest() == sha256, model
+
+
+async def test_the_committed_recording_replays_to_its_digest(merge_runner):
+    run = await merge_runner(*REPLAY)
+    assert run.code == 0, run.err
+    assert run.summary["calls"]["live"] == 0
+    assert 1 <= run.summary["trials"]["collided"] <= 6
+    assert (await merge_runner("digest")).out == GOLDEN["emulator"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["smollm2", "smollm2-free"])
+async def test_the_recordings_of_a_real_small_model_replay_to_what_their_page_says(
+    merge_runner, model
+):
+    run = await merge_runner("replay", "baseline", "--model", model, "--json")
+    assert run.code == 0, run.err
+    trials, decisions = run.summary["trials"], run.summary["decisions"]
+    assert run.summary["calls"]["live"] == 0
+    figures = [trials["planned"], trials["collided"], decisions, run.summary["invalid_decisions"]]
+    row = " | ".join([f"| `{model}`", *map(str, figures)])
+    assert f"{row} |" in (PROJECT / "docs/reference/smollm2.md").read_text()
+    assert (await merge_runner("digest")).out == GOLDEN[model]
+
+
+@pytest.mark.slow
+async def test_the_first_screen_of_the_readme_shows_what_is_printed(merge_runner):
+    shown = re.search(r"```text\n(.*?)```", (PROJECT / "README.md").read_text(), re.DOTALL)[1]
+    printed = (await merge_runner("replay", "baseline")).out
+    parts = [part for line in shown.splitlines() for part in line.split("...") if part]
+    assert len(parts) >= 5
+    for part in parts:
+        assert part in printed
+
+
+@pytest.mark.slow
+async def test_without_replies_of_its_own_a_replay_takes_the_recording_that_ships(
+    merge_runner, tmp_path
+):
+    part = ("baseline", "--reps", 1, "--conditions", "N_0_0,L_4_8")
+    for _ in range(2):  # the first one makes the cache folder, which says nothing of replies
+        run = await merge_runner("replay", *part)
+        assert run.code == 0, run.err
+        shipped = tmp_path.joinpath(run.err.split("ships with merge-runner: ")[1].split("\n")[0])
+        assert shipped.samefile(RECORDING)
+    (tmp_path / "own.toml").write_text("repetitions = { baseline = 1 }")
+    assert (await merge_runner("replay", "own.toml", "--reps", 1)).code == 4
+
+
+@pytest.mark.slow
+async def test_replies_of_ones_own_are_not_mixed_with_those_that_ship(merge_runner):
+    part = ("baseline", "--reps", 1, "--conditions")
+    assert (await merge_runner("sweep", *part, "N_0_0")).code == 0
+    replay = await merge_runner("replay", *part, "N_0_0", "--db", "other")
+    assert (replay.code, "ships with" in replay.err) == (0, False)
+    assert (await merge_runner("replay", *part, "L_4_8", "--db", "other")).code == 4
+
+
+@pytest.mark.slow
+async def test_the_recording_is_what_the_emulator_answers_today(merge_runner, tmp_path):
+    part = ("--reps", 1, "--json")
+    live = await merge_runner("sweep", "baseline", *part)
+    assert live.code == 0, live.err
+    replay = await merge_runner(*REPLAY, "--reps", 1, "--db", "replay.duckdb", "--cache", "empty")
+    assert replay.code == 0, replay.err
+    digest = results_digest(tmp_path / "results/merge.duckdb")
+    assert digest == results_digest(tmp_path / "replay.duckdb")
+
+
+async def test_a_replay_opens_no_network_socket_and_needs_no_key(tmp_path):
+    done = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", SEALED, *map(str, REPLAY), "--reps", "1",
+        cwd=tmp_path, env=environment(), stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    out, err = await done.communicate()
+    assert done.returncode == 0, err
+    assert json.loads(out)["calls"]["live"] == 0
+
+
+def test_a_replay_imports_no_library_that_it_does_not_use():
+    code = (
+        "import sys, merge_runner.cli, merge_runner.run.sweep;"
+        "unused = ('httpx', 'aiohttp', 'pandas', 'statsmodels', 'tenacity', 'numpy', 'rich');"
+        "print([m for m in unused if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.slow
+async def test_missing_replies_are_counted_with_what_differs_and_the_rest_finishes(
+    merge_runner, small
+):
+    lacking = ("replay", "baseline", "--recording", small, "--json")
+    run = await merge_runner(*lacking, "--reps", 2)
+    assert run.code == 4
+    assert run.summary["trials"]["failed"] == 11
+    assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] == 11
+    (told,) = run.summary["messages"]
+    assert re.fullmatch(
+        r"emulator/baseline/\w+-?\d_-?\d/rep02, left, decision 0: the nearest recorded request "
+        r"differs in repetition \(recorded 1, wanted 2\); 22 calls of 11 trials differ like this",
+        told,
+    )
+    part = ("--reps", 1, "--conditions", "N_0_0")
+    ablated = await merge_runner(*lacking, *part, "--variants", "A1")
+    assert ablated.code == 4
+    assert "body.messages.0.content (recorded 'History of the last 2 s" in ablated.err
+    other = await merge_runner(*lacking, *part, "--sample-set", 2)
+    assert "sample_set (recorded 0, wanted 2)" in other.err
+
+
+@pytest.mark.slow
+async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, small, tmp_path):
+    for folder in ("merge_runner_analysis", "merge_runner", "experiments"):
+        shutil.copytree(PROJECT / folder, tmp_path / "edited" / folder)
+    blocks = tmp_path / "edited/merge_runner/prompts/blocks.py"
+    blocks.write_text(blocks.read_text().replace("- Your speed:", "- Your spead:"))
+    run = await merge_runner.start(
+        "replay", "baseline", "--recording", small, "--reps", 1, "--json",
+        PYTHONPATH=str(tmp_path / "edited"),
+    )  # fmt: skip
+    out, _ = await run.communicate()
+    assert run.returncode == 4
+    told, held = json.loads(out)["messages"]
+    assert "small.parquet holds 206 calls of scripted-driver" in held
+    assert "recorded '- Your speed: 1" in told
+    assert "wanted '- Your spead: 1" in told
+    assert told.endswith("; 22 calls of 11 trials differ like this")
+
+
+@pytest.mark.slow
+async def test_a_replay_that_finds_nothing_stores_nothing_and_says_what_is_recorded(
+    merge_runner, tmp_path
+):
+    other = ("replay", "ablations", "--model", "o3", "--recording", RECORDING)
+    small = ("--reps", 1, "--conditions", "N_0_0", "--recording", RECORDING)
+    fresh = await merge_runner("replay", "baseline", "--sample-set", 3, *small)
+    run = await merge_runner(*other)
+    assert (fresh.code, run.code) == (4, 4)
+    assert not (tmp_path / "results").exists()
+    assert (
+        "nothing of this replay is recorded, and nothing is stored: "
+        f"{RECORDING} holds 2054 calls of scripted-driver"
+    ) in run.err
+    cached = await merge_runner("replay", "ablations", "--reps", 1)
+    assert cached.code == 4
+    assert "the cache holds no call at all" in cached.err
+
+
+@pytest.mark.slow
+async def test_a_replay_plays_what_a_smaller_recording_holds_and_says_so(merge_runner, tmp_path):
+    part = ("--reps", 2, "--conditions", "N_0_0,R_-4_8")
+    assert (await merge_runner("sweep", "baseline", *part)).code == 0
+    assert (await merge_runner("recording", "export", "part.parquet")).code == 0
+    replay = ("replay", "baseline", "--recording", "part.parquet", "--cache", "none", "--json")
+    run = await merge_runner(*replay, "--db", "part.duckdb")
+    assert run.code == 0, run.err
+    assert run.summary["trials"]["planned"] == 4
+    assert "the recording holds 4 of the plan's 110 trials" in run.err
+    digest = results_digest(tmp_path / "results/merge.duckdb")
+    assert results_digest(tmp_path / "part.duckdb") == digest
+    asked = await merge_runner(*replay, "--reps", 3, "--db", "asked.duckdb")
+    assert asked.code == 4, "what is asked for is what is played"
+    assert asked.summary["trials"]["planned"] == 33
+
+
+@pytest.mark.long
+async def test_several_sweeps_go_into_one_file_and_several_files_into_one_replay(
+    merge_runner, tmp_path
+):
+    sweeps = []
+    for name, part in (("a", ("N_0_0",)), ("b", ("R_-4_8",)), ("c", ("N_0_0,R_-4_8", "--reps", 2))):
+        run = await merge_runner("sweep", "baseline", "--reps", 1, "--json", "--conditions", *part)
+        assert run.code == 0, run.err
+        sweeps.append(run.summary["sweep_id"])
+        assert (await merge_runner("recording", "export", f"{name}.parquet")).code == 0
+    both = ("--sweep", sweeps[0], "--sweep", sweeps[1])
+    export = await merge_runner("recording", "export", "both.parquet", *both)
+    assert export.code == 0, export.err
+    assert (await merge_runner("recording", "verify", "both.parquet")).code == 0
+    audit = await merge_runner("audit", "--recording", "both.parquet")
+    assert audit.code == 0, audit.out
+    info = json.loads((await merge_runner("recording", "info", "both.parquet")).out)
+    assert [row["sweep_id"] for row in json.loads(info["provenance"]["sweeps"])] == sweeps[:2]
+    replay = ("replay", "baseline", "--cache", "none", "--json")
+    digests = []
+    for files in (("both",), ("a", "b"), ("a", "c", "b")):
+        named = [word for file in files for word in ("--recording", f"{file}.parquet")]
+        db = f"{'-'.join(files)}.duckdb"
+        run = await merge_runner(*replay, *named, "--db", db)
+        assert run.code == 0, run.err
+        digests.append(results_digest(tmp_path / db))
+    assert digests[0] == digests[1]
+    assert [trials for _, trials in digests] == [2, 2, 4]
+    unknown = await merge_runner("recording", "export", "x.parquet", "--sweep", "nobody")
+    assert unknown.code == 2
+    assert f"unknown sweep 'nobody'; valid: {', '.join(sweeps)}" in unknown.err
+
+
+@pytest.mark.long
+async def test_recordings_that_contradict_each_other_are_not_replayed_together(
+    merge_runner, tmp_path
+):
+    for name, faults in (("good", None), ("bad", FaultPlan(rates={"malformed": 1.0}))):
+        async with watched(faults=faults) as server:
+            env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
+            part = ("baseline", "--model", "o3", "--reps", 1, "--conditions", "L_4_0", "--yes")
+            places = ("--db", f"{name}.duckdb", "--cache", name)
+            asked = (*part, *FAST, *places, "--keep-going")
+            assert (await merge_runner("sweep", *asked, **env)).code == 0
+        assert (await merge_runner("recording", "export", f"{name}.parquet", *places)).code == 0
+    cache = ResponseCache(tmp_path / "one")
+    entries = list(read_recording(tmp_path / "bad.parquet"))
+    (good, *_) = read_recording(tmp_path / "good.parquet")
+    cache.put_now([type(good)(good.request, entries[0].attempts)])
+    export_recording(tmp_path / "other.parquet", cache, [good.request.key], {})
+    replay = ("replay", *part[:-1], "--recording", "good.parquet", "--recording", "other.parquet")
+    run = await merge_runner(*replay)
+    assert run.code == 1
+    assert f"other.parquet holds another reply to the call {good.request.key}" in run.err
+
+
+def test_what_a_recording_says_of_its_plug_ins_may_be_anything():
+    """It may come from anybody."""
+    study = {"study": {"plugins": {"b.py": "1", "a.py": "2"}}}
+    for config in (study, {}, [], {"study": None}, {"study": {"plugins": 1}}, {"typed": ["x"]}):
+        rows = [{"sweep_id": "s", "config": json.dumps(config)}]
+        names = ["a.py", "b.py"] if config == study else []
+        for sweeps in (rows, [*rows, *rows]):
+            told = provenance_of(sweeps)
+            assert carried_plugins(told) == names
+            assert "typed" not in json.dumps(told)
+    assert carried_plugins({"sweeps": "[1, null, {}]"}) == []
+    assert carried_plugins({"config": "no JSON"}) == []
+    assert provenance_of([{"config": "no JSON"}]) == {"config": "no JSON"}
+
+
+async def test_an_export_and_an_import_close_the_cache(merge_runner, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert (await merge_runner("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")).code == 0
+    closed = []
+    monkeypatch.setattr(ResponseCache, "close", lambda cache: closed.append(cache.folder.name))
+    commands.recording_export(tmp_path / "a.parquet")
+    commands.recording_import(tmp_path / "a.parquet", tmp_path / "other")
+    assert closed == ["responses", "other"]
+
+
+@pytest.mark.slow
+async def test_an_exported_sweep_goes_round_through_a_file(merge_runner, tmp_path):
+    part = ("baseline", "--reps", 1, "--conditions", "N_0_0,R_-4_8")
+    assert (await merge_runner("sweep", *part)).code == 0
+    assert (await merge_runner("recording", "export", "sweep.parquet")).code == 0
+    assert (await merge_runner("recording", "verify", "sweep.parquet")).code == 0
+    info = json.loads((await merge_runner("recording", "info", "sweep.parquet")).out)
+    assert info["endpoints"] == {"emulator": info["calls"]}
+    assert json.loads(info["provenance"]["config"])["repetitions"] == {"baseline": 1}
+    elsewhere = ("--cache", "elsewhere")
+    added = await merge_runner("recording", "import", "sweep.parquet", *elsewhere)
+    assert f"{info['calls']} calls added" in added.err
+    again = await merge_runner("recording", "import", "sweep.parquet", *elsewhere)
+    assert "0 calls added" in again.err
+    replay = await merge_runner("replay", *part, "--db", "replay.duckdb", *elsewhere)
+    assert replay.code == 0
+    digest = results_digest(tmp_path / "results/merge.duckdb")
+    assert digest == results_digest(tmp_path / "replay.duckdb")
+    assert digest[1] == 2
+
+
+def changed(recording, file, change: str = "SELECT 1", **metadata: str) -> None:
+    """Rewrite a recording with one thing changed and the rest of its metadata kept."""
+    with duckdb.connect() as connection:
+        told = connection.execute(f"FROM parquet_kv_metadata('{recording}')").fetchall()
+        kept = {k.decode(): v.decode() for _, k, v in told} | metadata
+        pairs = ", ".join(f"{k}: {quoted(v)}" for k, v in kept.items())
+        connection.execute(f"CREATE TABLE calls AS FROM '{recording}'")
+        connection.execute(change)
+        connection.execute(f"COPY calls TO '{file}' (FORMAT parquet, KV_METADATA {{{pairs}}})")
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_rewritten_recording_that_is_not_changed_is_whole(small, tmp_path, whole):
+    """The other tests would show nothing if the rewriting alone made it damaged."""
+    changed(RECORDING if whole else small, tmp_path / "same.parquet", "SELECT 1")
+    conditions = [e.request.slot.condition for e in read_recording(tmp_path / "same.parquet")]
+    assert set(conditions) == set(CONDITIONS)
+    assert len(conditions) == 2054 if whole else len(conditions) > 150
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("UPDATE calls SET body = replace(body, 'merge', 'marge')", "does not belong to its key"),
+        ("UPDATE calls SET side = 'right' WHERE side = 'left'", "does not belong to its key"),
+        ("UPDATE calls SET endpoint = 'openai'", "does not belong to its key"),
+        ("UPDATE calls SET attempts = '[]'", "is damaged"),
+        ("UPDATE calls SET attempts = 'import os'", "is damaged"),
+        ("INSERT INTO calls FROM calls LIMIT 1", "repeats"),
+        ("DELETE FROM calls WHERE condition = 'L_4_8'", "is not as it was exported"),
+        ("UPDATE calls SET attempts = replace(attempts, 'right', 'left')", "not as it was"),
+        ("ALTER TABLE calls ADD COLUMN extra INTEGER", "is not one of our recordings"),
+    ],
+)
+async def test_a_recording_that_was_tampered_with_is_refused_whole(
+    merge_runner, small, tmp_path, change, says
+):
+    changed(small, tmp_path / "bad.parquet", change)
+    for command in ("verify", "import"):
+        run = await merge_runner("recording", command, "bad.parquet")
+        assert run.code == 1
+        assert says in run.err
+        assert "Traceback" not in run.err
+    left = await merge_runner("replay", "baseline", "--reps", 1, "--conditions", "N_0_0")
+    assert "ships with merge-runner" in left.err, "nothing of it entered the cache"
+
+
+@pytest.fixture(scope="module")
+def told(prepare, tmp_path_factory):
+    """A recording of a sweep that says where it comes from."""
+    folder = tmp_path_factory.mktemp("told")
+    part = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
+    assert prepare(folder, *part).code == 0
+    assert prepare(folder, "recording", "export", "told.parquet").code == 0
+    return folder / "told.parquet"
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["git_commit", "git_dirty", "config", "started_at", "ended_at", "exit_code", "name", "versions",
+     "sweep_id", "provenance_sha256", "added"],
+)  # fmt: skip
+def test_a_recording_that_says_something_else_of_its_origin_is_refused(told, tmp_path, name):
+    origin = summarise(told)["provenance"]
+    assert name in origin or name == "added"
+    changed(told, tmp_path / "same.parquet")
+    assert summarise(tmp_path / "same.parquet")["provenance"] == origin
+    changed(told, tmp_path / "bad.parquet", **{name: origin.get(name, "") + " "})
+    with pytest.raises(RecordingError, match="what it says of where it comes from"):
+        summarise(tmp_path / "bad.parquet")
+    cache = ResponseCache(tmp_path / "cache")
+    with pytest.raises(RecordingError):
+        import_recording(tmp_path / "bad.parquet", cache)
+    assert list(cache.entries()) == []
+
+
+@pytest.mark.parametrize("number", [1, 3])
+async def test_a_recording_of_another_format_is_refused(merge_runner, told, tmp_path, number):
+    changed(told, tmp_path / "other.parquet", format=f"merge-runner recording {number}")
+    for command in ("verify", "info", "import"):
+        run = await merge_runner("recording", command, "other.parquet")
+        assert run.code == 1
+        (line,) = run.err.splitlines()
+        assert f"has the format 'merge-runner recording {number}' with keys of" in line
+
+
+@pytest.mark.slow
+async def test_a_recording_holds_no_secret(merge_runner, tmp_path):
+    async with watched() as server:
+        env = {"OPENAI_API_KEY": "sk-very-secret-1", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        part = ("--reps", 1, "--conditions", "N_0_0", "--model", "o3", "--yes", *FAST)
+        assert (await merge_runner("sweep", "baseline", *part, **env)).code == 0
+        assert (await merge_runner("recording", "export", "o3.parquet", **env)).code == 0
+    for folder, _, names in os.walk(tmp_path):
+        for name in names:
+            assert b"sk-very-secret" not in Path(folder, name).read_bytes(), name
+    with duckdb.connect() as connection:
+        rows = connection.execute(f"FROM '{tmp_path / 'o3.parquet'}'").fetchall()
+    assert "sk-very-secret" not in str(rows)
+
+
+@pytest.mark.slow
+async def test_a_named_recording_comes_before_what_the_cache_holds(merge_runner, tmp_path):
+    part = ("baseline", "--reps", 1, "--conditions", "L_4_0", "--model", "o3", "--json")
+    digests = []
+    # The second server's replies are all bad, and lie in the cache that the replay uses.
+    for name, faults in (("good", None), ("bad", FaultPlan(rates={"malformed": 1.0}))):
+        async with watched(faults=faults) as server:
+            env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
+            places = ("--db", f"{name}.duckdb", "--cache", name)
+            sweep = ("sweep", *part, "--yes", "--keep-going", *FAST, *places)
+            assert (await merge_runner(*sweep, **env)).code == 0
+            assert (await merge_runner("recording", "export", f"{name}.parquet", *places)).code == 0
+        digests.append(results_digest(tmp_path / f"{name}.duckdb"))
+    replay = ("replay", *part, "--cache", "bad", "--recording", "good.parquet", "--db", "r.duckdb")
+    assert (await merge_runner(*replay)).code == 0
+    assert digests[0] != digests[1]
+    assert results_digest(tmp_path / "r.duckdb") == digests[0]
+
+
+@pytest.mark.slow
+async def test_a_replay_into_stored_trials_names_each_column_that_differs(merge_runner, tmp_path):
+    part = ("--reps", 1, "--conditions", "N_0_0,L_4_0")
+    assert (await merge_runner(*REPLAY, *part)).code == 0
+    assert (await merge_runner(*REPLAY, *part)).code == 0
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb")) as connection:
+        connection.execute(
+            "UPDATE states SET acceleration_mps2 = acceleration_mps2 + 0.001 "
+            "WHERE trial_id LIKE '%N_0_0%' AND step = 7"
+        )
+        connection.execute("UPDATE decisions SET rationale = 'no' WHERE trial_id LIKE '%L_4_0%'")
+    again = await merge_runner(*REPLAY, *part)
+    assert again.code == 1
+    (line,) = (line for line in again.err.splitlines() if "stored otherwise" in line)
+    assert "2 trials are stored otherwise in results/merge.duckdb" in line
+    assert "emulator/baseline/N_0_0/rep01 (states.acceleration_mps2)" in line
+    assert "emulator/baseline/L_4_0/rep01 (decisions.rationale)" in line
+
+
+@pytest.mark.slow
+async def test_a_damaged_reply_fails_its_trial_alone(merge_runner, tmp_path):
+    part = ("--reps", 1, "--conditions", "N_0_0,L_4_0", "--json")
+    assert (await merge_runner("sweep", "baseline", *part)).code == 0
+    with sqlite3.connect(tmp_path / "cache/responses/cache.db") as database:
+        database.execute(
+            "UPDATE Cache SET value = substr(value, 1, 100) "
+            'WHERE value LIKE \'%"condition":"N_0_0"%"decision":4%\''
+        )
+    run = await merge_runner("replay", "baseline", *part, "--db", "replay.duckdb")
+    assert run.code == 1
+    assert run.summary["trials"]["failed"] == 1
+    assert "the recorded reply is damaged" in run.summary["failed"]["emulator/baseline/N_0_0/rep01"]
+    assert "Traceback" not in run.err

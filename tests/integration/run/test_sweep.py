@@ -1,0 +1,403 @@
+"""Sweeps as a user runs them, over real HTTP against the emulator."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import json
+import os
+import signal
+import termios
+
+import pytest
+from aiohttp import web
+
+from merge_runner.records import SLOT_HEADER
+from merge_runner.results.database import open_database
+from merge_runner.results.store import results_digest
+from tests.support.gate import HANGS_S, Gate
+from tests.support.harness import FAST, PROGRAM, environment, watched
+from tests.support.mock_server import TRANSIENT, FaultPlan
+
+SMALL = ("sweep", "baseline", "--reps", 1, "--json")
+TWO = ("--conditions", "N_0_0,L_4_8")
+FIVE = ("--conditions", "N_0_0,L_4_8,R_-4_0,L_0_-8,R_-4_8")
+DB = "results/merge.duckdb"
+
+
+@pytest.mark.slow
+async def test_a_sweep_stores_every_trial_and_prints_outcomes_and_the_database(merge_runner):
+    run = await merge_runner("sweep", "baseline", "--reps", 1)
+    assert run.code == 0, run.err
+    lines = run.out.splitlines()
+    assert lines[0].split() == [
+        "condition",
+        "trials",
+        "left",
+        "first",
+        "right",
+        "first",
+        "collided",
+        "timeout",
+        "failed",
+    ]
+    assert [line.split()[1] for line in lines[1:13]] == ["1"] * 11 + ["11"]
+    assert "database: results/merge.duckdb" in lines
+    assert "scripted stand-in" in run.out
+    assert "11/11 ended" in run.err
+
+
+@pytest.mark.slow
+async def test_several_sweeps_are_played_one_after_the_other(merge_runner):
+    names = ("baseline", "ablations", "--variants", "baseline", "--reps", 1, "--json", *TWO)
+    run = await merge_runner("sweep", *names)
+    assert run.code == 0, run.err
+    summaries = [json.loads(line) for line in run.out.splitlines()]
+    assert [each["trials"]["stored_before"] for each in summaries] == [0, 2]
+    again = await merge_runner("replay", *names, "--db", "replayed.duckdb")
+    assert (again.code, len(again.out.splitlines())) == (0, 2), again.err
+
+
+async def test_of_several_sweeps_all_are_looked_at_before_the_first_is_played(merge_runner):
+    run = await merge_runner("sweep", "baseline", "ablation", "--reps", 1)
+    assert (run.code, run.out) == (2, "")
+    assert "ablations" in run.err
+    apart = await merge_runner("sweep", "one/study.toml", "two/study.toml")
+    assert (apart.code, "--db and --cache" in apart.err) == (2, True)
+
+
+async def test_what_is_recorded_is_not_asked_again_and_what_is_new_is(merge_runner, tmp_path):
+    async with watched() as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        first = (await merge_runner(*SMALL, *TWO, **env)).summary
+        asked_first = server.requests
+        second = (
+            await merge_runner("sweep", "baseline", "--reps", 2, "--json", *TWO, **env)
+        ).summary
+        new = server.requests - asked_first
+        (tmp_path / "results/merge.duckdb").unlink()
+        third = (
+            await merge_runner("sweep", "baseline", "--reps", 2, "--json", *TWO, **env)
+        ).summary
+        assert first["calls"] == {"live": asked_first, "cached": 0}
+        assert second["calls"] == {"live": new, "cached": 0}
+        assert second["trials"]["stored_before"] == 2
+        assert third["calls"] == {"live": 0, "cached": asked_first + new}
+        assert set(server.asked.values()) == {1}
+    assert third["trials"]["finished"] + third["trials"]["collided"] == 4
+
+
+async def test_the_digest_depends_on_no_schedule_and_no_transient_fault(merge_runner, tmp_path):
+    # Of each transient fault a twenty-fifth; a hang ends soon, without a reply.
+    faulty = FaultPlan(seed=5, hang_s=0.3, rates=dict.fromkeys(TRANSIENT, 0.04))
+    for name, in_flight, plan in (("one", 1, None), ("many", 500, None), ("faults", 200, faulty)):
+        places = ("--db", f"{name}.duckdb", "--cache", name, "--in-flight", in_flight)
+        async with watched(faults=plan) as server:
+            env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+            run = await merge_runner(*SMALL, *FIVE, *places, **env)
+        assert run.code == 0, run.err
+        assert run.summary["trials"]["failed"] == 0
+    faults = sum(n for outcome, n in run.summary["attempts"].items() if outcome != "ok")
+    assert faults > 20, "hardly a fault was injected"
+    digests = [results_digest(tmp_path / f"{name}.duckdb") for name in ("one", "many", "faults")]
+    assert digests[0] == digests[1] == digests[2]
+    assert digests[0][1] == 5
+
+
+@pytest.mark.slow
+async def test_another_sample_set_and_another_prompt_are_other_samples(merge_runner):
+    base = (await merge_runner(*SMALL, *TWO)).summary
+    other = (await merge_runner(*SMALL, *TWO, "--sample-set", 1)).summary
+    ablated = (await merge_runner(*SMALL, *TWO, "--variants", "A1")).summary
+    assert base["calls"]["cached"] == other["calls"]["cached"] == 0
+    assert other["calls"]["live"] > 0
+    assert ablated["calls"]["live"] > 0
+    ids = await merge_runner("sql", "select trial_id from trials order by all", "--format", "csv")
+    assert ids.out.split()[1:] == [
+        "emulator/A1/L_4_8/rep01",
+        "emulator/A1/N_0_0/rep01",
+        "emulator/baseline/L_4_8/rep01",
+        "emulator/baseline/L_4_8/rep01/set1",
+        "emulator/baseline/N_0_0/rep01",
+        "emulator/baseline/N_0_0/rep01/set1",
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("model", "variables", "path"),
+    [
+        ("o3", ("OPENAI_API_KEY", "OPENAI_BASE_URL"), "/v1"),
+        ("gpt-6-sol", ("OPENAI_API_KEY", "OPENAI_BASE_URL"), "/v1"),
+        ("gemini-2.5-pro", ("GEMINI_API_KEY", "GOOGLE_GEMINI_BASE_URL"), ""),
+        ("claude-sonnet-4-6", ("ANTHROPIC_API_KEY", "ANTHROPIC_BASE_URL"), ""),
+    ],
+)
+async def test_a_real_model_runs_against_any_server_of_its_format_and_replays_without_a_key(
+    merge_runner, tmp_path, model, variables, path
+):
+    sweep = (*SMALL, "--conditions", "L_4_0", "--model", model, *FAST)
+    without = await merge_runner(*sweep)
+    assert without.code == 2
+    assert variables[0] in without.err
+    assert "`merge-runner sweep baseline` runs" in without.err
+    async with watched() as server:
+        env = {variables[0]: "dummy-key", variables[1]: server.url + path}
+        unasked = await merge_runner(*sweep, **env)
+        assert unasked.code == 2
+        assert "--yes" in unasked.err
+        assert server.requests == 0, "money was spent without a question"
+        live = await merge_runner(*sweep, "--yes", **env)
+        assert live.code == 0, live.err
+        assert live.summary["calls"]["live"] == server.requests
+        assert live.summary["cost_usd"] > 0
+        assert not any(SLOT_HEADER in headers for headers in server.headers)
+        assert any("dummy-key" in value for value in server.headers[0].values())
+    # The URL of the stub is gone and no key is set: the recorded identity serves.
+    replay = await merge_runner(
+        "replay", "baseline", "--reps", 1, "--conditions", "L_4_0", "--model", model,
+        "--db", "replay.duckdb", "--json",
+    )  # fmt: skip
+    assert replay.code == 0, replay.err
+    assert results_digest(tmp_path / DB) == results_digest(tmp_path / "replay.duckdb")
+
+
+@pytest.mark.slow
+async def test_a_stub_never_answers_for_the_real_endpoint(merge_runner):
+    async with watched() as one, watched() as other:
+        for server in (one, other):
+            env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
+            sweep = (*SMALL, "--conditions", "L_4_0", "--model", "o3", "--yes", *FAST)
+            assert (await merge_runner(*sweep, **env)).code == 0
+        assert one.requests == other.requests > 0
+    ambiguous = await merge_runner("replay", "baseline", "--reps", 1, "--model", "o3")
+    assert ambiguous.code == 2
+    assert one.url in ambiguous.err
+
+
+async def test_a_failed_trial_is_a_row_and_the_same_command_plays_it_anew(merge_runner):
+    broken = True
+
+    async def middle(request, handler):
+        slot = json.loads(request.headers[SLOT_HEADER])
+        if broken and slot["condition"] == "N_0_0" and slot["decision"] == 3:
+            return web.json_response({"error": {"message": "No such thing."}}, status=400)
+        return await handler(request)
+
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*SMALL, *TWO, **env)
+        assert run.code == 1
+        assert run.summary["trials"]["failed"] == 1
+        assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] == 1
+        assert "No such thing." in run.summary["failed"]["emulator/baseline/N_0_0/rep01"]
+        calls = await merge_runner("sql", "select outcome, count(*) n from calls group by all")
+        assert "bad_request" in calls.out
+        broken = False
+        again = await merge_runner(*SMALL, *TWO, **env)
+        assert again.code == 0, again.err
+        answered = {k: n for k, n in server.asked.items() if n > 1}
+        assert len(answered) == 2, "only the two rejected calls were asked again"
+    rows = await merge_runner("sql", "select count(*) n from trials", "--format", "json")
+    assert json.loads(rows.out) == [{"n": 2}]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("status", "error", "code", "says"),
+    [
+        (429, {"type": "insufficient_quota", "code": "insufficient_quota"}, 3, "quota"),
+        (401, {"type": "invalid_request_error", "code": "invalid_api_key"}, 2, "key"),
+        (404, {"type": "invalid_request_error", "code": "model_not_found"}, 2, "model"),
+    ],
+)
+async def test_an_account_problem_stops_the_sweep_and_it_goes_on_later(
+    merge_runner, status, error, code, says
+):
+    allowed = 30
+
+    async def middle(request, handler):
+        nonlocal allowed
+        allowed -= 1
+        if allowed < 0:
+            return web.json_response({"error": {"message": "no more", **error}}, status=status)
+        return await handler(request)
+
+    async with watched(middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        sweep = (*SMALL, *TWO, "--in-flight", 1)
+        run = await merge_runner(*sweep, **env)
+        assert run.code == code
+        assert says in run.summary["messages"][0]
+        assert server.requests <= 32, "it went on asking"
+        allowed = 10_000
+        assert (await merge_runner(*sweep, **env)).code == 0
+        # Each answered call was asked once; those refused at the stop, once more.
+        assert sum(n > 1 for n in server.asked.values()) <= 2
+
+
+async def test_ctrl_c_saves_what_is_in_flight_and_the_same_command_goes_on(
+    merge_runner, tmp_path, quiet
+):
+    async with watched(faults=FaultPlan(latency_s=0.2)) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await merge_runner.start(*SMALL, **env)
+        while server.requests < 60:
+            await asyncio.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        out, err = await process.communicate()
+        assert process.returncode == 130, err
+        assert "Run the same command again" in json.loads(out)["messages"][0]
+        assert "calls in flight" in err.decode()
+        again = await merge_runner(*SMALL, **env)
+        assert again.code == 0
+        assert set(server.asked.values()) == {1}, "an answered call was asked again"
+    assert results_digest(tmp_path / DB) == quiet
+
+
+def of_a_terminal():
+    """Make a process one of its terminal, whose closing it is told, also where nohup ignores it."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+
+@pytest.mark.slow
+async def test_a_terminal_that_closes_loses_no_call_that_is_in_flight(
+    merge_runner, tmp_path, quiet
+):
+    gate = Gate(40, tmp_path)
+    ours, theirs = os.openpty()
+    async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await asyncio.create_subprocess_exec(
+            PROGRAM,
+            *map(str, SMALL),
+            cwd=tmp_path,
+            env=environment(**env),
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+            preexec_fn=of_a_terminal,
+        )
+        os.close(theirs)
+        asyncio.get_running_loop().add_reader(ours, os.read, ours, 2**16)
+        await gate.quiet(tmp_path / "cache/responses", trials=4)
+        asyncio.get_running_loop().remove_reader(ours)
+        os.close(ours)
+        # As the shell does, and the service that ends what a login has left.
+        process.send_signal(signal.SIGHUP)
+        process.send_signal(signal.SIGTERM)
+        gate.open()
+        assert await process.wait() == 130
+        again = await merge_runner(*SMALL, **env)
+        assert again.code == 0, again.err
+        assert not gate.asked_again
+    assert results_digest(tmp_path / DB) == quiet
+
+
+async def test_two_signals_at_once_end_it_as_one_does(merge_runner):
+    async with watched(faults=FaultPlan(latency_s=0.2)) as server:
+        process = await merge_runner.start(*SMALL, EMULATOR_BASE_URL=f"{server.url}/v1")
+        while server.requests < 40:
+            await asyncio.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
+        _, err = await process.communicate()
+    assert process.returncode == 130
+    assert b"Traceback" not in err
+
+
+async def test_each_bad_answer_is_followed_by_a_fallback(merge_runner):
+    async with watched(faults=FaultPlan(rates={"malformed": 0.4})) as server:
+        bad = await merge_runner(*SMALL, *TWO, EMULATOR_BASE_URL=f"{server.url}/v1")
+    assert bad.summary["invalid_decisions"] > 5
+    assert bad.summary["fallbacks"] == bad.summary["invalid_decisions"]
+
+
+async def test_another_process_queries_while_a_sweep_runs(merge_runner, tmp_path):
+    gate = Gate(200, tmp_path)  # of two trials at a time, of up to 40 calls each
+    async with watched(gate.middle) as server, asyncio.timeout(HANGS_S):
+        sweep = ("sweep", "baseline", "--reps", 2, "--in-flight", 2)
+        process = await merge_runner.start(*sweep, EMULATOR_BASE_URL=f"{server.url}/v1")
+        seen = 0
+        while not seen:
+            query = await merge_runner("sql", "select count(*) n from trials", "--format", "json")
+            if query.code == 0:  # before the sweep has made the database it is 2
+                seen = json.loads(query.out)[0]["n"]
+        assert process.returncode is None
+        gate.open()
+        assert await process.wait() == 0
+    assert seen < 22
+
+
+async def test_a_locked_database_is_waited_for(merge_runner, tmp_path):
+    await merge_runner(*SMALL, "--conditions", "N_0_0")
+    process = await merge_runner.start(
+        *SMALL, *TWO, "--reps", 2, "--in-flight", 1, EMULATOR_BASE_URL=""
+    )
+    await asyncio.sleep(1.2)
+    db = tmp_path / "results/merge.duckdb"
+    with open_database(db, read_only=False, patience_s=10):  # the sweep may be writing just now
+        await asyncio.sleep(4)
+    out, err = await process.communicate()
+    assert process.returncode == 0, err
+    assert json.loads(out)["trials"]["planned"] == 4
+
+
+async def test_another_served_model_is_said_loudly_and_an_alias_is_none(merge_runner):
+    served = "gemini-3.8-flash"
+
+    async def middle(request, handler):
+        reply = await handler(request)
+        body = json.loads(reply.body)
+        body["model"] = served
+        return web.json_response(body)
+
+    for served, expected in (("gpt-4o", 1), ("o3", 0)):
+        async with watched(middle) as server:
+            env = {"OPENAI_API_KEY": "k", "OPENAI_BASE_URL": f"{server.url}/v1"}
+            run = await merge_runner(
+                "sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--model", "o3",
+                "--yes", *FAST, "--db", f"{served}.duckdb", **env,
+            )  # fmt: skip
+            assert run.code == 0
+            assert run.out.count("another model answered") == expected
+
+
+async def test_programs_drive_without_a_call_alone_and_against_a_model(merge_runner):
+    alone = await merge_runner(*SMALL, "--model", "constant")
+    assert alone.summary["trials"]["collided"] == 11
+    assert alone.summary["calls"] == {"live": 0, "cached": 0}
+    orderly = await merge_runner(*SMALL, "--model", "projected-order")
+    assert orderly.summary["trials"]["finished"] == 11
+    mixed = await merge_runner(*SMALL, *TWO, "--model", "emulator+constant")
+    assert mixed.code == 0
+    rows = await merge_runner(
+        "sql",
+        "select distinct model_left, model_right, side, call_key is null as program "
+        "from decisions join trials using (trial_id, spec_hash) where source = 'llm' order by all",
+        "--format", "csv",
+    )  # fmt: skip
+    assert rows.out.split()[1:] == [
+        "emulator,constant,left,False",
+        "emulator,constant,right,True",
+    ]
+
+
+async def test_a_dry_run_tells_and_touches_nothing(merge_runner, tmp_path):
+    run = await merge_runner("sweep", "ablations", "--model", "o3", "--dry-run", "--json")
+    assert run.code == 0
+    assert run.summary["trials"] == 495
+    assert run.summary["calls"] == pytest.approx(495 * 21, rel=0.01)
+    assert run.summary["cost_usd"] > 50
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_a_dry_run_counts_the_trials_of_programs_that_are_not_stored(merge_runner):
+    part = ("sweep", "baseline", "--model", "idm", "--model", "idm+constant", "--reps", 2)
+    told = await merge_runner(*part, "--dry-run", "--json")
+    assert (told.summary["trials"], told.summary["calls"]) == (44, 0)
+    await merge_runner(*part, "--conditions", "N_0_0")
+    told = await merge_runner(*part, "--dry-run", "--json")
+    assert told.summary["trials"] == 40

@@ -1,0 +1,172 @@
+"""``human import`` of a zip that was made to harm: refused or read past, and nothing is run."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import stat
+import zipfile
+from contextlib import suppress
+
+import pytest
+
+from merge_runner.errors import UsageError
+from merge_runner.results.store import query
+from merge_runner_analysis.human.archive import Unreadable, open_files
+from tests.support import program
+from tests.support.harness import environment
+from tests.support.recordings import drive, write_folder, write_zip
+
+GOOD_CSV = drive("L_4_0").csv()
+GOOD = {"a/experiment_4_iter_1.csv": GOOD_CSV}
+TRIAL = "experiment_9_iter_9"
+
+
+class Bomb:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.fixture
+def imported(tmp_path):
+    """Imports a download with the program, in an empty folder."""
+
+    def run(path):
+        done = program.run(("human", "import", path), cwd=tmp_path, env=environment())
+        assert "Traceback" not in done.err
+        return done
+
+    return run
+
+
+def trials(tmp_path):
+    return query(tmp_path / "results/merge.duckdb", "SELECT count(*) FROM trials")[1][0][0]
+
+
+def with_link(path, name, target):
+    with zipfile.ZipFile(path, "a") as archive:
+        member = zipfile.ZipInfo(name)
+        member.create_system = 3
+        member.external_attr = (stat.S_IFLNK | 0o777) << 16
+        archive.writestr(member, target)
+    return path
+
+
+def test_a_member_that_leads_out_refuses_the_zip(imported, tmp_path):
+    path = write_zip(tmp_path / "d.zip", {**GOOD, "../out.csv": b"x"})
+    before = set(tmp_path.parent.rglob("*"))
+    run = imported(path)
+    assert (run.code, len(run.err.splitlines())) == (2, 1)
+    assert "is unsafe" in run.err
+    assert set(tmp_path.parent.rglob("*")) == before
+
+
+def test_a_link_in_a_zip_is_not_followed(imported, tmp_path):
+    secret = tmp_path / "secret"
+    secret.write_text("private")
+    path = with_link(write_zip(tmp_path / "d.zip", GOOD), f"{TRIAL}.csv", str(secret))
+    run = imported(path)
+    assert run.code == 1
+    assert f"error: {TRIAL}.csv: it lacks " in run.err
+    assert "private" not in run.err + run.out
+    assert trials(tmp_path) == 1
+
+
+def test_a_device_or_a_pipe_in_a_folder_is_not_read(tmp_path):
+    folder = write_folder(tmp_path / "d", GOOD)
+    (folder / f"{TRIAL}.csv").symlink_to("/dev/zero")
+    os.mkfifo(folder / f"{TRIAL}8.csv")
+    with open_files(folder) as files:
+        for file in files:
+            if TRIAL in file.name:
+                with pytest.raises(Unreadable, match="not a regular file"):
+                    file.read()
+
+
+def test_a_zip_within_the_zip_is_not_opened(imported, tmp_path):
+    inner = write_zip(tmp_path / "inner.zip", {f"{TRIAL}.csv": drive("N_0_0").csv()}).read_bytes()
+    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, "inner.zip": inner}))
+    assert run.code == 0
+    assert trials(tmp_path) == 1
+
+
+@pytest.mark.long
+def test_a_bomb_refuses_the_zip_before_anything_is_unpacked(imported, tmp_path):
+    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.csv": bytes(65 * 2**20)}))
+    assert (run.code, len(run.err.splitlines())) == (2, 1)
+    assert "bytes unpacked" in run.err
+    assert not (tmp_path / "results").exists()
+
+
+def test_pickles_are_never_read_under_any_name(imported, tmp_path):
+    mark = tmp_path / "mark"
+    bomb = pickle.dumps(Bomb(mark))
+    hostile = {f"{TRIAL[:-1]}{k}.{suffix}": bomb for k, suffix in enumerate(("pkl", "csv", "mat"))}
+    hostile |= {"auto_save.pkl": bomb, "experiment_4_iter_1.pkl": bomb}
+    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, **hostile}))
+    assert run.code == 1
+    assert "1 files could not be read" in run.out
+    assert trials(tmp_path) == 1
+    assert not mark.exists()
+    pickle.loads(bomb)
+    assert mark.exists(), "or else this test would show nothing"
+
+
+def test_names_cannot_speak_to_the_terminal(imported, tmp_path):
+    name = f"two\nlines\x1b[2J\u202e/{TRIAL}.csv"
+    for path in (
+        write_zip(tmp_path / "d.zip", {name: b"x"}),
+        write_folder(tmp_path / "folder", {name: b"x"}),
+    ):
+        run = imported(path)
+        assert run.code == 1
+        error, *notes = run.err.splitlines()
+        assert error.startswith(f"error: two?lines?[2J?/{TRIAL}.csv: it lacks ")
+        assert error.isprintable()
+        assert notes
+        assert all(note.startswith("note: ") for note in notes)
+
+
+def test_text_that_looks_like_sql_or_a_formula_is_text(imported, tmp_path):
+    recording = drive("L_4_0")
+    recording.columns["end_state"] = ["'); DROP TABLE trials; --"]
+    content = recording.csv()
+    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.csv": content}))
+    assert run.code == 1
+    assert "DROP TABLE trials; --" in run.err
+    assert trials(tmp_path) == 1
+
+
+def test_every_archive_that_is_damaged_is_refused_or_its_files_are(tmp_path):
+    chance = random.Random(1)
+    whole = write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.csv": GOOD_CSV[:2000]}).read_bytes()
+    # Near the ends are the headers.
+    places = [*range(100), *range(len(whole) - 300, len(whole))]
+    for _ in range(500):
+        damaged = bytearray(whole)
+        for _ in range(chance.choice((1, 3))):
+            damaged[chance.choice(places)] = chance.randrange(256)
+        (tmp_path / "d.zip").write_bytes(damaged)
+        with suppress(UsageError), open_files(tmp_path / "d.zip") as files:
+            read_all(files)
+
+
+def read_all(files):
+    for file in files:
+        assert file.name.isprintable()
+        with suppress(Unreadable):
+            assert file.size > 2**20 or file.read()
+
+
+def test_nothing_is_written_whatever_the_members_are_called(tmp_path):
+    names = ("a/b/c.csv", "d.csv/", f"{TRIAL}.csv", "x" * 300, "con.csv", "~/e.csv", "$HOME/f.csv")
+    path = write_zip(tmp_path / "d.zip", dict.fromkeys(names, b"x"))
+    with open_files(path) as files:
+        read_all(files)
+    assert list(tmp_path.rglob("*")) == [path]

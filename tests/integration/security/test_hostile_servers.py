@@ -1,0 +1,300 @@
+"""A server may send what it likes: memory, time and the sweep stay within their bounds."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gzip
+import json
+import shutil
+import ssl
+import subprocess
+import time
+import tracemalloc
+import zlib
+
+import pytest
+
+from merge_runner.config import Endpoint
+from merge_runner.llm.http import HttpTransport
+from merge_runner.llm.http_outcome import TransportFailure
+from tests.support.harness import FAST
+from tests.support.raw_server import CHAT, a_request, head, ok, raw_server
+
+KEY = "sk-dummy-Zx81/Qp55"
+ONE = ("baseline", "--reps", 1, "--conditions", "N_0_0", "--yes", *FAST)
+MB = 10**6
+MEMORY = 64 * MB
+
+
+async def answered(answer, *, most_bytes=16 * MB, timeout_s=5.0, auth=None):
+    """The reply to a request to a server with this answer; raises TransportFailure."""
+    async with raw_server(answer) as server:
+        endpoint = Endpoint("openai", "openai", server.url, auth or {})
+        transport = HttpTransport(endpoint, connections=1, most_bytes=most_bytes)
+        try:
+            return await transport.send(a_request(), attempt=1, timeout_s=timeout_s)
+        finally:
+            await transport.close()
+
+
+async def refused(answer, **options):
+    """The failure, which must be one that is not tried again, and what it took."""
+    with pytest.raises(TransportFailure) as failure, watched_memory() as watched:
+        await answered(answer, **options)
+    assert (failure.value.outcome, failure.value.action) == ("reply_refused", "fail")
+    assert failure.value.sent, "it may be charged"
+    assert watched["peak"] < MEMORY
+    return str(failure.value)
+
+
+@contextlib.contextmanager
+def watched_memory():
+    watched = {}
+    tracemalloc.start()
+    try:
+        yield watched
+    finally:
+        watched["peak"] = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+
+
+async def longest_stall():
+    """What the loop computed at a stretch at worst, in s, until this is cancelled."""
+    worst = 0.0
+    try:
+        while True:
+            before = time.thread_time()
+            await asyncio.sleep(0.001)
+            worst = max(worst, time.thread_time() - before)
+    except asyncio.CancelledError:
+        return worst
+
+
+def bomb(packed_mb):
+    """Gzip of so many megabytes that unpacks to a thousand times as much."""
+    packing = zlib.compressobj(9, wbits=31)
+    start = packing.compress(b"[") + packing.flush(zlib.Z_FULL_FLUSH)
+    block = packing.compress(bytes(8 * MB)) + packing.flush(zlib.Z_FULL_FLUSH)
+    return start + block * (packed_mb * MB // len(block))
+
+
+async def test_three_megabytes_of_gzip_are_refused_in_little_memory_and_the_loop_goes_on():
+    packed = bomb(3)
+    assert len(packed) > 2.9 * MB
+    stall = asyncio.create_task(longest_stall())
+    started = time.process_time()
+    said = await refused(ok(packed, content_encoding="gzip"))
+    assert "longer than 16 MB (max_reply_mb)" in said
+    assert time.process_time() - started < 2
+    stall.cancel()
+    assert await stall < 0.5
+
+
+@pytest.mark.parametrize("encoding", ["gzip", "GZIP", "deflate", "identity", ""])
+async def test_a_reply_of_exactly_the_bound_is_taken_and_one_byte_more_is_not(encoding):
+    text = b"\xc3\xbc" * 500
+
+    def reply(body):
+        packed = {"deflate": zlib.compress, "identity": bytes, "": bytes}.get(
+            encoding, gzip.compress
+        )(body)
+        return ok(packed, content_encoding=encoding)
+
+    taken = await answered(reply(text), most_bytes=1000)
+    assert taken.body == text.decode()
+    assert "longer than" in await refused(reply(text + b"x"), most_bytes=1000)
+
+
+async def test_a_large_compressed_reply_that_comes_in_pieces_arrives_whole():
+    text = json.dumps([str(n) for n in range(100_000)])
+
+    async def in_pieces(talk, _):
+        packed = gzip.compress(text.encode())
+        await talk.say(head(content_encoding="gzip", content_length=len(packed)))
+        for start in range(0, len(packed), 50_000):
+            await talk.say(packed[start : start + 50_000])
+            await asyncio.sleep(0)
+
+    assert (await answered(in_pieces)).body == text
+
+
+async def test_a_reply_that_is_not_compressed_as_it_says_is_tried_again():
+    with pytest.raises(TransportFailure) as failure:
+        await answered(ok(b"no gzip", content_encoding="gzip"))
+    assert (failure.value.outcome, failure.value.action) == ("connection_lost", "retry")
+
+
+async def test_an_empty_body_is_none_that_is_cut():
+    assert (await answered(ok(b"", 502, content_encoding="gzip"))).status == 502
+
+
+def endless(beginning, unit):
+    async def say(talk, _):
+        await talk.say(beginning)
+        with contextlib.suppress(ConnectionError):
+            while not talk.writer.is_closing():
+                await talk.say(unit)
+                await asyncio.sleep(0)
+
+    return say
+
+
+CHUNKED = head(transfer_encoding="chunked")
+
+
+def in_chunks(body):
+    return b"%x\r\n%s\r\n" % (len(body), body)
+
+
+ENDLESS = {
+    "headers": endless(b"HTTP/1.1 200 X\r\n", b"x: y\r\n" * 1000),
+    "one header": endless(b"HTTP/1.1 200 X\r\nx: ", b"y" * 65536),
+    "status line": endless(b"HTTP/1.1 200 ", b"y" * 65536),
+    "empty lines": endless(b"", b"\r\n" * 30_000),
+    "interim responses": endless(b"", head(103) * 1000),
+    "a chunk's extension": endless(CHUNKED + b"5;", b"y" * 65536),
+    "trailers": endless(CHUNKED + b"0\r\n", b"x: y\r\n" * 1000),
+    "a body": endless(head(), b"y" * 65536),
+    "chunks": endless(CHUNKED, b"10000\r\n" + b"y" * 65536 + b"\r\n"),
+    "chunks of one byte": endless(CHUNKED, b"1\r\ny\r\n" * 10_000),
+    "more after a gzip": endless(
+        head(transfer_encoding="chunked", content_encoding="gzip") + in_chunks(gzip.compress(CHAT)),
+        b"10000\r\n" + b"y" * 65536 + b"\r\n",
+    ),
+    "gzip of nothing": endless(
+        head(transfer_encoding="chunked", content_encoding="gzip")
+        + b"a\r\n\x1f\x8b\x08\0\0\0\0\0\0\3\r\n",
+        b"5\r\n\0\0\0\xff\xff\r\n" * 10_000,
+    ),
+}
+
+
+async def test_a_byte_order_mark_before_json_is_left_out():
+    assert (await answered(ok(b"\xef\xbb\xbf" + CHAT))).body == CHAT.decode()
+
+
+@pytest.mark.parametrize("answer", ENDLESS.values(), ids=ENDLESS)
+async def test_what_never_ends_is_ended_in_little_memory(answer):
+    with pytest.raises(TransportFailure) as failure, watched_memory() as watched:
+        await answered(answer, most_bytes=MB, timeout_s=0.5)
+    assert failure.value.outcome in ("connection_lost", "reply_refused", "timeout")
+    assert watched["peak"] < MEMORY
+
+
+async def test_a_drip_of_single_bytes_runs_into_the_timeout():
+    async def drip(talk, _):
+        await talk.drip(ok(), every_s=0.02)
+
+    with pytest.raises(TransportFailure, match="no reply within") as failure:
+        await answered(drip, timeout_s=0.2)
+    assert failure.value.outcome == "timeout"
+
+
+BRIEF = {  # a beginning, what is repeated, and an end
+    "brackets": (b"", b"[", b""),
+    "lists": (b"[", b"[],", b"1]"),
+    "texts": (b"[", b'"a",', b"1]"),
+    "escapes": (b'[[["', b'\\"', b'"]]]'),
+}
+
+
+@pytest.mark.parametrize("parts", BRIEF.values(), ids=BRIEF)
+async def test_sixteen_megabytes_hold_the_loop_for_a_moment_only(parts):
+    begin, unit, end = parts
+    body = begin + unit * ((16 * MB - 10) // len(unit)) + end
+    stall = asyncio.create_task(longest_stall())
+    assert (await answered(ok(body))).payload is not None or unit == b"["
+    stall.cancel()
+    assert await stall < 1.5
+
+
+@pytest.fixture(scope="module")
+def self_signed(tmp_path_factory):
+    """A server's side of TLS that nobody trusts."""
+    if shutil.which("openssl") is None:
+        pytest.skip("needs openssl")
+    folder = tmp_path_factory.mktemp("tls")
+    made = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2"
+    names = ["-subj", "/CN=localhost", "-keyout", "key", "-out", "cert"]
+    subprocess.run([*made.split(), *names], cwd=folder, check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(folder / "cert", folder / "key")
+    return context
+
+
+async def test_a_bad_certificate_ends_a_sweep_at_once_and_nothing_is_sent(
+    merge_runner, self_signed
+):
+    async with raw_server(ok(), tls=self_signed) as server:
+        run = await merge_runner(
+            *("sweep", *ONE, "--model", "o3"), OPENAI_API_KEY=KEY, OPENAI_BASE_URL=server.url
+        )
+    assert (run.code, server.requests) == (2, [])
+    last = run.err.splitlines()[-1]
+    assert "the endpoint's certificate cannot be trusted, and nothing was sent" in last
+    assert "Traceback" not in run.err
+
+
+@pytest.mark.parametrize(
+    ("variables", "says"),
+    [
+        ({"SSL_CERT_FILE": "/nowhere.pem"}, "SSL_CERT_FILE names cannot be read (No such file"),
+        (
+            {"HTTPS_PROXY": "ftp://proxy.invalid"},
+            "HTTPS_PROXY or ALL_PROXY is no URL of an HTTP proxy",
+        ),
+        (
+            {"ALL_PROXY": f"socks5://u:{KEY}@proxy.invalid"},
+            "a SOCKS proxy needs an HTTP proxy before it",
+        ),
+        ({"https_proxy": "http://[::1"}, "HTTPS_PROXY or ALL_PROXY is no URL of an HTTP proxy"),
+        ({"OPENAI_BASE_URL": "https://a..b/v1"}, "OPENAI_BASE_URL is no base URL"),
+        ({"OPENAI_BASE_URL": f"https://{'a' * 300}/v1"}, "OPENAI_BASE_URL is no base URL"),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+async def test_an_environment_that_cannot_be_used_is_told_before_anything_is_asked(
+    merge_runner, variables, says
+):
+    run = await merge_runner("sweep", *ONE, "--model", "o3", OPENAI_API_KEY=KEY, **variables)
+    assert run.code == 2, run.err
+    line = run.err.splitlines()[-1]
+    assert says in line
+    assert KEY not in run.err
+    assert "Traceback" not in run.err
+
+
+@pytest.mark.slow
+async def test_a_proxy_that_cannot_be_used_does_not_matter_on_loopback(merge_runner):
+    run = await merge_runner("sweep", *ONE, "--model", "emulator", ALL_PROXY="socks5://a:1")
+    assert run.code == 0, run.err
+
+
+async def test_a_503_that_asks_for_an_hour_is_told_as_such(merge_runner):
+    async with raw_server(ok(b'{"error": {"message": "maintenance"}}', 503, retry_after=3600)) as s:
+        run = await merge_runner(
+            *("sweep", *ONE, "--model", "o3"), OPENAI_API_KEY=KEY, OPENAI_BASE_URL=s.url
+        )
+    assert (run.code, len(s.requests)) == (1, 1)
+    assert "the server asks to wait 3600 s, longer than a call's deadline of 1200 s" in run.err
+
+
+@pytest.mark.slow
+async def test_a_refused_reply_fails_its_call_and_is_not_asked_again(merge_runner, tmp_path):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/models.toml").write_text(
+        '[m]\nprovider = "openai"\nformat = "openai-chat"\nid = "m"\nmax_output_tokens = 10\n'
+        'max_reply_mb = 0.001\nprice = { input = 1, output = 2, source = "s" }\n'
+    )
+    (tmp_path / "experiments/mine.toml").write_text("repetitions = { baseline = 1 }\n")
+    async with raw_server(ok(CHAT + b" " * 2000)) as server:
+        run = await merge_runner(
+            *("sweep", "mine", "--conditions", "N_0_0", "--yes", "--model", "m", "--json"),
+            OPENAI_API_KEY=KEY,
+            OPENAI_BASE_URL=server.url,
+        )
+    assert run.code == 1
+    calls = await merge_runner("sql", "SELECT outcome, error FROM calls", "--format", "csv")
+    assert "reply_refused,the reply is longer than 0.001 MB (max_reply" in calls.out
+    assert len(server.requests) == 2, "once for each driver"

@@ -1,0 +1,174 @@
+"""A study of imperfect perception and of state lines, from its file to what is read of it."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import html
+import re
+from statistics import median
+
+import duckdb
+import pytest
+from starlette.testclient import TestClient
+
+from merge_runner.results.store import query, results_digest
+from merge_runner_analysis.explorer.app import explorer
+from merge_runner_analysis.explorer.site import Site
+from tests.support.harness import FAST, watched
+from tests.support.mock_server import FaultPlan
+
+STUDY = """
+models = ["emulator", "emulator+projected-order"]
+repetitions = 1
+conditions = ["L_4_0", "N_0_0"]
+
+[factors]
+prompt = ["told_more"]
+perception = ["perfect", "foggy", "short"]
+
+[prompts.told_more]
+remove = ["C0"]
+add = [{ block = "state.table" }, { block = "state.time_to_merge" }, { block = "state.time_gap" }]
+
+[perception.foggy]
+position_sd_m = 0.5
+speed_sd_mps = 0.3
+autocorrelation_s = 1.0
+delay_s = 0.4
+dropout = 0.3
+
+[perception.short]
+range_m = 3.0
+"""
+HOST = "127.0.0.1:8700"
+BESIDE = """
+SELECT trial_id, side, told_distance_m - distance_m AS error_m,
+    told_other_speed_mps - other_speed_mps AS error_mps, other_seen
+FROM perceptions ORDER BY ALL
+"""
+
+
+@pytest.fixture
+def foggy(tmp_path):
+    (tmp_path / "foggy.toml").write_text(STUDY)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def db(prepare, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("foggy")
+    (folder / "foggy.toml").write_text(STUDY)
+    done = prepare(folder, "sweep", "foggy.toml", *FAST)
+    assert done.code == 0, done.err
+    return folder / "results/merge.duckdb"
+
+
+@pytest.mark.long
+async def test_a_foggy_study_that_is_killed_goes_on_and_replays_sealed_to_the_same_digest(
+    merge_runner, foggy
+):
+    begun = asyncio.Event()
+
+    async def slowly(request, handler):
+        begun.set()
+        return await handler(request)
+
+    sweep = ("sweep", "foggy.toml", "--json", *FAST)
+    async with watched(slowly, FaultPlan(latency_s=0.05)) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await merge_runner.start(*sweep, "--in-flight", 2, **env)
+        await begun.wait()
+        await asyncio.sleep(0.5)
+        process.kill()
+        await process.wait()
+        whole = await merge_runner(*sweep, **env)
+    assert (whole.code, whole.summary["trials"]["planned"]) == (0, 12), whole.err
+    exported = await merge_runner("recording", "export", "all.parquet")
+    assert exported.code == 0, exported.err
+    replay = ("replay", "foggy.toml", "--recording", "all.parquet", "--cache", "no", "--db", "r")
+    again = await merge_runner(*replay)
+    assert again.code == 0, again.err
+    assert results_digest(foggy / "r") == results_digest(foggy / "results/merge.duckdb")
+    assert query(foggy / "r", BESIDE) == query(foggy / "results/merge.duckdb", BESIDE)
+    audit = await merge_runner("audit", "--db", "r")
+    assert (audit.code, "12 replayed" in audit.out) == (0, True), audit.out
+    assert "all holds" in audit.out
+    with duckdb.connect(str(foggy / "r")) as connection:
+        connection.execute("UPDATE decisions SET told_distance_m = told_distance_m + 0.01")
+    audit = await merge_runner("audit", "--db", "r")
+    assert audit.code == 1
+    assert "decisions.told_distance_m" in audit.out
+
+
+def test_what_was_so_stands_beside_what_was_told(db):
+    _, rows = query(db, BESIDE)
+    errors = {
+        level: [row for row in rows if f"perception={level}" in row[0]]
+        for level in ("perfect", "foggy", "short")
+    }
+    assert errors["perfect"] == []
+    assert len({row[2] for row in errors["foggy"]}) > 60
+    assert all(row[4] for row in errors["foggy"])
+    assert 0.3 < median(abs(row[2]) for row in errors["foggy"]) < 3
+    unseen = [row for row in errors["short"] if not row[4]]
+    assert unseen
+    assert {row[2:4] for row in unseen} == {(None, None)}
+    assert {row[2:4] for row in errors["short"] if row[4]} == {(0.0, 0.0)}
+
+
+def test_the_prompt_says_what_was_told_and_not_what_was_so(db):
+    _, rows = query(
+        db,
+        "SELECT prompt, other_seen, told_distance_m, told_other_speed_mps FROM decisions "
+        "WHERE prompt IS NOT NULL AND other_seen IS NOT NULL",
+    )
+    assert {seen for _, seen, *_ in rows} == {True, False}
+    for prompt, seen, distance_m, speed_mps in rows:
+        told = (f"{distance_m:.2f}".replace("-0.00", "0.00"), f"{speed_mps:.2f}") if seen else None
+        distance, speed = told or ("not seen", "not seen")
+        assert f"| Speed of the other car | {speed} | m/s |" in prompt
+        assert f"behind) | {distance} | m |" in prompt
+
+
+def test_programs_are_told_no_more_than_models(db):
+    """A program in a short range keeps its speed until it sees the other."""
+    _, rows = query(
+        db,
+        "SELECT plan[1] FROM decisions WHERE call_key IS NULL AND NOT other_seen",
+    )
+    assert {plan for (plan,) in rows} == {0.0}
+    _, rows = query(db, "SELECT count(*) FROM decisions WHERE call_key IS NULL AND plan[1] <> 0")
+    assert rows[0][0] > 0
+
+
+def test_the_panel_of_a_decision_shows_both_beside_each_other(db):
+    client = TestClient(explorer(Site(db)), base_url=f"http://{HOST}")
+
+    def panel(level):
+        trial = f"emulator/told_more/L_4_0/rep01/perception={level}"
+        text = client.get(f"/trials/{trial}").text
+        text = text.partition('">right</span> decision 0 at')[2].partition("</article>")[0]
+        return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", text)).replace("−", "-").split())
+
+    with duckdb.connect(str(db), read_only=True) as connection:
+        so, told = connection.execute(
+            "SELECT distance_m, told_distance_m FROM perceptions WHERE side = 'right' "
+            "AND decision = 0 AND trial_id = 'emulator/told_more/L_4_0/rep01/perception=foggy'"
+        ).fetchone()
+    said = f"how far ahead the other is (m) {so:.2f} {told:.2f} {told - so:+.2f}"
+    assert said in panel("foggy")
+    assert " not seen " in panel("short")
+    assert "what it perceived" not in panel("perfect")
+    assert "state.table" in panel("foggy")
+    assert "situation as a table" in panel("foggy")
+
+
+async def test_what_was_told_is_exported_with_its_meaning(merge_runner, db, tmp_path):
+    done = await merge_runner("export", "out", "--db", db)
+    assert done.code == 0, done.err
+    with (tmp_path / "out/dictionary.csv").open(newline="", encoding="utf-8") as file:
+        meanings = {(row["table"], row["column"]): row["meaning"] for row in csv.DictReader(file)}
+    assert meanings["perceptions", "distance_m"] == "how far ahead the other was"
+    with (tmp_path / "out/perceptions.csv").open(newline="", encoding="utf-8") as file:
+        assert len(list(csv.DictReader(file))) > 100

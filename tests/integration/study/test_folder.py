@@ -1,0 +1,181 @@
+"""The folder that `merge-runner init` writes: what it has runs there, and is refused elsewhere."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import json
+import re
+import shlex
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from merge_runner import Study
+from merge_runner.config import ModelEntry
+from merge_runner.paths import DEFAULT_DB, home_of
+from merge_runner.results.store import query, results_digest
+from merge_runner.study.file import TEMPLATE, write_folder
+from tests.support.harness import PROGRAM, watched
+from tests.support.mock_server import FaultPlan
+
+
+@pytest.fixture
+def study(tmp_path):
+    """A new study."""
+    folder = tmp_path / "mine"
+    write_folder(folder)
+    return folder
+
+
+@pytest.mark.slow
+async def test_a_new_study_is_killed_resumed_replayed_and_shown(merge_runner, study):
+    begun = asyncio.Event()
+
+    async def begin(request, handler):
+        begun.set()
+        return await handler(request)
+
+    async with watched(begin, FaultPlan(latency_s=0.05)) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        sweep = ("sweep", "study.toml", "--in-flight", 2, "--json")
+        process = await merge_runner.start(*sweep, cwd=study, **env)
+        await begun.wait()
+        await asyncio.sleep(0.3)
+        process.kill()
+        assert await process.wait() != 0
+        before = server.requests
+        resumed = await merge_runner(*sweep, cwd=study, **env)
+        assert (resumed.code, resumed.summary["trials"]["planned"]) == (0, 24), resumed.err
+        assert resumed.summary["calls"]["live"] == server.requests - before
+        done = server.requests
+        again = await merge_runner("replay", "study.toml", "--db", "again.duckdb", cwd=study, **env)
+        assert again.code == 0, again.err
+        assert server.requests == done
+    digest = results_digest(study / "results/merge.duckdb")
+    assert results_digest(study / "again.duckdb") == digest
+    tables = await merge_runner("tables", "ablation-quantitative", cwd=study)
+    assert "emulator+hesitant [temperature=0.2]/hurry" in tables.out
+
+
+async def test_an_export_names_the_plug_ins_that_it_carries_and_has_no_command_line(
+    merge_runner, study, tmp_path
+):
+    part = ("--only", "temperature=0.2", "--only", "prompt=baseline")
+    played = await merge_runner("sweep", study / "study.toml", *part)
+    assert played.code == 0, played.err
+    places = ("--db", study / "results/merge.duckdb", "--cache", study / "cache/responses")
+    export = await merge_runner("recording", "export", "mine.parquet", *places)
+    assert "the whole source of the study's plug-ins: plugin.py" in export.err
+    told = await merge_runner("recording", "info", "mine.parquet")
+    info = json.loads(told.out)
+    assert info["plugins"] == ["plugin.py"]
+    assert str(tmp_path) not in told.out
+    assert str(tmp_path).encode() not in (tmp_path / "mine.parquet").read_bytes()
+    config = json.loads(info["provenance"]["config"])
+    [(stored,)] = query(study / "results/merge.duckdb", "SELECT config FROM sweeps")[1]
+    assert json.loads(stored).keys() - config.keys() == {"typed"}
+
+
+async def test_results_lie_beside_the_study_wherever_it_is_started(merge_runner, study, tmp_path):
+    outside = ("mine/study.toml", "--only", "temperature=0.2", "--only", "prompt=baseline")
+    begun = await merge_runner("sweep", *outside, "--json")
+    assert begun.code == 0, begun.err
+    assert not (tmp_path / "results").exists()
+    assert not (tmp_path / "cache").exists()
+    inside = await merge_runner("sweep", "study.toml", *outside[1:], "--json", cwd=study)
+    assert inside.summary["trials"]["stored_before"] == begun.summary["trials"]["planned"]
+    made = Study(study / "study.toml")
+    assert (made.db, made.cache) == (study / "results/merge.duckdb", study / "cache/responses")
+    tables = await merge_runner("tables", "gap", "--study", "mine/study.toml")
+    assert "hesitant" in tables.out
+    named = await merge_runner("tables", "gap", "--study", "mine/study.toml", "--db", DEFAULT_DB)
+    assert "there is no database results/merge.duckdb" in named.err
+
+
+def test_a_study_of_a_folder_experiments_has_its_results_beside_that_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert home_of("baseline") == home_of("experiments/mine.toml") == Path()
+    assert home_of(str(tmp_path.parent / "experiments/mine.toml")) == tmp_path.parent
+
+
+@pytest.mark.long
+async def test_the_commands_of_its_readme_and_its_makefile_work(merge_runner, study):
+    (block,) = re.findall(r"```sh\n(.*?)```", (study / "README.md").read_text(), re.DOTALL)
+    assert "pip install merge_runner-*.whl " in block  # as the project's own README says
+    commands = [shlex.split(line, comments=True) for line in block.splitlines()]
+    ours = [words[1:] for words in commands if words[0] == "merge-runner" and words[1] != "view"]
+    assert len(ours) >= 8
+    for words in ours:
+        done = await merge_runner(*words, cwd=study)
+        assert done.code == 0, (words, done.err)
+    targets = subprocess.run(
+        [
+            "make",
+            "--no-print-directory",
+            "-n",
+            "sweep",
+            "replay",
+            "tables",
+            "report",
+            "view",
+            "ARGS=--db x",
+        ],
+        cwd=study,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert targets.stdout.splitlines() == [
+        "merge-runner sweep study.toml --db x",
+        "merge-runner replay study.toml --db x",
+        "merge-runner tables --study study.toml --db x",
+        "merge-runner report --study study.toml --db x",
+        "merge-runner view --study study.toml --db x",
+    ]
+
+
+async def test_init_says_what_to_type_and_refuses_a_folder_that_is_not_empty(
+    merge_runner, tmp_path
+):
+    made = await merge_runner("init", "my study")
+    assert (made.code, made.out) == (0, "go on: cd 'my study' && merge-runner sweep study.toml\n")
+    names = {path.name for path in (tmp_path / "my study").iterdir()}
+    files = ("study.toml", "models.toml", "plugin.py", "README.md", "CITATION.cff", "Makefile")
+    assert names == {*files, ".gitignore"}
+    again = await merge_runner("init", "my study")
+    assert (again.code, again.err) == (
+        2,
+        "error: my study is not empty: name a new folder\n",
+    )
+    (tmp_path / "file").touch()
+    assert "file cannot be written" in (await merge_runner("init", "file")).err
+
+
+def test_a_plug_in_is_short_and_every_commented_line_of_the_registry_can_be_used():
+    plugin = (TEMPLATE / "plugin.py").read_text()
+    assert len(plugin.splitlines()) < 40
+    assert ast.parse(plugin)
+    lines = (TEMPLATE / "models.toml").read_text().splitlines()
+    used = [line.removeprefix("# ") if re.match(r"# (\[|\w+ = )", line) else line for line in lines]
+    entries = tomllib.loads("\n".join(used))
+    assert set(entries) == {"emulator-priced", "my-local"}
+    for entry in entries.values():
+        ModelEntry.model_validate(entry)
+
+
+def test_the_commented_lines_of_the_study_can_be_used(study):
+    text = (study / "study.toml").read_text()
+    used = re.sub(r"^# (?=\[|total_usd|prompt = |temperature = )", "", text, flags=re.MULTILINE)
+    (study / "study.toml").write_text(used)
+    out = subprocess.run(
+        [PROGRAM, "sweep", "study.toml", "--dry-run"],
+        cwd=study,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert out.returncode == 0, out.stderr
+    assert re.search(r"trials +18 ", out.stdout)

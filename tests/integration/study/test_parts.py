@@ -1,0 +1,304 @@
+"""The prompts, conditions and plug-ins that a study adds."""
+
+from __future__ import annotations
+
+import json
+import sys
+from importlib import import_module
+
+import pytest
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
+from merge_runner.prompts.blocks import blocks_of, prompt_of, render_prompt
+from merge_runner.registry import Catalogue, collecting, using
+from merge_runner.run.plan import make_plan
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import World
+from merge_runner.source import STUDY_PLUGINS, source_digest
+from tests.support.harness import how_to
+
+HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
+DRIVER = """
+from merge_runner.drivers.registry import PROGRAMS, Program
+
+class Braking:
+    def __init__(self, seat):
+        self.seat = seat
+
+    async def decide(self, observation, number):
+        return self.seat.held({action})
+
+PROGRAMS.register("braking", Program(Braking, "brakes"))
+"""
+
+
+@pytest.fixture
+def plan_of(tmp_path):
+    """Makes the plan of a study's text."""
+
+    def plan(text, models=(), plugin=None, conditions=True):
+        file = tmp_path / "mine.toml"
+        file.write_text((HEAD if conditions else "repetitions = 1\n") + text)
+        if plugin is not None:
+            (tmp_path / "mine.py").write_text(plugin)
+        return make_plan(str(file), models, trust=True)
+
+    return plan
+
+
+def prompt(plan, variant):
+    scenario = ScenarioConfig()
+    seen = World(scenario, CONDITIONS["N_0_0"], TRACK).observe("left")
+    return render_prompt(seen, None, prompt=plan.parts.prompts[variant], scenario=scenario)
+
+
+def persona(text="You are a taxi driver."):
+    added = f'add = [{{ after = "C3.human", text = "{text}" }}]'
+    return f'[factors]\nprompt = ["taxi"]\n[prompts.taxi]\n{added}\n'
+
+
+MODELS = """
+[talker-1]
+provider = "talker"
+format = "say"
+id = "talker-1"
+max_output_tokens = 2000
+price = "free"
+"""
+
+
+def test_models_beside_a_study_may_speak_a_wire_format_of_its_plug_ins(plan_of, tmp_path):
+    (tmp_path / "models.toml").write_text(MODELS)
+    named = 'models = ["talker-1"]\n[plugins]\nfiles = ["mine.py"]\n'
+    plan = plan_of(named, plugin=how_to("add-a-wire-format"))
+    assert plan.entries["talker-1"].format == "say"
+    assert {json.loads(text)["left"]["path"] for text in plan.specs().values()} == {"/say"}
+
+
+def test_a_paragraph_is_added_where_it_belongs(plan_of):
+    plan = plan_of(persona("You drive {own_speed_kmh} km/h, {own_speed_mph} mph."))
+    lines = prompt(plan, "taxi").split("\n\n")
+    place = lines.index("You drive 36.00 km/h, 22.37 mph.")
+    assert lines[place - 1].startswith("Drive the way a human driver")
+    plain = prompt(make_plan("baseline"), "baseline")
+    assert lines[:place] + lines[place + 1 :] == plain.split("\n\n")
+
+
+@pytest.mark.parametrize(
+    ("change", "neighbours"),
+    [
+        ("", ("C0", "C1")),
+        ('remove = ["C1", "C2"]\n', ("C0", "C3.safety")),
+        ('based_on = "A1"\n', ("C0", "C2")),
+    ],
+)
+def test_a_ready_block_stands_behind_the_situation_unless_it_is_put_elsewhere(
+    plan_of, change, neighbours
+):
+    head = '[factors]\nprompt = ["more"]\n[prompts.more]\n'
+    plan = plan_of(f'{head}{change}add = [{{ block = "state.time_gap" }}]\n', "emulator")
+    names = list(plan.parts.prompts["more"].blocks)
+    place = names.index("state.time_gap")
+    assert (names[place - 1], names[place + 1]) == neighbours
+    plan = plan_of(f'{head}{change}add = [{{ block = "state.time_gap", before = "C5" }}]\n')
+    assert list(plan.parts.prompts["more"].blocks)[-2:] == ["state.time_gap", "C5"]
+    assert "\n\nTime gap (" in prompt(plan, "more")
+
+
+def test_an_edited_prompt_is_another_spec_at_once(plan_of):
+    texts = ["You are late.", "You are early."]
+    plans = [plan_of(persona(text)) for text in texts]
+    specs = [plan.trial_specs()[0].spec_hash for plan in plans]
+    assert specs[0] != specs[1]
+    for plan, text in zip(plans, texts, strict=True):
+        assert [each in prompt(plan, "taxi") for each in texts] == [each == text for each in texts]
+
+
+def test_blocks_are_removed_replaced_and_moved(plan_of):
+    plan = plan_of(
+        '[factors]\nprompt = ["other"]\n[prompts.other]\nbased_on = "A2"\n'
+        'remove = ["C3.safety", "C4"]\nreplace = { "C3.human" = "Drive like a robot." }\n'
+        'add = [{ after = "C0", block = "C4" }]\n'
+    )
+    rest = [name for name in blocks_of("A2") if name not in ("C0", "C3.safety", "C4")]
+    assert list(plan.parts.prompts["other"].blocks) == ["C0", "C4", *rest]
+    assert "Drive like a robot." in prompt(plan, "other")
+
+
+def test_the_place_of_a_block_is_in_the_hash_of_its_prompt(plan_of):
+    plan = plan_of(
+        '[factors]\nprompt = ["other"]\n[prompts.other]\nremove = ["C4"]\n'
+        'add = [{ after = "C0", block = "C4" }]\n'
+    )
+    assert plan.parts.prompts["other"].digests != prompt_of("baseline").digests
+
+
+OWN = """
+[[conditions]]
+name = "X"
+projected_headway_m = 1
+relative_velocity_mps = 0.5
+mean_speed_mps = {speed}
+"""
+
+
+def test_an_own_condition_is_played_and_another_mean_speed_is_another_spec(plan_of):
+    specs = []
+    for speed in (10.0, 12.0):
+        specs += plan_of(OWN.format(speed=speed), conditions=False).trial_specs()
+        assert specs[-1].kinematics.speeds_mps[0] == speed + 0.25
+    assert len({spec.spec_hash for spec in specs}) == 2
+    plain = make_plan("baseline", "emulator").trial_specs()[0].spec_hash
+    assert specs[0].spec_hash == plain  # its headway and velocity stand in the trial's row
+
+
+def test_all_stands_for_the_conditions_of_the_scenario(plan_of):
+    text = (
+        'conditions = ["all", { name = "Y", projected_headway_m = 1, relative_velocity_mps = 0 }]\n'
+    )
+    plan = plan_of(text, conditions=False)
+    assert len(plan.conditions) == 12
+
+
+def test_a_plug_in_beside_the_study_drives_and_an_edit_of_it_is_another_driver(plan_of):
+    text = '[plugins]\nfiles = ["mine.py"]\n'
+    hashes = []
+    for action in (-0.1, -0.1, -0.2):
+        plan = plan_of(text, ["braking"], plugin=DRIVER.format(action=action))
+        hashes.append(plan.trial_specs()[0].spec_hash)
+    assert hashes[0] == hashes[1] != hashes[2]
+    assert plan.model_dump(mode="json")["study"]["plugins"] == {
+        "mine.py": DRIVER.format(action=-0.2)
+    }
+
+
+def test_an_edit_of_what_a_plug_in_imports_is_another_driver(tmp_path):
+    study = tmp_path / "mine.toml"
+    study.write_text(HEAD + '[plugins]\nfiles = ["gains.py", "mine.py"]\n')
+    driver = "from .gains import GAIN\n" + DRIVER.format(action="GAIN")
+    (tmp_path / "mine.py").write_text(driver)
+    hashes = []
+    for gain in (-0.1, -0.9):
+        (tmp_path / "gains.py").write_text(f"GAIN = {gain}\n")
+        hashes.append(make_plan(str(study), ["braking"], trust=True).trial_specs()[0].spec_hash)
+    assert hashes[0] != hashes[1]
+
+
+def test_what_an_earlier_study_added_is_gone(plan_of):
+    plan_of('[plugins]\nfiles = ["mine.py"]\n', ["braking"], plugin=DRIVER.format(action=0))
+    with pytest.raises(UsageError, match="unknown model 'braking'"):
+        plan_of("", ["braking"])
+    plan_of(persona())
+    with pytest.raises(UsageError, match="unknown variant 'taxi'"):
+        plan_of('[factors]\nprompt = ["taxi"]\n')
+
+
+@pytest.mark.parametrize(
+    ("text", "plugin", "says"),
+    [
+        (
+            persona("{speed}"),
+            None,
+            "block 'added by taxi': 'speed'; valid: ",
+        ),
+        (
+            persona().replace("C3.human", "C9"),
+            None,
+            "unknown block of the prompt taxi 'C9'; valid: C0",
+        ),
+        (
+            persona().replace("C3.human", "A"),
+            None,
+            "unknown block of the prompt taxi 'A'; valid: C0",
+        ),
+        ('[prompts.baseline]\nremove = ["C2"]\n', None, "there is a variant 'baseline' already"),
+        (
+            '[prompts.x]\nremove = ["C2"]\nreplace = { C2 = "x" }\n',
+            None,
+            "unknown block of the prompt x 'C2'; valid: C0",
+        ),
+        (
+            '[prompts.x]\nadd = [{ after = "C0" }]\n',
+            None,
+            "give it a block, a text, or merge",
+        ),
+        (
+            '[prompts.x]\nadd = [{ after = "C0", text = "a", merge = "b" }]\n',
+            None,
+            "give it a block, a text, or merge",
+        ),
+        ('[prompts.x]\nadd = [{ block = "C9" }]\n', None, "unknown prompt block 'C9'; valid: C0"),
+        ('[prompts.x]\nadd = [{ block = "C2" }]\n', None, "C2, which it has already"),
+        ("[prompts.x]\nad = []\n", None, "unknown key 'prompts.x.ad'; valid: based_on, remove"),
+        ('[plugins]\nfiles = ["none.py"]\n', None, "none.py cannot be read"),
+        (
+            '[plugins]\nfiles = ["mine.py"]\n',
+            "\n1 / 0",
+            "mine.py, line 2, fails: ZeroDivisionError",
+        ),
+        ('[plugins]\nfiles = ["mine.py"]\n', "def", "mine.py, line 1, fails: SyntaxError"),
+        ('[plugins]\nfiles = ["mine.py"]\n', "assert 0, 'no'", "fails: AssertionError: no"),
+        ('[plugins]\nfiles = ["mine.py", "a/mine.py"]\n', "", "cannot be read"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(plan_of, text, plugin, says):
+    with pytest.raises(UsageError) as caught:
+        plan_of(text, plugin=plugin)
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_import_that_fails_hides_no_other_one(plan_of, tmp_path, monkeypatch):
+    """What the others register is no part of the study, also where one needs a path of its own."""
+    (tmp_path / "found_by_a_plug_in.py").write_text(
+        "from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition\n"
+        'CONDITIONS.register("found", Condition(1.0, 0.0))\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(CONDITIONS, "_things", dict(CONDITIONS._things))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    beside = tmp_path / "beside"
+    beside.mkdir()
+    (beside / "found_by_its_path.py").write_text("")
+    own = f"import sys\nsys.path.insert(0, {str(beside)!r})\nimport found_by_its_path\n"
+    own += "import found_by_a_plug_in\n"
+    plan = plan_of('[plugins]\nfiles = ["mine.py"]\n', plugin=own)
+    assert "found" in CONDITIONS
+    assert not plan.parts.catalogue.parts
+
+
+def test_the_hash_of_a_plug_in_is_that_of_a_package_of_its_name(plan_of, tmp_path, monkeypatch):
+    """However many others there are: what was stored of it stays its own."""
+    study = tmp_path / "study.toml"
+    driver = "from .gains import GAIN\n" + DRIVER.format(action="GAIN")
+    study.write_text(HEAD + '[plugins]\nfiles = ["gains.py", "mine.py", "other.py"]\n')
+    for folder in (tmp_path, tmp_path / STUDY_PLUGINS):
+        folder.mkdir(exist_ok=True)
+        (folder / "gains.py").write_text("GAIN = -0.1\n")
+        (folder / "other.py").write_text("")
+        (folder / "mine.py").write_text(driver)
+    hashed = []
+    for text in ("", "X = 1\n"):
+        (tmp_path / "other.py").write_text(text)
+        plan = make_plan(str(study), ["braking"], trust=True)
+        hashed.append(plan.parts.programs["braking"].in_spec("braking")["source"])
+    monkeypatch.syspath_prepend(tmp_path)
+    with collecting(Catalogue()):
+        package = import_module(f"{STUDY_PLUGINS}.mine")
+    assert hashed == [source_digest(package.Braking)] * 2
+
+
+def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monkeypatch):
+    register = 'CONDITIONS.register("elsewhere", Condition(1.0, 0.0))\n'
+    imports = "from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition\n"
+    (tmp_path / "imported_by_a_plug_in.py").write_text(imports + register)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(CONDITIONS, "_things", dict(CONDITIONS._things))
+    own = f"import imported_by_a_plug_in\n{imports}{register.replace('elsewhere', 'own')}"
+    plan = plan_of('[plugins]\nfiles = ["mine.py"]\n', plugin=own)
+    with using(plan.parts.catalogue):
+        assert {"elsewhere", "own"} < {*CONDITIONS}
+    assert "elsewhere" in CONDITIONS
+    assert "own" not in CONDITIONS

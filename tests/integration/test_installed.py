@@ -1,0 +1,170 @@
+"""The program runs wherever it is installed, and imports nothing of the folder it is called in."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from merge_runner import __version__
+from merge_runner_analysis.commands import app
+from tests.support.harness import PROGRAM, PROJECT, Run, environment
+
+MODULE = (sys.executable, "-m", "merge_runner")
+BUILD = "import sys; from setuptools import build_meta; print(build_meta.build_{}(sys.argv[1]))"
+DESCRIBED = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+
+
+def run(folder: Path, *command: object, **changes: str) -> Run:
+    done = subprocess.run(
+        [*map(str, command)],
+        cwd=folder,
+        env=environment(**changes),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return Run(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory):
+    """A folder with modules of the names of ours and of those of a library."""
+    folder = tmp_path_factory.mktemp("hostile")
+    for name in ("analysis", "merge_runner", "typer", "duckdb"):
+        (folder / f"{name}.py").write_text(f"raise AssertionError('{name} of the folder')\n")
+    return folder
+
+
+def test_python_m_merge_runner_has_every_command_and_the_version(tmp_path):
+    listed = run(tmp_path, *MODULE, "--help").out
+    for name in typer.main.get_command(app).commands:
+        assert f"  {name} " in listed
+    assert __version__ == DESCRIBED["version"]
+    for program in (MODULE, [PROGRAM]):
+        assert run(tmp_path, *program, "--version").out == f"merge-runner {__version__}\n"
+
+
+@pytest.mark.long
+def test_no_command_imports_from_the_folder_it_is_called_in(hostile, tmp_path):
+    assert run(hostile, PROGRAM, "tables", "--db", tmp_path / "none").code == 2
+    small = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
+    # It starts an emulator, and that imports from the folder as little.
+    done = run(hostile, PROGRAM, *small)
+    assert done.code == 0, done.err
+    (tmp_path / "analysis.py").write_text("raise AssertionError('analysis of the folder')")
+    for command in (small, ("tables", "gap")):
+        done = run(tmp_path, *MODULE, *command)
+        assert done.code == 0, done.err
+
+
+def test_a_file_of_the_users_named_analysis_and_ours_are_two_modules(tmp_path):
+    (tmp_path / "analysis.py").write_text("MINE = True\n")
+    both = "import analysis; from merge_runner_analysis import table; assert analysis.MINE"
+    assert run(tmp_path, sys.executable, "-c", both).code == 0
+
+
+def test_a_library_that_is_not_there_is_named_in_one_line(tmp_path):
+    (tmp_path / "duckdb.py").write_text("raise ModuleNotFoundError('no', name='duckdb')")
+    done = run(tmp_path, PROGRAM, "digest", PYTHONPATH=f"{tmp_path}:{PROJECT}")
+    assert done.code == 2
+    assert done.err == "error: this needs duckdb, which is not installed: pip install duckdb\n"
+
+
+def test_where_a_module_of_posix_is_missing_the_systems_it_runs_on_are_named(tmp_path):
+    (tmp_path / "fcntl.py").write_text("raise ModuleNotFoundError('no', name='fcntl')")
+    done = run(tmp_path, PROGRAM, "ledger", PYTHONPATH=f"{tmp_path}:{PROJECT}")
+    assert done.code == 2
+    assert (
+        done.err == "error: merge-runner runs on Linux and macOS; on Windows it runs within WSL\n"
+    )
+
+
+def built(kind: str, source: Path, to: Path) -> Path:
+    done = run(source, sys.executable, "-c", BUILD.format(kind), to)
+    assert done.code == 0, done.err
+    return to / done.out.split()[-1]
+
+
+def checkout_in(folder: Path) -> Path:
+    """A copy of what a build takes, which leaves its own files there."""
+    checkout = folder / "checkout"
+    checkout.mkdir()
+    tracked = subprocess.run(
+        ["git", "ls-files", "merge_runner", "merge_runner_analysis", "merge_runner_cei", "analysis",
+         "plugins", "experiments", "cache", "pyproject.toml", "README.md", "LICENSE"],
+        cwd=PROJECT, capture_output=True, text=True, check=True,
+    ).stdout.split()  # fmt: skip
+    run(PROJECT, "cp", "--parents", "--no-dereference", *tracked, checkout)
+    return checkout
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the_sdist(tmp_path):
+    checkout = checkout_in(tmp_path)
+    sdist = built("sdist", checkout, tmp_path)
+    shutil.unpack_archive(sdist, tmp_path / "sdist")
+    (unpacked,) = (tmp_path / "sdist").iterdir()
+    contents = []
+    for source in (checkout, unpacked):
+        with zipfile.ZipFile(built("wheel", source, tmp_path / source.name)) as wheel:
+            contents.append({entry.filename: entry.CRC for entry in wheel.infolist()})
+    (from_checkout, from_sdist) = ({n for n in names if "RECORD" not in n} for names in contents)
+    assert from_checkout == from_sdist
+    shipped = {
+        f"merge_runner/{link}/{file.name}"
+        for link, folder in (("experiments", "experiments"), ("recordings", "cache/recordings"))
+        for file in (PROJECT / folder).iterdir()
+    }
+    shipped |= {
+        "merge_runner/py.typed",
+        "merge_runner_analysis/py.typed",
+        "merge_runner_cei/driver.py",
+    }
+    assert shipped <= from_checkout
+    assert not {name for name in from_checkout if name.startswith(("tests", "benchmarks"))}
+
+
+def test_the_oldest_packages_that_are_tested_are_those_that_pyproject_names():
+    lock = (PROJECT / "requirements-lowest.lock").read_text()
+    tested = dict(re.findall(r"^([a-z0-9-]+)==([0-9.]+)", lock, re.MULTILINE))
+    for requirement in DESCRIBED["dependencies"]:
+        name, oldest = re.split(">=|,", requirement)[:2]
+        assert re.fullmatch(rf"{re.escape(oldest)}(\.0)*", tested[name]), name
+
+
+def test_the_citation_is_of_this_version_and_names_the_paper():
+    text = (PROJECT / "CITATION.cff").read_text()
+    told = dict(re.findall(r"^([a-z-]+): (.+)$", text, re.MULTILINE))
+    assert told["cff-version"] == "1.2.0"
+    assert told["version"] == DESCRIBED["version"]
+    assert told["license"] == DESCRIBED["license"]
+    authors = (PROJECT / "LICENSE").read_text().split("(c) 2026 ")[1].split("\n")[0]
+    assert f"authors:\n  - name: {authors}\n" in text
+    assert "arXiv:2604.09609" in text
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (PROJECT / ".venv/runtime").exists(), reason="make has made no .venv")
+def test_make_says_the_exit_code_of_the_program(tmp_path):
+    missed = run(
+        PROJECT, "make", "replay", "MODEL=o3", "RECORDING=",
+        f"ARGS=--reps 1 --conditions N_0_0 --db {tmp_path}/db --cache {tmp_path}/cache",
+    )  # fmt: skip
+    assert "replay] Error 4" in missed.err
+    assert missed.code == 2
+
+
+def test_make_hands_nothing_to_an_inner_make(tmp_path):
+    inner = tmp_path / "Makefile"
+    inner.write_text((PROJECT / "Makefile").read_text().split("help:")[0] + "\ninner:\n\t@env\n")
+    seen = run(tmp_path, "make", "inner", "MODEL=o3", "ARGS=-x").out
+    assert not re.search(r"^(MAKEFLAGS|ARGS|MODEL)=", seen, re.MULTILINE)

@@ -1,0 +1,205 @@
+"""A scripted stand-in is never taken for the model whose name was used."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import replace
+from urllib.parse import urlsplit
+
+import duckdb
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from merge_runner.config import driver_name
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.records import SCRIPTED_FIELD, Attempt, Slot, is_scripted, make_request
+from merge_runner.results.database import in_memory, schema_sql
+from merge_runner.results.recording import export_recording, read_recording
+from tests.support.harness import FAST, PROJECT, as_a_model, watched
+
+MACRO = re.search(r"CREATE MACRO[^;]*driver_name[^;]*;", schema_sql())[0]
+SMALL = ("--reps", 1, "--conditions", "L_4_0", "--json")
+# The registry's entries by the variables that lead to them; all four formats are among them.
+POINTED = {
+    "o3": ("OPENAI", "/v1"),
+    "gpt-5.6-sol": ("OPENAI", "/v1"),
+    "gemini-2.5-pro": ("GOOGLE_GEMINI", ""),
+    "claude-sonnet-4-6": ("ANTHROPIC", ""),
+}
+
+
+def pointed_at(emulator_url, model):
+    """The variables by which a user leads a model's calls to the emulator."""
+    name, path = POINTED[model]
+    keys = dict.fromkeys(("OPENAI_API_KEY", "GEMINI_API_KEY", "ANTHROPIC_API_KEY"), "x")
+    return {**keys, f"{name}_BASE_URL": emulator_url.removesuffix("/v1") + path}
+
+
+def marks(db):
+    """What calls and trials say of who answered."""
+    with duckdb.connect(str(db), read_only=True) as connection:
+        return connection.execute(
+            "SELECT DISTINCT calls.scripted, trials.scripted, http_status "
+            "FROM calls JOIN trials USING (trial_id, spec_hash)"
+        ).fetchall()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("model", POINTED)
+async def test_the_emulator_behind_a_models_name_is_stored_as_what_it_is(
+    merge_runner, emulator_url, tmp_path, model
+):
+    pointed = pointed_at(emulator_url, model)
+    run = await merge_runner("sweep", "baseline", "--model", model, *SMALL, *FAST, "--yes",
+                             **pointed)  # fmt: skip
+    assert run.code == 0, run.err
+    assert marks(tmp_path / "results/merge.duckdb") == [(True, True, 200)]
+    await merge_runner("recording", "export", "told.parquet")
+    with_flags = list(read_recording(tmp_path / "told.parquet"))
+    assert all(a.scripted for entry in with_flags for a in entry.attempts)
+    stripped = ResponseCache(tmp_path / "stripped")
+    stripped.put_now(
+        replace(entry, attempts=tuple(replace(a, scripted=False) for a in entry.attempts))
+        for entry in with_flags
+    )
+    export_recording(tmp_path / "untold.parquet", stripped,
+                     [entry.request.key for entry in with_flags], {})  # fmt: skip
+    for recording in ("told", "untold"):
+        info = (await merge_runner("recording", "info", f"{recording}.parquet")).summary
+        assert info["scripted"] == info["calls"] == len(with_flags)
+        replay = await merge_runner(
+            "replay", "baseline", "--model", model, *SMALL, "--cache", "empty",
+            "--recording", f"{recording}.parquet", "--db", f"{recording}.duckdb",
+        )  # fmt: skip
+        assert replay.code == 0, replay.err
+        assert replay.summary["scripted"] is True
+        assert marks(tmp_path / f"{recording}.duckdb") == [(True, True, 200)]
+
+
+@pytest.mark.slow
+async def test_so_it_is_where_dask_workers_ask(merge_runner, emulator_url, tmp_path):
+    run = await merge_runner("sweep", "baseline", "--model", "o3", *SMALL, *FAST, "--yes",
+                             "--dask", "local:1", **pointed_at(emulator_url, "o3"))  # fmt: skip
+    assert run.code == 0, run.err
+    assert marks(tmp_path / "results/merge.duckdb") == [(True, True, 200)]
+
+
+@pytest.mark.parametrize(
+    ("reply", "scripted"),
+    [
+        (f'{{"{SCRIPTED_FIELD}": true}}', True),
+        (f'[{{"error": {{}}, "{SCRIPTED_FIELD}": true}}]', True),
+        (f'{{"choices": [{{"content": "{SCRIPTED_FIELD}"}}]}}', False),
+        (f'{{"choices": [{{"{SCRIPTED_FIELD}": true}}]}}', False),
+        (f'"{SCRIPTED_FIELD}"', False),
+        (SCRIPTED_FIELD, False),
+        ("[" * 100_000 + SCRIPTED_FIELD, False),
+        (None, False),
+    ],
+)
+def test_what_a_model_writes_does_not_make_it_a_stand_in(reply, scripted):
+    request = make_request(provider="openai", endpoint="openai", model="o3", path="", headers={},
+                           body={}, slot=Slot("L_4_0", 1, "left", 0, 0))  # fmt: skip
+    attempt = Attempt(1, "ok", 200, reply=reply)
+    assert is_scripted(request, attempt) is scripted
+    assert is_scripted(request, replace(attempt, scripted=True))
+    assert is_scripted(replace(request, provider="emulator"), attempt)
+
+
+@pytest.fixture
+def estimated(merge_runner):
+    """What a whole sweep of o3 is estimated at, and whose earlier answers were measured."""
+
+    async def estimate(**changes):
+        run = await merge_runner("sweep", "baseline", "--model", "o3", "--dry-run", "--json",
+                                 **{"OPENAI_API_KEY": "x", **changes})  # fmt: skip
+        assert run.code == 0, run.err
+        return run.summary["cost_usd"], run.summary["measured"]
+
+    return estimate
+
+
+@pytest.mark.long
+async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
+    merge_runner, emulator_url, estimated
+):
+    before = await estimated()
+    pointed = pointed_at(emulator_url, "o3")
+    run = await merge_runner("sweep", "baseline", "--model", "o3", *SMALL, *FAST, "--yes",
+                             **pointed)  # fmt: skip
+    assert run.code == 0, run.err
+    assert await estimated() == before
+    assert before[1] is False
+    # Nor at the very address where it answers, but that some of it is recorded now.
+    there, measured = await estimated(**pointed)
+    assert measured is False
+    assert 0.9 * before[0] < there < before[0]
+
+
+@pytest.mark.long
+async def test_answers_at_another_effort_or_place_do_not_change_it_either(
+    merge_runner, estimated, tmp_path
+):
+    async with watched(as_a_model, honest=False) as server:
+        there = pointed_at(f"{server.url}/v1", "o3")
+        run = await merge_runner("sweep", "baseline", "--model", "o3", *SMALL, *FAST, "--yes",
+                                 **there)  # fmt: skip
+    assert run.code == 0, run.err
+    assert marks(tmp_path / "results/merge.duckdb") == [(False, False, 200)]
+    assert (await estimated(**there))[1], "of these there is something to measure"
+    assert not (await estimated())[1]
+    registry = (PROJECT / "experiments/models.toml").read_text()
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/models.toml").write_text(registry.replace('"medium"', '"high"'))
+    shutil.copy(PROJECT / "experiments/baseline.toml", tmp_path / "experiments")
+    assert not (await estimated(**there))[1]
+
+
+@pytest.mark.slow
+async def test_a_summary_says_who_answered_and_where(merge_runner, emulator_url, tmp_path):
+    host = emulator_url.removeprefix("http://").removesuffix("/v1")
+    sweep = ("sweep", "baseline", "--model", "o3+constant", *SMALL[:-1], *FAST, "--yes")
+    run = await merge_runner(*sweep, **pointed_at(emulator_url, "o3"))
+    assert run.code == 0, run.err
+    assert f"o3 at {host}: a scripted stand-in answered, not o3\n" in run.out
+    assert f"driver  o3 at {host}+constant\n" in run.err
+    assert "WARNING: a scripted stand-in answers, not o3" in run.err
+    dry = await merge_runner(*sweep[:-1], "--dry-run", **pointed_at(emulator_url, "o3"))
+    assert f"driver  o3 at {host}+constant\n" in dry.out
+
+
+@pytest.mark.slow
+async def test_the_emulator_by_its_own_name_is_said_to_be_one(merge_runner):
+    run = await merge_runner("sweep", "baseline", *SMALL[:-1])
+    assert "The model `emulator` is a scripted stand-in, no language model.\n" in run.out
+    assert "stand-in answer" not in run.out + run.err
+
+
+hosts = st.one_of(
+    st.from_regex(r"[a-z][a-z0-9.-]{0,20}", fullmatch=True),
+    st.ip_addresses(v=4).map(str),
+    st.ip_addresses(v=6).map(lambda address: f"[{address}]"),
+)
+paths = st.lists(st.text(st.characters(exclude_characters="?#", codec="ascii"))).map("/".join)
+urls = st.builds(
+    "{}://{}{}/{}".format,
+    st.sampled_from(["http", "https"]),
+    hosts,
+    st.integers(1, 65535).map(":{}".format) | st.just(""),
+    paths,
+)
+
+
+@pytest.mark.long
+@given(st.none() | st.sampled_from(["openai", "emulator", "emulator#faults-1-{}"]) | urls)
+def test_the_program_and_the_database_name_a_driver_alike(endpoint):
+    with in_memory({}) as connection:
+        connection.execute(MACRO)
+        (named,) = connection.execute("SELECT driver_name('o3', ?)", [endpoint]).fetchone()
+    assert driver_name("o3", endpoint) == named
+    if endpoint and "://" in endpoint:
+        assert named == f"o3 at {urlsplit(endpoint).netloc}"
+    else:
+        assert named == "o3"

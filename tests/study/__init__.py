@@ -1,1 +1,0 @@
-"""Studies: their files, their parts, and what their factors cross to."""

@@ -1,0 +1,143 @@
+"""The program as a user runs it, and a server that tests can watch."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+from collections import Counter
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from aiohttp import web
+
+from merge_runner.emulator.server import HOST
+from merge_runner.records import SCRIPTED_FIELD, SLOT_HEADER
+from merge_runner.registry import GROUP
+from merge_runner.run.plan import Options, Plan
+from merge_runner.run.sweep import open_sweep
+from tests.support.mock_server import application
+
+PROJECT = Path(__file__).parents[2]
+PROGRAM = Path(sys.executable).with_name("merge-runner")
+RECORDING = PROJECT / "cache/recordings/emulator-baseline.parquet"
+# Variables that would change what a run does.
+CONFIGURING = ("_API_KEY", "_BASE_URL", "_PROXY", "_proxy", "LOCAL_MODEL")
+# No account's limits, which would make a sweep take minutes.
+FAST = ("--rpm", 10**6, "--tpm", 10**9)
+Middle = Callable[[web.Request, Callable[[web.Request], Awaitable[web.StreamResponse]]], Awaitable]
+
+
+@dataclass
+class Run:
+    """What a command did."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def summary(self) -> dict:
+        return json.loads(self.out)
+
+
+def how_to(name: str) -> str:
+    """The code of a page of docs/how-to."""
+    page = (PROJECT / f"docs/how-to/{name}.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    return code
+
+
+def plugin(folder: Path, source: str, module: str = "dummies") -> dict[str, str]:
+    """Variables under which a package with this source is installed, its entry point named."""
+    described = folder / f"{module}-1.0.dist-info"
+    described.mkdir(parents=True)
+    (folder / f"{module}.py").write_text(source)
+    (described / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+    (described / "entry_points.txt").write_text(f"[{GROUP}]\n{module} = {module}\n")
+    return {"PYTHONPATH": os.pathsep.join(map(str, (folder, PROJECT)))}
+
+
+def asked_to_write(arguments: Sequence[str], what: str) -> None:
+    """Leave the program unless it is told to ``--write``, for which it says what that would do."""
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser.add_argument("--write", action="store_true", required=True, help=f"write {what}")
+    parser.parse_args(arguments)
+
+
+def environment(**changes: str) -> dict[str, str]:
+    """The environment without keys, base URLs and proxies, and as if no make ran the tests."""
+    kept = {k: v for k, v in os.environ.items() if not k.endswith(CONFIGURING)}
+    for name in ("MAKELEVEL", "MAKEFLAGS", "MFLAGS"):
+        kept.pop(name, None)
+    # Compiled modules are kept, or each of the many starts would compile them anew.
+    kept.pop("PYTHONDONTWRITEBYTECODE", None)
+    return {**kept, **changes}
+
+
+async def run_sweep(plan: Plan, options: Options, *, say: Callable[[str], None]) -> dict:
+    """Play a plan in this process."""
+    async with open_sweep(plan, options, say=say) as sweep:
+        return await sweep.run()
+
+
+def each(usd: float) -> Callable[[int], float]:
+    """Trials of which each is expected to cost so much."""
+    return lambda _: usd
+
+
+@dataclass
+class Watched:
+    """An emulator in the test's own process: who asked what, and how often."""
+
+    url: str = ""
+    asked: Counter[str] = field(default_factory=Counter)
+    headers: list[dict[str, str]] = field(default_factory=list)
+    paths: list[str] = field(default_factory=list)
+
+    @property
+    def requests(self) -> int:
+        return self.asked.total()
+
+
+async def as_a_model(request: web.Request, handler) -> web.StreamResponse:
+    """Answer without the field that says that a stand-in does."""
+    body = json.loads((await handler(request)).body)
+    del body[SCRIPTED_FIELD]
+    return web.json_response(body)
+
+
+@asynccontextmanager
+async def watched(middle: Middle | None = None, faults=None, *, honest: bool = True):
+    """Serve the emulator on loopback; ``middle`` may answer in its place.
+
+    Unless it is ``honest``, no header says that a stand-in answers.
+    """
+    seen = Watched()
+
+    @web.middleware
+    async def watch(request, handler):
+        seen.paths.append(request.path)
+        # Of batches, only their handlers know how large a body may be.
+        is_batch = "batch" in request.path or "/files" in request.path
+        body = "" if is_batch else await request.text()
+        seen.asked[request.headers.get(SLOT_HEADER, "") + body] += 1
+        seen.headers.append({name.lower(): value for name, value in request.headers.items()})
+        return await (middle(request, handler) if middle else handler(request))
+
+    app = application(faults)
+    app.middlewares.append(watch)
+    if not honest:
+        app.on_response_prepare.clear()
+    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
+    await runner.setup()
+    await web.TCPSite(runner, HOST, 0).start()
+    seen.url = f"http://{HOST}:{runner.addresses[0][1]}"
+    try:
+        yield seen
+    finally:
+        await runner.cleanup()

@@ -1,0 +1,36 @@
+"""A trial in which a model says what nobody should."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+from tests.support.studies import Drive, Said, played
+
+# What a model may write; none of it may run, hide, or turn the page around.
+HOSTILE = (
+    "<script>document.title='owned'</script><img src=x onerror=\"document.title='owned'\">"
+    "{{ 7*7 }}{% raw %} \u202etxet\u202c \x00\x1b[2J </pre></script> "
+)
+LONG = 1_000_000
+
+
+def hostile_trial():
+    """A trial whose left driver says what nobody should."""
+    said = {1: Said(failure="no_array")}
+    drive = Drive("<b>o3</b>", "baseline", "L_4_0", 1, (0.4, 0.4), (-0.4, -0.4), said)
+    record = played(drive)
+    decisions = [replace(row, decision=_hostile(row.decision)) for row in record.decisions]
+    return replace(record, decisions=tuple(decisions))
+
+
+def _hostile(decision):
+    reply = decision.reply
+    text = HOSTILE + "x" * LONG
+    attempts = [replace(a, reply=json.dumps({"text": text}), error=HOSTILE) for a in reply.attempts]
+    return replace(
+        decision,
+        rationale=HOSTILE,
+        prompt=f"You drive a car.\n\n{HOSTILE}",
+        reply=replace(reply, attempts=tuple(attempts)),
+    )

@@ -1,0 +1,177 @@
+"""The emulator with faults and batch modes, as a server on loopback."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import socket
+import struct
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import httpx
+from aiohttp import web
+
+from merge_runner.emulator import server
+from merge_runner.emulator.handler import (
+    CHAT,
+    GEMINI,
+    MESSAGES,
+    RESPONSES,
+    Asked,
+    Emulator,
+    as_json,
+    as_response,
+)
+from merge_runner.records import SCRIPTED_HEADER
+from tests.support.mock_server.batches import MODES, Batches, BrokenOff
+from tests.support.mock_server.errors import ERRORS, as_error
+from tests.support.mock_server.plans import FaultPlan
+
+BREAKS = ("hang", "reset", "truncated_body")
+REFUSAL = "I cannot help with that."
+PROSE = "M\n\nI would rather describe my plan in words than write a list of numbers."
+# A linger time of zero sends a reset instead of an orderly close.
+RESET_AT_CLOSE = struct.pack("ii", 1, 0)
+
+
+class FaultyEmulator(Emulator):
+    """Fails as its plan says, plays batch modes, and counts its answers: each would be billed."""
+
+    def __init__(self, plan: FaultPlan | None = None) -> None:
+        self.plan = plan or FaultPlan()
+        super().__init__()
+        self._answered: Counter[tuple[str, str | None, str | None]] = Counter()
+        self._batches = Batches(self)
+        self._routes = [route for mode in MODES for route in mode(self._batches).routes()]
+
+    async def respond(self, request: httpx.Request) -> httpx.Response:
+        """Answer a request; raises BrokenOff."""
+        path = request.url.path
+        if path == "/emulator/answered":
+            self._batches.settle()
+            return as_json(self.count())
+        for method, pattern, handler in self._routes:
+            if method == request.method and (named := re.fullmatch(pattern, path)):
+                return handler(request, **named.groupdict())
+        return await super().respond(request)
+
+    def count(self) -> list[dict[str, Any]]:
+        """How often each request was answered; one without a ``custom_id`` was asked singly."""
+        return [
+            {"body_sha256": body, "slot": slot, "custom_id": custom_id, "answered": count}
+            for (body, slot, custom_id), count in self._answered.items()
+        ]
+
+    async def reply(self, asked: Asked, attempt: int) -> httpx.Response:
+        """The response, or what takes its place; raises BrokenOff."""
+        fault = self.plan.fault(asked.where, attempt)
+        answer = self.answer(asked, attempt, fault)
+        await asyncio.sleep(self.plan.latency_s)
+        if fault == "hang":
+            await asyncio.sleep(self.plan.hang_s)
+        if fault in BREAKS:
+            raise BrokenOff(fault)
+        if fault == "bad_gateway":
+            page = b"<html>502 Bad Gateway</html>"
+            return as_response(page, 502, {"content-type": "text/plain"})
+        if fault == "rate_limit":
+            return as_error(asked.wire, 429, "Rate limit reached.", self.plan.delay_s)
+        if fault in ERRORS:
+            return as_error(asked.wire, ERRORS[fault], "An emulated fault.")
+        response = as_json(answer)
+        if fault == "truncated_json":
+            return as_response((await response.aread())[:-20], 200, response.headers)
+        return response
+
+    def answer(
+        self, asked: Asked, attempt: int, fault: str | None = None, custom_id: str | None = None
+    ) -> dict[str, Any]:
+        """The body of an answer, which is counted."""
+        body = super().answer(asked, attempt)
+        if fault not in (*ERRORS, *BREAKS, "rate_limit", "bad_gateway"):
+            self._answered[asked.body_sha256, asked.slot, custom_id] += 1
+        if fault == "malformed":
+            _put_text(asked, body, PROSE)
+        if fault in ("empty", "refused"):
+            _say_nothing(asked, body, refused=fault == "refused")
+        return body
+
+
+def _put_text(asked: Asked, body: dict[str, Any], text: str) -> None:
+    """Put another text in the place of an answer's."""
+    if asked.wire is CHAT:
+        body["choices"][0]["message"]["content"] = text
+    elif asked.wire is RESPONSES:
+        body["output"][1]["content"][0]["text"] = text
+    elif asked.wire is GEMINI:
+        body["candidates"][0]["content"]["parts"][0]["text"] = text
+    elif asked.wire is MESSAGES:
+        body["content"][0]["text"] = text
+
+
+def _say_nothing(asked: Asked, body: dict[str, Any], *, refused: bool) -> None:
+    """Take the text out of an answer, or put a refusal in its place."""
+    if asked.wire is CHAT:
+        said = {"content": None, "refusal": REFUSAL} if refused else {"content": ""}
+        body["choices"][0]["message"] |= said
+    elif asked.wire is RESPONSES:
+        said = {"type": "refusal", "refusal": REFUSAL} if refused else {"type": "output_text"}
+        body["output"][1]["content"] = [{"text": "", "annotations": [], **said}]
+    elif asked.wire is GEMINI:
+        del body["candidates"][0]["content"]["parts"]
+        body["candidates"][0]["finishReason"] = "SAFETY" if refused else "STOP"
+    elif asked.wire is MESSAGES:
+        body |= {"content": [], "stop_reason": "refusal" if refused else "end_turn"}
+
+
+@web.middleware
+async def _break_off(request: web.Request, handler) -> web.StreamResponse:
+    """Cut the connection before or within the reply."""
+    try:
+        return await handler(request)
+    except BrokenOff as exc:
+        transport, fault = request.transport, exc.fault  # None once the client has gone
+    if transport is not None and fault == "truncated_body":
+        transport.write(
+            b"HTTP/1.1 200 OK\r\ncontent-type: application/json\r\n"
+            b'%s: true\r\ncontent-length: 5000\r\n\r\n{"id": "cut' % SCRIPTED_HEADER.encode()
+        )
+        transport.close()
+    elif transport is not None:
+        if fault == "reset":
+            connection = transport.get_extra_info("socket")
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET_AT_CLOSE)
+        transport.abort()
+    return web.Response(status=500)  # which nobody gets: the connection has ended
+
+
+def application(plan: FaultPlan | None = None) -> web.Application:
+    """An emulator as an application of aiohttp."""
+    app = server.application(FaultyEmulator(plan))
+    app.middlewares.append(_break_off)
+    return app
+
+
+async def serve(port: int, plan: FaultPlan | None = None) -> tuple[web.AppRunner, str]:
+    """Start an emulator on a loopback port (0: any free one); returns it with its base URL."""
+    return await server.serve(port, application(plan))
+
+
+@contextmanager
+def served(plan: FaultPlan) -> Iterator[str]:
+    """Serve an emulator by a thread of its own; yields its base URL."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    runner, url = asyncio.run_coroutine_threadsafe(serve(0, plan), loop).result()
+    try:
+        yield url
+    finally:
+        asyncio.run_coroutine_threadsafe(runner.cleanup(), loop).result()
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()

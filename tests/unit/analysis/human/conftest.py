@@ -1,0 +1,1 @@
+from tests.support.human_fixtures import human

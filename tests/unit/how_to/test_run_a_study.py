@@ -1,0 +1,109 @@
+"""The page about a study's file: every key is there, and every example can be played."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import fields, is_dataclass
+
+import pytest
+
+from merge_runner.config import ScenarioConfig, model_in
+from merge_runner.prompts.blocks import BLOCKS, FIELDS, VARIANTS, Variant, prompt_of, render_prompt
+from merge_runner.run.plan import Options, make_plan
+from merge_runner.run.sweep import unsent
+from merge_runner.study.file import StudyFile
+from tests.support.harness import PROJECT
+from tests.unit.prompts.test_render import FIRST
+
+PAGE = (PROJECT / "docs/how-to/run-a-study.md").read_text()
+EXAMPLES = dict(re.findall(r"^## ([^\n]*)\n+```toml\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE))
+
+
+def keys(model: type):
+    """The keys of a table of the file, and of those within it but the scenario's."""
+    if is_dataclass(model):
+        yield from (field.name for field in fields(model))
+        return
+    yield from model.model_fields
+    for field in model.model_fields.values():
+        inner = model_in(field.annotation)
+        if inner is not None and inner is not ScenarioConfig:
+            yield from keys(inner)
+
+
+def plan_of(folder, example, **asked):
+    (folder / "study.toml").write_text(EXAMPLES[example])
+    (folder / "plugin.py").touch()
+    return make_plan(str(folder / "study.toml"), trust=True, **asked)
+
+
+@pytest.mark.parametrize(
+    ("example", "arms"),
+    [
+        ("Who, how often, where", 2),
+        ("What varies", 12 + 6 + 4 + 2),  # those against projected-order both ways round
+        ("Prompts", 5),
+        ("The driving task", 1),
+        ("What a driver perceives", 2),
+        ("Drivers", 3),
+        ("Money and plug-ins", 2),
+    ],
+)
+def test_every_example_can_be_played(example, arms, tmp_path):
+    plan = plan_of(tmp_path, example)
+    assert len(plan.arms) == arms
+    assert len(plan.trial_specs()) == plan.trials
+
+
+async def test_the_study_of_the_readme_fits_its_cap_with_models_that_answer_in_2027(tmp_path):
+    readme = (PROJECT / "README.md").read_text()
+    ((text, trials, usd),) = re.findall(
+        r"^```toml\n(.*?)^```\n\n(\d+) trials, about (\d+) USD", readme, re.DOTALL | re.MULTILINE
+    )
+    (tmp_path / "study.toml").write_text(text)
+    plan = make_plan(str(tmp_path / "study.toml"))
+    options = Options(tmp_path / "db", tmp_path / "cache")
+    expected = await unsent(plan, options, say=pytest.fail)
+    assert (expected.trials, round(expected.cost_usd)) == (int(trials), int(usd))
+    assert expected.cost_usd < plan.study.file.budget["total_usd"]
+    for entry in plan.entries.values():
+        assert entry.shutdown is None or entry.shutdown.year > 2027
+
+
+def test_no_example_is_left_out():
+    assert len(EXAMPLES) == PAGE.count("```toml\n") == 7
+
+
+def test_every_key_is_explained_and_shown_in_an_example():
+    explained = re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL)
+    shown = "\n".join(EXAMPLES.values())
+    for key in keys(StudyFile):
+        if key != "name":  # of a condition, and of the scenario
+            assert f"`{key}" in explained, key
+        assert re.search(rf"\b{key}\b", shown) or key == "text", key
+    for text in EXAMPLES.values():
+        StudyFile.model_validate(tomllib.loads(text))
+
+
+def test_all_fields_and_blocks_of_a_prompt_are_named():
+    (fields,) = re.findall(r"<!-- fields -->(.*?)<!-- end -->", PAGE, re.DOTALL)
+    assert re.findall(r"`(\w+)`", fields) == [*FIELDS]
+    for block in BLOCKS:
+        assert f"`{block}`" in PAGE
+
+
+@pytest.mark.parametrize("name", [name for name in BLOCKS if name.startswith("state.")][:-1])
+def test_what_a_ready_block_says_is_shown(name, own_parts):
+    VARIANTS.register(f"with_{name}", Variant(adds=frozenset({name})))
+    prompt = render_prompt(FIRST, None, prompt=prompt_of(f"with_{name}"), scenario=ScenarioConfig())
+    said = prompt.split("\n\n")[2]
+    assert f"| `{name}` | {' '.join(said.splitlines())} |" in PAGE
+
+
+def test_combinations_that_skip_names_are_left_out(tmp_path):
+    plan = plan_of(tmp_path, "What varies")
+    found = [(arm.model, *arm.factors.values()) for arm in plan.arms]
+    assert not [arm for arm in found if "o3" in arm[0] and "0.2" in arm]
+    assert not [arm for arm in found if {"A2", "projected-order"} <= {*arm}]
+    assert len(found) == len({*found})

@@ -1,0 +1,742 @@
+"""Rounds through the client, over a batch mode in memory that misbehaves as told."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import random
+import re
+import tempfile
+from collections import Counter
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.config import ModelEntry, Price
+from merge_runner.errors import (
+    CacheFailed,
+    CallFailed,
+    EndpointRefused,
+    ProviderDown,
+    QuotaExhausted,
+)
+from merge_runner.llm.batch.providers import BatchFailed, BatchStatus
+from merge_runner.llm.batch.rounds import Rounds
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.client import LlmClient
+from merge_runner.llm.formats import FORMATS
+from merge_runner.llm.http_outcome import RawReply
+from merge_runner.llm.ledger import Budget, Ledger
+from merge_runner.llm.limiter import Limiter
+from merge_runner.records import Slot
+from tests.support.virtual_time import in_virtual_time, now_s
+
+PRICE = Price(input=1.0, output=100.0, source="made up")
+USAGE = {"prompt_tokens": 10, "completion_tokens": 5}
+# Of the tokens above, in USD.
+ONE_USD = (10 * 1.0 + 5 * 100.0) / 1e6
+
+
+def answer(text):
+    choice = {"message": {"content": text}, "finish_reason": "stop"}
+    return RawReply(200, {}, json.dumps({"model": "m-1", "choices": [choice], "usage": USAGE}))
+
+
+def error(status, kind="server_error"):
+    told = {"error": {"message": "no", "type": kind, "code": None}}
+    return RawReply(status, {}, json.dumps(told))
+
+
+class Memory:
+    """A provider's batch mode, of which each batch ends at the first look.
+
+    ``fates`` are replies to lines by repetition, one after the other: None is an expiry, and what
+    is "missing" has no result. ``creations`` and ``states`` are raised or returned in their order
+    before the usual.
+    """
+
+    takes_mark = True
+    wire = FORMATS["openai-chat"]
+
+    def __init__(self):
+        self.batches = {}
+        self.marks = {}
+        self.fates = {}
+        self.creations = []
+        self.states = []
+        self.answered = Counter()
+
+    async def create(self, lines, mark):
+        step = self.creations.pop(0) if self.creations else None
+        if isinstance(step, BatchFailed) and not step.sent:
+            raise step
+        batch_id = f"batch-{len(self.batches)}"
+        self.batches[batch_id] = list(lines)
+        self.marks[batch_id] = mark
+        if step is not None:
+            raise step
+        return batch_id
+
+    async def find(self, mark):
+        return next((each for each, its in self.marks.items() if its == mark), None)
+
+    async def status(self, batch_id):
+        if batch_id not in self.batches:
+            raise BatchFailed("lost", "HTTP 404: no such batch", sent=False)
+        step = self.states.pop(0) if self.states else BatchStatus([batch_id])
+        if isinstance(step, BatchFailed):
+            raise step
+        return step
+
+    async def results(self, paths):
+        for line in reversed(self.batches[paths[0]]):
+            repetition = line.slot.repetition
+            fates = self.fates.get(repetition, [])
+            fate = fates.pop(0) if fates else answer(f"batched {repetition}")
+            if fate == "missing":
+                continue
+            if fate is not None and fate.status == 200:
+                self.answered[line.key] += 1
+            yield line.key, fate
+
+    @property
+    def sizes(self):
+        return [len(lines) for lines in self.batches.values()]
+
+
+class Alone:
+    """The plain endpoint."""
+
+    def __init__(self):
+        self.asked = []
+
+    async def send(self, request, *, attempt, timeout_s):
+        self.asked.append(request.slot.repetition)
+        return answer(f"alone {request.slot.repetition}")
+
+
+@pytest.fixture
+def cache(tmp_path):
+    cache = ResponseCache(tmp_path / "responses")
+    yield cache
+    cache.close()
+
+
+class Run:
+    """A run's client, and the rounds that it asks in."""
+
+    def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", submits=True):
+        self.said = []
+        self.alone = Alone()
+        self.rounds = Rounds(cache, {"m"}, submits=submits, say=self.said.append)
+        self.rounds.services["m"] = service
+        self.ledger = Ledger(cache, scope)
+        budget = Budget(self.ledger, cap)
+        entry = ModelEntry(
+            provider="openai", format="openai-chat", id="m-1", max_output_tokens=100, price=price
+        )
+        self.client = LlmClient(
+            name="m",
+            entry=entry,
+            endpoint="openai",
+            cache=cache,
+            transport=self.alone,
+            limiter=Limiter(),
+            budget=budget,
+            rounds=self.rounds,
+            model="m",
+            batch_price=0.5,
+        )
+
+    async def ask(self, repetitions=1, decision=0):
+        """The replies to several at once, or what each of them raised."""
+        async with contextlib.AsyncExitStack() as stack:
+            asks = [
+                asyncio.create_task(
+                    self.client.ask("prompt", Slot("A1", each, "left", decision, 0), order=each)
+                )
+                for each in range(1, repetitions + 1)
+            ]
+
+            def is_idle():
+                waiting = sum(not each.done() for each in asks)
+                return bool(waiting) and waiting == self.client.idle_askers
+
+            watching = asyncio.create_task(self.rounds.watch(is_idle))
+            stack.callback(watching.cancel)
+            return await asyncio.gather(*asks, return_exceptions=True)
+
+    async def end(self):
+        await self.client.drain()
+        await self.rounds.close()
+
+
+def texts(replies):
+    return [each.text for each in replies]
+
+
+def outcomes(reply):
+    return [(attempt.outcome, attempt.batch_id) for attempt in reply.attempts]
+
+
+@in_virtual_time
+async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
+    service = Memory()
+    run = Run(cache, service)
+    replies = await run.ask(20)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 21)]
+    assert service.sizes == [20]
+    assert {attempt.batch_id for reply in replies for attempt in reply.attempts} == {"batch-0"}
+    (attempt,) = replies[0].attempts
+    assert attempt.cost_usd == pytest.approx(ONE_USD / 2)
+    assert datetime.now(UTC) - datetime.fromisoformat(attempt.started_at) < timedelta(minutes=5)
+    assert attempt.latency_s is None
+    assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
+    assert (run.ledger.read().reserved_usd, run.alone.asked) == (0.0, [])
+    await run.end()
+    assert not Run(cache, service).rounds.batches
+
+
+@in_virtual_time
+async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
+    class Watching(Memory):
+        async def create(self, lines, mark):
+            aside.append(run.ledger.read().reserved_usd)
+            self.size = len(lines[0].body.encode())
+            return await super().create(lines, mark)
+
+    aside = []
+    service = Watching()
+    run = Run(cache, service)
+    await run.ask(3)
+    bytes_of_one = len(service.batches["batch-0"][0].body.encode())
+    assert aside == [pytest.approx(3 * (bytes_of_one + 100 * 100.0) / 1e6 / 2)]
+
+
+@in_virtual_time
+async def test_a_line_that_failed_is_asked_alone(cache):
+    service = Memory()
+    service.fates = {2: [error(500)], 3: [error(429)]}
+    run = Run(cache, service)
+    replies = await run.ask(3)
+    assert texts(replies) == ["batched 1", "alone 2", "alone 3"]
+    assert (service.sizes, sorted(run.alone.asked)) == ([3], [2, 3])
+    assert outcomes(replies[1]) == [("server_error", "batch-0"), ("ok", None)]
+    assert [reply.attempts[0].cost_usd for reply in replies[1:]] == [0.0] * 2
+    assert run.ledger.read().spent_usd == pytest.approx((0.5 + 1 + 1) * ONE_USD)
+    assert run.ledger.read().reserved_usd == 0.0
+
+
+@in_virtual_time
+async def test_a_line_that_expired_is_asked_alone_at_the_full_price(cache):
+    service = Memory()
+    service.fates = {1: [None]}
+    run = Run(cache, service)
+    (reply,) = await run.ask()
+    assert reply.text == "alone 1"
+    assert outcomes(reply) == [("expired", "batch-0"), ("ok", None)]
+    assert [attempt.cost_usd for attempt in reply.attempts] == [0.0, pytest.approx(ONE_USD)]
+
+
+@in_virtual_time
+async def test_a_request_that_is_refused_fails_its_call_alone(cache):
+    service = Memory()
+    service.fates = {1: [error(400, "invalid_request_error")]}
+    refused, other = await Run(cache, service).ask(2)
+    assert isinstance(refused, CallFailed)
+    assert other.text == "batched 2"
+
+
+@in_virtual_time
+async def test_a_line_without_a_result_may_have_been_charged_and_is_asked_alone(cache):
+    service = Memory()
+    service.fates = {1: ["missing"]}
+    run = Run(cache, service)
+    (reply,) = await run.ask()
+    assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
+    assert reply.attempts[0].cost_usd is None
+    assert run.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cache):
+    service = Memory()
+    service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 2
+    run = Run(cache, service)
+    assert texts(await run.ask(8)) == [f"batched {number}" for number in range(1, 9)]
+    assert sorted(service.sizes) == [2, 2, 4]
+    assert len(run.said) == 1
+    await run.ask(8, decision=1)
+    assert service.sizes[3:] == [8]  # there is room again
+    assert not run.ledger.read().reserved_usd
+    await run.end()
+    assert not Run(cache, service).rounds.batches
+
+
+@in_virtual_time
+async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
+    service = Memory()
+    service.states = [BatchStatus(failure=BatchFailed("smaller", "enqueued"))]
+    run = Run(cache, service)
+    replies = await run.ask(4)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
+    assert service.sizes == [4, 2, 2]
+    assert [len(reply.attempts) for reply in replies] == [1] * 4
+
+
+@in_virtual_time
+async def test_a_file_of_results_that_is_named_later_is_read(cache):
+    service = Memory()
+    service.batches["early"] = []
+    service.states = [BatchStatus(["early"], results=2)] * 2
+    run = Run(cache, service)
+    assert texts(await run.ask(2)) == ["batched 1", "batched 2"]
+    assert run.alone.asked == []
+
+
+@in_virtual_time
+async def test_where_no_batch_mode_is_at_the_first_creation_the_run_ends(cache):
+    service = Memory()
+    service.creations = [BatchFailed("refused", "HTTP 404", sent=False)]
+    run = Run(cache, service)
+    (first, *_) = await run.ask(3)
+    assert (type(first), first.exit_code) == (EndpointRefused, 2)
+    assert "leave --batch out" in str(first)
+    assert (run.alone.asked, run.ledger.read().committed_usd) == ([], 0.0)
+
+
+@in_virtual_time
+async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache, monkeypatch):
+    async def is_full(*_):
+        raise CacheFailed("the disk is full")
+
+    service = Memory()
+    run = Run(cache, service)
+    with monkeypatch.context() as patch:
+        patch.setattr(cache, "put", is_full)
+        assert {type(each) for each in await run.ask(2)} == {CacheFailed}
+        await run.end()
+    later = Run(cache, service)
+    assert texts(await later.ask(2)) == ["batched 1", "batched 2"]
+    assert (service.sizes, later.alone.asked) == ([2], [])
+    await later.end()
+    assert not Run(cache, service).rounds.batches
+
+
+async def left_behind(cache, service, repetitions=1, **options):
+    """A run that is interrupted while a batch waits."""
+    service.states = [BatchStatus()] * 1000
+    run = Run(cache, service, **options)
+    asking = asyncio.create_task(run.ask(repetitions))
+    await asyncio.sleep(5)
+    assert len(run.rounds.standing()) == 1
+    asking.cancel()
+    await run.end()
+    service.states = []
+    return run
+
+
+@in_virtual_time
+async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
+    class Slow(Memory):
+        async def status(self, batch_id):
+            return BatchStatus(None if batch_id == "batch-0" else [batch_id])
+
+    service = Slow()
+    service.creations = [None, BatchFailed("again", "HTTP 504")]
+    with contextlib.closing(ResponseCache(tmp_path / "other")) as other:
+        one, two = Run(cache, service), Run(other, service)
+        asking = asyncio.create_task(one.ask())
+        await asyncio.sleep(10)
+        (reply,) = await two.ask()
+        assert outcomes(reply) == [("ok", "batch-1")]
+        asking.cancel()
+        await one.end()
+        await two.end()
+
+
+@in_virtual_time
+async def test_a_creation_that_comes_into_effect_late_is_not_repeated(cache):
+    class Late(Memory):
+        async def create(self, lines, mark):
+            service.tasks.append(asyncio.create_task(self.arrive(lines, mark)))
+            raise BatchFailed("again", "HTTP 504")
+
+        async def arrive(self, lines, mark):
+            await asyncio.sleep(20)
+            await super().create(lines, mark)
+
+    service = Late()
+    service.tasks = []
+    assert texts(await Run(cache, service).ask(2)) == ["batched 1", "batched 2"]
+    assert service.sizes == [2]
+
+
+@in_virtual_time
+async def test_a_single_line_that_finds_no_room_is_asked_alone(cache):
+    service = Memory()
+    service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 1000
+    run = Run(cache, service)
+    (reply,) = await asyncio.wait_for(run.ask(), 120)
+    assert reply.text == "alone 1"
+    assert len(service.creations) == 999
+
+
+@in_virtual_time
+async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
+    class Down(Memory):
+        async def create(self, lines, mark):
+            self.creations.append(mark)
+            await asyncio.sleep(30)
+            raise BatchFailed("again", "HTTP 502")
+
+    service = Down()
+    run = Run(cache, service)
+    asking = asyncio.create_task(run.ask())
+    await asyncio.sleep(5)
+    asking.cancel()
+    began_s = now_s()
+    await run.end()
+    assert now_s() - began_s < 31
+    assert len(service.creations) == 1
+
+
+@in_virtual_time
+async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(cache):
+    class Late(Memory):
+        looks = 0
+
+        async def status(self, batch_id):
+            return BatchStatus([batch_id], 3)
+
+        async def results(self, paths):
+            self.looks += 1
+            whole = [each async for each in super().results(paths)]
+            for result in whole if self.looks > 1 else whole[:1]:
+                yield result
+
+    service = Late()
+    run = Run(cache, service)
+    assert texts(await run.ask(3)) == ["batched 1", "batched 2", "batched 3"]
+    assert (service.looks, service.sizes) == (2, [3])
+
+
+class WithoutResults(Memory):
+    async def results(self, paths):
+        raise BatchFailed("again", "HTTP 503")
+        yield
+
+
+@in_virtual_time
+async def test_an_answer_whose_money_was_released_is_spent_and_is_no_overrun(cache):
+    service = Memory()
+    left = await left_behind(cache, service, cap=10)
+    left.ledger.release()
+    run = Run(cache, service, cap=10)
+    await run.ask()
+    spending = run.ledger.read()
+    assert spending.spent_usd == pytest.approx(ONE_USD / 2)
+    assert (spending.overruns, spending.overrun_usd, spending.open_attempts) == ({}, 0.0, 0)
+    assert not run.client.meter.notes
+
+
+@in_virtual_time
+async def test_results_that_never_come_are_waited_for_an_hour(cache):
+    run, began_s = Run(cache, WithoutResults()), now_s()
+    (reply,) = await run.ask()
+    assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
+    assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
+    assert run.ledger.read().open_attempts == 1
+    assert 3500 <= now_s() - began_s < 3800
+
+
+@in_virtual_time
+async def test_what_a_batch_answered_unreadably_stays_set_aside(cache):
+    class Broken(Memory):
+        async def results(self, paths):
+            yield "", None
+            yield "", None
+
+    run = Run(cache, Broken())
+    (reply,) = await run.ask()
+    assert [each.cost_usd for each in reply.attempts] == [None, pytest.approx(ONE_USD)]
+    assert run.ledger.read().open_attempts == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "raised"),
+    [("quota", QuotaExhausted), ("refused", EndpointRefused)],
+)
+@in_virtual_time
+async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothing(
+    cache, kind, raised
+):
+    service = Memory()
+    service.creations = [BatchFailed(kind, "no", sent=False)] * 1000
+    run = Run(cache, service)
+    assert {type(each) for each in await run.ask(3)} == {raised}
+    spending = run.ledger.read()
+    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.0, 0.0, 0)
+    await run.end()
+    assert not Run(cache, service).rounds.batches
+
+
+@in_virtual_time
+async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cache):
+    service = Memory()
+    service.creations = [BatchFailed("again", "no", sent=False)] * 99
+    run = Run(cache, service)
+    assert {type(each) for each in await run.ask(3)} == {ProviderDown}
+    await run.end()
+    assert run.ledger.read().open_attempts == 3  # whether it was created is not known yet
+    service.creations = []
+    assert texts(await Run(cache, service).ask(3)) == ["batched 1", "batched 2", "batched 3"]
+    assert service.sizes == [3]
+    assert Ledger(cache, "test").read().open_attempts == 0
+
+
+@in_virtual_time
+async def test_a_batch_that_may_have_been_created_where_it_takes_no_mark_is_asked_alone(cache):
+    service = Memory()
+    service.takes_mark = False
+    service.creations = [BatchFailed("again", "connection lost", sent=True)]
+    run = Run(cache, service)
+    replies = await run.ask(2)
+    assert [outcomes(each) for each in replies] == [[("batch_lost", None), ("ok", None)]] * 2
+    assert run.ledger.read().open_attempts == 2  # what it may cost stays set aside
+
+
+@in_virtual_time
+async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
+    service = Memory()
+    service.states = [BatchFailed("again", "HTTP 503")] * 40
+    run = Run(cache, service)
+    assert texts(await run.ask()) == ["batched 1"]
+    assert run.said == ["m: HTTP 503; it is asked again until it answers"]
+
+
+async def killed(run, repetitions, when):
+    """Ask, and end the run as a kill does when ``when`` is set: nothing more is written."""
+    asking = asyncio.create_task(run.ask(repetitions))
+    await when.wait()
+    asking.cancel()
+    for batch in run.rounds.batches.values():
+        batch.work and batch.work.cancel()
+    await run.client.drain()
+
+
+@pytest.mark.parametrize("step", ["before the creation", "after it", "while it waits"])
+@in_virtual_time
+async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice(cache, step):
+    class Dying(Memory):
+        async def create(self, lines, mark):
+            if step == "before the creation":
+                died.set()
+                await asyncio.Event().wait()
+            batch_id = await super().create(lines, mark)
+            if step == "after it":
+                died.set()
+                await asyncio.Event().wait()
+            return batch_id
+
+        async def status(self, batch_id):
+            if not died.is_set():
+                died.set()
+                return BatchStatus()
+            return await super().status(batch_id)
+
+    died = asyncio.Event()
+    service = Dying()
+    first = Run(cache, service)
+    await killed(first, 5, died)
+    before = first.ledger.read()
+    assert before.open_attempts == 5
+    step = "over"
+    second = Run(cache, service)
+    replies = await second.ask(5)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 6)]
+    assert [outcomes(reply) for reply in replies] == [[("ok", "batch-0")]] * 5
+    assert service.sizes == [5]
+    assert set(service.answered.values()) == {1}
+    spending = second.ledger.read()
+    assert spending.spent_usd == pytest.approx(5 * ONE_USD / 2)
+    assert (spending.reserved_usd, spending.open_attempts) == (0.0, 0)
+    await second.end()
+    assert not Run(cache, service).rounds.batches
+
+
+class SetBack(datetime):
+    """A clock that goes an hour back with each batch."""
+
+    hours = 0
+
+    @classmethod
+    def now(cls, tz=None):
+        cls.hours += 1
+        return datetime.now(tz) - timedelta(hours=cls.hours)
+
+
+@in_virtual_time
+async def test_of_a_failed_batch_and_its_smaller_ones_the_smaller_are_taken_up_whatever_the_clock(
+    cache, monkeypatch
+):
+    class TooLarge(Memory):
+        async def status(self, batch_id):
+            if batch_id == "batch-0":
+                return BatchStatus(failure=BatchFailed("smaller", "enqueued"))
+            if not died.is_set():
+                died.set()
+                return BatchStatus()
+            return await super().status(batch_id)
+
+    monkeypatch.setattr("merge_runner.llm.batch.rounds.datetime", SetBack)
+    died = asyncio.Event()
+    service = TooLarge()
+    await killed(Run(cache, service), 4, died)
+    assert service.sizes == [4, 2]
+    run = Run(cache, service)
+    assert texts(await run.ask(4)) == [f"batched {number}" for number in range(1, 5)]
+    paid = Counter(line.key for each in list(service.batches.values())[1:] for line in each)
+    assert sorted(paid.values()) == [1] * 4
+
+
+@in_virtual_time
+async def test_a_run_that_dies_before_an_id_is_noted_where_no_mark_is_asks_that_round_alone(cache):
+    class Dying(Memory):
+        takes_mark = False
+
+        async def create(self, lines, mark):
+            batch_id = await super().create(lines, mark)
+            died.set()
+            await asyncio.Event().wait()
+            return batch_id
+
+    died = asyncio.Event()
+    await killed(Run(cache, Dying()), 2, died)
+    service = Memory()
+    service.takes_mark = False
+    run = Run(cache, service)
+    replies = await run.ask(2)
+    assert [outcomes(each) for each in replies] == [[("batch_lost", None), ("ok", None)]] * 2
+    assert run.ledger.read().open_attempts == 2  # what the lost batch may cost stays set aside
+    await run.ask(2, decision=1)
+    assert service.sizes == [2]  # the next round is a batch again
+
+
+@in_virtual_time
+async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache):
+    service = Memory()
+    await left_behind(cache, service, repetitions=2)
+    later = Run(cache, service, submits=False)
+    assert texts(await later.ask(3)) == ["batched 1", "batched 2", "alone 3"]
+    assert later.alone.asked == [3]
+
+
+@in_virtual_time
+async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache):
+    service = Memory()
+    first = await left_behind(cache, service, repetitions=2, scope="first")
+    second = Run(cache, service, scope="second")
+    assert texts(await second.ask(2)) == ["batched 1", "batched 2"]
+    assert first.ledger.read().spent_usd == pytest.approx(ONE_USD)
+    assert first.ledger.read().open_attempts == second.ledger.read().open_attempts == 0
+    assert second.ledger.read().spent_usd == 0.0
+
+
+@in_virtual_time
+async def test_a_batch_that_is_gone_stops_the_run_unless_it_asks_singly(cache):
+    service = Memory()
+    await left_behind(cache, service)
+    service.batches.clear()
+    (stopped,) = await Run(cache, service).ask()
+    assert isinstance(stopped, EndpointRefused)
+    assert "the same command without --batch" in str(stopped)
+    anew = Run(cache, service, submits=False)
+    (reply,) = await anew.ask()
+    assert [attempt.outcome for attempt in reply.attempts] == ["batch_lost", "ok"]
+    assert anew.ledger.read().open_attempts == 1  # nobody knows what it cost
+
+
+@pytest.mark.parametrize("kind", ["refused", "quota"])
+@in_virtual_time
+async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind):
+    service = Memory()
+    await left_behind(cache, service)
+    for _ in range(2):
+        service.states = [BatchFailed(kind, "HTTP 401", sent=False)]
+        run = Run(cache, service, submits=False)
+        (stopped,) = await run.ask()
+        assert isinstance(stopped, EndpointRefused)
+        await run.end()
+    (reply,) = await Run(cache, service).ask()
+    assert outcomes(reply) == [("ok", "batch-0")]
+
+
+@in_virtual_time
+async def test_under_a_cap_a_round_takes_what_fits_and_the_next_ones_the_rest(cache):
+    service = Memory()
+    run = Run(cache, service, cap=0.06)
+    replies = await run.ask(20)
+    assert texts(replies) == [f"batched {number}" for number in range(1, 21)]
+    assert len(service.sizes) > 1
+    assert max(service.sizes) * 0.005 <= 0.06
+    assert run.ledger.read().spent_usd == pytest.approx(10 * ONE_USD)
+
+
+class Dear(Memory):
+    """Bills up to the worst case of each line, or what it did not cost, as the seed says."""
+
+    def __init__(self, seed):
+        super().__init__()
+        self.chance = random.Random(seed)
+        self.bill_usd = 0.0
+
+    async def results(self, paths):
+        async for key, raw in super().results(paths):
+            read = 10
+            written = self.chance.randint(0, 100)
+            kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])
+            if kind != "ok":
+                yield key, error(500) if kind == "failed" else None
+                continue
+            body = json.loads(raw.body)
+            body["usage"] = {"prompt_tokens": read, "completion_tokens": written}
+            self.bill_usd += (read + 100 * written) / 1e6 / 2
+            yield key, RawReply(200, {}, json.dumps(body))
+
+
+@given(seed=st.integers(0, 1000), cents=st.integers(1, 12), runs=st.integers(1, 3))
+@settings(max_examples=25)
+def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
+    @in_virtual_time
+    async def sweep():
+        with tempfile.TemporaryDirectory() as folder:
+            cache = ResponseCache(Path(folder))
+            service, alone_usd = Dear(seed), 0.0
+            for number in range(runs):
+                run = Run(cache, service, cap=cents / 100)
+                await run.ask(12, decision=number)
+                await run.end()
+                alone_usd += len(run.alone.asked) * ONE_USD
+            assert service.bill_usd + alone_usd <= cents / 100 + 1e-9
+            assert run.ledger.read().spent_usd == pytest.approx(service.bill_usd + alone_usd)
+            cache.close()
+
+    sweep()
+
+
+@in_virtual_time
+async def test_what_is_pending_is_told_by_model_and_batch(cache):
+    service = Memory()
+    service.states = [BatchStatus()] * 10**4
+    run = Run(cache, service)
+    asking = asyncio.create_task(run.ask(3))
+    await asyncio.sleep(5)
+    (line,) = run.rounds.standing()
+    assert re.fullmatch("3 calls of m wait in batch batch-0 since [0-9:]{8} UTC", line)
+    asking.cancel()
+    await run.end()

@@ -1,0 +1,277 @@
+"""The first live call of a run goes alone, and ends it where no other one would fare better."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
+from merge_runner.llm.cache import ResponseCache
+from merge_runner.llm.http_outcome import TransportFailure
+from tests.support.virtual_time import in_virtual_time, now_s
+from tests.unit.llm.test_client import (  # noqa: F401 # fixtures
+    PRICE,
+    Server,
+    answer,
+    error,
+    make,
+    raw,
+    slot,
+    ticks,
+)
+
+WEB_PAGE = raw("\n<!DOCTYPE html><html>Welcome</html>")
+PROXY_407 = TransportFailure("proxy_refused", "the proxy says 407", sent=False, action="refused")
+REFUSED = TransportFailure("no_connection", "refused", sent=False)
+
+
+@pytest.fixture
+def cache(tmp_path):
+    """Opened anew in each loop: many write at once."""
+    opened = ResponseCache(tmp_path)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def begin(make):  # noqa: F811
+    """A client whose run begins."""
+
+    def begin(*replies, known=False, **changes):
+        return make(*replies, passed=False, known=known, **changes)
+
+    return begin
+
+
+def ask_all(client, number=5):
+    return [asyncio.create_task(client.ask("prompt", slot(n))) for n in range(1, number + 1)]
+
+
+async def results(tasks):
+    return await asyncio.gather(*tasks, return_exceptions=True)
+
+
+@in_virtual_time
+async def test_the_others_wait_until_the_first_call_is_answered(begin):
+    client = begin(answer())
+    client.transport.open.clear()
+    asked = ask_all(client)
+    await ticks()
+    assert len(client.transport.sent) == 1
+    assert [wait.what for wait in client.waits] == ["for the first answer of my-model"] * 4
+    client.transport.open.set()
+    await asyncio.gather(*asked)
+    assert len(client.transport.sent) == 5
+    assert set(client.transport.times) == {0}, "they then go at once"
+
+
+@in_virtual_time
+async def test_what_passes_is_tried_again_by_one_call_alone(begin):
+    client = begin(error(503), error(429), TransportFailure("timeout", "no reply"), answer())
+    await asyncio.gather(*ask_all(client))
+    assert len(client.transport.sent) == 3 + 5
+    first_three = client.transport.times[:4]
+    assert first_three == sorted(set(first_three)), "one at a time"
+
+
+@pytest.mark.parametrize(
+    ("reply", "advice"),
+    [
+        (error(401), "set OPENAI_API_KEY to a valid one"),
+        (error(404), "see `merge-runner models`"),
+        (raw({"error": {"message": "m", "param": "temperature"}}, 400), r"look at \[my-model\] in"),
+        (error(400, "max_tokens is too large"), r"look at \[my-model\] in"),
+        (error(405), "set OPENAI_BASE_URL"),
+        (raw("moved", 301), "set OPENAI_BASE_URL"),
+        (WEB_PAGE, "does not speak openai-chat"),
+        (raw({"status": "up"}), "does not speak openai-chat"),
+        (raw("data: {}", content_type="text/event-stream"), r"events \(SSE\).*text/event-stream"),
+        (raw("\ufffd", content_encoding="br"), r"Content-Encoding \(br\) that cannot be read"),
+        (answer(None, reasoning_content="M"), "lies in `reasoning_content`.*enable_thinking"),
+        (PROXY_407, r"HTTPS_PROXY.*nothing was sent.*\(the proxy says 407\)"),
+    ],
+)
+@in_virtual_time
+async def test_a_wrong_configuration_is_told_by_one_call(begin, reply, advice):
+    client = begin(reply)
+    tasks = ask_all(client)
+    with pytest.raises(EndpointRefused, match=advice) as caught:
+        await tasks[0]
+    await client.drain()
+    assert len(client.transport.sent) == 1
+    assert "\n" not in str(caught.value)
+    assert all(isinstance(result, BaseException) for result in await results(tasks))
+
+
+@pytest.mark.parametrize(
+    ("reply", "advice"),
+    [
+        (raw({"error": "Unexpected endpoint (POST /x)"}), "set OPENAI_BASE_URL.*Unexpected endp"),
+        (raw(""), "set OPENAI_BASE_URL.*an empty body"),
+        (raw('{"choices": ['), "does not speak openai-chat"),
+        (
+            TransportFailure("connection_lost", "Got more than 9", reason="unreadable_reply"),
+            "64 KiB.*Got more than 9",
+        ),
+        (
+            TransportFailure("proxy_refused", "HTTP 503", sent=False, reason="proxy_refused"),
+            "HTTPS_PROXY.*HTTP 503",
+        ),
+    ],
+)
+@in_virtual_time
+async def test_what_may_pass_is_told_after_three_of_them_within_seconds(begin, reply, advice):
+    client = begin(reply)
+    with pytest.raises(EndpointRefused, match=advice):
+        await client.ask("prompt", slot())
+    assert len(client.transport.sent) == 3
+    assert now_s() < 5
+    passing = begin(reply, reply, answer())
+    assert (await passing.ask("prompt", slot())).outcome == "ok"
+
+
+@pytest.mark.parametrize("body", ["data: {}", "<html>", "", {"status": "up"}, {"error": "m"}])
+@in_virtual_time
+async def test_in_the_midst_of_a_run_what_is_not_understood_is_asked_again(begin, body):
+    client = begin(answer(), *[raw(body)] * 4, answer())
+    await client.ask("prompt", slot())
+    assert (await client.ask("prompt", slot(2))).outcome == "ok"
+    assert len(client.transport.sent) == 6
+
+
+@in_virtual_time
+async def test_an_endpoint_that_has_answered_before_is_given_three_tries(begin):
+    client = begin(raw("data: {}", content_type="text/event-stream"), known=True)
+    with pytest.raises(EndpointRefused, match="SSE"):
+        await client.ask("prompt", slot())
+    assert len(client.transport.sent) == 3
+
+
+@in_virtual_time
+async def test_a_model_that_has_answered_before_may_think_without_an_answer(begin):
+    client = begin(answer(None, reasoning_content="hm"), known=True)
+    assert (await client.ask("prompt", slot())).outcome == "empty"
+
+
+@in_virtual_time
+async def test_a_first_call_that_waits_says_so_once_with_what_came_last_and_until_when(begin):
+    client = begin(*[error(503, "warming up")] * 5, answer(), deadline_s=600)
+    await client.ask("prompt", slot())
+    told = [note for note in client.meter.notes if "first call" in note]
+    assert len(told) == 1
+    assert "UTC, after HTTP 503: warming up" in told[0]
+    silent = begin(answer(), deadline_s=600)
+    silent.transport.open.clear()
+    asked = asyncio.create_task(silent.ask("prompt", slot(2)))
+    await asyncio.sleep(6)
+    assert ["nothing has come yet" in note for note in silent.meter.notes] == [True]
+    silent.transport.open.set()
+    await asked
+    await silent.ask("prompt", slot(3))
+    await asyncio.sleep(9)
+    assert len(silent.meter.notes) == 1
+
+
+@in_virtual_time
+async def test_what_certainly_was_not_sent_costs_nothing(begin):
+    client = begin(PROXY_407, price=PRICE, cap=1.0)
+    with pytest.raises(EndpointRefused):
+        await client.ask("prompt", slot())
+    assert client.budget.ledger.read().committed_usd == 0
+
+
+@in_virtual_time
+async def test_where_nobody_listens_the_run_ends_within_seconds(begin):
+    client = begin(REFUSED)
+    with pytest.raises(ProviderDown, match=r"refused: check the network, or set OPENAI_BASE_URL"):
+        await client.ask("prompt", slot())
+    assert 5 <= now_s() < 12
+
+
+@in_virtual_time
+async def test_a_server_that_has_answered_is_waited_for_as_long_as_a_call_may_take(begin):
+    client = begin(answer(), *[REFUSED] * 9, answer())
+    assert (await client.ask("prompt", slot())).outcome == "ok"
+    assert (await client.ask("prompt", slot(2))).outcome == "ok"
+    assert now_s() > 60
+
+
+@in_virtual_time
+async def test_a_server_that_just_starts_is_waited_for(begin):
+    client = begin(REFUSED, REFUSED, answer())
+    assert (await client.ask("prompt", slot())).outcome == "ok"
+
+
+@in_virtual_time
+async def test_no_answer_to_the_first_call_within_its_deadline_ends_the_run(begin):
+    client = begin(error(503, "down"), deadline_s=60)
+    tasks = ask_all(client)
+    with pytest.raises(
+        ProviderDown, match=r"the first call of this run: no answer within 60 s.*down"
+    ):
+        await tasks[0]
+    sent = len(client.transport.sent)
+    await client.drain()
+    await results(tasks)
+    assert len(client.transport.sent) == sent
+
+
+@in_virtual_time
+async def test_a_prompt_that_is_refused_for_its_content_fails_alone(begin):
+    flagged = raw({"error": {"message": "flagged", "code": "invalid_prompt"}}, 400)
+    client = begin(flagged, answer())
+    tasks = ask_all(client, 3)
+    first, *others = await results(tasks)
+    assert isinstance(first, CallFailed)
+    assert [reply.outcome for reply in others] == ["ok", "ok"]
+
+
+@in_virtual_time
+async def test_an_answer_that_is_recorded_needs_no_first_call(begin):
+    await begin(answer()).ask("prompt", slot())
+    client = begin(error(401))
+    assert (await client.ask("prompt", slot())).cached
+    assert client.transport.sent == []
+
+
+@in_virtual_time
+async def test_a_first_call_that_is_given_up_lets_the_next_one_go(begin):
+    client = begin(answer())
+    client.transport.open.clear()
+    asked = ask_all(client, 2)
+    await ticks()
+    for call in client._calls:
+        call.task.cancel()
+        break
+    await ticks()
+    assert len(client.transport.sent) == 2
+    client.transport.open.set()
+    await results(asked)
+
+
+@in_virtual_time
+async def test_a_web_page_is_free_where_no_model_ever_answered_and_may_be_charged_elsewhere(begin):
+    stray = begin(WEB_PAGE, price=PRICE, cap=1.0)
+    with pytest.raises(EndpointRefused):
+        await stray.ask("prompt", slot())
+    assert stray.budget.ledger.read().committed_usd == 0
+    gateway = begin(WEB_PAGE, answer(), price=PRICE, cap=1.0, known=True)
+    assert (await gateway.ask("prompt", slot())).outcome == "ok"
+    assert gateway.budget.ledger.read().open_attempts == 1
+
+
+@in_virtual_time
+async def test_where_a_model_has_answered_before_one_refused_prompt_does_not_end_every_run(begin):
+    client = begin(error(400), error(400), answer(), known=True)
+    first, second, *others = await results(ask_all(client))
+    assert isinstance(first, CallFailed)
+    assert isinstance(second, CallFailed)
+    assert [reply.outcome for reply in others] == ["ok"] * 3
+    changed = begin(error(400, "unknown parameter"), known=True)
+    tasks = [asyncio.create_task(changed.ask("another", slot(n))) for n in range(9)]
+    with pytest.raises(EndpointRefused, match="unknown parameter"):
+        await tasks[2]
+    await changed.drain()
+    await results(tasks)
+    assert len(changed.transport.sent) == 3

@@ -1,0 +1,274 @@
+"""The text of the prompts, byte for byte, and that an ablation changes nothing but its block.
+
+To rewrite the golden files after a wanted change of the text, set UPDATE_GOLDEN_PROMPTS=1 and
+run this file; then read the difference, since it is a new experiment.
+"""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
+from merge_runner.prompts.blocks import (
+    BLOCKS,
+    VARIANTS,
+    Block,
+    Variant,
+    blocks_of,
+    prompt_of,
+    render_prompt,
+)
+from merge_runner.records import SIDES, Observation
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import World
+
+GOLDEN = Path(__file__).parents[2] / "golden" / "prompts"
+UPDATE = os.environ.get("UPDATE_GOLDEN_PROMPTS") == "1"
+
+FIRST = Observation(
+    road="merge",
+    own_speed_mps=9.6,
+    other_speed_mps=10.4,
+    relative_distance_m=-7.538461538461533,
+    distance_to_merge_m=42.46153846153847,
+    own_accelerations_mps2=(0.0,) * 10,
+    other_speeds_mps=(10.4,) * 10,
+    own_position_m=57.53846153846153,
+    other_acceleration_mps2=0.0,
+)
+MID_RUN = Observation(
+    road="merge",
+    own_speed_mps=10.85,
+    other_speed_mps=9.0125,
+    relative_distance_m=-3.1416,
+    distance_to_merge_m=12.3456,
+    own_accelerations_mps2=(0.0,) * 5 + (0.5, 0.75, 1.0, 1.25, 2.5),
+    other_speeds_mps=(10.4, 10.3, 10.1, 9.9, 9.75, 9.6, 9.45, 9.3, 9.2, 9.1),
+    own_position_m=87.6544,
+    other_acceleration_mps2=-0.4375,
+)
+STRAIGHT = replace(
+    MID_RUN,
+    road="straight",
+    relative_distance_m=8.375,
+    distance_to_merge_m=None,
+    own_position_m=102.5,
+)
+REST_OF_PLAN = (0.3, 0.25, 0.2, 0.15, 0.1, 0.05, 0.0, 0.0, -0.05, -0.1, -1.0, -0.5, 0.0, 1.0, 0.5)
+
+FORMS = {
+    "first": (FIRST, None),
+    "mid_run": (MID_RUN, REST_OF_PLAN),
+    "straight": (STRAIGHT, REST_OF_PLAN),
+}
+# How the paragraph begins that a variant leaves out.
+REMOVED = {
+    "A1": "History of the last",
+    "A2": "Previous plan",
+    "A3": "Avoid a collision",
+    "A4": "Drive the way a human",
+    "A5": "Be risk-averse",
+    "A6": "Reassess",
+    "A7": "Tactical decision",
+}
+CASES = [(variant, form) for variant in VARIANTS for form in FORMS]
+
+law = settings(deadline=None, derandomize=True)  # the gate must not depend on luck or load
+
+
+def render(variant, form, **scenario):
+    observation, rest = FORMS[form]
+    return render_prompt(
+        observation, rest, prompt=prompt_of(variant), scenario=ScenarioConfig(**scenario)
+    )
+
+
+@pytest.mark.parametrize(("variant", "form"), CASES)
+def test_the_prompt_is_the_golden_text(variant, form):
+    file = GOLDEN / f"{variant}_{form}.txt"
+    prompt = render(variant, form)
+    if UPDATE:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(prompt.encode())
+    assert prompt == file.read_bytes().decode()
+
+
+def test_every_golden_file_is_checked():
+    assert {file.stem for file in GOLDEN.iterdir()} == {f"{v}_{form}" for v, form in CASES}
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(("variant", "beginning"), REMOVED.items())
+def test_an_ablation_removes_its_paragraph_and_changes_no_other_byte(variant, beginning, form):
+    paragraphs = render("baseline", form).split("\n\n")
+    kept = [paragraph for paragraph in paragraphs if not paragraph.startswith(beginning)]
+    asked_here = not (variant == "A7" and form == "straight")
+    assert len(paragraphs) - len(kept) == (1 if asked_here else 0)
+    assert render(variant, form) == "\n\n".join(kept)
+
+
+def test_without_a_tactical_question_on_the_straight_road_a7_is_the_baseline():
+    assert render("A7", "straight") == render("baseline", "straight")
+    assert render("A7", "mid_run") != render("baseline", "mid_run")
+
+
+def test_the_straight_form_names_no_distance_to_the_merge_point():
+    assert "distance to the merge" in render("baseline", "mid_run")
+    assert "distance to the merge" not in render("baseline", "straight")
+
+
+def test_the_first_decision_is_told_that_it_has_no_previous_plan():
+    line = next(x for x in render("baseline", "first").splitlines() if x.startswith("Previous"))
+    assert line.endswith(": none, this is your first decision")
+
+
+def test_both_sides_of_the_symmetric_condition_get_the_identical_prompt():
+    scenario = ScenarioConfig()
+    world = World(scenario, CONDITIONS["N_0_0"], TRACK)
+    for action in (0.0, 0.3, -0.7):
+        left, right = (
+            render_prompt(
+                world.observe(side), None, prompt=prompt_of("baseline"), scenario=scenario
+            )
+            for side in SIDES
+        )
+        assert left == right
+        world.advance({"left": action, "right": action})
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_prompt_tells_left_from_right(form):
+    words = render("baseline", form).lower().replace("the right of way", "").split()
+    assert not {"left", "right"} & set(words)
+
+
+@pytest.mark.parametrize("value", [-0.0, -0.001, -0.00499])
+def test_a_value_that_rounds_to_zero_has_no_sign(value):
+    seen = Observation(
+        "merge", value, value, value, value, (value,) * 10, (value,) * 10, value, value
+    )
+    prompt = render_prompt(
+        seen, (value,) * 15, prompt=prompt_of("baseline"), scenario=ScenarioConfig()
+    )
+    assert "-0.00" not in prompt
+    # Three speeds and distances, one to the merge point, two histories and the plan.
+    assert prompt.count("0.00") == 4 + 2 * 10 + 15
+
+
+@law
+@given(st.floats(-200, 200))
+def test_every_value_is_shown_to_two_decimals(value):
+    seen = replace(FIRST, relative_distance_m=value)
+    prompt = render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=ScenarioConfig())
+    line = next(x for x in prompt.splitlines() if x.startswith("- Relative distance"))
+    shown = line.split("): ")[1].removesuffix(" m")
+    assert abs(float(shown) - value) <= 0.005 + 1e-9
+    assert len(shown.split(".")[1]) == 2
+
+
+def test_the_numbers_of_the_task_come_from_the_scenario():
+    prompt = render(
+        "baseline",
+        "first",
+        horizon_s=3,
+        step_s=0.25,
+        prompt_rate_hz=2,
+        memory_s=1.5,
+        max_acceleration_mps2=3.5,
+        vehicle_length_m=5.2,
+    )
+    for words in (
+        "a new plan every 0.5 s",
+        "Length of each car: 5.2 m",
+        "History of the last 1.5 s, one value every 0.25 s",
+        "plan for the next 3 s as a list of exactly 12 numbers, one for every 0.25 s",
+        "an acceleration of 3.5 m/s^2 and -1 for a deceleration of 3.5 m/s^2",
+    ):
+        assert words in prompt
+
+
+def test_no_two_blocks_share_a_digest():
+    assert len({block.digest for block in BLOCKS.values()}) == len(BLOCKS)
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_a_changed_text_on_either_road_or_another_place_changes_the_digest(name):
+    block = BLOCKS[name]
+    changed = {
+        block.digest,
+        replace(block, merge=f"{block.merge} ").digest,
+        replace(block, straight=f"{block.straight or ''} ").digest,
+        replace(block, before="C2").digest,
+        replace(block, before="C5").digest,
+    }
+    assert len(changed) == 5
+    assert replace(block, meaning="something else").digest == block.digest
+
+
+def test_texts_that_change_roads_change_the_digest():
+    assert Block("x", "One.", "Two.").digest != Block("x", "Two.", "One.").digest
+
+
+def test_added_blocks_stand_where_they_say_in_the_order_of_their_names(own_parts):
+    """Also where the last one was registered first."""
+    for name, before in (("Z", "C5"), ("B", "C1"), ("Y", "C5"), ("X", "C5")):
+        BLOCKS.register(name, Block("more", f"Text {name}.", None, before=before))
+    VARIANTS.register("A8", Variant(removes=frozenset({"C4"}), adds=frozenset("ZBY")))
+    kept = [name for name in blocks_of("baseline") if name != "C4"]
+    assert [*blocks_of("A8")] == ["C0", "B", *kept[1:-1], "Y", "Z", "C5"]
+    prompt = render_prompt(FIRST, None, prompt=prompt_of("A8"), scenario=ScenarioConfig())
+    assert "\n\nText B.\n\nHistory of" in prompt
+    assert "\n\nText Y.\n\nText Z.\n\nOutput format" in prompt
+
+
+def test_a_variant_of_a_block_that_there_is_not_is_refused(own_parts):
+    VARIANTS.register("A8", Variant(adds=frozenset({"C6"})))
+    with pytest.raises(UsageError, match=r"unknown prompt block 'C6'; valid: C0, .*variant A8"):
+        blocks_of("A8")
+
+
+@pytest.mark.parametrize("history_start", ["cruise", "empty"])
+def test_in_a_finer_world_the_histories_are_those_of_the_plans_steps(history_start):
+    coarse = ScenarioConfig(history_start=history_start)
+    fine = coarse.model_copy(update={"step_s": 0.05, "plan_step_s": 0.2})
+    worlds = [World(scenario, CONDITIONS["L_4_0"], TRACK) for scenario in (coarse, fine)]
+    for number in range(4):
+        prompts = [
+            render_prompt(
+                world.observe("right"), [0.5], prompt=prompt_of("baseline"), scenario=scenario
+            )
+            for world, scenario in zip(worlds, (coarse, fine), strict=True)
+        ]
+        assert prompts[0] == prompts[1]
+        for k in range(5):
+            action = (0.313, -0.717, 0.919, 0.123, -0.231)[k] / (number + 1)
+            for world, steps in zip(worlds, (1, 4), strict=True):
+                for _ in range(steps):
+                    world.advance({"left": action / 2, "right": action})
+
+
+@pytest.mark.parametrize("variant", REMOVED)
+def test_a_variant_keeps_the_digests_of_all_blocks_but_its_own(variant):
+    (removed,) = VARIANTS[variant].removes
+    kept = prompt_of("baseline").digests
+    del kept[removed]
+    assert prompt_of(variant).digests == kept
+
+
+def test_the_seven_ablations_remove_seven_different_blocks():
+    assert set(VARIANTS) == {"baseline", *REMOVED}
+    assert not VARIANTS["baseline"].removes | VARIANTS["baseline"].adds
+    removed = [variant.removes for variant in VARIANTS.values()]
+    assert len(frozenset().union(*removed)) == len(REMOVED)
+
+
+@pytest.mark.parametrize("field", ["{own_speed:>999999999}", "{own_speed!r}"])
+def test_a_field_of_a_block_stands_alone_in_its_braces(field):
+    with pytest.raises(UsageError, match="cannot be read, a field stands alone in its braces"):
+        Block("too wide", f"You drive at {field} m/s.", None)

@@ -1,0 +1,70 @@
+"""What is shown while a sweep runs."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+from merge_runner.llm.client import Meter
+from merge_runner.records import Attempt, Usage
+from merge_runner.run.progress import _results
+from tests.support.standings import progress, runner
+
+
+def ago(seconds):
+    return datetime.now(UTC) - timedelta(seconds=seconds)
+
+
+def rows(shown):
+    return shown.standing("").rows
+
+
+def test_every_figure_is_that_of_the_meters():
+    meters = [Meter(calls_live=30, calls_cached=20, calls_shared=8), Meter(calls_live=4)]
+    meters[0].count_attempt(Attempt(1, "ok", usage=Usage(100, 0, 50), cost_usd=1.5))
+    meters[1].count_attempt(Attempt(1, "timeout"))
+    meters[1].mismatches["o3 -> gpt-4o"] = 2
+    shown = progress(runner(*meters, running=5), cap_usd=20, began_at=ago(60))
+    shown.planned += 7
+    shown.stored += 7
+    shown.outcome_counts.update(finished=2, failed=1, suspended=1)
+    fields = dict(rows(shown))
+    assert fields["trials"] == "3/10 ended (+7 stored before), 5 running"
+    assert fields["failed"] == "1"
+    assert fields["WARNING"] == "another model answers: o3 -> gpt-4o"
+    assert fields["calls"] == "34 live, 12 from recordings, 8 shared with another trial"
+    assert fields["cost"] == "1.50 USD, 4.25 of 20 over all runs"
+    # 3 of 10 trials have ended but only 46 of 210 calls are made: the larger share tells.
+    assert fields["time"] == "60 s, about 140 s left"
+
+
+def test_the_calls_tell_the_time_left_while_no_trial_has_ended():
+    shown = progress(runner(Meter(calls_live=70)), began_at=ago(10))
+    assert dict(rows(shown))["time"] == "10 s, about 20 s left"
+    shown.runner = runner(Meter())
+    assert dict(rows(shown))["time"] == "10 s"
+
+
+def test_batches_are_shown_and_that_nobody_need_wait():
+    texts = [f"round 4 of at most 30: 220 calls of o3 in batch {number}" for number in range(5)]
+    shown = progress(runner(Meter(calls_live=70)), batches=lambda: texts)
+    assert [text for name, text in rows(shown) if name == "waiting"] == [
+        *texts[:3],
+        "2 others",
+        "you may close this: the same command goes on",
+    ]
+    assert "left" not in dict(rows(shown))["time"]  # nobody knows how long a batch takes
+
+
+def test_replies_that_cost_more_than_is_counted_are_a_warning():
+    meter = Meter(calls_live=3)
+    meter.underpriced["priority"] = 2
+    warning = dict(rows(progress(runner(meter))))["WARNING"]
+    assert warning.startswith("0: replies are of the service tier 'priority'")
+    assert "tiers = { priority = 2.0 }" in warning
+
+
+def test_the_summary_says_of_no_fallback_that_an_earlier_plan_was_there():
+    """A model of which no reply is valid has none."""
+    counts = {"decisions": 92, "invalid_decisions": 92, "fallbacks": 92, "no_decision": 0}
+    (line,) = _results({"first_looks": [], "outcomes_by_level": [], **counts})
+    assert line == "decisions: 92, 92 invalid (100.0%), 92 fallbacks"

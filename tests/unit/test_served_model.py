@@ -1,0 +1,101 @@
+"""All that tell of another model's answers tell the same, by the aliases of all sweeps."""
+
+from __future__ import annotations
+
+import json
+
+import duckdb
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from merge_runner.audit.checks import audit_sweep
+from merge_runner.results.database import in_memory
+from merge_runner.results.store import sweep_facts
+from merge_runner.served_model import others_among, sql_of
+from merge_runner_analysis.data.provenance import provenance, tally
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.explorer.catalogue import Catalogue
+from merge_runner_analysis.explorer.pages.sweep import list_runs
+from merge_runner_analysis.tables.attempts import attempts
+from tests.support.studies import Drive, Said, write_study
+
+SERVED = ("another", "o3", "o3-2025", "o3-2026", "it's")
+OTHERS = ["another", "it's"]
+
+
+@pytest.fixture
+def db(tmp_path):
+    """One sweep with answers under several names, and a later one of which it has an alias."""
+    path = tmp_path / "m.duckdb"
+    drives = [
+        Drive("o3", "baseline", "L_4_0", rep, (0.5,), (-0.5,), said={0: Said(served=name)})
+        for rep, name in enumerate(SERVED, 1)
+    ]
+    models = {"o3": {"id": "o3", "provider": "openai", "aliases": ["o3-2025"]}}
+    write_study(path, drives, config={"models": models})
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE calls SET http_status = 200")
+        models["o3"]["aliases"] = ["o3-2026"]
+        connection.execute(
+            "INSERT INTO sweeps BY NAME SELECT * REPLACE ('sweep-2' AS sweep_id, ? AS config) "
+            "FROM sweeps",
+            [json.dumps({"models": models})],
+        )
+    return path
+
+
+def test_all_that_tell_of_other_models_tell_the_same(db):
+    assert sorted(served for _, served, _ in sweep_facts(db, "sweep-1")["others"]) == OTHERS
+    assert sorted(provenance(db).mismatches.served) == OTHERS
+    found = [
+        f.text for f in audit_sweep(db, "sweep-1", [], finished=True).findings if f.kind == "served"
+    ]
+    assert sorted(text.split(": ")[0] for text in found) == [f"o3 -> {name}" for name in OTHERS]
+    catalogue = Catalogue(db)
+    *_, run = list_runs(catalogue)
+    assert run["row"]["others"] == len(OTHERS)
+    causes = [cause for cause, _ in catalogue.facets({})["cause"]]
+    assert [c for c in causes if c.startswith("model: ")] == [f"model: o3 → {n}" for n in OTHERS]
+
+
+def test_a_configuration_that_declares_nonsense_declares_nothing(db):
+    with duckdb.connect(str(db)) as connection:
+        connection.execute(
+            "UPDATE sweeps SET config = ? WHERE sweep_id = 'sweep-2'",
+            ['{"models": {"o3": {"id": "o3", "aliases": 5}, "x": [], "y": null}}'],
+        )
+    assert sorted(provenance(db).mismatches.served) == [*OTHERS, "o3-2026"]
+
+
+def test_the_table_and_the_trials_behind_its_cell_agree(db):
+    study = Study(db)
+    (group,) = study.models
+    assert tally(study, group)["other_model"] == len(OTHERS)
+    (source,) = explain(study, attempts(study), f"{group.id}:other_model").sources
+    assert len(source.numerator) == len(OTHERS)
+
+
+names = st.text(max_size=3)
+
+
+@pytest.fixture(scope="module")
+def memory():
+    with in_memory({}) as connection:
+        yield connection
+
+
+@given(st.lists(st.tuples(names, names)), st.lists(st.tuples(names, names)))
+def test_the_condition_in_sql_is_the_rule(memory, pairs, aliases):
+    others = others_among(pairs, aliases)
+    for pair in pairs:
+        (other,) = memory.execute(
+            f"SELECT {sql_of(others)} FROM (SELECT ? AS model_requested, ? AS model_served)", pair
+        ).fetchone()
+        assert other is (pair in others)
+
+
+def test_neither_the_id_nor_an_alias_is_another_model():
+    pairs = [("o3", "gpt-4o"), ("o3", "o3"), ("o3", "o3-2025")]
+    assert others_among(pairs, [("o3", "o3-2025")]) == [("o3", "gpt-4o")]

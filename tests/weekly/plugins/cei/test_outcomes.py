@@ -1,0 +1,78 @@
+"""What a simulation is summed up by is what the analysis says of the same trials."""
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from merge_runner.records import canonical_json
+from merge_runner.results.store import Store
+from merge_runner_analysis.data.load import load
+from merge_runner_cei.batch import simulate
+from merge_runner_cei.calibration.outcomes import measured, summary
+from tests.support.cei_trials import cei, model, played, scenario, simulated
+
+pytestmark = pytest.mark.long
+
+# Among them are trials that collide.
+TRIALS = [
+    (condition, repetition)
+    for condition in ("N_0_0", "L_0_-8", "R_-4_8", "L_4_8")
+    for repetition in range(1, 4)
+] + [("N_0_0", 18), ("N_0_0", 25)]
+MEASURES = ("gap_mean100_m", "conflict_resolution_s")
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    """The same trials: from the database of the runner, and simulated."""
+    task = scenario()
+    db = tmp_path_factory.mktemp("cei") / "merge.duckdb"
+
+    async def play():
+        return [await played(*trial, task, cei(set="K0")) for trial in TRIALS]
+
+    Store(db).add_recorded(
+        asyncio.run(play()), {"cei": canonical_json({"scenario": task.model_dump()})}
+    )
+    trials = [simulated(*trial, task) for trial in TRIALS]
+    study = model(task)
+    frame = measured(study.task, trials, simulate(study, trials))
+    ids = [f"cei/baseline/{condition}/rep{n:02d}" for condition, n in TRIALS]
+    stored = load("SELECT * FROM trials JOIN trial_metrics USING (trial_id, spec_hash)", db)
+    states = load("SELECT * FROM states ORDER BY step", db)
+    return frame.assign(trial_id=ids).set_index("trial_id"), stored.set_index("trial_id"), states
+
+
+def test_outcomes_and_measures_are_those_of_the_database(both):
+    simulated_, stored, _ = both
+    stored = stored.loc[simulated_.index]
+    assert {"finished", "collided"} <= set(simulated_["status"])
+    assert list(simulated_["status"]) == list(stored["status"])
+    firsts = [
+        [first or None for first in frame["merged_first"].fillna("")]
+        for frame in (simulated_, stored)
+    ]
+    assert firsts[0] == firsts[1]
+    for measure in (*MEASURES, "projected_headway_m", "relative_velocity_mps"):
+        np.testing.assert_allclose(
+            simulated_[measure].astype(float), stored[measure].astype(float), rtol=0, atol=1e-6
+        )
+
+
+def test_deviations_and_first_actions_are_those_of_the_stored_states(both):
+    simulated_, _, states = both
+    for (trial_id, side), rows in states.groupby(["trial_id", "side"]):
+        speeds = rows["velocity_mps"]
+        row = simulated_.loc[trial_id]
+        deviation = (speeds - speeds.iloc[0]).abs().max()
+        assert row[f"deviation_{side}_mps"] == pytest.approx(deviation, abs=1e-9)
+        first = rows["acceleration_mps2"].iloc[1]
+        assert row[f"first_{side}_mps2"] == pytest.approx(first, abs=1e-6)
+
+
+def test_a_summary_leaves_out_what_no_fit_can_tell(both):
+    simulated_, _, _ = both
+    few = summary(simulated_.iloc[:8])
+    assert ("who_first", "intercept") not in few
+    assert few["collisions", "count"] == (simulated_["status"].iloc[:8] == "collided").sum()

@@ -1,0 +1,114 @@
+"""The notebooks of the docs, executed as notebooks."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+from tests.support.harness import CONFIGURING, PROJECT, asked_to_write
+
+pytestmark = pytest.mark.long
+
+NOTEBOOKS = sorted((PROJECT / "docs/notebooks").glob("*.ipynb"))
+PICTURE = "a picture"
+RUN_A_STUDY, OWN = "run-a-study", "own-driver-and-metric"
+
+
+def code(notebook):
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def shown(cell) -> str:
+    """What stands below a cell, as text."""
+    texts = [out.text if "text" in out else out["data"]["text/plain"] for out in cell.outputs]
+    return "\n".join(texts)
+
+
+async def execute(notebook, folder):
+    """Run all cells in a folder; what they print stands below them."""
+    client = NotebookClient(
+        notebook, timeout=120, record_timing=False, resources={"metadata": {"path": str(folder)}}
+    )
+    await client.async_execute()
+
+
+@pytest.fixture(scope="module")
+def executed(tmp_path_factory, emulator_url):
+    """Executes a notebook in an empty folder, beside an emulator."""
+
+    async def run(notebook):
+        for name in [name for name in os.environ if name.endswith(CONFIGURING)]:
+            del os.environ[name]
+        os.environ |= {"EMULATOR_BASE_URL": emulator_url, "PYTHONPATH": str(PROJECT)}
+        await execute(notebook, tmp_path_factory.mktemp("notebook"))
+        return code(notebook)
+
+    before = dict(os.environ)
+    yield run
+    os.environ.clear()
+    os.environ.update(before)
+
+
+def named(name: str):
+    return nbformat.read(PROJECT / f"docs/notebooks/{name}.ipynb", as_version=4)
+
+
+def results(cells):
+    """The value of each cell as text, and its pictures; the summary of a run names times."""
+    kinds = ("execute_result", "display_data")
+    values = [
+        PICTURE if "image/png" in out.data else out.data["text/plain"]
+        for cell in cells
+        for out in cell.outputs
+        if out.output_type in kinds and "decisions: " not in out.data["text/plain"]
+    ]
+    return [value for value in values if "trials: " not in value]
+
+
+async def test_a_study_is_run_in_a_notebook_and_looked_at_by_factor(executed):
+    cells = await executed(named(RUN_A_STUDY))
+    (estimate, run, types, means, *_, replayed, tables) = map(shown, cells)
+    assert estimate == "(48, 0.0)"
+    assert "trials: 48/48 ended" in run
+    assert "\x1b" not in run
+    assert "\r" not in run
+    assert "temperature    float64" in types
+    assert "projected-order 0.2" in means
+    assert replayed.splitlines()[-1] == "(0, True)"
+    assert "gap_m" in tables
+
+
+async def test_an_edited_file_is_another_driver_and_a_metric_is_in_the_tables(executed):
+    _, _, played, again, _, table = map(shown, await executed(named(OWN)))
+    assert played.splitlines()[-1] == "22"
+    assert again.splitlines()[-1] == "(0, set())"
+    assert "hardest_braking_mps2" in table
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: Path(path).stem)
+async def test_a_notebook_is_stored_with_what_its_cells_print_and_a_figure(executed, path):
+    stored = nbformat.read(path, as_version=4)
+    before = results(code(stored))
+    assert PICTURE in before
+    assert results(await executed(stored)) == before
+
+
+def main(*arguments: str) -> None:
+    """Write what the cells print, where that is asked for."""
+    asked_to_write(arguments, "what the cells of docs/notebooks print below them")
+    for path in NOTEBOOKS:
+        notebook = nbformat.read(path, as_version=4)
+        with TemporaryDirectory() as folder:
+            asyncio.run(execute(notebook, folder))
+        nbformat.write(notebook, path)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
