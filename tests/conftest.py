@@ -14,6 +14,7 @@ from merge_runner.registry import Catalogue, collecting
 from merge_runner.results.store import results_digest
 from tests.support import program
 from tests.support.crossed_study import play
+from tests.support.golden import golden, golden_copy
 from tests.support.harness import Run, environment
 from tests.support.mock_server import FaultPlan, served
 from tests.support.program import Process

@@ -57,12 +57,17 @@ class Mine:
     run: Callable[..., Run]
 
 
-def play(folder: Path, prepare: Callable[..., Run]) -> Mine:
-    """Write the study and play it."""
+def write(folder: Path) -> None:
+    """Write the files of the study."""
     (folder / "mine.toml").write_text(STUDY)
     (folder / "mine.py").write_text(PLUGIN)
     models = [MODEL.format(name=name, price=price) for name, price in (("cheap", 1), ("dear", 9))]
     (folder / "models.toml").write_text("".join(models))
+
+
+def play(folder: Path, prepare: Callable[..., Run]) -> Mine:
+    """Write the study and play it."""
+    write(folder)
     ran = prepare(folder, "sweep", "mine.toml", "--yes", "--trust", "--db", "t.duckdb", *FAST)
     assert ran.code == 0, ran.err
 
