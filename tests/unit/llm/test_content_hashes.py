@@ -1,3 +1,5 @@
+"""The key under which a call is kept: every part of a request, and its slot."""
+
 import hashlib
 import json
 from copy import deepcopy
@@ -5,7 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_runner import records
@@ -21,7 +23,6 @@ BASE = {
     "path": "/chat/completions",
     "headers": {"anthropic-version": "2023-06-01"},
     "body": {
-        "model": "o3-2025-04-16",
         "messages": [{"role": "user", "content": "Où? 你好"}],
         "cap": 100,
         "stream": False,
@@ -37,85 +38,56 @@ def key(**changes):
 
 # A recording made today must be found by every later version: these never change.
 @pytest.mark.parametrize(
-    ("wire", "provider", "parameters", "golden"),
+    ("wire", "parameters", "golden"),
     [
         (
             "openai-chat",
-            "openai",
             {"reasoning_effort": "medium"},
             "183440a71555bb1b12e4465754ee2fb79a441520ad88bbd7ae09ec84767b1e13",
         ),
         (
             "openai-responses",
-            "openai",
             {"reasoning": {"effort": "medium"}},
             "7b22f0497cf9ad648032234e467c718a0e03c3b5620a76766773562513e2dc39",
         ),
         (
             "gemini",
-            "gemini",
             {"temperature": 1.0, "thinkingConfig": {"thinkingBudget": -1}},
             "6aa82e929487f3261444871e83f33a2bab58c338dc3bdb9cfa9af526066b707c",
         ),
-        (
-            "anthropic",
-            "anthropic",
-            {},
-            "1e316d951d608d61bd406d75d1ca4a05c637805695f4cfe1f0c1112a932d7896",
-        ),
+        ("anthropic", {}, "1e316d951d608d61bd406d75d1ca4a05c637805695f4cfe1f0c1112a932d7896"),
     ],
 )
-def test_the_key_of_a_known_request_never_changes(wire, provider, parameters, golden):
+def test_the_key_of_a_known_request_never_changes(wire, parameters, golden):
+    provider = wire.partition("-")[0]
     entry = ModelEntry(
         provider=provider, format=wire, id="model-1", parameters=parameters, max_output_tokens=100
     )
-    request = FORMATS[wire].request(entry, "Où allez-vous?\n你好")
-    made = make_request(
-        provider=provider,
-        endpoint=provider,
-        model=entry.id,
-        path=request.path,
-        headers=request.headers,
-        body=request.body,
-        slot=SLOT,
-    )
-    assert made.key == golden
+    sent = FORMATS[wire].request(entry, "Où allez-vous?\n你好")
+    named = {"provider": provider, "endpoint": provider, "model": "model-1", "slot": SLOT}
+    assert make_request(path=sent.path, headers=sent.headers, body=sent.body, **named).key == golden
 
 
-def test_the_key_is_sha256_of_one_canonical_json_object():
+def test_the_key_is_sha256_of_one_canonical_json_object_with_the_body_that_is_sent():
     request = make_request(**BASE)
+    assert request.body == canonical_json(BASE["body"])
+    slot = {"condition": "A1", "repetition": 1, "side": "left", "decision": 0, "sample_set": 0}
     whole = {
         "body": json.loads(request.body),
         "endpoint": request.endpoint,
         "headers": request.headers,
         "key_version": 1,
         "path": request.path,
-        "slot": {
-            "condition": "A1",
-            "repetition": 1,
-            "side": "left",
-            "decision": 0,
-            "sample_set": 0,
-        },
+        "slot": slot,
     }
     assert request.key == hashlib.sha256(canonical_json(whole).encode()).hexdigest()
+    parts = {name: getattr(request, name) for name in ("endpoint", "path", "headers", "body")}
+    assert request.key == call_key(slot=request.slot, **parts)
 
 
 def test_canonical_json_has_sorted_keys_no_spaces_and_plain_letters():
     assert canonical_json({"b": [1, 1.0, None], "a": {"d": "é", "c": True}}) == (
         '{"a":{"c":true,"d":"é"},"b":[1,1.0,null]}'
-    )
-
-
-def test_the_body_that_is_sent_is_the_one_that_is_hashed():
-    request = make_request(**BASE)
-    assert request.body == canonical_json(BASE["body"])
-    assert request.key == call_key(
-        endpoint=request.endpoint,
-        path=request.path,
-        headers=request.headers,
-        body=request.body,
-        slot=request.slot,
     )
 
 
@@ -128,6 +100,7 @@ def test_the_body_that_is_sent_is_the_one_that_is_hashed():
         {"headers": {"anthropic-version": "2026-10-21"}},
         {"headers": {"anthropic-beta": "2023-06-01"}},
         {"headers": {"anthropic-version": "2023-06-01", "more": ""}},
+        {"body": {**BASE["body"], "seed": None}},
         {"slot": replace(SLOT, condition="A2")},
         {"slot": replace(SLOT, repetition=2)},
         {"slot": replace(SLOT, side="right")},
@@ -142,8 +115,7 @@ def test_any_other_part_is_another_key(changes):
 
 def leaves(value, path=()):
     """The paths to all values inside a JSON value."""
-    items = value.items() if isinstance(value, dict) else enumerate(value)
-    for name, inner in items:
+    for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
         if isinstance(inner, dict | list):
             yield from leaves(inner, (*path, name))
         else:
@@ -151,20 +123,16 @@ def leaves(value, path=()):
 
 
 @pytest.mark.parametrize("path", list(leaves(BASE["body"])), ids=str)
-@pytest.mark.parametrize("value", ["other", 2, 1.5, True, {}, ["other"]], ids=str)
-def test_any_other_value_in_the_body_is_another_key(path, value):
-    body = deepcopy(BASE["body"])
-    inner = body
+def test_any_other_value_in_the_body_is_another_key(path):
+    body = inner = deepcopy(BASE["body"])
     for name in path[:-1]:
         inner = inner[name]
-    inner[path[-1]] = value
-    assert key(body=body) != key()
+    keys = {key()}
+    for inner[path[-1]] in ("other", 2, 1.5, True, {}, ["other"]):
+        keys.add(key(body=body))
     del inner[path[-1]]
-    assert key(body=body) != key()
-
-
-def test_an_added_field_in_the_body_is_another_key():
-    assert key(body={**BASE["body"], "seed": None}) != key()
+    keys.add(key(body=body))
+    assert len(keys) == 8
 
 
 def test_numbers_that_are_equal_but_spelt_differently_are_different_requests():
@@ -177,15 +145,11 @@ def test_another_key_version_is_another_key(monkeypatch):
     assert key() != before
 
 
-def test_labels_do_not_enter_the_key():
-    assert key(provider="other", model="other") == key()
-
-
-def test_the_order_of_fields_does_not_matter():
+def test_labels_and_the_order_of_fields_do_not_matter():
     turned = dict(reversed(BASE["body"].items()))
     turned["nested"] = dict(reversed(turned["nested"].items()))
-    assert list(turned) != list(BASE["body"])
     assert make_request(**{**BASE, "body": turned}) == make_request(**BASE)
+    assert key(provider="other", model="other") == key()
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
@@ -205,25 +169,17 @@ def two_cuts(draw):
     return [tuple(text[a:b] for a, b in pairwise(cut)) for cut in cuts]
 
 
-def key_of_parts(parts):
-    endpoint, path, header, prompt, condition = parts
-    return key(
-        endpoint=endpoint,
-        path=path,
-        headers={"h": header},
-        body={"p": prompt},
-        slot=replace(SLOT, condition=condition),
-    )
+def key_of_parts(endpoint, path, header, prompt, condition):
+    slot = replace(SLOT, condition=condition)
+    return key(endpoint=endpoint, path=path, headers={"h": header}, body={"p": prompt}, slot=slot)
 
 
-@settings(deadline=None)
 @given(two_cuts())
 def test_no_two_tuples_of_parts_share_a_key(two):
     one, other = two
-    assert (key_of_parts(one) == key_of_parts(other)) == (one == other)
+    assert (key_of_parts(*one) == key_of_parts(*other)) == (one == other)
 
 
-@settings(deadline=None)
 @given(prompt=st.text(), other=st.text())
 def test_a_prompt_cannot_pretend_to_be_another_part(prompt, other):
     spelt = f'{prompt}"}},"endpoint":{canonical_json(other)}'

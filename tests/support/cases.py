@@ -1,0 +1,28 @@
+"""Cases that are data: tables of the files in tests/cases, whose keys are the ids of tests."""
+
+from __future__ import annotations
+
+import tomllib
+
+import pytest
+
+from tests.support.harness import PROJECT
+
+
+def table(file, name):
+    """A table of a file, by name of its cases."""
+    return tomllib.loads((PROJECT / f"tests/cases/{file}.toml").read_text())[name]
+
+
+def cases(file, name):
+    """The cases of a table, a parameter each."""
+    return [pytest.param(case, id=key) for key, case in table(file, name).items()]
+
+
+def by_format(file, name):
+    """The cases of a table for each wire format, two parameters each."""
+    return [
+        pytest.param(wire, case, id=f"{wire} {key}")
+        for wire, named in table(file, name).items()
+        for key, case in named.items()
+    ]

@@ -1,0 +1,271 @@
+"""What is made of each reply; the cases are in tests/cases/http_outcomes.toml."""
+
+import json
+from datetime import UTC, datetime
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from merge_runner.config import ModelEntry
+from merge_runner.llm.formats import FORMATS, Reading, WireFormat, WireRequest
+from merge_runner.llm.http_outcome import (
+    RawReply,
+    judge,
+    may_be_charged,
+    reason_of,
+    server_delay_s,
+    why_refused,
+)
+from tests.support.cases import by_format, cases
+
+
+def judged(wire, status, body, headers=None):
+    text = body if isinstance(body, str) else json.dumps(body)
+    return judge(RawReply(status, headers or {}, text), FORMATS[wire])
+
+
+@pytest.mark.parametrize(("wire", "case"), by_format("http_outcomes", "means"))
+def test_what_a_reply_means(wire, case):
+    status, (action, name) = case.get("status", 200), case["means"].split()
+    found = judged(wire, status, case["body"], case.get("headers"))
+    assert (found.action, found.name, found.pause) == (action, name, name == "rate_limited")
+    if name == "rate_limited":
+        assert found.delay_s == case.get("wait_s")
+    if status != 200:
+        assert (found.reading.outcome, found.reading.text) == ("error", "")
+        assert action == "accept" or str(status) in found.message
+
+
+@pytest.mark.parametrize("status", [408, 409, 500, 502, 503, 504, 520, 524, 529])
+def test_the_delay_that_a_failing_server_asks_for_is_kept_for_this_call_alone(status):
+    found = judged("openai-chat", status, "<html>", {"retry-after": "9"})
+    assert (found.action, found.delay_s, found.pause) == ("retry", 9, False)
+
+
+def openrouter(message, **within):
+    return {"error": {"code": 429, "message": message, "metadata": {"headers": within}}}
+
+
+@pytest.mark.parametrize(
+    ("headers", "within", "delay_s"),
+    [
+        ({"x-ratelimit-reset": "60"}, {}, 60),
+        ({"x-ratelimit-reset": "60", "x-ratelimit-remaining": "0"}, {}, 60),
+        ({"x-ratelimit-reset": "60", "x-ratelimit-remaining": "7"}, {}, None),
+        ({"x-ratelimit-reset": "soon"}, {}, None),
+        ({"x-ratelimit-reset": "60", "retry-after": "3"}, {}, 3),
+        ({}, {"X-RateLimit-Reset": str(1_800_000_030_000), "X-RateLimit-Remaining": "0"}, 30),
+        ({}, {"X-RateLimit-Reset": str(1_800_000_030)}, 30),
+        ({}, {"X-RateLimit-Reset": str(1_700_000_000)}, None),
+    ],
+)
+def test_the_reset_of_a_used_up_limit_is_a_delay(headers, within, delay_s):
+    error = RawReply(429, headers, json.dumps(openrouter("Rate limit exceeded", **within))).error
+    now = datetime.fromtimestamp(1_800_000_000, UTC)
+    assert server_delay_s(error, FORMATS["openai-chat"], now) == delay_s
+
+
+def test_a_quota_of_a_day_says_when_it_opens_again_unless_that_is_not_known():
+    told = openrouter("free-models-per-day", **{"X-RateLimit-Reset": "1999999999000"})
+    assert judged("openai-chat", 200, told).delay_s > 1e6
+    details = [{"violations": [{"quotaId": "RequestsPerDayPerProject"}]}, {"retryDelay": "38s"}]
+    day = {"error": {"code": 429, "status": "RESOURCE_EXHAUSTED", "details": details}}
+    spent = {"error": {"message": "m", "type": "insufficient_quota"}}
+    for found in (
+        judged("gemini", 429, day),
+        judged("openai-chat", 429, spent, {"retry-after": "1"}),
+    ):
+        assert (found.name, found.delay_s) == ("quota_exhausted", None)
+
+
+def test_what_came_in_the_place_of_an_answer_is_in_the_message():
+    events = 'data: {"choices": [{"delta": {"content": "M"}}]}\n\ndata: [DONE]\n'
+    message = judged("openai-chat", 200, events, {"content-type": "text/event-stream"}).message
+    assert "text/event-stream: data: {" in message
+    assert "\n" not in message
+    long = judged("openai-chat", 200, {"status": "x" * 1000}, {"content-type": "text/json"})
+    assert "text/json: " in long.message
+    assert len(long.message) < 300
+
+
+@pytest.mark.parametrize("case", cases("http_outcomes", "first_call"))
+def test_what_no_call_of_a_run_would_fare_better_with(case):
+    outcome = judged("openai-chat", case.get("status", 200), case["body"], case.get("headers"))
+    reason = case.get("reason")
+    assert reason_of(outcome, "http://localhost/v1/chat/completions") == reason
+    if reason is not None:
+        entry = ModelEntry(provider="local", format="openai-chat", id="m", max_output_tokens=10)
+        assert "\n" not in why_refused(reason, "local", entry, outcome)
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("http://localhost/v1/v1/messages", "path_twice"),
+        ("http://localhost/x/v1beta/v1beta/models/m:generateContent", "path_twice"),
+        ("http://localhost/v1/chat/completions/chat/completions", "path_twice"),
+        ("http://localhost/v1/messages", "unknown_model"),
+        ("http://localhost/v1/v1beta/messages", "unknown_model"),
+        ("anthropic/v1/messages", "unknown_model"),
+    ],
+)
+def test_a_path_that_stands_twice_in_a_url_is_no_unknown_model(url, reason):
+    body = {"type": "error", "error": {"type": "not_found_error", "message": "m"}}
+    assert reason_of(judged("anthropic", 404, body), url) == reason
+
+
+PARTS = [{"type": "thinking", "thinking": [{"type": "text", "text": "M"}]}]
+
+
+@pytest.mark.parametrize(
+    ("message", "finish", "reason"),
+    [
+        ({"content": None, "reasoning_content": "M\nI go first."}, "stop", "reasoning_alone"),
+        ({"content": None, "reasoning": "M\nI go first."}, "stop", "reasoning_alone"),
+        ({"content": PARTS}, "stop", "reasoning_alone"),
+        ({"content": None, "reasoning": "M\nI go first."}, "length", None),
+        ({"content": ""}, "stop", None),
+        ({"content": "<think>M</think>"}, "stop", None),
+    ],
+)
+def test_an_answer_that_is_nothing_but_reasoning_is_told(message, finish, reason):
+    body = {"choices": [{"message": message, "finish_reason": finish}]}
+    assert reason_of(judged("openai-chat", 200, body), "") == reason
+
+
+@pytest.mark.parametrize("word", ["abort", "network_error", "insufficient_system_resource"])
+def test_a_finish_reason_that_says_so_names_the_server_that_broke_off(word):
+    choice = {"message": {"content": "M\nI am"}, "finish_reason": word}
+    found = judged("openai-chat", 200, {"choices": [choice]})
+    assert found.message == f"the server broke its answer off (finish reason {word})"
+    assert (found.reading.finish_reason, found.delay_s) == (word, None)
+
+
+@pytest.mark.parametrize(("status", "outcome"), [(200, "bad_body"), (500, "server_error")])
+def test_a_body_that_is_nested_too_deep_is_no_json(status, outcome):
+    found = judged("openai-chat", status, "[" * 100_000)
+    assert (found.action, found.name) == ("retry", outcome)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ({"error": {"message": "the words", "type": "t"}}, "the words"),
+        ({"error": {"message": "the words\n* in  lines\n"}}, "the words * in lines"),
+        ([{"error": {"message": "the words"}}], "the words"),
+        ({"error": "the words"}, "the words"),
+        ({"message": "the words", "object": "error"}, "the words"),
+        ("some\n  text\twithout JSON", "some text without JSON"),
+        ("x" * 1000, "x" * 200),
+        ("", "no reason is given"),
+    ],
+)
+def test_the_servers_words_are_the_message(body, message):
+    assert judged("openai-chat", 400, body).message == f"HTTP 400: {message}"
+
+
+def test_what_was_read_of_a_failed_answer_is_kept():
+    told = {"status": "failed", "error": {"code": "server_error", "message": "m"}}
+    body = told | {"model": "m-1", "usage": {"input_tokens": 7}}
+    reading = judged("openai-responses", 200, body).reading
+    assert (reading.model_served, reading.usage.input_tokens) == ("m-1", 7)
+
+
+NAMES = [
+    *("error", "message", "type", "code", "status", "details", "choices", "violations"),
+    *("quotaId", "retryDelay", "reason", "error_code", "finish_reason", "output"),
+]
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(NAMES), inner, max_size=4)
+    ),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=50)
+@given(
+    st.sampled_from(list(FORMATS)),
+    st.sampled_from([200, 400, 402, 404, 429, 500]),
+    st.text() | json_values.map(json.dumps),
+)
+# A digit, but not a decimal one.
+@example("openai-chat", 200, '{"error": {"code": "²"}}')
+def test_no_body_makes_it_raise(wire, status, body):
+    found = judged(wire, status, body)
+    assert found.action in ("accept", "retry", "fail", "quota", "refused")
+    assert found.name
+
+
+class Stubborn(WireFormat):
+    """A format that understands a few errors otherwise than all others."""
+
+    members = frozenset({"said"})
+
+    def request(self, entry, prompt):
+        return WireRequest("/", {})
+
+    def read(self, payload):
+        return Reading("error" if payload.get("error") else "ok")
+
+    def meaning(self, error):
+        return "request_too_large" if "insufficient_quota" in error.names else None
+
+    def delay_s(self, error):
+        return 11.0 if "soon" in error.names else None
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "headers", "name", "delay_s"),
+    [
+        (429, "insufficient_quota", {}, "request_too_large", None),
+        (503, "soon", {}, "overloaded", 11),
+        (503, "soon", {"retry-after": "13"}, "overloaded", 13),
+        # What only another format knows, as a gateway may pass it on.
+        (400, "model_not_found", {}, "unknown_model", None),
+        (429, "enforced_spend_limit_reached", {}, "quota_exhausted", None),
+    ],
+)
+def test_a_formats_own_word_on_an_error_goes_before_that_of_others(
+    status, code, headers, name, delay_s
+):
+    body = {"error": {"message": "m", "type": "invalid_request_error", "code": code}}
+    found = judge(RawReply(status, headers, json.dumps(body)), Stubborn())
+    assert (found.name, found.delay_s) == (name, delay_s)
+
+
+@pytest.mark.parametrize("case", cases("http_outcomes", "charged"))
+def test_what_may_be_charged_though_no_usage_is_told(case):
+    reply = RawReply(case["status"], {}, case["body"])
+    assert may_be_charged(reply, case.get("provider")) == case["charged"]
+
+
+@pytest.mark.parametrize("status", [400, 429, 500, 503])
+@pytest.mark.parametrize(
+    ("wire", "told"),
+    [
+        ("openai-chat", {"usage": {"prompt_tokens": 7, "completion_tokens": 9}}),
+        ("openai-responses", {"usage": {"input_tokens": 7, "output_tokens": 9}}),
+        ("anthropic", {"usage": {"input_tokens": 7, "output_tokens": 9}}),
+        ("gemini", {"usageMetadata": {"promptTokenCount": 7, "candidatesTokenCount": 9}}),
+    ],
+)
+def test_usage_in_an_error_is_read_in_every_format(status, wire, told):
+    usage = judged(wire, status, {"error": {"message": "m"}} | told).reading.usage
+    assert (usage.input_tokens, usage.output_tokens) == (7, 9)
+
+
+@pytest.mark.parametrize(
+    ("body", "page"),
+    [
+        ("<!DOCTYPE html><p>", True),
+        ("\ufeff\n <HTML lang=en>", True),
+        ('{"html": "<html>"}', False),
+        ("<hr>", False),
+        ("", False),
+    ],
+)
+def test_a_web_page_is_told_from_all_else(body, page):
+    assert RawReply(200, {}, body).is_web_page == page
