@@ -35,8 +35,7 @@ from tests.integration.llm.test_scenarios import (  # noqa: F401 # fixtures
 )
 from tests.support.harness import each
 from tests.support.mock_server import FaultPlan
-from tests.support.scenarios import SCENARIOS
-from tests.support.scenarios.playing import ScenarioPlan, playing
+from tests.support.scenarios import SCENARIOS, ScenarioPlan, playing
 from tests.support.virtual_time import in_virtual_time
 
 PRICE = Price(input=2, output=8, source="test")
