@@ -1,79 +1,72 @@
-from __future__ import annotations
+"""Batch services over HTTP: to the emulator, or to a server that says what a test tells it."""
 
-import contextlib
+from __future__ import annotations
 
 import pytest
 from aiohttp import web
 
-from merge_runner.config import Endpoint, ModelEntry
+from merge_runner.config import Endpoint, ModelEntry, ScenarioConfig
 from merge_runner.llm.batch.providers import SERVICES
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
-from tests.support.mock_server import serve
+from merge_runner.prompts.blocks import prompt_of, render_prompt
+from merge_runner.records import Slot, make_request
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.geometry import TRACK
+from merge_runner.scenarios.merge.world import World
 
-# What stands before the paths of a provider: OpenAI's version belongs to its base URL.
-PROVIDERS = {
-    "openai-chat": ("openai", "/v1"),
-    "openai-responses": ("openai", "/v1"),
-    "anthropic": ("anthropic", ""),
-    "gemini": ("gemini", ""),
-}
 KEY = "sk-dummy-0123456789"
 
 
+def provider_of(form):
+    return form.partition("-")[0]
+
+
 def entry_of(form, provider=None, **options):
-    return ModelEntry(
-        provider=provider or PROVIDERS[form][0],
-        format=form,
-        id="some-model",
-        max_output_tokens=1000,
-        **options,
-    )
+    named = {"provider": provider or provider_of(form), "format": form, "id": "some-model"}
+    return ModelEntry(max_output_tokens=1000, **named, **options)
 
 
-@pytest.fixture(autouse=True)
-def _no_certificates(monkeypatch, tmp_path):
-    # Nothing here speaks TLS, and to load the certificates takes longer than most of the tests.
-    monkeypatch.delenv("SSL_CERT_FILE", raising=False)
-    monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path))
+def lines(form, count=11, *, provider=None, first=0):
+    """So many different requests with real prompts, each of another slot."""
+    entry, made, scenario = entry_of(form, provider), [], ScenarioConfig()
+    for number in range(first, first + count):
+        condition = list(CONDITIONS)[number % len(CONDITIONS)]
+        slot = Slot(condition, 1 + number // len(CONDITIONS), "left", 0, 0)
+        seen = World(scenario, CONDITIONS[condition], TRACK).observe("left")
+        prompt = render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
+        sent = FORMATS[form].request(entry, f"{prompt}\n{slot.repetition}")
+        named = {"provider": entry.provider, "endpoint": entry.provider, "model": entry.id}
+        sent = {"path": sent.path, "headers": sent.headers, "body": sent.body}
+        made.append(make_request(slot=slot, **named, **sent))
+    return made
 
 
-@pytest.fixture(params=PROVIDERS)
+@pytest.fixture(params=FORMATS)
 def form(request):
     """Every wire format in turn."""
     return request.param
 
 
 @pytest.fixture
-async def emulator():
-    """A function that starts an emulator with the given faults and returns its base URL."""
-    async with contextlib.AsyncExitStack() as stack:
-
-        async def start(faults=None):
-            runner, url = await serve(0, faults)
-            stack.push_async_callback(runner.cleanup)
-            return url
-
-        yield start
-
-
-@pytest.fixture
 async def transport_to():
     """A function that makes a transport to an endpoint."""
-    async with contextlib.AsyncExitStack() as stack:
+    made = []
 
-        def make(endpoint, **options):
-            transport = HttpTransport(endpoint, connections=4, **options)
-            stack.push_async_callback(transport.close)
-            return transport
+    def make(endpoint, **options):
+        made.append(HttpTransport(endpoint, connections=4, **options))
+        return made[-1]
 
-        yield make
+    yield make
+    for transport in made:
+        await transport.close()
 
 
 def endpoint_at(url, form, provider=None):
-    name = provider or PROVIDERS[form][0]
-    headers = {"authorization": f"Bearer {KEY}"}
-    return Endpoint(name, name, url + PROVIDERS[form][1], headers)
+    """OpenAI's version belongs to its base URL."""
+    name = provider or provider_of(form)
+    base_url = f"{url}/v1" if form.startswith("openai") else url
+    return Endpoint(name, name, base_url, {"authorization": f"Bearer {KEY}"})
 
 
 @pytest.fixture
@@ -82,8 +75,7 @@ def service_at(transport_to):
 
     def make(url, form, provider=None, **options):
         endpoint = endpoint_at(url, form, provider)
-        transport = transport_to(endpoint, **options)
-        return SERVICES[form](transport, endpoint, FORMATS[form])
+        return SERVICES[form](transport_to(endpoint, **options), endpoint, FORMATS[form])
 
     return make
 
@@ -99,17 +91,13 @@ class Says:
     async def handle(self, request):
         await request.read()
         self.asked.append((f"{request.method} {request.path}", dict(request.headers)))
-        reply = self.replies.get(f"{request.method} {request.path}")
-        if reply is None:
-            return web.json_response({"error": {"message": "not found"}}, status=404)
-        return await reply(request) if callable(reply) else reply_of(reply)
-
-
-def reply_of(told):
-    status, body, *headers = told
-    if isinstance(body, bytes):
-        return web.Response(status=status, body=body)
-    return web.json_response(body, status=status, headers=headers[0] if headers else None)
+        told = self.replies.get(f"{request.method} {request.path}", (404, {"error": "not found"}))
+        if callable(told):
+            return await told(request)
+        status, body, *headers = told
+        if isinstance(body, bytes):
+            return web.Response(status=status, body=body)
+        return web.json_response(body, status=status, headers=headers[0] if headers else None)
 
 
 @pytest.fixture

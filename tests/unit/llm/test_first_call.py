@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 
 import pytest
 
 from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import TransportFailure
+from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
 from tests.support.virtual_time import in_virtual_time, now_s
-from tests.unit.llm.test_client import (  # noqa: F401 # fixtures
-    PRICE,
-    Server,
-    answer,
-    error,
-    make,
-    raw,
-    slot,
-    ticks,
-)
 
 WEB_PAGE = raw("\n<!DOCTYPE html><html>Welcome</html>")
 PROXY_407 = TransportFailure("proxy_refused", "the proxy says 407", sent=False, action="refused")
@@ -35,21 +27,13 @@ def cache(tmp_path):
 
 
 @pytest.fixture
-def begin(make):  # noqa: F811
+def begin(make):
     """A client whose run begins."""
-
-    def begin(*replies, known=False, **changes):
-        return make(*replies, passed=False, known=known, **changes)
-
-    return begin
+    return partial(make, passed=False)
 
 
 def ask_all(client, number=5):
     return [asyncio.create_task(client.ask("prompt", slot(n))) for n in range(1, number + 1)]
-
-
-async def results(tasks):
-    return await asyncio.gather(*tasks, return_exceptions=True)
 
 
 @in_virtual_time
@@ -101,7 +85,10 @@ async def test_a_wrong_configuration_is_told_by_one_call(begin, reply, advice):
     await client.drain()
     assert len(client.transport.sent) == 1
     assert "\n" not in str(caught.value)
-    assert all(isinstance(result, BaseException) for result in await results(tasks))
+    assert all(
+        isinstance(result, BaseException)
+        for result in await asyncio.gather(*tasks, return_exceptions=True)
+    )
 
 
 @pytest.mark.parametrize(
@@ -141,15 +128,11 @@ async def test_in_the_midst_of_a_run_what_is_not_understood_is_asked_again(begin
 
 
 @in_virtual_time
-async def test_an_endpoint_that_has_answered_before_is_given_three_tries(begin):
+async def test_an_endpoint_that_has_answered_before_is_given_three_tries_and_may_think_alone(begin):
     client = begin(raw("data: {}", content_type="text/event-stream"), known=True)
     with pytest.raises(EndpointRefused, match="SSE"):
         await client.ask("prompt", slot())
     assert len(client.transport.sent) == 3
-
-
-@in_virtual_time
-async def test_a_model_that_has_answered_before_may_think_without_an_answer(begin):
     client = begin(answer(None, reasoning_content="hm"), known=True)
     assert (await client.ask("prompt", slot())).outcome == "empty"
 
@@ -163,7 +146,7 @@ async def test_a_first_call_that_waits_says_so_once_with_what_came_last_and_unti
     assert "UTC, after HTTP 503: warming up" in told[0]
     silent = begin(answer(), deadline_s=600)
     silent.transport.open.clear()
-    asked = asyncio.create_task(silent.ask("prompt", slot(2)))
+    asked = await begun(silent.ask("prompt", slot(2)))
     await asyncio.sleep(6)
     assert ["nothing has come yet" in note for note in silent.meter.notes] == [True]
     silent.transport.open.set()
@@ -171,14 +154,6 @@ async def test_a_first_call_that_waits_says_so_once_with_what_came_last_and_unti
     await silent.ask("prompt", slot(3))
     await asyncio.sleep(9)
     assert len(silent.meter.notes) == 1
-
-
-@in_virtual_time
-async def test_what_certainly_was_not_sent_costs_nothing(begin):
-    client = begin(PROXY_407, price=PRICE, cap=1.0)
-    with pytest.raises(EndpointRefused):
-        await client.ask("prompt", slot())
-    assert client.budget.ledger.read().committed_usd == 0
 
 
 @in_virtual_time
@@ -213,7 +188,7 @@ async def test_no_answer_to_the_first_call_within_its_deadline_ends_the_run(begi
         await tasks[0]
     sent = len(client.transport.sent)
     await client.drain()
-    await results(tasks)
+    await asyncio.gather(*tasks, return_exceptions=True)
     assert len(client.transport.sent) == sent
 
 
@@ -222,7 +197,7 @@ async def test_a_prompt_that_is_refused_for_its_content_fails_alone(begin):
     flagged = raw({"error": {"message": "flagged", "code": "invalid_prompt"}}, 400)
     client = begin(flagged, answer())
     tasks = ask_all(client, 3)
-    first, *others = await results(tasks)
+    first, *others = await asyncio.gather(*tasks, return_exceptions=True)
     assert isinstance(first, CallFailed)
     assert [reply.outcome for reply in others] == ["ok", "ok"]
 
@@ -241,21 +216,20 @@ async def test_a_first_call_that_is_given_up_lets_the_next_one_go(begin):
     client.transport.open.clear()
     asked = ask_all(client, 2)
     await ticks()
-    for call in client._calls:
-        call.task.cancel()
-        break
+    next(iter(client.under_way.values())).task.cancel()
     await ticks()
     assert len(client.transport.sent) == 2
     client.transport.open.set()
-    await results(asked)
+    await asyncio.gather(*asked, return_exceptions=True)
 
 
 @in_virtual_time
 async def test_a_web_page_is_free_where_no_model_ever_answered_and_may_be_charged_elsewhere(begin):
-    stray = begin(WEB_PAGE, price=PRICE, cap=1.0)
-    with pytest.raises(EndpointRefused):
-        await stray.ask("prompt", slot())
-    assert stray.budget.ledger.read().committed_usd == 0
+    for free in (WEB_PAGE, PROXY_407):
+        stray = begin(free, price=PRICE, cap=1.0)
+        with pytest.raises(EndpointRefused):
+            await stray.ask("prompt", slot())
+        assert stray.budget.ledger.read().committed_usd == 0
     gateway = begin(WEB_PAGE, answer(), price=PRICE, cap=1.0, known=True)
     assert (await gateway.ask("prompt", slot())).outcome == "ok"
     assert gateway.budget.ledger.read().open_attempts == 1
@@ -264,7 +238,7 @@ async def test_a_web_page_is_free_where_no_model_ever_answered_and_may_be_charge
 @in_virtual_time
 async def test_where_a_model_has_answered_before_one_refused_prompt_does_not_end_every_run(begin):
     client = begin(error(400), error(400), answer(), known=True)
-    first, second, *others = await results(ask_all(client))
+    first, second, *others = await asyncio.gather(*ask_all(client), return_exceptions=True)
     assert isinstance(first, CallFailed)
     assert isinstance(second, CallFailed)
     assert [reply.outcome for reply in others] == ["ok"] * 3
@@ -273,5 +247,5 @@ async def test_where_a_model_has_answered_before_one_refused_prompt_does_not_end
     with pytest.raises(EndpointRefused, match="unknown parameter"):
         await tasks[2]
     await changed.drain()
-    await results(tasks)
+    await asyncio.gather(*tasks, return_exceptions=True)
     assert len(changed.transport.sent) == 3

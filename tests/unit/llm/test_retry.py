@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
 from merge_runner.errors import CallFailed
-from merge_runner.llm import client as module
 from merge_runner.llm.http_outcome import backoff_s
 from merge_runner.llm.limiter import Limiter
+from tests.support.clients import answer, error, slot
 from tests.support.virtual_time import in_virtual_time, now_s
-from tests.unit.llm.test_client import answer, cache, error, make, opened, slot  # noqa: F401 # fixtures
 
 BUSY = error(503)
 
@@ -24,23 +22,24 @@ def waits(client):
 
 
 @in_virtual_time
-async def test_waits_double_from_half_a_second_to_a_minute(make):  # noqa: F811
+async def test_waits_double_from_half_a_second_to_a_minute(make):
     client = make(*[BUSY] * 11, answer())
     await client.ask("prompt", slot())
     for number, wait_s in enumerate(waits(client)):
         assert min(0.5 * 2**number, 60) - 0.001 <= wait_s <= min(0.5 * 2**number + 0.5, 60) + 0.001
         assert backoff_s(number + 1) == min(0.5 * 2**number, 60)
+    assert backoff_s(10**9) == 60
 
 
 @in_virtual_time
-async def test_waits_differ_so_that_those_who_failed_together_do_not_return_together(make):  # noqa: F811
+async def test_waits_differ_so_that_those_who_failed_together_do_not_return_together(make):
     clients = [make(BUSY, answer()) for _ in range(10)]
     await asyncio.gather(*(client.ask("p", slot(n)) for n, client in enumerate(clients, 1)))
     assert len({waits(client)[0] for client in clients}) > 1
 
 
 @in_virtual_time
-async def test_the_delay_that_a_server_asks_for_is_slept_and_cannot_shorten_the_backoff(make):  # noqa: F811
+async def test_the_delay_that_a_server_asks_for_is_slept_and_cannot_shorten_the_backoff(make):
     asked = [error(503, retry_after=delay) for delay in ("17.5", "90", "0.001")]
     client = make(*asked, answer())
     await client.ask("prompt", slot())
@@ -50,16 +49,17 @@ async def test_the_delay_that_a_server_asks_for_is_slept_and_cannot_shorten_the_
 
 
 @in_virtual_time
-async def test_attempts_and_waits_count_against_the_deadline(make):  # noqa: F811
-    client = make(error(503, retry_after="30"), deadline_s=100.0)
-    with pytest.raises(CallFailed, match="no answer within 100 s"):
+async def test_attempts_and_waits_count_against_the_deadline(make):
+    client = make(error(503, "no room", retry_after="30"), deadline_s=100.0, timeout_s=60)
+    with pytest.raises(CallFailed, match=r"no answer within 100 s.*no room") as caught:
         await client.ask("prompt", slot())
-    assert client.transport.timeouts == pytest.approx([100, 70, 40, 10], abs=0.01)
+    assert client.transport.timeouts == pytest.approx([60, 60, 40, 10], abs=0.01)
+    assert [attempt.outcome for attempt in caught.value.attempts] == ["overloaded"] * 4
     assert now_s() < 91, "a wait that would pass the deadline is not begun"
 
 
 @in_virtual_time
-async def test_the_wait_for_a_turn_does_not_count(make):  # noqa: F811
+async def test_the_wait_for_a_turn_does_not_count(make):
     again = error(503, retry_after="10")
     client = make(again, again, answer(), deadline_s=50.0, limiter=Limiter(rpm=1))
     assert (await client.ask("prompt", slot())).outcome == "ok"
@@ -68,17 +68,8 @@ async def test_the_wait_for_a_turn_does_not_count(make):  # noqa: F811
 
 
 @in_virtual_time
-async def test_a_wait_that_the_deadline_does_not_allow_is_told(make):  # noqa: F811
+async def test_a_wait_that_the_deadline_does_not_allow_is_told(make):
     client = make(error(503, retry_after="3600"), deadline_s=60.0)
     with pytest.raises(CallFailed, match="asks to wait 3600 s, longer than a call"):
         await client.ask("prompt", slot())
     assert (len(client.transport.sent), now_s()) == (1, 0)
-
-
-def test_the_backoff_has_no_end_of_numbers():
-    assert backoff_s(10**9) == 60
-
-
-def test_no_newer_tenacity_warns_of_how_it_is_used():
-    """What it deprecates (names of its waits) is not used: only its loop is."""
-    assert "tenacity.wait" not in Path(module.__file__).read_text()

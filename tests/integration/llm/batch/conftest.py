@@ -1,8 +1,1 @@
-from tests.support.batch_fixtures import (
-    _no_certificates,
-    emulator,
-    form,
-    server,
-    service_at,
-    transport_to,
-)
+from tests.support.batch_fixtures import form, server, service_at, transport_to

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from merge_runner.config import PROVIDERS, BatchTerms
 from merge_runner.llm.batch.providers import SERVICES, batch_terms
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.models import load_models
-from tests.support.batch_fixtures import entry_of
-from tests.support.batch_lines import lines
+from tests.support.batch_fixtures import entry_of, lines
 
 OWN = BatchTerms(price_factor=0.6, source="contract, 2026-11")
 
@@ -30,6 +31,7 @@ def test_an_entry_may_have_terms_of_its_own_or_no_batch_mode():
     assert batch_terms(entry_of("openai-chat", path="/deployments/x/chat/completions")) is None
 
 
+@pytest.mark.parametrize("form", FORMATS)
 def test_the_price_of_a_provider_holds_at_its_own_address(form, monkeypatch):
     elsewhere = {"base_url": "http://127.0.0.1:8000"}
     entry = entry_of(form, **elsewhere)
@@ -43,6 +45,7 @@ def test_the_price_of_a_provider_holds_at_its_own_address(form, monkeypatch):
     assert batch_terms(entry_of(form, "emulator")).price_factor == 0.5
 
 
+@pytest.mark.parametrize("form", FORMATS)
 def test_a_key_is_an_id_that_every_provider_takes(form):
     for line in lines(form, 3):
         assert re.fullmatch("[a-zA-Z0-9_-]{1,64}", line.key)

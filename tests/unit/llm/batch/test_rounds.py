@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import random
 import re
 import tempfile
@@ -29,26 +28,15 @@ from merge_runner.llm.batch.rounds import Rounds
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http_outcome import RawReply
 from merge_runner.llm.ledger import Budget, Ledger
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot
+from tests.support.clients import answer, error
 from tests.support.virtual_time import in_virtual_time, now_s
 
 PRICE = Price(input=1.0, output=100.0, source="made up")
-USAGE = {"prompt_tokens": 10, "completion_tokens": 5}
-# Of the tokens above, in USD.
+# Of the tokens of an answer, in USD.
 ONE_USD = (10 * 1.0 + 5 * 100.0) / 1e6
-
-
-def answer(text):
-    choice = {"message": {"content": text}, "finish_reason": "stop"}
-    return RawReply(200, {}, json.dumps({"model": "m-1", "choices": [choice], "usage": USAGE}))
-
-
-def error(status, kind="server_error"):
-    told = {"error": {"message": "no", "type": kind, "code": None}}
-    return RawReply(status, {}, json.dumps(told))
 
 
 class Memory:
@@ -130,12 +118,10 @@ class Run:
     """A run's client, and the rounds that it asks in."""
 
     def __init__(self, cache, service, *, cap=None, price=PRICE, scope="test", submits=True):
-        self.said = []
-        self.alone = Alone()
+        self.said, self.alone = [], Alone()
         self.rounds = Rounds(cache, {"m"}, submits=submits, say=self.said.append)
         self.rounds.services["m"] = service
         self.ledger = Ledger(cache, scope)
-        budget = Budget(self.ledger, cap)
         entry = ModelEntry(
             provider="openai", format="openai-chat", id="m-1", max_output_tokens=100, price=price
         )
@@ -146,7 +132,7 @@ class Run:
             cache=cache,
             transport=self.alone,
             limiter=Limiter(),
-            budget=budget,
+            budget=Budget(self.ledger, cap),
             rounds=self.rounds,
             model="m",
             batch_price=0.5,
@@ -206,7 +192,6 @@ async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
     class Watching(Memory):
         async def create(self, lines, mark):
             aside.append(run.ledger.read().reserved_usd)
-            self.size = len(lines[0].body.encode())
             return await super().create(lines, mark)
 
     aside = []
@@ -218,48 +203,30 @@ async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
 
 
 @in_virtual_time
-async def test_a_line_that_failed_is_asked_alone(cache):
+async def test_a_line_that_failed_expired_or_is_missing_is_asked_alone_at_the_full_price(cache):
     service = Memory()
-    service.fates = {2: [error(500)], 3: [error(429)]}
+    service.fates = {2: [error(500)], 3: [error(429)], 4: [None], 5: ["missing"]}
     run = Run(cache, service)
-    replies = await run.ask(3)
-    assert texts(replies) == ["batched 1", "alone 2", "alone 3"]
-    assert (service.sizes, sorted(run.alone.asked)) == ([3], [2, 3])
-    assert outcomes(replies[1]) == [("server_error", "batch-0"), ("ok", None)]
-    assert [reply.attempts[0].cost_usd for reply in replies[1:]] == [0.0] * 2
-    assert run.ledger.read().spent_usd == pytest.approx((0.5 + 1 + 1) * ONE_USD)
-    assert run.ledger.read().reserved_usd == 0.0
-
-
-@in_virtual_time
-async def test_a_line_that_expired_is_asked_alone_at_the_full_price(cache):
-    service = Memory()
-    service.fates = {1: [None]}
-    run = Run(cache, service)
-    (reply,) = await run.ask()
-    assert reply.text == "alone 1"
-    assert outcomes(reply) == [("expired", "batch-0"), ("ok", None)]
-    assert [attempt.cost_usd for attempt in reply.attempts] == [0.0, pytest.approx(ONE_USD)]
+    replies = await run.ask(5)
+    assert texts(replies) == ["batched 1", "alone 2", "alone 3", "alone 4", "alone 5"]
+    assert (service.sizes, sorted(run.alone.asked)) == ([5], [2, 3, 4, 5])
+    ended = ("server_error", "rate_limited", "expired", "no_result")
+    assert list(map(outcomes, replies[1:])) == [[(e, "batch-0"), ("ok", None)] for e in ended]
+    # Only what has no result may have been charged.
+    assert [reply.attempts[0].cost_usd for reply in replies[1:]] == [0.0, 0.0, 0.0, None]
+    assert replies[3].attempts[1].cost_usd == pytest.approx(ONE_USD)
+    spending = run.ledger.read()
+    assert spending.spent_usd == pytest.approx((0.5 + 4) * ONE_USD)
+    assert spending.open_attempts == 1
 
 
 @in_virtual_time
 async def test_a_request_that_is_refused_fails_its_call_alone(cache):
     service = Memory()
-    service.fates = {1: [error(400, "invalid_request_error")]}
+    service.fates = {1: [error(400, code="invalid_request_error")]}
     refused, other = await Run(cache, service).ask(2)
     assert isinstance(refused, CallFailed)
     assert other.text == "batched 2"
-
-
-@in_virtual_time
-async def test_a_line_without_a_result_may_have_been_charged_and_is_asked_alone(cache):
-    service = Memory()
-    service.fates = {1: ["missing"]}
-    run = Run(cache, service)
-    (reply,) = await run.ask()
-    assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
-    assert reply.attempts[0].cost_usd is None
-    assert run.ledger.read().open_attempts == 1
 
 
 @in_virtual_time
@@ -333,7 +300,10 @@ async def left_behind(cache, service, repetitions=1, **options):
     run = Run(cache, service, **options)
     asking = asyncio.create_task(run.ask(repetitions))
     await asyncio.sleep(5)
-    assert len(run.rounds.standing()) == 1
+    (line,) = run.rounds.standing()
+    assert re.fullmatch(
+        f"{repetitions} calls? of m waits? in batch batch-0 since [0-9:]{{8}} UTC", line
+    )
     asking.cancel()
     await run.end()
     service.states = []
@@ -425,12 +395,6 @@ async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(ca
     assert (service.looks, service.sizes) == (2, [3])
 
 
-class WithoutResults(Memory):
-    async def results(self, paths):
-        raise BatchFailed("again", "HTTP 503")
-        yield
-
-
 @in_virtual_time
 async def test_an_answer_whose_money_was_released_is_spent_and_is_no_overrun(cache):
     service = Memory()
@@ -446,6 +410,11 @@ async def test_an_answer_whose_money_was_released_is_spent_and_is_no_overrun(cac
 
 @in_virtual_time
 async def test_results_that_never_come_are_waited_for_an_hour(cache):
+    class WithoutResults(Memory):
+        async def results(self, paths):
+            raise BatchFailed("again", "HTTP 503")
+            yield
+
     run, began_s = Run(cache, WithoutResults()), now_s()
     (reply,) = await run.ask()
     assert outcomes(reply) == [("no_result", "batch-0"), ("ok", None)]
@@ -696,21 +665,18 @@ class Dear(Memory):
         self.bill_usd = 0.0
 
     async def results(self, paths):
-        async for key, raw in super().results(paths):
-            read = 10
+        async for key, _ in super().results(paths):
             written = self.chance.randint(0, 100)
             kind = self.chance.choice(["ok"] * 8 + ["failed", "expired"])
             if kind != "ok":
                 yield key, error(500) if kind == "failed" else None
                 continue
-            body = json.loads(raw.body)
-            body["usage"] = {"prompt_tokens": read, "completion_tokens": written}
-            self.bill_usd += (read + 100 * written) / 1e6 / 2
-            yield key, RawReply(200, {}, json.dumps(body))
+            self.bill_usd += (10 + 100 * written) / 1e6 / 2
+            yield key, answer("M", usage=(10, written))
 
 
 @given(seed=st.integers(0, 1000), cents=st.integers(1, 12), runs=st.integers(1, 3))
-@settings(max_examples=25)
+@settings(max_examples=6)
 def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
     @in_virtual_time
     async def sweep():
@@ -727,16 +693,3 @@ def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
             cache.close()
 
     sweep()
-
-
-@in_virtual_time
-async def test_what_is_pending_is_told_by_model_and_batch(cache):
-    service = Memory()
-    service.states = [BatchStatus()] * 10**4
-    run = Run(cache, service)
-    asking = asyncio.create_task(run.ask(3))
-    await asyncio.sleep(5)
-    (line,) = run.rounds.standing()
-    assert re.fullmatch("3 calls of m wait in batch batch-0 since [0-9:]{8} UTC", line)
-    asking.cancel()
-    await run.end()

@@ -1,0 +1,1 @@
+from tests.support.clients import cache, make, opened
