@@ -70,3 +70,15 @@ def in_virtual_time(test):
 def now_s():
     """The virtual time."""
     return asyncio.get_running_loop().time()
+
+
+def fullest_window(times, weights, length=60.0):
+    """The largest total weight in any window of this length, up to the rounding of its edges."""
+    largest = total = first = 0
+    for time, weight in zip(times, weights, strict=True):
+        total += weight
+        while times[first] <= time - length + 1e-9:
+            total -= weights[first]
+            first += 1
+        largest = max(largest, total)
+    return largest

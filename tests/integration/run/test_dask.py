@@ -34,12 +34,11 @@ from merge_runner.run import cluster
 from merge_runner.run.cluster import DaskTasks, Task, connected, fingerprint, play_task
 from merge_runner.run.local_runner import FirstDecisions
 from merge_runner.run.plan import Options, make_plan
-from tests.integration.llm.test_limiter import fullest_window
 from tests.support import program
 from tests.support.gate import HANGS_S, Gate
 from tests.support.harness import FAST, PROJECT, environment, watched
 from tests.support.mock_server import FaultPlan
-from tests.support.virtual_time import in_virtual_time, now_s
+from tests.support.virtual_time import fullest_window, in_virtual_time, now_s
 
 SMALL = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--json")
 # Six trials of 19 calls each.

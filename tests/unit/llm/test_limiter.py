@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.limiter import Limiter, Pause
-from tests.support.virtual_time import in_virtual_time, now_s
+from tests.support.clients import ticks
+from tests.support.virtual_time import fullest_window, in_virtual_time, now_s
 
 MINUTE = 60.0
 
@@ -34,35 +35,22 @@ class Queue:
         self.tokens.append(tokens)
         return settle
 
-    async def settled(self):
-        """Let everybody run who can without time passing."""
-        for _ in range(20):
-            await asyncio.sleep(0)
-
     async def all_served(self):
         await asyncio.gather(*self.tasks)
 
 
-def fullest_window(times, weights, length=MINUTE):
-    """The largest total weight in any window of this length, up to the rounding of its edges."""
-    largest = total = first = 0
-    for time, weight in zip(times, weights, strict=True):
-        total += weight
-        while times[first] <= time - length + 1e-9:
-            total -= weights[first]
-            first += 1
-        largest = max(largest, total)
-    return largest
+async def served(limiter, count=1, tokens=0):
+    """When so many who ask at once are served."""
+    queue = Queue(limiter)
+    for number in range(count):
+        queue.ask(number, tokens)
+    await queue.all_served()
+    return queue.times
 
 
 @in_virtual_time
 async def test_no_limits_pass_everybody_at_once():
-    queue = Queue(Limiter())
-    for number in range(50):
-        queue.ask(number, tokens=10**9)
-    await queue.all_served()
-    assert queue.names == list(range(50))
-    assert set(queue.times) == {0.0}
+    assert await served(Limiter(), 50, tokens=10**9) == [0.0] * 50
 
 
 @pytest.mark.parametrize("limits", [{}, {"rpm": 600}, {"tpm": 100}], ids=str)
@@ -93,33 +81,23 @@ async def test_a_late_arrival_of_an_older_trial_goes_first():
 @pytest.mark.parametrize("rpm", [1, 7, 50, 245, 500])
 @in_virtual_time
 async def test_no_window_holds_more_requests_than_the_limit(rpm):
-    queue = Queue(Limiter(rpm=rpm))
-    for number in range(int(rpm * 1.1) + 2):
-        queue.ask(number)
-    await queue.all_served()
-    assert fullest_window(queue.times, [1] * len(queue.times)) <= rpm
+    times = await served(Limiter(rpm=rpm), int(rpm * 1.1) + 2)
+    assert fullest_window(times, [1] * len(times)) <= rpm
 
 
 @pytest.mark.parametrize("rpm", [60, 500])
 @in_virtual_time
 async def test_requests_flow_evenly_and_not_a_window_at_once(rpm):
-    queue = Queue(Limiter(rpm=rpm))
-    for number in range(rpm // 3):
-        queue.ask(number)
-    await queue.all_served()
-    assert fullest_window(queue.times, [1] * len(queue.times), length=1.0) <= 2 * rpm / 60
+    times = await served(Limiter(rpm=rpm), rpm // 3)
+    assert fullest_window(times, [1] * len(times), length=1.0) <= 2 * rpm / 60
 
 
 @in_virtual_time
 async def test_an_idle_limiter_saves_up_no_requests():
-    queue = Queue(Limiter(rpm=10))
-    queue.ask()
-    await queue.all_served()
+    limiter = Limiter(rpm=10)
+    await served(limiter)
     await asyncio.sleep(10 * MINUTE)
-    for _ in range(30):
-        queue.ask()
-    await queue.all_served()
-    assert fullest_window(queue.times, [1] * 31) <= 10
+    assert fullest_window(await served(limiter, 30), [1] * 30) <= 10
 
 
 @in_virtual_time
@@ -127,7 +105,7 @@ async def test_a_turn_that_a_pause_holds_up_is_not_one_too_many_after_it():
     limiter = Limiter(rpm=4)
     queue = Queue(limiter)
     queue.ask()
-    await queue.settled()
+    await ticks()
     for _ in range(8):
         queue.ask()
     await asyncio.sleep(5)
@@ -138,15 +116,12 @@ async def test_a_turn_that_a_pause_holds_up_is_not_one_too_many_after_it():
 
 @in_virtual_time
 async def test_short_windows_work_alike():
-    queue = Queue(Limiter(rpm=20, tpm=100, window_s=0.3))
-    for _ in range(50):
-        queue.ask(tokens=7)
-    await queue.all_served()
-    assert fullest_window(queue.times, [1] * 50, 0.3) <= 20
-    assert fullest_window(queue.times, queue.tokens, 0.3) <= 100
+    times = await served(Limiter(rpm=20, tpm=100, window_s=0.3), 50, tokens=7)
+    assert fullest_window(times, [1] * 50, 0.3) <= 20
+    assert fullest_window(times, [7] * 50, 0.3) <= 100
 
 
-@settings(deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 100), st.integers(0, 3), st.integers(0, 30)), max_size=30))
 @in_virtual_time
 async def test_no_window_holds_more_tokens_than_the_limit(asked):
@@ -161,11 +136,7 @@ async def test_no_window_holds_more_tokens_than_the_limit(asked):
 
 @in_virtual_time
 async def test_tokens_come_back_after_a_window():
-    queue = Queue(Limiter(tpm=100))
-    for _ in range(4):
-        queue.ask(tokens=50)
-    await queue.all_served()
-    assert queue.times == [0, 0, MINUTE, MINUTE]
+    assert await served(Limiter(tpm=100), 4, tokens=50) == [0, 0, MINUTE, MINUTE]
 
 
 @in_virtual_time
@@ -173,7 +144,7 @@ async def test_a_heavy_request_at_the_head_is_not_overtaken():
     queue = Queue(Limiter(tpm=100))
     for name, tokens in [("filling", 60), ("heavy", 100), ("light", 1), ("lighter", 0)]:
         queue.ask(name, tokens)
-    await queue.settled()
+    await ticks()
     assert queue.names == ["filling"]
     await queue.all_served()
     assert queue.names == ["filling", "heavy", "light", "lighter"]
@@ -184,7 +155,7 @@ async def test_settling_lower_frees_tokens_for_those_who_wait():
     queue = Queue(Limiter(tpm=100))
     settle = await queue.ask("first", 90)
     waiting = queue.ask("second", 50)
-    await queue.settled()
+    await ticks()
     assert not waiting.done()
     settle(50)
     await queue.all_served()
@@ -194,8 +165,7 @@ async def test_settling_lower_frees_tokens_for_those_who_wait():
 @in_virtual_time
 async def test_settling_higher_holds_others_back():
     queue = Queue(Limiter(tpm=100))
-    settle = await queue.ask("first", 10)
-    settle(80)
+    (await queue.ask("first", 10))(80)
     queue.ask("second", 50)
     await queue.all_served()
     assert queue.times == [0, MINUTE]
@@ -215,7 +185,7 @@ async def test_settling_after_the_window_changes_nothing():
     assert queue.times == [0, MINUTE, MINUTE, 2 * MINUTE]
 
 
-@settings(deadline=None)
+@settings(max_examples=40)
 @given(
     st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100), st.integers(0, 90)), max_size=20)
 )
@@ -238,7 +208,7 @@ async def test_settled_tokens_are_what_counts(asked):
 async def test_who_has_given_up_is_skipped_and_takes_no_place():
     queue = Queue(Limiter(rpm=1))
     tasks = [queue.ask(number) for number in range(5)]
-    await queue.settled()
+    await ticks()
     for number in (1, 3):
         tasks[number].cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
@@ -259,45 +229,26 @@ async def test_who_has_given_up_holds_back_nobody_with_its_tokens():
 
 
 @in_virtual_time
-async def test_a_pause_holds_everybody():
+async def test_a_pause_holds_everybody_and_a_shorter_one_does_not_end_it():
     limiter = Limiter()
     queue = Queue(limiter)
-    limiter.pause(30)
-    queue.ask(0)
-    await asyncio.sleep(10)
-    queue.ask(1)
-    await queue.all_served()
-    assert queue.times == [30, 30]
-
-
-@in_virtual_time
-async def test_a_shorter_pause_does_not_end_a_longer_one():
-    limiter = Limiter()
     limiter.pause(30)
     limiter.pause(5)
-    queue = Queue(limiter)
-    queue.ask()
+    queue.ask(0)
     await asyncio.sleep(20)
     limiter.pause(20)
+    queue.ask(1)
     await queue.all_served()
-    assert queue.times == [40]
+    assert queue.times == [40, 40]
 
 
 @in_virtual_time
 async def test_a_pause_is_shared_by_all_limiters_of_one_key():
     shared = Pause()
-    one, other, stranger = (
-        Queue(Limiter(pause=shared)),
-        Queue(Limiter(pause=shared)),
-        Queue(Limiter()),
-    )
-    one.limiter.pause(30)
-    for queue in (one, other, stranger):
-        queue.ask()
-        await queue.settled()
-    for queue in (one, other, stranger):
-        await queue.all_served()
-    assert [queue.times for queue in (one, other, stranger)] == [[30], [30], [0]]
+    one, other, stranger = Limiter(pause=shared), Limiter(pause=shared), Limiter()
+    one.pause(30)
+    times = await asyncio.gather(*map(served, (one, other, stranger)))
+    assert times == [[30], [30], [0]]
 
 
 @in_virtual_time
