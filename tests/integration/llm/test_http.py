@@ -17,6 +17,7 @@ from merge_runner.emulator.driver import answer
 from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.client import LlmClient
+from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import Connections, HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.llm.limiter import Limiter
@@ -26,21 +27,11 @@ from merge_runner.records import Slot, call_key, canonical_json, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from tests.support.mock_server import FaultPlan, serve
+from tests.support.mock_server import FaultPlan
+from tests.support.raw_server import raw_server
 
 SLOT = Slot("N_0_0", 1, "left", 0, 0)
 KEY = "sk-dummy-0123456789"
-PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY")
-
-
-@pytest.fixture(autouse=True)
-def _no_settings_of_the_user(monkeypatch, tmp_path):
-    for name in PROXIES:
-        monkeypatch.delenv(name, raising=False)
-        monkeypatch.delenv(name.lower(), raising=False)
-    # Nothing here speaks TLS, and to load the certificates takes longer than most of the tests.
-    monkeypatch.delenv("SSL_CERT_FILE", raising=False)
-    monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path))
 
 
 class Recorder:
@@ -70,20 +61,6 @@ async def recorder():
     kept.url = f"http://127.0.0.1:{runner.addresses[0][1]}"
     yield kept
     await runner.cleanup()
-
-
-@pytest.fixture
-async def emulator():
-    runners = []
-
-    async def start(faults=None):
-        runner, url = await serve(0, faults)
-        runners.append(runner)
-        return url
-
-    yield start
-    for runner in runners:
-        await runner.cleanup()
 
 
 @pytest.fixture
@@ -126,36 +103,33 @@ async def send(endpoint, request=None, *, attempt=1, timeout_s=10.0):
 
 
 @contextlib.asynccontextmanager
-async def server_that_says(raw):
+async def server_that_says(answer):
     """The URL of a server that answers with these bytes, whatever they are, and hangs up."""
 
-    async def talk(reader, writer):
-        await reader.readuntil(b"\r\n\r\n")
-        writer.write(raw)
-        await writer.drain()
-        writer.close()
+    async def say(talk, request):
+        await talk.say(answer)
+        talk.close()
 
-    server = await asyncio.start_server(talk, "127.0.0.1", 0)
-    async with server:
-        yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    async with raw_server(say) as server:
+        yield server.url
+
+
+async def failed(endpoint, **options):
+    with pytest.raises(TransportFailure) as failure:
+        await send(endpoint, **options)
+    return failure.value
 
 
 async def test_it_posts_exactly_the_bytes_that_were_hashed(recorder):
     request = request_for()
     await send(endpoint_at(f"{recorder.url}/v1"), request)
     (got,), (body,) = recorder.requests, recorder.bodies
-    assert got.method == "POST"
-    assert got.path == "/v1/chat/completions"
-    assert body == request.body.encode()
-    assert got.headers["content-type"] == "application/json"
+    assert (got.method, got.path) == ("POST", "/v1/chat/completions")
+    assert (body, got.headers["content-type"]) == (request.body.encode(), "application/json")
     # The key can be computed from what the server got.
-    assert request.key == call_key(
-        endpoint="openai",
-        path=request.path,
-        headers={"anthropic-version": got.headers["anthropic-version"]},
-        body=body.decode(),
-        slot=SLOT,
-    )
+    headers = {"anthropic-version": got.headers["anthropic-version"]}
+    parts = {"path": request.path, "headers": headers, "body": body.decode(), "slot": SLOT}
+    assert request.key == call_key(endpoint="openai", **parts)
 
 
 async def test_it_returns_status_lower_case_headers_and_text(recorder):
@@ -166,8 +140,7 @@ async def test_it_returns_status_lower_case_headers_and_text(recorder):
         content_type="application/json",
     )
     reply = await send(endpoint_at(recorder.url))
-    assert reply.status == 418
-    assert reply.body == '{"text": "Gr\u00fc\u00dfe"}'
+    assert (reply.status, reply.body) == (418, '{"text": "Gr\u00fc\u00dfe"}')
     assert (reply.headers["retry-after"], reply.headers["x-should-retry"]) == ("7", "true")
     assert all(name == name.lower() for name in reply.headers)
 
@@ -201,42 +174,40 @@ async def test_nobody_else_is_told_the_slot(recorder, provider, identity):
 
 
 @pytest.mark.parametrize(
-    ("provider", "variable", "header", "value"),
+    ("provider", "header", "value"),
     [
-        ("openai", "OPENAI_API_KEY", "authorization", f"Bearer {KEY}"),
-        ("gemini", "GEMINI_API_KEY", "x-goog-api-key", KEY),
-        ("anthropic", "ANTHROPIC_API_KEY", "x-api-key", KEY),
-        ("local", "LOCAL_API_KEY", "authorization", f"Bearer {KEY}"),
+        ("openai", "authorization", f"Bearer {KEY}"),
+        ("gemini", "x-goog-api-key", KEY),
+        ("anthropic", "x-api-key", KEY),
+        ("local", "authorization", f"Bearer {KEY}"),
     ],
 )
 async def test_the_key_is_sent_and_masked_where_the_server_echoes_it(
-    recorder, provider, variable, header, value
+    recorder, provider, header, value
 ):
     def echo(request):
-        headers = dict(request.headers)
-        return web.json_response({"error": {"message": "bad key", "got": headers}}, status=401)
+        got = {name.lower(): text for name, text in request.headers.items()}
+        return web.json_response({"error": {"message": "bad key", "got": got}}, status=401)
 
     recorder.reply = echo
-    entry = ModelEntry(
-        provider=provider,
-        format="openai-chat",
-        id="m",
-        max_output_tokens=10,
-        base_url=recorder.url,
+    reply = await send(
+        resolve_endpoint("m", entry(provider, recorder.url), {f"{provider.upper()}_API_KEY": KEY})
     )
-    reply = await send(resolve_endpoint("m", entry, {variable: KEY}))
     assert recorder.requests[0].headers[header] == value
-    assert reply.status == 401
-    assert KEY not in reply.body
     # All the rest of the body is kept.
-    got = {name.lower(): text for name, text in json.loads(reply.body)["error"]["got"].items()}
-    assert got[header] == value.replace(KEY, "[key]")
-    assert json.loads(reply.body)["error"]["message"] == "bad key"
+    error = json.loads(reply.body)["error"]
+    assert (reply.status, error["message"]) == (401, "bad key")
+    assert error["got"][header] == value.replace(KEY, "[key]")
+    assert KEY not in reply.body
+
+
+def entry(provider, url=None):
+    named = {"provider": provider, "format": "openai-chat", "id": "m", "base_url": url}
+    return ModelEntry(**named, max_output_tokens=10)
 
 
 async def test_without_a_key_no_auth_header_is_sent(recorder):
-    entry = ModelEntry(provider="local", format="openai-chat", id="m", max_output_tokens=10)
-    await send(resolve_endpoint("m", entry, {"LOCAL_BASE_URL": recorder.url}))
+    await send(resolve_endpoint("m", entry("local"), {"LOCAL_BASE_URL": recorder.url}))
     names = {name.lower() for name in recorder.requests[0].headers}
     assert not names & {"authorization", "api-key", "x-api-key", "x-goog-api-key"}
 
@@ -294,27 +265,18 @@ async def test_nothing_of_a_proxys_user_info_is_left_of_what_it_answers(
 
 async def test_no_reply_in_time_is_a_timeout(emulator):
     url = await emulator(FaultPlan(rates={"hang": 1.0}))
-    with pytest.raises(TransportFailure) as failure:
-        await send(endpoint_at(f"{url}/v1"), timeout_s=0.1)
-    assert failure.value.outcome == "timeout"
+    assert (await failed(endpoint_at(f"{url}/v1"), timeout_s=0.1)).outcome == "timeout"
 
 
-async def test_a_reply_that_stalls_in_its_body_is_a_timeout(recorder):
-    async def stall(request):
-        reply = web.StreamResponse()
-        await reply.prepare(request)
-        await reply.write(b'{"id": ')
-        await asyncio.sleep(30)
-
-    recorder.reply = stall
-    with pytest.raises(TransportFailure) as failure:
-        await send(endpoint_at(recorder.url), timeout_s=0.1)
-    assert failure.value.outcome == "timeout"
+async def test_a_reply_that_stalls_in_its_body_is_a_timeout():
+    stalled = b'HTTP/1.1 200 OK\r\ncontent-length: 99\r\n\r\n{"id": '
+    async with raw_server(stalled) as server:
+        assert (await failed(endpoint_at(server.url), timeout_s=0.1)).outcome == "timeout"
 
 
 async def test_a_timeout_gives_its_connection_back(recorder):
     async def hang(request):
-        await asyncio.sleep(30)
+        await asyncio.Event().wait()
 
     async with transport_to(endpoint_at(recorder.url), connections=1) as transport:
         recorder.reply = hang
@@ -322,92 +284,68 @@ async def test_a_timeout_gives_its_connection_back(recorder):
             with pytest.raises(TransportFailure):
                 await transport.send(request_for(), attempt=attempt, timeout_s=0.1)
         recorder.reply = lambda request: web.json_response({})
-        reply = await transport.send(request_for(), attempt=3, timeout_s=10)
-    assert reply.status == 200
+        assert (await transport.send(request_for(), attempt=3, timeout_s=10)).status == 200
 
 
 @pytest.mark.parametrize("fault", ["reset", "truncated_body"])
 async def test_a_broken_connection_is_a_lost_one(emulator, fault):
     url = await emulator(FaultPlan(rates={fault: 1.0}))
-    with pytest.raises(TransportFailure) as failure:
-        await send(endpoint_at(f"{url}/v1"))
-    assert (failure.value.outcome, failure.value.sent) == ("connection_lost", True)
-    assert str(failure.value)
+    failure = await failed(endpoint_at(f"{url}/v1"))
+    assert (failure.outcome, failure.sent) == ("connection_lost", True)
+    assert str(failure)
 
 
 async def test_a_refused_connection_cannot_be_charged(dead_port):
-    with pytest.raises(TransportFailure) as failure:
-        await send(endpoint_at(f"http://127.0.0.1:{dead_port}"))
-    assert (failure.value.outcome, failure.value.sent) == ("no_connection", False)
+    failure = await failed(endpoint_at(f"http://127.0.0.1:{dead_port}"))
+    assert (failure.outcome, failure.sent) == ("no_connection", False)
 
 
-@pytest.mark.parametrize(
-    "raw",
-    [
-        b"",
-        b"garbage\r\n\r\n",
-        b"HTTP/1.1 20",
-        b'HTTP/1.1 200 OK\r\ncontent-length: 9\r\n\r\n{"a"',
-        b'HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\n9\r\n{"a"',
-        b'HTTP/1.1 200 OK\r\ntransfer-encoding: chunked\r\n\r\nzz\r\n{"a"',
-        b"HTTP/1.1 200 OK\r\nx: " + b"a" * 70_000 + b"\r\n\r\n",
-        b"HTTP/1.1 200 OK\r\ncontent-encoding: gzip\r\ncontent-length: 4\r\n\r\nabcd",
-    ],
-    ids=[
-        "nothing",
-        "no HTTP",
-        "cut status",
-        "short body",
-        "cut chunk",
-        "no chunk",
-        "huge header",
-        "no gzip",
-    ],
-)
-async def test_a_reply_that_cannot_be_read_is_a_transport_failure(raw):
-    # Whatever an endpoint sends, it is an attempt that failed and no end of the sweep.
+OK = b"HTTP/1.1 200 OK\r\n"
+# What is no reply, and what is said of it. Whatever comes, it is an attempt that failed.
+UNREADABLE = {
+    "nothing": (b"", ""),
+    "no HTTP": (b"garbage\r\n\r\n", ""),
+    "cut status": (b"HTTP/1.1 20", ""),
+    "short body": (OK + b'content-length: 9\r\n\r\n{"a"', ""),
+    "cut chunk": (OK + b'transfer-encoding: chunked\r\n\r\n9\r\n{"a"', ""),
+    "no chunk": (OK + b'transfer-encoding: chunked\r\n\r\nzz\r\n{"a"', ""),
+    "huge header": (OK + b"x: " + b"a" * 70_000 + b"\r\n\r\n", "Got more than 65536 bytes"),
+    "no gzip": (
+        OK + b"content-encoding: gzip\r\ncontent-length: 4\r\n\r\nabcd",
+        "not in the Content-Encoding that it names",
+    ),
+}
+
+
+@pytest.mark.parametrize(("raw", "why"), UNREADABLE.values(), ids=UNREADABLE)
+async def test_a_reply_that_cannot_be_read_is_a_transport_failure(raw, why):
     async with server_that_says(raw) as url:
-        with pytest.raises(TransportFailure):
-            await send(endpoint_at(url))
+        failure = await failed(endpoint_at(url))
+    assert why in str(failure)
+    if why:
+        assert (failure.reason, failure.sent) == ("unreadable_reply", True)
 
 
-async def test_headers_up_to_64_kib_are_read_and_what_cannot_be_read_is_told(recorder):
+async def test_headers_up_to_64_kib_are_read(recorder):
     recorder.reply = lambda request: web.json_response({}, headers={"x-policy": "a" * 60_000})
     assert (await send(endpoint_at(recorder.url))).status == 200
-    for raw, why in (
-        (b"HTTP/1.1 200 OK\r\nx: " + b"a" * 70_000 + b"\r\n\r\n", "Got more than 65536 bytes"),
-        (
-            b"HTTP/1.1 200 OK\r\ncontent-encoding: gzip\r\ncontent-length: 4\r\n\r\nabcd",
-            "not in the Content-Encoding that it names",
-        ),
-    ):
-        async with server_that_says(raw) as url:
-            with pytest.raises(TransportFailure, match=why) as failure:
-                await send(endpoint_at(url))
-        assert (failure.value.reason, failure.value.sent) == ("unreadable_reply", True)
 
 
-async def test_connections_are_kept_alive_while_a_model_thinks(recorder):
+async def test_connections_are_kept_alive_while_a_model_thinks(recorder, monkeypatch):
     options = []
 
     class Watched(Connections):
         async def connect(self, *args, **changes):
             connection = await super().connect(*args, **changes)
             channel = connection.transport.get_extra_info("socket")
-            options.append(
-                (
-                    channel.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE),
-                    channel.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE),
-                    channel.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL),
-                    channel.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT),
-                )
-            )
+            names = (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+            options.append(channel.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE))
+            options.extend(channel.getsockopt(socket.IPPROTO_TCP, name) for name in names)
             return connection
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("merge_runner.llm.http.Connections", Watched)
-        await send(endpoint_at(recorder.url))
-    assert options == [(1, 60, 60, 5)]
+    monkeypatch.setattr("merge_runner.llm.http.Connections", Watched)
+    await send(endpoint_at(recorder.url))
+    assert options == [1, 60, 60, 5]
 
 
 @pytest.mark.parametrize(
@@ -424,16 +362,13 @@ async def test_a_proxy_that_does_not_connect_has_sent_nothing(
 ):
     async with server_that_says(answer_of_the_proxy) as url:
         monkeypatch.setenv("HTTPS_PROXY", url)
-        with pytest.raises(TransportFailure) as failure:
-            await send(endpoint_at("https://llm.invalid/v1"))
-    told = failure.value
+        told = await failed(endpoint_at("https://llm.invalid/v1"))
     assert (told.outcome, told.action, told.sent) == (outcome, action, False)
     assert words in str(told)
 
 
 async def test_no_more_connections_are_open_than_allowed(recorder):
-    open_now, most = 0, 0
-    full = asyncio.Event()
+    open_now, most, full = 0, 0, asyncio.Event()
 
     async def busy(request):
         nonlocal open_now, most
@@ -442,7 +377,8 @@ async def test_no_more_connections_are_open_than_allowed(recorder):
         if open_now == 3:
             full.set()
         await full.wait()
-        await asyncio.sleep(0.02)  # time for a connection too many
+        for _ in range(20):  # turns for a connection too many
+            await asyncio.sleep(0)
         open_now -= 1
         return web.json_response({})
 
@@ -453,19 +389,9 @@ async def test_no_more_connections_are_open_than_allowed(recorder):
     assert most == 3
 
 
-FORMATS = ("openai-chat", "openai-responses", "gemini", "anthropic")
-SLOTS = [Slot("L_4_8", repetition, "left", 0, 0) for repetition in range(1, 5)]
-
-
-def driving_prompt():
-    scenario = ScenarioConfig()
-    seen = World(scenario, CONDITIONS["L_4_8"], TRACK).observe("left")
-    return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
-
-
-@contextlib.asynccontextmanager
-async def client_for(wire, url, folder):
-    """A whole client of the emulator, wired as a sweep does it."""
+@pytest.mark.parametrize("wire", FORMATS)
+async def test_a_client_gets_its_answers_from_the_emulator(emulator, tmp_path, wire):
+    url = await emulator()
     entry = ModelEntry(
         provider="emulator",
         format=wire,
@@ -473,36 +399,24 @@ async def client_for(wire, url, folder):
         max_output_tokens=4000,
         price="free",
         base_url=f"{url}/v1" if wire.startswith("openai") else url,
-        timeout_s=0.5,
-        deadline_s=60,
     )
     endpoint = resolve_endpoint("m", entry, {})
-    cache = ResponseCache(folder)
-    async with transport_to(endpoint, connections=16) as transport:
-        yield LlmClient(
-            name="m",
-            entry=entry,
-            endpoint=endpoint.identity,
-            cache=cache,
-            transport=transport,
-            limiter=Limiter(),
-        )
-    cache.close()
-
-
-@pytest.mark.parametrize("wire", FORMATS)
-async def test_a_client_gets_its_answers_from_the_emulator(emulator, tmp_path, wire):
-    async with client_for(wire, await emulator(), tmp_path) as client:
-        replies = await asyncio.gather(*(client.ask(driving_prompt(), slot) for slot in SLOTS))
-    for slot, reply in zip(SLOTS, replies, strict=True):
+    slots = [Slot("L_4_8", repetition, "left", 0, 0) for repetition in range(1, 5)]
+    scenario = ScenarioConfig()
+    seen = World(scenario, CONDITIONS["L_4_8"], TRACK).observe("left")
+    prompt = render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
+    with contextlib.closing(ResponseCache(tmp_path)) as cache:
+        async with transport_to(endpoint, connections=16) as transport:
+            ways = {"cache": cache, "transport": transport, "limiter": Limiter()}
+            client = LlmClient(name="m", entry=entry, endpoint=endpoint.identity, **ways)
+            replies = await asyncio.gather(*(client.ask(prompt, slot) for slot in slots))
+    for slot, reply in zip(slots, replies, strict=True):
         # The slot arrived: the answer is the one of this slot, as by a call without HTTP.
-        assert reply.text == answer(driving_prompt(), slot)
+        assert (reply.outcome, reply.text) == ("ok", answer(prompt, slot))
         assert parse_reply(reply.text, 20).plan
-        assert reply.outcome == "ok"
         last = reply.attempts[-1]
-        assert last.http_status == 200
-        assert last.model_served == "scripted-driver"
+        assert (last.http_status, last.model_served) == (200, "scripted-driver")
         assert last.finish_reason
-        assert last.usage.input_tokens == len(driving_prompt().encode()) // 4
+        assert last.usage.input_tokens == len(prompt.encode()) // 4
         visible = len(reply.text.encode()) // 4
         assert last.usage.output_tokens == last.usage.reasoning_tokens + visible
