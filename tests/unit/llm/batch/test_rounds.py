@@ -44,7 +44,8 @@ class Memory:
 
     ``fates`` are replies to lines by repetition, one after the other: None is an expiry, and what
     is "missing" has no result. ``creations`` and ``states`` are raised or returned in their order
-    before the usual.
+    before the usual. ``partial`` looks at the results show one of them alone. At the ``step`` that
+    it has, it says so by ``died``, and where that is about a creation, it answers no more.
     """
 
     takes_mark = True
@@ -57,8 +58,16 @@ class Memory:
         self.creations = []
         self.states = []
         self.answered = Counter()
+        self.partial = 0
+        self.step, self.died = "", asyncio.Event()
+
+    async def dies(self, step):
+        if self.step == step:
+            self.died.set()
+            await asyncio.Event().wait()
 
     async def create(self, lines, mark):
+        await self.dies("before the creation")
         step = self.creations.pop(0) if self.creations else None
         if isinstance(step, BatchFailed) and not step.sent:
             raise step
@@ -67,6 +76,7 @@ class Memory:
         self.marks[batch_id] = mark
         if step is not None:
             raise step
+        await self.dies("after the creation")
         return batch_id
 
     async def find(self, mark):
@@ -75,6 +85,10 @@ class Memory:
     async def status(self, batch_id):
         if batch_id not in self.batches:
             raise BatchFailed("lost", "HTTP 404: no such batch", sent=False)
+        if self.step == "while it waits":
+            self.step = ""
+            self.died.set()
+            return BatchStatus()
         step = self.states.pop(0) if self.states else BatchStatus([batch_id])
         if isinstance(step, BatchFailed):
             raise step
@@ -90,6 +104,9 @@ class Memory:
             if fate is not None and fate.status == 200:
                 self.answered[line.key] += 1
             yield line.key, fate
+            if self.partial:
+                self.partial -= 1
+                return
 
     @property
     def sizes(self):
@@ -255,25 +272,18 @@ async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves
     assert [len(reply.attempts) for reply in replies] == [1] * 4
 
 
+@pytest.mark.parametrize("named_late", [True, False])
 @in_virtual_time
-async def test_a_file_of_results_that_is_named_later_is_read(cache):
+async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(cache, named_late):
     service = Memory()
-    service.batches["early"] = []
-    service.states = [BatchStatus(["early"], results=2)] * 2
+    if named_late:  # the file that has them
+        service.batches["early"] = []
+        service.states = [BatchStatus(["early"], results=2)] * 2
+    else:
+        service.states, service.partial = [BatchStatus(["batch-0"], results=2)] * 2, 1
     run = Run(cache, service)
     assert texts(await run.ask(2)) == ["batched 1", "batched 2"]
-    assert run.alone.asked == []
-
-
-@in_virtual_time
-async def test_where_no_batch_mode_is_at_the_first_creation_the_run_ends(cache):
-    service = Memory()
-    service.creations = [BatchFailed("refused", "HTTP 404", sent=False)]
-    run = Run(cache, service)
-    (first, *_) = await run.ask(3)
-    assert (type(first), first.exit_code) == (EndpointRefused, 2)
-    assert "leave --batch out" in str(first)
-    assert (run.alone.asked, run.ledger.read().committed_usd) == ([], 0.0)
+    assert (run.alone.asked, service.partial) == ([], 0)
 
 
 @in_virtual_time
@@ -376,26 +386,6 @@ async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
 
 
 @in_virtual_time
-async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(cache):
-    class Late(Memory):
-        looks = 0
-
-        async def status(self, batch_id):
-            return BatchStatus([batch_id], 3)
-
-        async def results(self, paths):
-            self.looks += 1
-            whole = [each async for each in super().results(paths)]
-            for result in whole if self.looks > 1 else whole[:1]:
-                yield result
-
-    service = Late()
-    run = Run(cache, service)
-    assert texts(await run.ask(3)) == ["batched 1", "batched 2", "batched 3"]
-    assert (service.looks, service.sizes) == (2, [3])
-
-
-@in_virtual_time
 async def test_an_answer_whose_money_was_released_is_spent_and_is_no_overrun(cache):
     service = Memory()
     left = await left_behind(cache, service, cap=10)
@@ -437,19 +427,20 @@ async def test_what_a_batch_answered_unreadably_stays_set_aside(cache):
 
 
 @pytest.mark.parametrize(
-    ("kind", "raised"),
-    [("quota", QuotaExhausted), ("refused", EndpointRefused)],
+    ("kind", "raised", "code"), [("quota", QuotaExhausted, 3), ("refused", EndpointRefused, 2)]
 )
 @in_virtual_time
 async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothing(
-    cache, kind, raised
+    cache, kind, raised, code
 ):
     service = Memory()
     service.creations = [BatchFailed(kind, "no", sent=False)] * 1000
     run = Run(cache, service)
-    assert {type(each) for each in await run.ask(3)} == {raised}
+    replies = await run.ask(3)
+    assert {(type(each), each.exit_code) for each in replies} == {(raised, code)}
+    assert kind == "quota" or "leave --batch out" in str(replies[0])
     spending = run.ledger.read()
-    assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (0.0, 0.0, 0)
+    assert (spending.committed_usd, spending.open_attempts, run.alone.asked) == (0.0, 0, [])
     await run.end()
     assert not Run(cache, service).rounds.batches
 
@@ -469,17 +460,6 @@ async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cac
 
 
 @in_virtual_time
-async def test_a_batch_that_may_have_been_created_where_it_takes_no_mark_is_asked_alone(cache):
-    service = Memory()
-    service.takes_mark = False
-    service.creations = [BatchFailed("again", "connection lost", sent=True)]
-    run = Run(cache, service)
-    replies = await run.ask(2)
-    assert [outcomes(each) for each in replies] == [[("batch_lost", None), ("ok", None)]] * 2
-    assert run.ledger.read().open_attempts == 2  # what it may cost stays set aside
-
-
-@in_virtual_time
 async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
     service = Memory()
     service.states = [BatchFailed("again", "HTTP 503")] * 40
@@ -488,49 +468,30 @@ async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
     assert run.said == ["m: HTTP 503; it is asked again until it answers"]
 
 
-async def killed(run, repetitions, when):
-    """Ask, and end the run as a kill does when ``when`` is set: nothing more is written."""
+async def killed(run, repetitions, service):
+    """Ask, and end the run as a kill does at the service's step: nothing more is written."""
     asking = asyncio.create_task(run.ask(repetitions))
-    await when.wait()
+    await service.died.wait()
     asking.cancel()
     for batch in run.rounds.batches.values():
         batch.work and batch.work.cancel()
     await run.client.drain()
+    service.step = ""
 
 
-@pytest.mark.parametrize("step", ["before the creation", "after it", "while it waits"])
+@pytest.mark.parametrize("step", ["before the creation", "after the creation", "while it waits"])
 @in_virtual_time
 async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice(cache, step):
-    class Dying(Memory):
-        async def create(self, lines, mark):
-            if step == "before the creation":
-                died.set()
-                await asyncio.Event().wait()
-            batch_id = await super().create(lines, mark)
-            if step == "after it":
-                died.set()
-                await asyncio.Event().wait()
-            return batch_id
-
-        async def status(self, batch_id):
-            if not died.is_set():
-                died.set()
-                return BatchStatus()
-            return await super().status(batch_id)
-
-    died = asyncio.Event()
-    service = Dying()
+    service = Memory()
+    service.step = step
     first = Run(cache, service)
-    await killed(first, 5, died)
-    before = first.ledger.read()
-    assert before.open_attempts == 5
-    step = "over"
+    await killed(first, 5, service)
+    assert first.ledger.read().open_attempts == 5
     second = Run(cache, service)
     replies = await second.ask(5)
     assert texts(replies) == [f"batched {number}" for number in range(1, 6)]
     assert [outcomes(reply) for reply in replies] == [[("ok", "batch-0")]] * 5
-    assert service.sizes == [5]
-    assert set(service.answered.values()) == {1}
+    assert (service.sizes, set(service.answered.values())) == ([5], {1})
     spending = second.ledger.read()
     assert spending.spent_usd == pytest.approx(5 * ONE_USD / 2)
     assert (spending.reserved_usd, spending.open_attempts) == (0.0, 0)
@@ -557,15 +518,12 @@ async def test_of_a_failed_batch_and_its_smaller_ones_the_smaller_are_taken_up_w
         async def status(self, batch_id):
             if batch_id == "batch-0":
                 return BatchStatus(failure=BatchFailed("smaller", "enqueued"))
-            if not died.is_set():
-                died.set()
-                return BatchStatus()
             return await super().status(batch_id)
 
     monkeypatch.setattr("merge_runner.llm.batch.rounds.datetime", SetBack)
-    died = asyncio.Event()
     service = TooLarge()
-    await killed(Run(cache, service), 4, died)
+    service.step = "while it waits"
+    await killed(Run(cache, service), 4, service)
     assert service.sizes == [4, 2]
     run = Run(cache, service)
     assert texts(await run.ask(4)) == [f"batched {number}" for number in range(1, 5)]
@@ -573,27 +531,24 @@ async def test_of_a_failed_batch_and_its_smaller_ones_the_smaller_are_taken_up_w
     assert sorted(paid.values()) == [1] * 4
 
 
+@pytest.mark.parametrize("dies", [False, True])
 @in_virtual_time
-async def test_a_run_that_dies_before_an_id_is_noted_where_no_mark_is_asks_that_round_alone(cache):
-    class Dying(Memory):
-        takes_mark = False
-
-        async def create(self, lines, mark):
-            batch_id = await super().create(lines, mark)
-            died.set()
-            await asyncio.Event().wait()
-            return batch_id
-
-    died = asyncio.Event()
-    await killed(Run(cache, Dying()), 2, died)
+async def test_a_batch_that_may_have_been_created_where_it_takes_no_mark_is_asked_alone(
+    cache, dies
+):
     service = Memory()
     service.takes_mark = False
+    if dies:  # before its id is noted
+        service.step = "after the creation"
+        await killed(Run(cache, service), 2, service)
+    else:
+        service.creations = [BatchFailed("again", "connection lost", sent=True)]
     run = Run(cache, service)
     replies = await run.ask(2)
     assert [outcomes(each) for each in replies] == [[("batch_lost", None), ("ok", None)]] * 2
     assert run.ledger.read().open_attempts == 2  # what the lost batch may cost stays set aside
     await run.ask(2, decision=1)
-    assert service.sizes == [2]  # the next round is a batch again
+    assert service.sizes == [2, 2]  # the next round is a batch again
 
 
 @in_virtual_time
