@@ -9,14 +9,17 @@ import pytest
 from tests.support.harness import PROJECT
 
 
-def table(file, name):
-    """A table of a file, by name of its cases."""
-    return tomllib.loads((PROJECT / f"tests/cases/{file}.toml").read_text())[name]
+def table(file, *names):
+    """A table of a file, or all of it, by name of its cases."""
+    found = tomllib.loads((PROJECT / f"tests/cases/{file}.toml").read_text())
+    for name in names:
+        found = found[name]
+    return found
 
 
-def cases(file, name):
+def cases(file, *names):
     """The cases of a table, a parameter each."""
-    return [pytest.param(case, id=key) for key, case in table(file, name).items()]
+    return [pytest.param(case, id=key) for key, case in table(file, *names).items()]
 
 
 def by_format(file, name):

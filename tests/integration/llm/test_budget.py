@@ -17,6 +17,7 @@ from merge_runner.errors import CacheFailed, TrialSuspended, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache
 from merge_runner.llm.ledger import FILE, TABLES, Asked, Budget, Ledger, Spending, scopes
 from merge_runner.records import Attempt, Slot, make_request
+from tests.support.cases import cases
 from tests.support.harness import each
 
 CAP = 100
@@ -67,14 +68,6 @@ def set_aside(budget, trial, worst, driver=""):
     return budget.set_aside(trial, f"key {trial}", asked(worst, driver))
 
 
-async def soon(job):
-    """A job under way, after everybody could run."""
-    task = asyncio.create_task(job)
-    for _ in range(5):
-        await asyncio.sleep(0)
-    return task
-
-
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(calls, st.integers(0, 60))
 async def test_what_is_spent_and_set_aside_never_exceeds_the_cap(cache, plan, trial_usd):
@@ -105,21 +98,65 @@ async def test_what_is_spent_and_set_aside_never_exceeds_the_cap(cache, plan, tr
     assert ledger.spending.open_attempts == sum(map(min, unknown, paid))
 
 
-async def test_spending_is_that_of_all_runs(ledger, cache):
-    await attempt(Budget(ledger, 1.0), 1, 0.5, 0.4)
-    again = Budget(Ledger(cache, ledger.scope), 1.0)
-    with pytest.raises(TrialSuspended, match=r"0\.4000 of 1 USD"):
-        await attempt(again, 1, 0.7, 0.7)
-    await attempt(again, 1, 0.6, 0.6)
+class Trials:
+    """Plays the steps of tests/cases/money.toml."""
+
+    def __init__(self, cache, scope, case):
+        self.cache, self.scope, self.case = cache, scope, case
+        self.waiting, self.paid = {}, {}
+        self.begin_a_run()
+
+    def begin_a_run(self):
+        trial = [each(self.case["trial"])] if "trial" in self.case else []
+        self.budget = Budget(Ledger(self.cache, self.scope), self.case.get("cap"), *trial)
+
+    async def reserves(self, trial, worst):
+        self.paid[trial] = await set_aside(self.budget, trial, worst)
+
+    def job(self, trial, verb, worst=0, actual="0"):
+        if verb == "begins":
+            return self.budget.admit(trial)
+        if verb == "reserves":
+            return self.reserves(trial, float(worst))
+        return attempt(self.budget, trial, float(worst), None if actual == "?" else float(actual))
+
+    async def play(self, step):
+        trial, verb, *more = step.split()
+        trial = trial if trial == "new" else int(trial)
+        ends = more.pop() if more and more[-1] in ("waits", "suspended") else "goes"
+        match verb:
+            case "run":
+                self.begin_a_run()
+            case "leaves":
+                self.budget.leave(trial)
+            case "returns":
+                self.paid[trial].close()
+            case "stays" | "goes" | "fails":
+                ends = {"stays": "waits", "goes": "goes", "fails": "suspended"}[verb]
+                await self.ends(trial, ends)
+            case _:
+                self.waiting[trial] = asyncio.create_task(self.job(trial, verb, *more))
+                await self.ends(trial, ends)
+
+    async def ends(self, trial, how):
+        task = self.waiting[trial]
+        if how == "waits":
+            await asyncio.wait([task], timeout=0.01)
+            assert not task.done()
+        elif how == "goes":
+            await asyncio.wait_for(task, 5)
+        else:
+            with pytest.raises(TrialSuspended, match=self.case.get("says")):
+                await asyncio.wait_for(task, 5)
 
 
-async def test_an_attempt_of_unknown_cost_counts_with_its_worst_case_for_ever(ledger):
-    budget = Budget(ledger, 1.0)
-    await attempt(budget, 1, 0.75, None)
-    with pytest.raises(TrialSuspended):
-        await attempt(budget, 1, 0.5, 0.5)
-    await attempt(budget, 1, 0.25, 0.25)
-    assert (ledger.spending.reserved_usd, ledger.spending.open_attempts) == (0.75, 1)
+@pytest.mark.parametrize("case", cases("money"))
+async def test_money_goes_to_trials_in_their_order_and_never_beyond_the_cap(cache, request, case):
+    trials = Trials(cache, request.node.name, case)
+    for step in case["steps"]:
+        await trials.play(step)
+    if "spent" in case:
+        assert trials.budget.ledger.read().spent_usd == case["spent"]
 
 
 async def test_an_attempt_that_a_dead_process_began_counts_too(ledger, cache):
@@ -141,54 +178,6 @@ async def test_the_ledger_refuses_what_two_processes_reserved_at_once(ledger, ca
     assert both[1].ledger.read().committed_usd == 0.75
 
 
-async def test_a_reservation_waits_for_what_is_in_flight(ledger):
-    budget = Budget(ledger, 1.0)
-    paid = await set_aside(budget, 1, 0.75)
-    waiting = await soon(set_aside(budget, 2, 0.5))
-    assert not waiting.done()
-    paid.close()
-    await waiting
-
-
-async def test_a_trial_begins_only_where_it_could_end_within_the_cap(ledger):
-    budget = Budget(ledger, 10.0, each(4.0))
-    for trial in (1, 2):
-        await attempt(budget, trial, 1.0, 0.5)
-    third = await soon(attempt(budget, 3, 1.0, 0.5))
-    # 1 USD is spent and 3 + 3 are allowed: another 4 do not fit.
-    assert not third.done()
-    await attempt(budget, 1, 1.0, 0.5)
-    await asyncio.sleep(0.01)
-    assert not third.done()
-    budget.leave(1)
-    await third
-
-
-async def test_attempts_that_cost_nothing_do_not_use_up_an_allowance(ledger):
-    budget = Budget(ledger, 5.0, each(4.0))
-    for _ in range(10):
-        await attempt(budget, 1, 1.0, 0.0)
-    other = await soon(budget.admit(2))
-    assert not other.done()
-    await attempt(budget, 1, 4.0, 4.0)
-    budget.leave(1)
-    with pytest.raises(TrialSuspended):
-        await other
-
-
-async def test_the_oldest_trial_may_spend_what_is_kept_for_younger_ones(ledger):
-    budget = Budget(ledger, 6.0, each(2.0))
-    for trial in (1, 2, 3):
-        await budget.admit(trial)
-    for _ in range(5):
-        await attempt(budget, 1, 1.0, 1.0)
-    waiting = await soon(attempt(budget, 3, 1.0, 1.0))
-    assert not waiting.done(), "1 USD is left, and the second trial is older"
-    await attempt(budget, 2, 1.0, 0.0)
-    budget.leave(2)
-    await waiting
-
-
 async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_for_its_own(
     ledger, monkeypatch
 ):
@@ -197,76 +186,6 @@ async def test_money_that_is_left_is_spent_although_an_older_trial_never_asks_fo
     await budget.admit(1)
     await budget.admit(2)
     await attempt(budget, 2, 3.0, 3.0)
-
-
-async def test_trials_begin_in_their_order_and_the_first_is_never_overtaken(ledger):
-    budget = Budget(ledger, 5.0, each(4.0))
-    begun = []
-
-    async def trial(order):
-        await budget.admit(order)
-        begun.append(order)
-
-    await trial(1)
-    waiting = [await soon(trial(order)) for order in (4, 3, 2)]
-    for order in (1, 2, 3):
-        budget.leave(order)
-        await asyncio.sleep(0.01)
-    await asyncio.gather(*waiting)
-    assert begun == [1, 2, 3, 4]
-
-
-async def test_without_money_for_a_whole_trial_the_first_one_alone_begins(ledger):
-    budget = Budget(ledger, 3.0, each(4.0))
-    await budget.admit(1)  # or it would never be known that a trial costs less
-    other = await soon(budget.admit(2))
-    assert not other.done()
-    await attempt(budget, 1, 1.0, 1.0)
-    budget.leave(1)
-    with pytest.raises(TrialSuspended, match=r"a whole trial may cost 4\.00 USD"):
-        await other
-
-
-async def test_a_trial_that_ends_without_asking_leaves_the_first_that_asks_its_turn(ledger):
-    budget = Budget(ledger, 3.0, each(4.0))
-    await budget.admit(1)
-    budget.leave(1)  # its replies were all recorded
-    await budget.admit(2)
-
-
-async def test_a_begun_trial_is_paid_before_another_begins(ledger):
-    budget = Budget(ledger, 5.0, each(4.0))
-    await budget.admit(1)
-    other = await soon(set_aside(budget, 2, 2.0))  # 4 of 5 USD are the first trial's
-    assert not other.done()
-    await attempt(budget, 1, 4.0, 4.0)
-    budget.leave(1)
-    with pytest.raises(TrialSuspended):
-        await other
-
-
-async def test_a_trial_that_needs_more_than_its_allowance_is_suspended_at_the_cap(ledger):
-    budget = Budget(ledger, 4.0, each(3.0))
-    for _ in range(4):
-        await attempt(budget, 1, 1.0, 1.0)
-    with pytest.raises(TrialSuspended):
-        await attempt(budget, 1, 1.0, 1.0)
-
-
-async def test_without_a_cap_everything_passes_and_is_recorded(ledger):
-    budget = Budget(ledger)
-    for trial in range(3):
-        await attempt(budget, trial, 10.0**9, 10.0**6)
-    assert ledger.read().spent_usd == 3 * 10.0**6
-
-
-async def test_a_call_that_goes_on_after_its_trial_gets_no_money(ledger):
-    budget = Budget(ledger, 5.0, each(4.0))
-    await budget.admit(1)
-    budget.leave(1)
-    with pytest.raises(TrialSuspended):
-        await budget.admit(1)
-    await asyncio.wait_for(budget.admit(2), 1)
 
 
 async def test_a_damaged_record_of_spending_is_told_and_not_believed(tmp_path):
@@ -421,17 +340,6 @@ async def test_after_a_reply_that_cost_more_than_its_worst_case_as_much_is_set_a
         # A reply within what is now set aside does not count as another overrun of it.
         await paid.settle(tried(0.5))
     assert ledger.spending.overruns[O3.driver] == 3
-
-
-async def test_several_are_in_flight_only_while_twice_their_worst_cases_fit(ledger):
-    budget = Budget(ledger, 1.0)
-    paid = await set_aside(budget, 1, 0.25)
-    await set_aside(budget, 2, 0.25)  # 2 x 0.5 fit
-    third = await soon(set_aside(budget, 3, 0.25))
-    assert not third.done()
-    paid.close()
-    await third
-    third.result()
 
 
 async def test_a_suspended_trial_says_what_the_cap_is_needed_for(ledger):

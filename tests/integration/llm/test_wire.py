@@ -42,17 +42,24 @@ async def ask(transport, number=0, timeout_s=5.0):
     return json.loads(reply.body)["choices"][0]["message"]["content"]
 
 
-async def until(condition):
-    async with asyncio.timeout(5):
-        while not condition():
-            await asyncio.sleep(0.005)
+async def said_to(count, *answers, **timeouts_s):
+    """The outcomes of so many requests in a row, and the requests as the server saw them.
+
+    ``timeouts_s`` names the request that has another timeout: ``at_2=0.05``.
+    """
+    async with raw_server(*answers) as server, transport_to(server.url) as transport:
+        said = [
+            await ask(transport, timeout_s=timeouts_s.get(f"at_{number}", 5.0))
+            for number in range(1, count + 1)
+        ]
+    return said, server.requests
 
 
-async def test_a_silent_connection_is_used_again():
-    async with raw_server(ok(chat("a"))) as server, transport_to(server.url) as transport:
-        assert [await ask(transport) for _ in range(3)] == ["a"] * 3
-    assert [request.talk for request in server.requests] == [1, 1, 1]
-    assert server.requests[-1].headers["connection"] == "keep-alive"
+async def test_a_silent_connection_is_used_again_also_after_a_word_in_between():
+    for answer in (ok(chat("a")), head(103, link="</>") + ok(chat("a"))):
+        said, requests = await said_to(3, answer)
+        assert (said, [request.talk for request in requests]) == (["a"] * 3, [1, 1, 1])
+        assert requests[-1].headers["connection"] == "keep-alive"
 
 
 SURPLUS = {
@@ -86,11 +93,10 @@ async def test_bytes_beyond_an_answer_never_answer_the_next_request(surplus):
 
 @pytest.mark.parametrize("surplus", SURPLUS.values(), ids=SURPLUS)
 async def test_bytes_that_come_with_an_answer_never_answer_the_next_request(surplus):
-    answers = (ok(chat("a")) + surplus, ok(chat("b")))
-    async with raw_server(*answers) as server, transport_to(server.url) as transport:
-        # What is no HTTP may take the answer with it that it came with.
-        assert await ask(transport) in ("a", "connection_lost")
-        assert [await ask(transport), await ask(transport)] == ["b", "b"]
+    (first, *others), _ = await said_to(3, ok(chat("a")) + surplus, ok(chat("b")))
+    # What is no HTTP may take the answer with it that it came with.
+    assert first in ("a", "connection_lost")
+    assert others == ["b", "b"]
 
 
 async def test_bytes_that_the_loop_had_no_time_to_read_never_answer_the_next_request():
@@ -131,7 +137,7 @@ async def test_after_a_timeout_each_connection_is_for_one_request():
         raw_server(ok(chat("a")), late, ok(chat("b"))) as server,
         transport_to(server.url, connections=2) as transport,
     ):
-        assert [await ask(transport) for _ in range(1)] == ["a"]
+        assert await ask(transport) == "a"
         assert await ask(transport, timeout_s=0.05) == "timeout"
         given_up.set()
         assert [await ask(transport) for _ in range(2)] == ["b", "b"]
@@ -180,29 +186,22 @@ async def test_an_answer_that_names_another_request_is_none(name):
         return own if len(first) == 1 else first[0]
 
     answers = (echoing("a", name, swapped), echoing("late", name, swapped), echoing("b", name))
-    async with raw_server(*answers) as server, transport_to(server.url) as transport:
-        assert [await ask(transport) for _ in range(3)] == ["a", "wrong_answer", "b"]
+    assert (await said_to(3, *answers))[0] == ["a", "wrong_answer", "b"]
 
 
 async def test_where_answers_name_their_requests_connections_are_kept_also_after_a_timeout():
     async def hang(talk, request):
         await talk.left()
 
-    async with (
-        raw_server(echoing("a"), hang, echoing("b")) as server,
-        transport_to(server.url) as transport,
-    ):
-        answers = [await ask(transport), await ask(transport, timeout_s=0.05)]
-        answers += [await ask(transport), await ask(transport)]
-    assert answers == ["a", "timeout", "b", "b"]
-    assert [request.talk for request in server.requests] == [1, 1, 2, 2]
+    said, requests = await said_to(4, echoing("a"), hang, echoing("b"), at_2=0.05)
+    assert said == ["a", "timeout", "b", "b"]
+    assert [request.talk for request in requests] == [1, 1, 2, 2]
 
 
 async def test_an_id_that_the_server_gives_itself_says_nothing():
-    own = ok(chat("a"), x_request_id="req_011CSHoEeqs5C35K2UUqR7Fy")
-    async with raw_server(own) as server, transport_to(server.url) as transport:
-        assert [await ask(transport), await ask(transport)] == ["a", "a"]
-    ids = [request.headers["x-request-id"] for request in server.requests]
+    said, requests = await said_to(2, ok(chat("a"), x_request_id="req_011CSHoEeqs5C35K2UUqR7Fy"))
+    assert said == ["a", "a"]
+    ids = [request.headers["x-request-id"] for request in requests]
     assert len(set(ids)) == 2
     # llama-cpp-python's server refuses any other.
     assert [str(UUID(one, version=4)) for one in ids] == ids
@@ -213,9 +212,8 @@ async def test_a_connection_that_is_half_closed_is_not_used_again():
         await talk.say(ok(chat("a")))
         talk.half_close()
 
-    async with raw_server(half) as server, transport_to(server.url) as transport:
-        assert [await ask(transport), await ask(transport)] == ["a", "a"]
-    assert [request.talk for request in server.requests] == [1, 2]
+    said, requests = await said_to(2, half)
+    assert (said, [request.talk for request in requests]) == (["a", "a"], [1, 2])
 
 
 WRONG = {
@@ -243,21 +241,8 @@ async def test_a_wrong_length_ends_its_attempt_and_no_other(wrong):
 
 
 async def test_a_length_that_is_too_long_is_waited_for_until_the_timeout():
-    async with (
-        raw_server(head(content_length=500) + chat("a"), ok(chat("b"))) as server,
-        transport_to(server.url) as transport,
-    ):
-        assert await ask(transport, timeout_s=0.05) == "timeout"
-        assert await ask(transport) == "b"
-
-
-async def test_a_word_in_between_is_no_answer():
-    async with (
-        raw_server(head(103, link="</>") + ok(chat("a"))) as server,
-        transport_to(server.url) as transport,
-    ):
-        assert [await ask(transport), await ask(transport)] == ["a", "a"]
-    assert [request.talk for request in server.requests] == [1, 1]
+    endless = head(content_length=500) + chat("a")
+    assert (await said_to(2, endless, ok(chat("b")), at_1=0.05))[0] == ["timeout", "b"]
 
 
 async def test_of_a_header_that_is_sent_several_times_no_value_is_lost():
