@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS, Program
-from merge_runner.records import SIDES, TrialRecord, TrialSpec
+from merge_runner.records import SIDES, TrialRecord
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.trial import play_trial
 from merge_runner_cei.agents import Model
 from merge_runner_cei.batch import Trial
 from merge_runner_cei.motion import task_of
 from merge_runner_cei.parameters import SETS, Habits, offsets_of
+from tests.support.driven_trials import both, play, spec
 
 
 def scenario(**changes) -> ScenarioConfig:
@@ -23,22 +23,6 @@ def model(task: ScenarioConfig, name: str = "K0", habits: Habits | None = None) 
     return Model(task_of(task, TRACK), SETS[name], habits or Habits())
 
 
-def spec(condition: str, repetition: int = 1) -> TrialSpec:
-    return TrialSpec(
-        trial_id=f"cei/baseline/{condition}/rep{repetition:02d}",
-        spec_hash="cei",
-        source="driver",
-        model_left="cei",
-        model_right="cei",
-        variant="baseline",
-        condition=condition,
-        repetition=repetition,
-        sample_set=0,
-        order=0,
-        kinematics=CONDITIONS[condition],
-    )
-
-
 def cei(**changes) -> Program:
     """The program as a study may change it."""
     clock = changes.pop("clock", None)
@@ -48,8 +32,7 @@ def cei(**changes) -> Program:
 async def played(
     condition: str, repetition: int, task: ScenarioConfig, program: Program
 ) -> TrialRecord:
-    one = spec(condition, repetition)
-    return await play_trial(one, task, {side: program.make(task, one, side) for side in SIDES})
+    return await play(both(program), condition, repetition, scenario=task)
 
 
 def simulated(condition: str, repetition: int, task: ScenarioConfig, name: str = "K0") -> Trial:

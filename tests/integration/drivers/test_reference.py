@@ -13,49 +13,17 @@ from hypothesis import strategies as st
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
-from merge_runner.records import FAR_BEHIND_M, SIDES, Observation, TrialSpec
+from merge_runner.records import FAR_BEHIND_M, SIDES, Observation
 from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.vehicle import advance
-from merge_runner.trial import play_trial
 from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M, published
+from tests.support.driven_trials import OTHER, both, play, spec
 
 FINE = ScenarioConfig(step_s=0.05, plan_step_s=0.2)
 DRAG = FINE.model_copy(update={"resistance": "human"})
-MIRRORED = {"left": "right", "right": "left"}
 # The human intercept is a lasting preference of one side, which no mirror turns round.
 EVEN = PROGRAMS["human-odds"].with_changes("human-odds", {"odds_intercept": 0.0}, None)
 MIRRORABLE = {"idm": PROGRAMS["idm"], "human-odds": EVEN, "quantal": PROGRAMS["quantal"]}
-
-
-def spec_of(condition, repetition=1):
-    return TrialSpec(
-        "t",
-        "s",
-        "driver",
-        "a",
-        "b",
-        "baseline",
-        condition,
-        repetition,
-        0,
-        0,
-        kinematics=CONDITIONS[condition],
-    )
-
-
-async def play(programs, condition, repetition=1, scenario=FINE, seeds=None):
-    """A trial of these programs by side; ``seeds`` by side in place of the slot's."""
-    spec, drivers = spec_of(condition, repetition), {}
-    for side, program in programs.items():
-        seat = program.seat(scenario, spec, side)
-        if seeds is not None:
-            seat = replace(seat, seed=seeds[side], other_seed=seeds[MIRRORED[side]])
-        drivers[side] = program.driver(seat)
-    return await play_trial(spec, scenario, drivers)
-
-
-def both(program):
-    return dict.fromkeys(SIDES, program)
 
 
 def changed(name, clock_s=None, **parameters):
@@ -81,28 +49,27 @@ def mirror_of(condition):
 @pytest.mark.parametrize("right", MIRRORABLE)
 async def test_a_mirrored_pair_gives_the_mirrored_trial(left, right, condition):
     pair = {"left": MIRRORABLE[left], "right": MIRRORABLE[right]}
-    swapped = {MIRRORED[side]: program for side, program in pair.items()}
+    swapped = {OTHER[side]: program for side, program in pair.items()}
     one = await play(pair, condition, seeds={"left": 5, "right": 77}, scenario=DRAG)
     other = await play(swapped, mirror_of(condition), seeds={"right": 5, "left": 77}, scenario=DRAG)
     assert (one.status, len(one.states)) == (other.status, len(other.states))
-    assert MIRRORED.get(one.merged_first) == other.merged_first
+    assert OTHER.get(one.merged_first) == other.merged_first
     for side in SIDES:
-        for row, mirrored in zip(of_side(one, side), of_side(other, MIRRORED[side]), strict=True):
+        for row, mirrored in zip(of_side(one, side), of_side(other, OTHER[side]), strict=True):
             assert row.position_m == pytest.approx(mirrored.position_m, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", sorted({*PROGRAMS} - {"human-replay"}))
 async def test_a_program_declares_chance_exactly_where_another_seed_is_another_trial(name):
-    differs = False
+    def trial(condition, *seeds):
+        seeds = dict(zip(SIDES, seeds, strict=True))
+        return play(both(PROGRAMS[name]), condition, scenario=FINE, seeds=seeds)
+
     for condition in HUMAN_CONDITIONS:
-        one, other = [
-            await play(both(PROGRAMS[name]), condition, seeds=dict(zip(SIDES, seeds, strict=True)))
-            for seeds in ((1, 2), (2, 1))
-        ]
-        differs = one.states != other.states
-        if differs:
+        one, other = await trial(condition, 1, 2), await trial(condition, 2, 1)
+        if one.states != other.states:
             break
-    assert differs == PROGRAMS[name].chance
+    assert (one.states != other.states) == PROGRAMS[name].chance
 
 
 def seen(own_mps=10.0, other_mps=10.0, distance_m=50.0, other_ahead_m=0.0):
@@ -124,7 +91,7 @@ async def accelerates(driver, observation, number=0):
 @pytest.mark.parametrize("scenario", [FINE, DRAG])
 async def test_an_idm_alone_reaches_its_speed_and_never_passes_it(set_, factor, scenario):
     driver = changed("idm", set=set_, desired_speed_factor=factor).make(
-        scenario, spec_of("N_0_0"), "left"
+        scenario, spec("N_0_0"), "left"
     )
     position, speed, speeds = 50.0, 10.0, []
     for number in range(1200):
@@ -140,7 +107,7 @@ async def test_an_idm_alone_reaches_its_speed_and_never_passes_it(set_, factor, 
 
 
 async def test_idm_brakes_by_its_published_equation():
-    driver = PROGRAMS["idm"].make(FINE, spec_of("N_0_0"), "right")
+    driver = PROGRAMS["idm"].make(FINE, spec("N_0_0"), "right")
     await driver.decide(seen(own_mps=10.0), 0)  # it wants to drive at 10 m/s from now on
     wanted_gap = 5.0 + 1.5 * 9.0 + 9.0 * 0.5 / (2 * sqrt(3.0 * 5.0))
     expected = 3.0 * (1 - 0.9**4 - (wanted_gap / 20.0) ** 2)
@@ -148,18 +115,15 @@ async def test_idm_brakes_by_its_published_equation():
     assert await accelerates(driver, ahead) == pytest.approx(expected)
 
 
-IDM_NUMBERS = {
-    name: st.floats(0.001, 40 if name == "exponent" else 1000)
-    for name in PROGRAMS["idm"].values
-    if name != "set"
-}
+IDM_NUMBERS = {name: st.floats(0.001, 1000) for name in PROGRAMS["idm"].values if name != "set"}
+IDM_NUMBERS["exponent"] = st.floats(0.001, 40)
 
 
 @given(st.fixed_dictionaries(IDM_NUMBERS), *[st.floats(0, 100)] * 3, st.floats(-100, 100))
 async def test_an_idm_finds_an_acceleration_whatever_its_parameters(
     numbers, first_mps, own_mps, other_mps, ahead_m
 ):
-    driver = changed("idm", **numbers).make(FINE, spec_of("N_0_0"), "left")
+    driver = changed("idm", **numbers).make(FINE, spec("N_0_0"), "left")
     await driver.decide(seen(own_mps=first_mps), 0)
     now = seen(own_mps, other_mps, distance_m=-1.0, other_ahead_m=ahead_m)
     assert abs(await accelerates(driver, now, 1)) <= FINE.max_acceleration_mps2
@@ -168,29 +132,20 @@ async def test_an_idm_finds_an_acceleration_whatever_its_parameters(
 async def test_of_two_idm_on_a_tie_exactly_one_yields_and_not_always_the_same():
     first = Counter()
     for repetition in range(1, 21):
-        trial = await play(both(PROGRAMS["idm"]), "N_0_0", repetition)
+        trial = await play(both(PROGRAMS["idm"]), "N_0_0", repetition, scenario=FINE)
         assert trial.status == "finished"
         first[trial.merged_first] += 1
         slowest = {side: min(row.velocity_mps for row in of_side(trial, side)) for side in SIDES}
         assert slowest[trial.merged_first] == pytest.approx(10.0)
-        assert slowest[MIRRORED[trial.merged_first]] < 9.0
+        assert slowest[OTHER[trial.merged_first]] < 9.0
     assert min(first["left"], first["right"]) > 4
 
 
 def test_the_human_odds_and_gaps_are_the_published_ones():
     parameters = PROGRAMS["human-odds"].parameters
-    for table, terms in (
-        ("paper_who_first", ("odds_intercept", "odds_headway", "odds_velocity")),
-        (
-            "paper_gap",
-            (
-                "gap_intercept_m",
-                "gap_abs_headway",
-                "gap_abs_velocity_s",
-                "gap_headway_x_velocity_s",
-            ),
-        ),
-    ):
+    gap = ("gap_intercept_m", "gap_abs_headway", "gap_abs_velocity_s", "gap_headway_x_velocity_s")
+    who_first = ("odds_intercept", "odds_headway", "odds_velocity")
+    for table, terms in (("paper_who_first", who_first), ("paper_gap", gap)):
         rows = published(table)
         values = rows.loc[rows["driver"] == "human", "b"].astype(float)
         assert [parameters[term] for term in terms] == list(values)
@@ -200,7 +155,7 @@ def test_the_human_odds_and_gaps_are_the_published_ones():
 async def test_the_human_odds_are_drawn_and_both_sides_agree():
     wins, trials, certain = 0, 400, changed("human-odds", gap_sd_m=0.0)
     for repetition in range(1, trials + 1):
-        sides = {side: certain.make(FINE, spec_of("L_2_-8", repetition), side) for side in SIDES}
+        sides = {side: certain.make(FINE, spec("L_2_-8", repetition), side) for side in SIDES}
         # Left is 2 m ahead at the merge point, and 0.8 m/s slower.
         left = await accelerates(sides["left"], seen(9.6, 10.4, 48.0, -6.0))
         right = await accelerates(sides["right"], seen(10.4, 9.6, 54.0, 6.0))
@@ -212,8 +167,8 @@ async def test_the_human_odds_are_drawn_and_both_sides_agree():
 
 @pytest.mark.parametrize("condition", ["L_4_0", "N_0_0", "R_-4_8"])
 async def test_the_second_car_opens_the_human_gap_with_one_acceleration(condition):
-    trial = await play(both(changed("human-odds", gap_sd_m=0.0)), condition)
-    first, second = trial.merged_first, MIRRORED[trial.merged_first]
+    trial = await play(both(changed("human-odds", gap_sd_m=0.0)), condition, scenario=FINE)
+    first, second = trial.merged_first, OTHER[trial.merged_first]
     assert {round(row.acceleration_mps2, 9) for row in of_side(trial, first)} == {0.0}
     held = [round(row.acceleration_mps2, 6) for row in of_side(trial, second)][1:]
     assert len(dict.fromkeys(held)) == 2
@@ -226,7 +181,7 @@ async def test_the_second_car_opens_the_human_gap_with_one_acceleration(conditio
 
 
 async def test_a_quantal_driver_keeps_its_speed_where_nothing_is_in_its_way():
-    driver = changed("quantal", precision=1000.0).make(FINE, spec_of("N_0_0"), "left")
+    driver = changed("quantal", precision=1000.0).make(FINE, spec("N_0_0"), "left")
     assert await accelerates(driver, seen(other_ahead_m=-60.0)) == 0.0
 
 
@@ -234,7 +189,7 @@ async def test_a_quantal_driver_brakes_where_a_collision_costs_more():
     near = seen(distance_m=40.0, other_ahead_m=1.0)
     for cost, brakes in ((0.0, False), (1000.0, True)):
         driver = changed("quantal", precision=1000.0, collision_cost=cost).make(
-            FINE, spec_of("N_0_0"), "left"
+            FINE, spec("N_0_0"), "left"
         )
         assert (await accelerates(driver, near) < 0) is brakes
 
@@ -242,7 +197,7 @@ async def test_a_quantal_driver_brakes_where_a_collision_costs_more():
 async def test_a_quantal_driver_draws_by_its_precision():
     drawn = Counter()
     for repetition in range(1, 301):
-        driver = changed("quantal", precision=0.0).make(FINE, spec_of("N_0_0", repetition), "left")
+        driver = changed("quantal", precision=0.0).make(FINE, spec("N_0_0", repetition), "left")
         drawn[round(await accelerates(driver, seen()), 6)] += 1
     assert set(drawn) == {-2.5, -1.5, 0.0, 0.5}
     assert min(drawn.values()) > 45
@@ -276,7 +231,7 @@ def test_parameters_that_cannot_be_are_refused(name, parameters, said):
 @pytest.mark.parametrize("side", SIDES)
 async def test_human_odds_keeps_its_speed_and_draws_once_the_other_is_in_sight(side):
     always_yields = changed("human-odds", odds_intercept=-1000.0 if side == "left" else 1000.0)
-    driver = always_yields.make(FINE, spec_of("N_0_0"), side)
+    driver = always_yields.make(FINE, spec("N_0_0"), side)
     unseen = replace(seen(other_ahead_m=-FAR_BEHIND_M), other_seen=False)
     assert [await accelerates(driver, unseen, number) for number in range(3)] == [0.0] * 3
     assert await accelerates(driver, seen(distance_m=30.0), 3) < 0
@@ -286,12 +241,12 @@ async def test_human_odds_keeps_its_speed_and_draws_once_the_other_is_in_sight(s
 @pytest.mark.parametrize("value", [1000.0, -1000.0])
 async def test_human_odds_that_are_certain_are_drawn_as_others(parameter, value):
     program = changed("human-odds", **{parameter: value})
-    trial = await play(both(program), "L_4_8")
+    trial = await play(both(program), "L_4_8", scenario=FINE)
     assert trial.status in ("finished", "collided")
 
 
 @pytest.mark.parametrize("name", ["idm", "quantal"])
 async def test_a_driver_that_seems_to_stand_at_first_drives_on(name):
-    driver = PROGRAMS[name].make(FINE, spec_of("N_0_0"), "left")
+    driver = PROGRAMS[name].make(FINE, spec("N_0_0"), "left")
     for number, speed_mps in enumerate((0.0, 10.0)):
         assert -2.5 <= await accelerates(driver, seen(speed_mps), number) <= 2.5

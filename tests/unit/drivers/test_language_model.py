@@ -73,34 +73,19 @@ def listed(plan):
 
 
 async def test_exactly_the_first_five_actions_of_a_valid_plan_are_applied():
-    (decision,) = await decide(valid(PLAN))
-    assert decision.valid
-    assert decision.plan == PLAN
-    assert decision.applied == PLAN[:5] == (0.01, 0.02, 0.03, 0.04, 0.05)
-    assert not decision.fallback
-    assert decision.failure is None
-    assert (decision.tactical, decision.rationale) == ("M", "I go on.")
-
-
-async def test_a_decision_keeps_the_reply_it_was_read_from():
     reply = chat_reply(valid(PLAN))
     (decision,) = await decide(reply)
+    assert (decision.plan, decision.applied) == (PLAN, (0.01, 0.02, 0.03, 0.04, 0.05))
+    assert (decision.valid, decision.fallback, decision.failure) == (True, False, None)
+    assert (decision.tactical, decision.rationale) == ("M", "I go on.")
     assert decision.reply is reply
-
-
-async def test_the_first_prompt_has_no_previous_plan():
-    (decision,) = await decide(valid(PLAN))
-    assert remaining(decision) == "none, this is your first decision"
 
 
 @pytest.mark.parametrize("begins", [0, 2])  # 2: a driver that leaves its tunnel later
 async def test_only_the_first_prompt_says_that_it_is_the_first(begins):
     decisions = await decide(*[INVALID] * 3, valid(PLAN), INVALID, begins=begins)
-    assert [remaining(d) for d in decisions[:4]] == [
-        "none, this is your first decision",
-        *["none"] * 3,
-    ]
-    assert remaining(decisions[4]) == listed(PLAN[5:])
+    first = "none, this is your first decision"
+    assert [remaining(d) for d in decisions] == [first, *["none"] * 3, listed(PLAN[5:])]
 
 
 @pytest.mark.parametrize(
@@ -143,96 +128,63 @@ async def test_nothing_is_missing_where_no_decision_is_asked_for_or_one_is_given
     assert (decision.valid, decision.failure) == (True, None)
 
 
-async def test_what_is_wrong_with_a_plan_goes_before_a_missing_decision():
-    (decision,) = await decide(INVALID)
-    assert (decision.valid, decision.failure) == (False, "no_array")
+@pytest.mark.parametrize(
+    ("replies", "scenario", "applied"),
+    [
+        # Without a valid plan yet, the actions are zero.
+        ((INVALID, INVALID, PLAN), {}, (ZEROS, ZEROS, PLAN[:5])),
+        ((INVALID,), {"fallback": "restart"}, (ZEROS,)),
+        # After an invalid reply the old plan goes on where it was left, and ends in zeros.
+        (
+            (PLAN, INVALID, INVALID, OTHER_PLAN),
+            {},
+            (PLAN[:5], PLAN[5:10], PLAN[10:15], OTHER_PLAN[:5]),
+        ),
+        ((PLAN, *[INVALID] * 3), {}, (PLAN[:5], PLAN[5:10], PLAN[10:15], PLAN[15:])),
+        ((PLAN, *[INVALID] * 2), {"fallback": "restart"}, (PLAN[:5],) * 3),
+        (
+            (PLAN[:7], INVALID, INVALID),
+            {"horizon_s": 1.4},
+            (PLAN[:5], (*PLAN[5:7], *ZEROS[2:]), ZEROS),
+        ),
+        # The prompt rate says how many actions are driven: one prompt every 5, 2 or 1 steps.
+        ((PLAN, INVALID), {"prompt_rate_hz": 2.5}, (PLAN[:2], PLAN[2:4])),
+        ((PLAN, INVALID), {"prompt_rate_hz": 5}, (PLAN[:1], PLAN[1:2])),
+    ],
+)
+async def test_what_is_driven_is_the_newest_plan_from_where_it_was_left(replies, scenario, applied):
+    texts = [reply if reply is INVALID else valid(reply) for reply in replies]
+    decisions = await decide(*texts, **scenario)
+    assert tuple(d.applied for d in decisions) == applied
+    assert [d.plan for d in decisions] == [None if x is INVALID else x for x in replies]
+    assert [d.fallback for d in decisions] == [x is INVALID for x in replies]
+    assert {d.failure for d in decisions if d.fallback} <= {"no_array"}
 
 
-async def test_the_next_prompt_shows_the_fifteen_actions_that_were_not_executed():
-    decisions = await decide(valid(PLAN), valid(OTHER_PLAN), valid(PLAN))
-    assert [remaining(d) for d in decisions[1:]] == [listed(PLAN[5:]), listed(OTHER_PLAN[5:])]
-
-
-async def test_a_new_plan_replaces_the_old_one_at_once():
-    decisions = await decide(valid(PLAN), valid(OTHER_PLAN))
-    assert decisions[1].applied == OTHER_PLAN[:5]
-
-
-async def test_after_an_invalid_reply_the_old_plan_goes_on_where_it_was_left():
-    decisions = await decide(valid(PLAN), INVALID, INVALID, valid(OTHER_PLAN))
-    assert [d.applied for d in decisions] == [PLAN[:5], PLAN[5:10], PLAN[10:15], OTHER_PLAN[:5]]
-    assert [remaining(d) for d in decisions[1:]] == [
-        listed(PLAN[5:]),
-        listed(PLAN[10:]),
-        listed(PLAN[15:]),
-    ]
-    assert [d.fallback for d in decisions] == [False, True, True, False]
-    assert [d.plan for d in decisions] == [PLAN, None, None, OTHER_PLAN]
-    assert decisions[1].failure == "no_array"
-
-
-async def test_an_exhausted_plan_gives_way_to_zeros():
-    decisions = await decide(valid(PLAN), *[INVALID] * 5)
-    assert decisions[3].applied == PLAN[15:]
-    assert [d.applied for d in decisions[4:]] == [ZEROS, ZEROS]
-    assert remaining(decisions[4]).startswith("[]")
-
-
-async def test_a_plan_that_ends_within_a_second_is_filled_up_with_zeros():
-    """A horizon of 1.4 s is a plan of 7 actions."""
-    plan = PLAN[:7]
-    decisions = await decide(valid(plan), INVALID, horizon_s=1.4)
-    assert decisions[1].applied == (*plan[5:], 0.0, 0.0, 0.0)
-
-
-async def test_without_any_valid_plan_yet_the_actions_are_zero():
-    decisions = await decide(INVALID, INVALID, valid(PLAN))
-    assert [d.applied for d in decisions] == [ZEROS, ZEROS, PLAN[:5]]
-    assert [d.fallback for d in decisions] == [True, True, False]
-    assert remaining(decisions[2]) == "none"
-
-
-async def test_restart_drives_the_old_plan_from_its_first_action():
-    decisions = await decide(valid(PLAN), INVALID, INVALID, fallback="restart")
-    assert [d.applied for d in decisions] == [PLAN[:5]] * 3
-    assert [remaining(d) for d in decisions[1:]] == [listed(PLAN[5:])] * 2
-    assert [d.fallback for d in decisions] == [False, True, True]
-
-
-async def test_restart_has_nothing_to_restart_before_a_valid_plan():
-    (decision,) = await decide(INVALID, fallback="restart")
-    assert decision.applied == ZEROS
+@pytest.mark.parametrize(
+    ("replies", "scenario", "rest"),
+    [
+        ((valid(PLAN), valid(OTHER_PLAN), INVALID), {}, (PLAN[5:], OTHER_PLAN[5:])),
+        ((valid(PLAN), *[INVALID] * 4), {}, (PLAN[5:], PLAN[10:], PLAN[15:], ())),
+        ((valid(PLAN), *[INVALID] * 2), {"fallback": "restart"}, (PLAN[5:], PLAN[5:])),
+    ],
+)
+async def test_the_next_prompt_shows_the_actions_that_were_not_executed(replies, scenario, rest):
+    decisions = await decide(*replies, **scenario)
+    assert [remaining(d) for d in decisions[1:]] == [*map(listed, rest)]
 
 
 @pytest.mark.parametrize("outcome", ["refusal", "truncated", "empty"])
 async def test_an_answer_that_is_not_ok_is_named_and_not_searched_for_a_plan(outcome):
     reply = chat_reply(valid(OTHER_PLAN), outcome)
     decisions = await decide(valid(PLAN), reply)
-    assert decisions[1].plan is None
-    assert not decisions[1].valid
-    assert (decisions[1].failure, decisions[1].tactical) == (outcome, None)
-    assert decisions[1].applied == PLAN[5:10]
-    assert decisions[1].fallback
-    assert decisions[1].reply is reply
-
-
-@pytest.mark.parametrize("rate_hz", [1, 2.5, 5])
-async def test_the_prompt_rate_says_how_many_actions_are_driven(rate_hz):
-    """One prompt every 5, 2 or 1 steps of 0.2 s."""
-    executed = round(5 / rate_hz)
-    decisions = await decide(valid(PLAN), INVALID, prompt_rate_hz=rate_hz)
-    assert [d.applied for d in decisions] == [PLAN[:executed], PLAN[executed : 2 * executed]]
+    found = decisions[1]
+    assert (found.valid, found.plan, found.failure, found.tactical) == (False, None, outcome, None)
+    assert (found.applied, found.fallback) == (PLAN[5:10], True)
+    assert found.reply is reply
 
 
 async def test_the_variant_and_what_is_seen_decide_the_prompt():
-    (baseline,) = await decide(INVALID)
-    (ablated,) = await decide(INVALID, variant="A2")
-    assert "Previous plan" in baseline.prompt
-    assert "Previous plan" not in ablated.prompt
+    (baseline,), (ablated,) = await decide(INVALID), await decide(INVALID, variant="A2")
+    assert ["Previous plan" in each.prompt for each in (baseline, ablated)] == [True, False]
     assert "Your distance to the merge point: 50.00 m" in baseline.prompt
-
-
-async def test_two_drivers_share_no_plan():
-    await decide(valid(PLAN))
-    (decision,) = await decide(INVALID)
-    assert decision.applied == ZEROS

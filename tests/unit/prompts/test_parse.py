@@ -1,29 +1,19 @@
 """Replies as models write them: what is read, what is refused by name, and nothing is run."""
 
-import signal
-
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_runner.prompts.parse import parse_reply
+from tests.support.cases import table
 
 N = 20
 PLAN = tuple(round(0.05 * k - 0.5, 2) for k in range(N))
 LIST = str(list(PLAN))
 OTHER = str([-0.5] * N)
 TIMES = str([round(0.2 * k, 1) for k in range(N)])  # out of range
-REFUSALS = {
-    "no_array",
-    "several_arrays",
-    "wrong_length",
-    "not_a_number",
-    "not_finite",
-    "out_of_range",
-}
-MB = 1_000_000
-
-law = settings(deadline=None, derandomize=True)  # the gate must not depend on luck or load
+REFUSALS = {*table("replies", "entries").values(), "no_array", "several_arrays"}
+MANY = 250_000
 
 
 def fenced(code, tag="python"):
@@ -138,37 +128,6 @@ def test_the_length_that_is_wanted_is_the_callers():
         (fenced("[]"), "wrong_length"),
         (fenced("[0.1]*20"), "wrong_length"),
         (fenced(str([0.0] * 19)), "wrong_length"),
-        (fenced(str([0.0] * 21)), "wrong_length"),
-        (with_first("nan"), "not_finite"),
-        (with_first("NaN"), "not_finite"),
-        (with_first("inf"), "not_finite"),
-        (with_first("-Infinity"), "not_finite"),
-        (with_first("np.nan"), "not_finite"),
-        (with_first("math.inf"), "not_finite"),
-        (with_first("float('inf')"), "not_finite"),
-        (with_first('float("-nan")'), "not_finite"),
-        (with_first("1e999"), "not_finite"),
-        (with_first("-1e999"), "not_finite"),
-        (with_first("1.0001"), "out_of_range"),
-        (with_first("-1.0001"), "out_of_range"),
-        (with_first("2.5"), "out_of_range"),
-        (with_first("1e300"), "out_of_range"),
-        (with_first("1.0000000000000002"), "out_of_range"),  # the next float above 1
-        (with_first("True"), "not_a_number"),
-        (with_first("None"), "not_a_number"),
-        (with_first("'0.1'"), "not_a_number"),
-        (with_first("0.1 m/s^2"), "not_a_number"),
-        (with_first("..."), "not_a_number"),
-        (with_first(""), "not_a_number"),
-        (with_first("1/2"), "not_a_number"),
-        (with_first("0.5 * 2"), "not_a_number"),
-        (with_first("--0.5"), "not_a_number"),
-        (with_first("0 .5"), "not_a_number"),
-        (with_first("1_0e-2"), "not_a_number"),
-        (with_first("0x1"), "not_a_number"),
-        (with_first("1j"), "not_a_number"),
-        (with_first("\u0967"), "not_a_number"),  # a digit, but not an ASCII one
-        (with_first("__import__('os').getpid()"), "not_a_number"),
         (fenced("[0.1 for _ in range(20)]"), "not_a_number"),
         (fenced(LIST.replace(", ", "; ")), "not_a_number"),
     ],
@@ -178,127 +137,28 @@ def test_what_holds_not_one_plan_is_refused_by_name(reply, failure):
     assert (parsed.plan, parsed.failure) == (None, failure)
 
 
+@pytest.mark.parametrize(("entry", "failure"), table("replies", "entries").items())
+def test_an_entry_that_is_no_number_or_out_of_range_is_refused_by_name(entry, failure):
+    parsed = parse_reply(with_first(entry), N)
+    assert (parsed.plan, parsed.failure) == (None, failure)
+
+
 def test_an_expression_is_never_evaluated(tmp_path):
     trace = tmp_path / "trace"
     parse_reply(with_first(f"__import__('pathlib').Path({str(trace)!r}).touch()"), N)
     assert not trace.exists()
 
 
-@pytest.mark.parametrize(
-    ("head", "token", "rationale"),
-    [
-        ("M\nI am ahead.", "M", "I am ahead."),
-        ("Y\n\nI yield.", "Y", "I yield."),
-        ("m\nI am ahead.", "M", "I am ahead."),
-        ("**Y**\nI yield.", "Y", "I yield."),
-        ("`M`\nI am ahead.", "M", "I am ahead."),
-        ('"M"\nI am ahead.', "M", "I am ahead."),
-        ("(Y)\nI yield.", "Y", "I yield."),
-        ("M.\nI am ahead.", "M", "I am ahead."),
-        ("Decision: M\nI am ahead.", "M", "I am ahead."),
-        ("**Decision:** Y\nI yield.", "Y", "I yield."),
-        ("**Tactical decision: M**\nI am ahead.", "M", "I am ahead."),
-        ("### Tactical decision: Y\nI yield.", "Y", "I yield."),
-        ("M (merge first)\nI am ahead.", "M", "I am ahead."),
-        ("Y (yield)\nI am behind.", "Y", "I am behind."),
-        ("Y - I yield because I am behind.", "Y", "I yield because I am behind."),
-        ("**M** - I am ahead.", "M", "I am ahead."),
-        ("M: I am ahead.", "M", "I am ahead."),
-        ("Y, because I am behind.", "Y", "because I am behind."),
-        ("M", "M", ""),
-    ],
-)
-def test_the_token_is_read_in_its_usual_dressings_and_left_out_of_the_rationale(
-    head, token, rationale
-):
+@pytest.mark.parametrize(("head", "decided"), table("replies", "decided").items())
+def test_the_decision_at_the_head_is_read_in_its_usual_dressings_and_words(head, decided):
     parsed = parse_reply(f"{head}\n```python\n{LIST}\n```", N)
-    assert (parsed.tactical, parsed.rationale, parsed.plan) == (token, rationale, PLAN)
+    assert (parsed.plan, [parsed.tactical, parsed.rationale]) == (PLAN, decided)
 
 
-@pytest.mark.parametrize(
-    "head",
-    [
-        "Y \u2014 I yield because I am behind.",
-        "Y\u2014I yield because I am behind.",
-    ],
-)
-def test_an_em_dash_parts_the_token_from_the_rationale_as_a_hyphen_does(head):
-    parsed = parse_reply(f"{head}\n{LIST}", N)
-    assert (parsed.tactical, parsed.rationale) == ("Y", "I yield because I am behind.")
-
-
-@pytest.mark.parametrize(
-    "prose",
-    [
-        "",
-        "Maybe I go first.",
-        "May I go first?",
-        "My car is ahead.",
-        "Merging first is safe.",
-        "Yes, I go first.",
-        "Yielding is safe.",
-        "Yield or merge?",
-        "Merge first (Y)",
-        "Decision: M/Y",
-        "Decision: merge first or yield",
-        "Decision: do not yield",
-        "Decision: not M",
-        '{"choice": "none"}',
-        "I think.\nDecision: M\nNo.\nDecision: Y",
-        "You see me ahead.",
-        "Decision: Maybe",
-        "M, Y",
-        "M (yield)",
-        "Y; no, M.",
-        "Decision: M, Y",
-        "Decision: M, or yield, as you like",
-        "Decision: M (yield)",
-        "Decision: yield; no, merge first",
-        "**Decision: yield**, or merge first",
-        "Decision: merge (behind the other car)",
-        "Decision: merge, after the other car.",
-        "Decision (M/Y): M/Y",
-        "I merge first (M).",
-        "The other car yields.\nM",
-        "M/Y",
-        "MY",
-    ],
-)
+@pytest.mark.parametrize("prose", table("replies", "undecided"))
 def test_a_word_or_a_late_letter_is_no_token_and_stays_in_the_rationale(prose):
     parsed = parse_reply(f"{prose}\n```python\n{LIST}\n```", N)
     assert (parsed.tactical, parsed.rationale, parsed.plan) == (None, prose, PLAN)
-
-
-@pytest.mark.parametrize(
-    ("head", "token", "rationale"),
-    [
-        ("Decision: Merge first\nI am ahead.", "M", "I am ahead."),
-        ("**Yield**\nI am behind.", "Y", "I am behind."),
-        ("Yield\nI am behind.", "Y", "I am behind."),
-        ("Yield to the other car.\nI am behind.", "Y", "I am behind."),
-        ("Merge first (M)\n\nI am ahead.", "M", "I am ahead."),
-        ("1. Merge\nI am ahead.", "M", "I am ahead."),
-        ("1. M\nI am ahead.", "M", "I am ahead."),
-        ("My decision is to yield.\nI am behind.", "Y", "I am behind."),
-        ("## Tactical decision\n\n**Yield**\nI am behind.", "Y", "I am behind."),
-        ("## Decision\nM\nI am ahead.", "M", "I am ahead."),
-        ("Decision: Y - I am behind.", "Y", "I am behind."),
-        ("**Decision: yield**, I am behind.", "Y", "I am behind."),
-        ("Tactical decision: merge first because I am ahead.", "M", "because I am ahead."),
-        ("Decision: yield, merging behind it.", "Y", "merging behind it."),
-        ("Decision: merge. After that I keep the lead.", "M", "After that I keep the lead."),
-        ("Tactical decision (M/Y): Y\nI am behind.", "Y", "I am behind."),
-        ("**Tactical decision (M or Y):** M\nI am ahead.", "M", "I am ahead."),
-        ("Decision (M/Y): merge first, I am ahead.", "M", "I am ahead."),
-        # What stands further below stays in the rationale.
-        ("I am ahead.\n**Decision:** Merge first.", "M", "I am ahead.\n**Decision:** Merge first."),
-        ("Decision: M\nSo: go.\nDecision: M", "M", "So: go.\nDecision: M"),
-        ('{"decision": "yield"}', "Y", '{"decision": "yield"}'),
-    ],
-)
-def test_a_decision_in_other_words_is_read(head, token, rationale):
-    parsed = parse_reply(f"{head}\n```python\n{LIST}\n```", N)
-    assert (parsed.tactical, parsed.rationale, parsed.plan) == (token, rationale, PLAN)
 
 
 @pytest.mark.parametrize("key", ["decision", "tactical_decision", "Tactical decision", "choice"])
@@ -310,7 +170,6 @@ def test_a_decision_is_a_member_of_an_object(key, word, token):
         assert (parsed.tactical, parsed.plan) == (token, PLAN)
 
 
-@law
 @given(st.text(st.characters(blacklist_characters="[]`")), st.sampled_from("MY"))
 def test_whatever_is_below_a_letter_changes_nothing_of_it(prose, letter):
     assert parse_reply(f"{letter}\n{prose}", N).tactical == letter
@@ -325,18 +184,14 @@ def test_another_character_for_the_minus_or_a_space_is_read(minus, space):
 
 @pytest.mark.parametrize("invisible", "\u200b\u200c\u200d\u2060\ufeff")
 def test_a_character_that_nobody_sees_is_nothing_within_a_plan(invisible):
-    for code in (
-        LIST.replace("0.", f"{invisible}0.{invisible}"),
-        LIST.replace(",", invisible + ","),
-    ):
-        assert parse_reply(fenced(code), N).plan == PLAN
+    code = LIST.replace("0.", f"{invisible}0.{invisible}").replace(",", invisible + ",")
+    assert parse_reply(fenced(code), N).plan == PLAN
 
 
 def test_the_rationale_holds_all_prose_and_no_list():
     before, after = "I am ahead.", "I check again in a second."
-    assert parse_reply(f"M\n{before}\n```\n{LIST}\n```\n{after}", N).rationale == (
-        f"{before}\n{after}"
-    )
+    fenced_between = f"M\n{before}\n```\n{LIST}\n```\n{after}"
+    assert parse_reply(fenced_between, N).rationale == f"{before}\n{after}"
     assert parse_reply(f"M\n{before}\n{LIST}", N).rationale == before
 
 
@@ -346,19 +201,14 @@ def test_token_and_rationale_survive_an_invalid_plan():
     assert (parsed.tactical, parsed.rationale) == ("M", "I go first because I am ahead.")
 
 
-@law
 @given(st.text() | st.text("[]`#,.-+0123456789eEinfMY \r\n\"'*:"))
 def test_any_text_gives_a_plan_or_a_named_refusal(text):
     parsed = parse_reply(text, 1)
-    if parsed.plan is None:
-        assert parsed.failure in REFUSALS
-    else:
-        assert parsed.failure is None
-        assert len(parsed.plan) == 1
-        assert -1 <= parsed.plan[0] <= 1
+    assert parsed.failure in {None, *REFUSALS}
+    assert parsed.failure or (len(parsed.plan) == 1 and -1 <= parsed.plan[0] <= 1)
+    assert (parsed.plan is None) == (parsed.failure is not None)
 
 
-@law
 @given(st.lists(st.floats(-1, 1), min_size=N, max_size=N))
 def test_a_plan_that_is_written_out_in_full_survives_exactly(plan):
     parsed = parse_reply(fenced(repr(plan)), N)
@@ -366,53 +216,38 @@ def test_a_plan_that_is_written_out_in_full_survives_exactly(plan):
     assert list(map(repr, parsed.plan)) == list(map(repr, plan))
 
 
-@pytest.fixture
-def _watchdog():
-    """A pattern that backtracks would need hours for a megabyte: fail instead of hanging."""
-
-    def give_up(signum, frame):
-        raise TimeoutError("the parser does not come to an end")
-
-    previous = signal.signal(signal.SIGALRM, give_up)
-    signal.alarm(120)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, previous)
-
-
-@pytest.mark.usefixtures("_watchdog")
 @pytest.mark.parametrize(
     "text",
     [
-        "[" * MB,
-        "]" * MB,
-        "[array no.]" * (MB // 11),
-        "[[" * (MB // 4) + "]]" * (MB // 4),
-        "[0," * (MB // 3),
-        "[" + "0.00000000," * (MB // 11) + "]",
-        "```" * (MB // 3),
-        "```\n[" * (MB // 5),
-        "#" * MB,
-        "\r\n" * (MB // 2),
-        " " * MB,
-        "*" * MB,
-        "M" * MB,
-        "M " * (MB // 2),
-        "decision: " * (MB // 10),
-        "decision:\n" * (MB // 10),
-        ("decision: " * 7 + "\n") * (MB // 71),
-        ("-" * 79 + "\n") * (MB // 80),
-        '{"decision": ' * (MB // 13),
-        "[" + " " * MB + "x]",
-        "[-" + " " * MB + "]",
-        "[" + "-" * MB + "]",
-        "[0." + "1" * MB + "]",
-        "[0." + "1" * MB + "x]",
-        "[1e" + "1" * MB + "]",
-        "[" + "1" * MB + "]",
-        "[" + "1" * MB + "x]",
+        "[" * MANY,
+        "]" * MANY,
+        "[array no.]" * (MANY // 11),
+        "[[" * (MANY // 4) + "]]" * (MANY // 4),
+        "[0," * (MANY // 3),
+        "[" + "0.00000000," * (MANY // 11) + "]",
+        "```" * (MANY // 3),
+        "```\n[" * (MANY // 5),
+        "#" * MANY,
+        "\r\n" * (MANY // 2),
+        " " * MANY,
+        "*" * MANY,
+        "M" * MANY,
+        "M " * (MANY // 2),
+        "decision: " * (MANY // 10),
+        "decision:\n" * (MANY // 10),
+        ("decision: " * 7 + "\n") * (MANY // 71),
+        ("-" * 79 + "\n") * (MANY // 80),
+        '{"decision": ' * (MANY // 13),
+        "[" + " " * MANY + "x]",
+        "[-" + " " * MANY + "]",
+        "[" + "-" * MANY + "]",
+        "[0." + "1" * MANY + "]",
+        "[0." + "1" * MANY + "x]",
+        "[1e" + "1" * MANY + "]",
+        "[" + "1" * MANY + "]",
+        "[" + "1" * MANY + "x]",
     ],
     ids=lambda text: f"{text[:12]!r}...{text[-3:]!r}",
 )
-def test_a_megabyte_of_hostile_text_is_refused(text):
+def test_much_hostile_text_is_refused_at_once(text):
     assert parse_reply(text, N).failure in REFUSALS

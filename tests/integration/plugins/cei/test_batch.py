@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import Condition
 from merge_runner_cei.batch import Trial, simulate
 from tests.support.cei_trials import cei, model, played, scenario, simulated
@@ -11,26 +10,21 @@ from tests.support.cei_trials import cei, model, played, scenario, simulated
 TRIALS = [("N_0_0", 1), ("L_0_-8", 4), ("R_-4_8", 9), ("L_4_8", 12)]
 
 
-def trace(record, side):
-    rows = [row for row in record.states if row.side == side]
-    return np.array([[row.position_m, row.velocity_mps] for row in rows])
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("resistance", ["human", "none"])
-@pytest.mark.parametrize("rule", ["rectangle", "euclid2d"])
-async def test_a_trial_of_many_is_the_one_that_the_runner_plays(resistance, rule):
+async def test_a_trial_of_many_is_the_one_that_the_runner_plays(resistance):
+    """Of two rules of collision, one with each resistance."""
+    rule = {"human": "rectangle", "none": "euclid2d"}[resistance]
     task = scenario(resistance=resistance, collision_rule=rule)
     traces = simulate(model(task), [simulated(*trial, task) for trial in TRIALS])
     for n, trial in enumerate(TRIALS):
         record = await played(*trial, task, cei(set="K0"))
-        assert (record.status, record.states[-1].step) == (traces.status[n], traces.ended_at[n])
-        for i, side in enumerate(SIDES):
-            samples = slice(traces.ended_at[n] + 1)
-            found = np.column_stack(
-                [traces.positions_m[samples, i, n], traces.speeds_mps[samples, i, n]]
-            )
-            np.testing.assert_allclose(found, trace(record, side), rtol=0, atol=1e-9)
+        end = traces.ended_at[n]
+        assert (record.status, record.states[-1].step) == (traces.status[n], end)
+        rows = [[row.position_m, row.velocity_mps] for row in record.states]
+        found = np.stack(
+            [traces.positions_m[: end + 1, :, n], traces.speeds_mps[: end + 1, :, n]], 2
+        )
+        np.testing.assert_allclose(found.reshape(-1, 2), rows, rtol=0, atol=1e-9)
 
 
 def test_a_trial_does_not_depend_on_those_beside_it():
@@ -48,33 +42,29 @@ def test_a_trial_does_not_depend_on_those_beside_it():
 def test_mirrored_drivers_in_mirrored_conditions_drive_mirrored_trials(tunnel):
     task = scenario()
     trials = [simulated(*trial, task) for trial in TRIALS]
+    of = [one.condition for one in trials]
+    turned = [Condition(-one.projected_headway_m, -one.relative_velocity_mps) for one in of]
     mirrored = [
-        Trial(
-            Condition(-one.condition.projected_headway_m, -one.condition.relative_velocity_mps),
-            one.drivers[::-1],
-            one.seeds[::-1],
-        )
-        for one in trials
+        Trial(condition, one.drivers[::-1], one.seeds[::-1])
+        for condition, one in zip(turned, trials, strict=True)
     ]
     traces, turned = (simulate(model(task), each, tunnel=tunnel) for each in (trials, mirrored))
     np.testing.assert_allclose(traces.positions_m, turned.positions_m[:, ::-1], rtol=0, atol=1e-9)
     assert list(traces.status) == list(turned.status)
 
 
-def test_in_the_tunnel_the_cruise_control_leaves_the_published_error_of_speed():
-    task = scenario()
+# Of the humans, the speeds at which the experiment's recordings leave the tunnel.
+@pytest.mark.parametrize(
+    ("resistance", "speeds_mps"), [("human", [10.31742, 9.52372]), ("none", [10.4, 9.6])]
+)
+def test_in_the_tunnel_the_cruise_control_leaves_the_published_error_of_speed(
+    resistance, speeds_mps
+):
+    task = scenario(resistance=resistance)
     traces = simulate(model(task), [simulated("L_4_8", 1, task)], tunnel=True)
-    start = traces.control_at[0]
-    assert traces.positions_m[start, :, 0].min() > 50 >= traces.positions_m[start - 1, :, 0].min()
-    # The speeds at which the human experiment's recordings leave the tunnel.
-    assert traces.speeds_mps[start, :, 0] == pytest.approx([10.31742, 9.52372], abs=2e-4)
-
-
-def test_without_resistance_the_cruise_control_holds_the_speed():
-    task = scenario(resistance="none")
-    traces = simulate(model(task), [simulated("L_4_8", 1, task)], tunnel=True)
-    held = traces.speeds_mps[: traces.control_at[0] + 1, :, 0]
-    np.testing.assert_allclose(held, [[10.4, 9.6]] * len(held), rtol=0, atol=1e-12)
+    at = traces.control_at[0]
+    assert traces.positions_m[at, :, 0].min() > 50 >= traces.positions_m[at - 1, :, 0].min()
+    assert traces.speeds_mps[at, :, 0] == pytest.approx(speeds_mps, abs=2e-4)
 
 
 def test_two_cars_without_drivers_collide_as_every_condition_is_made_to():

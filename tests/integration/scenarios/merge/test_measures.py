@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 
 import duckdb
-import pytest
 
 from merge_runner.results.store import Store, query
 from merge_runner.scenarios.merge import measures
 
 
-@pytest.fixture
-def version(monkeypatch):
-    """The version with some text added to the SQL."""
+def test_a_remark_is_no_other_version_of_the_measures_and_a_definition_is(monkeypatch):
     read = Path.read_text
 
-    def added(text):
-        monkeypatch.setattr(Path, "read_text", lambda self, **how: read(self, **how) + text)
-        measures._definitions.cache_clear()
-        return measures.measures_version()
+    def version(added):
+        monkeypatch.setattr(Path, "read_text", lambda self, **how: read(self, **how) + added)
+        return importlib.reload(measures).measures_version()
 
-    yield added
-    measures._definitions.cache_clear()
-
-
-def test_a_remark_is_no_other_version_of_the_measures_and_a_definition_is(version):
-    assert version("") == version("-- A remark.\n") == version("    -- Another one.\n")
-    assert version("") == version("COMMENT ON VIEW trial_metrics IS 'what it means';\n")
-    assert version("") != version("SELECT 1;\n")
+    comment = "COMMENT ON VIEW trial_metrics IS 'what it means';\n"
+    (same,) = {*map(version, ("", "-- A remark.\n", "    -- Another one.\n", comment))}
+    assert version("SELECT 1;\n") != same
+    assert version("") == same
 
 
 def test_no_mean_depends_on_the_order_in_which_threads_add():

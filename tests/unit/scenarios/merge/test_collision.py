@@ -1,5 +1,6 @@
 """The three collision rules, against figures that were computed apart from this code."""
 
+from itertools import combinations
 from math import sqrt
 
 import pytest
@@ -10,8 +11,7 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 
-LENGTH_M = 4.5
-WIDTH_M = 1.8
+BOX_M = (4.5, 1.8)
 FIRST_CONTACT_M = 90.606  # no rectangles overlap while either vehicle is before it
 RULES = ("euclid2d", "rectangle", "shared_lane")
 
@@ -31,9 +31,7 @@ INTERVALS = {
 def overlaps(position_m, spacing_m=0.005):
     """The positions of the right vehicle, 80 to 115 m, that overlap with the left one's."""
     grid = (80 + spacing_m * k for k in range(round(35 / spacing_m)))
-    return [
-        other for other in grid if rectangles_overlap(TRACK, position_m, other, LENGTH_M, WIDTH_M)
-    ]
+    return [other for other in grid if rectangles_overlap(TRACK, position_m, other, *BOX_M)]
 
 
 @pytest.mark.parametrize(("position", "interval"), INTERVALS.items())
@@ -49,71 +47,61 @@ def test_rectangles_cannot_overlap_before_the_first_possible_contact():
     assert overlaps(FIRST_CONTACT_M + 0.01) != []
 
 
-def test_every_rule_treats_left_and_right_alike():
-    places = [85 + 1.7 * k for k in range(18)]
-    for rule in RULES:
-        scenario = ScenarioConfig(collision_rule=rule)
-        for a in places:
-            for b in places:
-                assert collided(scenario, TRACK, a, b) == collided(scenario, TRACK, b, a)
+@pytest.mark.parametrize("rule", RULES)
+def test_every_rule_treats_left_and_right_alike(rule):
+    scenario = ScenarioConfig(collision_rule=rule)
+    for a, b in combinations([85 + 1.7 * k for k in range(18)], 2):
+        assert collided(scenario, TRACK, a, b) == collided(scenario, TRACK, b, a)
 
 
 def test_the_vehicles_start_between_12_48_and_13_77_m_apart():
-    distances = []
-    for condition in CONDITIONS.values():
-        left, right = condition.positions_m(max(condition.exit_times_s(TRACK)), TRACK)
-        distances.append(sqrt(squared_distance_m2(TRACK, left, right)))
+    starts = [
+        condition.positions_m(max(condition.exit_times_s(TRACK)), TRACK)
+        for condition in CONDITIONS.values()
+    ]
+    distances = [sqrt(squared_distance_m2(TRACK, *start)) for start in starts]
     assert (min(distances), max(distances)) == pytest.approx((12.48, 13.77), abs=0.005)
 
 
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("start", ["both_exits", "own_exit"])
-def test_no_condition_starts_in_a_collision(rule, start):
-    scenario = ScenarioConfig(collision_rule=rule, control_start=start)
-    assert all(
-        World(scenario, condition, TRACK).status is None for condition in CONDITIONS.values()
-    )
+@pytest.mark.parametrize("control_start", ["both_exits", "own_exit"])
+def test_every_condition_ends_in_a_collision_at_constant_speed_and_starts_in_none(
+    rule, control_start
+):
+    scenario = ScenarioConfig(collision_rule=rule, control_start=control_start)
+    for condition in CONDITIONS.values():
+        world = World(scenario, condition, TRACK)
+        assert world.status is None
+        while world.status is None:
+            world.advance({"left": 0.0, "right": 0.0})
+        assert world.status == "collided"
 
 
-@pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("name", CONDITIONS)
-def test_every_condition_ends_in_a_collision_at_constant_speed(rule, name):
-    world = World(ScenarioConfig(collision_rule=rule), CONDITIONS[name], TRACK)
-    while world.status is None:
-        world.advance({"left": 0.0, "right": 0.0})
-    assert world.status == "collided"
-
-
-@pytest.mark.parametrize("follower", ["left", "right"])
-def test_at_equal_speed_a_headway_of_4_6_m_passes_and_one_of_4_4_m_collides(follower):
+def test_at_equal_speed_a_headway_of_4_6_m_passes_and_one_of_4_4_m_collides():
     def any_collision(headway_m):
-        ways = [(50 + 0.01 * k, 50 + 0.01 * k + headway_m) for k in range(10_000)]
-        pairs = ways if follower == "left" else [(right, left) for left, right in ways]
-        return any(collided(ScenarioConfig(), TRACK, left, right) for left, right in pairs)
+        places = (50 + 0.01 * k for k in range(10_000))
+        return any(collided(ScenarioConfig(), TRACK, at, at + headway_m) for at in places)
 
-    assert not any_collision(4.6)
-    assert any_collision(4.4)
+    assert [any_collision(headway_m) for headway_m in (4.6, 4.4)] == [False, True]
 
 
 def test_euclid2d_needs_less_than_a_vehicle_length_between_the_centres():
     """Level vehicles 18 m before the merge point are exactly 4.5 m apart, also in binary."""
-    assert squared_distance_m2(TRACK, 82.0, 82.0) == LENGTH_M**2
+    assert squared_distance_m2(TRACK, 82.0, 82.0) == 4.5**2
     assert not collided(ScenarioConfig(), TRACK, 82.0, 82.0)
     assert collided(ScenarioConfig(), TRACK, 82.01, 82.01)
 
 
 def test_rectangles_that_touch_do_not_collide():
-    assert not rectangles_overlap(TRACK, 101.0, 105.5, LENGTH_M, WIDTH_M)
-    assert rectangles_overlap(TRACK, 101.0, 105.49, LENGTH_M, WIDTH_M)
+    assert not rectangles_overlap(TRACK, 101.0, 105.5, *BOX_M)
+    assert rectangles_overlap(TRACK, 101.0, 105.49, *BOX_M)
 
 
 def test_shared_lane_needs_one_vehicle_at_the_merge_point_and_less_than_a_length():
     scenario = ScenarioConfig(collision_rule="shared_lane")
-    assert not collided(scenario, TRACK, 99.99, 99.99)
-    assert collided(scenario, TRACK, 100.0, 99.99)
-    assert collided(scenario, TRACK, 99.99, 100.0)
-    assert collided(scenario, TRACK, 95.51, 100.0)
-    assert not collided(scenario, TRACK, 95.5, 100.0)
+    hits, passes = ((100.0, 99.99), (99.99, 100.0), (95.51, 100.0)), ((99.99, 99.99), (95.5, 100.0))
+    assert all(collided(scenario, TRACK, *pair) for pair in hits)
+    assert not any(collided(scenario, TRACK, *pair) for pair in passes)
 
 
 @pytest.mark.parametrize("rule", RULES)

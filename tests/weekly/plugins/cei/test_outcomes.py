@@ -5,14 +5,13 @@ import asyncio
 import numpy as np
 import pytest
 
-from merge_runner.records import canonical_json
+from merge_runner.config import Perception
+from merge_runner.records import SIDES, canonical_json
 from merge_runner.results.store import Store
 from merge_runner_analysis.data.load import load
 from merge_runner_cei.batch import simulate
 from merge_runner_cei.calibration.outcomes import measured, summary
 from tests.support.cei_trials import cei, model, played, scenario, simulated
-
-pytestmark = pytest.mark.long
 
 # Among them are trials that collide.
 TRIALS = [
@@ -33,12 +32,12 @@ def both(tmp_path_factory):
         return [await played(*trial, task, cei(set="K0")) for trial in TRIALS]
 
     Store(db).add_recorded(
-        asyncio.run(play()), {"cei": canonical_json({"scenario": task.model_dump()})}
+        asyncio.run(play()), {"test": canonical_json({"scenario": task.model_dump()})}
     )
     trials = [simulated(*trial, task) for trial in TRIALS]
     study = model(task)
     frame = measured(study.task, trials, simulate(study, trials))
-    ids = [f"cei/baseline/{condition}/rep{n:02d}" for condition, n in TRIALS]
+    ids = [f"test/baseline/{condition}/rep{n:02d}" for condition, n in TRIALS]
     stored = load("SELECT * FROM trials JOIN trial_metrics USING (trial_id, spec_hash)", db)
     states = load("SELECT * FROM states ORDER BY step", db)
     return frame.assign(trial_id=ids).set_index("trial_id"), stored.set_index("trial_id"), states
@@ -48,12 +47,8 @@ def test_outcomes_and_measures_are_those_of_the_database(both):
     simulated_, stored, _ = both
     stored = stored.loc[simulated_.index]
     assert {"finished", "collided"} <= set(simulated_["status"])
-    assert list(simulated_["status"]) == list(stored["status"])
-    firsts = [
-        [first or None for first in frame["merged_first"].fillna("")]
-        for frame in (simulated_, stored)
-    ]
-    assert firsts[0] == firsts[1]
+    for name in ("status", "merged_first"):
+        assert list(simulated_[name].fillna("")) == list(stored[name].fillna(""))
     for measure in (*MEASURES, "projected_headway_m", "relative_velocity_mps"):
         np.testing.assert_allclose(
             simulated_[measure].astype(float), stored[measure].astype(float), rtol=0, atol=1e-6
@@ -76,3 +71,20 @@ def test_a_summary_leaves_out_what_no_fit_can_tell(both):
     few = summary(simulated_.iloc[:8])
     assert ("who_first", "intercept") not in few
     assert few["collisions", "count"] == (simulated_["status"].iloc[:8] == "collided").sum()
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("clock_s", [None, 1.0])
+@pytest.mark.parametrize("perception", [{"view_from_m": 25.0}, {"range_m": 7.0}])
+@pytest.mark.parametrize("resistance", ["none", "human"])
+async def test_drivers_that_see_each_other_late_mostly_still_avoid_a_collision(
+    perception, clock_s, resistance
+):
+    eyes = {f"perception_{side}": Perception(**perception) for side in SIDES}
+    task, driver = scenario(resistance=resistance, **eyes), cei(clock=clock_s)
+    trials = [
+        await played(condition, repetition, task, driver)
+        for condition in ("L_4_-8", "N_0_0", "R_-4_8")
+        for repetition in range(1, 4)
+    ]
+    assert sum(trial.status == "collided" for trial in trials) <= 4

@@ -11,8 +11,6 @@ from merge_runner_cei.driver import check
 from merge_runner_cei.parameters import SETS
 from tests.support.cei_trials import scenario, simulated
 
-pytestmark = pytest.mark.long
-
 
 def test_the_design_has_each_pair_ten_times_in_each_condition_with_the_seeds_of_the_slots():
     trials = design(SETS["K0"], experiment(), 0)

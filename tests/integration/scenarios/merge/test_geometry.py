@@ -46,9 +46,9 @@ def test_the_track_in_sql_is_the_simulators(database):
 
 @pytest.mark.parametrize("spec", [{"source": "human"}, {"scenario": {}}])
 def test_a_size_that_a_spec_does_not_say_is_that_of_the_experiment(database, spec):
-    found, default = geometry(database, spec), ScenarioConfig()
-    assert found["length_m"] == default.vehicle_length_m
-    assert found["width_m"] == default.vehicle_width_m
+    found, usual = geometry(database, spec), ScenarioConfig()
+    size = (usual.vehicle_length_m, usual.vehicle_width_m)
+    assert (found["length_m"], found["width_m"]) == size
 
 
 def test_the_bounds_of_the_experiments_vehicles_are_the_known_ones(database):
@@ -84,10 +84,9 @@ def test_boxes_overlap_between_the_bounds_and_nowhere_else(database, length_m, w
             for edge, way in ((low_m, -1), (high_m, 1))
             for far_m in (0, 0.1, 1, 5, 20)
         ]
-        for other_m in inside:
-            assert rectangles_overlap(TRACK, at_m, other_m, length_m, width_m)
-        for other_m in outside:
-            assert not rectangles_overlap(TRACK, at_m, other_m, length_m, width_m)
+        for other_m in inside + outside:
+            overlap = rectangles_overlap(TRACK, at_m, other_m, length_m, width_m)
+            assert overlap == (other_m in inside)
 
 
 @given(st.floats(0.5, 30), st.floats(0.2, 6), st.floats(0, 60), st.floats(0, 1))

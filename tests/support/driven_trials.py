@@ -1,0 +1,35 @@
+"""Trials that programs drive, without a study."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.records import SIDES, TrialSpec
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.trial import play_trial
+
+OTHER = {"left": "right", "right": "left"}
+
+
+def spec(condition: str, repetition: int = 1) -> TrialSpec:
+    trial_id = f"test/baseline/{condition}/rep{repetition:02d}"
+    who = (trial_id, "test", "driver", "a", "b", "baseline", condition, repetition, 0, 0)
+    return TrialSpec(*who, kinematics=CONDITIONS[condition])
+
+
+def both(program):
+    return dict.fromkeys(SIDES, program)
+
+
+async def play(
+    programs, condition: str, repetition: int = 1, *, scenario: ScenarioConfig, seeds=None
+):
+    """A trial of these programs by side; ``seeds`` by side in place of the slot's."""
+    trial, drivers = spec(condition, repetition), {}
+    for side, program in programs.items():
+        seat = program.seat(scenario, trial, side)
+        if seeds is not None:
+            seat = replace(seat, seed=seeds[side], other_seed=seeds[OTHER[side]])
+        drivers[side] = program.driver(seat)
+    return await play_trial(trial, scenario, drivers)
