@@ -1,90 +1,150 @@
-"""Count the mutants that the tests kill: ``python -m tests.weekly.mutants [PART]``.
+"""Count the mutants that tests kill: ``python tests/weekly/mutants ROOT RESULTS PART LANE...``.
 
-Each mutant is applied to a copy of the repository, and the tests named for its folder run there
-until one fails. A mutant that survives is printed. PART restricts the run to paths that have it.
+The tests of the lanes run in a copy of the commit at ROOT, and RESULTS keeps what each calls. Then
+each mutant with PART in its path is tried: tests of its function run, quickest first, until one
+fails. The same command goes on where it ended.
 """
 
-from __future__ import annotations
-
-import shutil
+import ast
+import json
+import os
+import re
 import subprocess
 import sys
-import tempfile
+import threading
 import tomllib
 from collections import Counter
+from itertools import accumulate, chain
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-LONGEST_S = 900  # a mutant that never ends is killed, too
-TESTS = {
-    "prompts": ("tests/prompts",),
-    "merge": (
-        "tests/scenarios",
-        "tests/integration/test_trial.py",
-        "tests/integration/drivers/test_reference.py",
-    ),
-    "llm": ("tests/integration/llm/test_cache.py",),
-    "stats": ("tests/analysis/stats", "tests/analysis/tables"),
-    "analysis": (
-        "tests/unit/analysis/test_metrics.py",
-        "tests/analysis/stats",
-        "tests/analysis/tables",
-    ),
-}
+import pytest
+
+HEAVY = "duckdb httpx hypothesis matplotlib.figure pandas pydantic scipy.stats statsmodels.api"
+OPTIONS = "-n0 -p no:cacheprovider -o faulthandler_timeout=400 -o faulthandler_exit_on_timeout=1"
+SECONDS, TOGETHER = 60, 300  # of the tests of a mutant; so many are collected together
+ROOT, RESULTS, PART, *LANES = sys.argv[1:]
+NOTES, COPY, RAN = [Path(f"{RESULTS}{end}").resolve() for end in ("", ".copy", ".ran")]
 
 
-def main() -> None:
-    """Print the survivors, and the share of mutants killed in each file."""
-    part = sys.argv[1] if len(sys.argv) > 1 else ""
-    with (Path(__file__).parent / "mutants.toml").open("rb") as file:
-        mutants = [each for each in tomllib.load(file)["mutant"] if part in each["file"]]
-    killed: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "copy"
-        tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True).splitlines()
-        for name in filter(lambda name: (ROOT / name).exists(), tracked):
-            (copy / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, copy / name, follow_symlinks=False)
-        for room in {Path(each["file"]).parent.name for each in mutants}:
-            if fails(room, copy):
-                sys.exit(f"the tests of {room} fail without a mutant")
-        for mutant in mutants:
-            if is_killed(mutant, copy):
-                killed[mutant["file"]] += 1
-            else:
-                print(f"survives: {mutant['file']}: {mutant['becomes'].strip()}", flush=True)
-    for name, count in Counter(each["file"] for each in mutants).items():
-        print(f"{killed[name]} of {count} killed: {name}")
-    print(f"{killed.total()} of {len(mutants)} killed")
+class Watch:
+    """Runs tests in a process with heavy libraries, and notes what each calls."""
 
+    def __init__(self, notes, names, *arguments, done=frozenset()) -> None:
+        self.notes, self.names, self.done, self.codes, self.of_fixture = notes, names, done, {}, {}
+        if (child := os.fork()) == 0:
+            os.setpgrp()
+            os.chdir(COPY)
+            sys.path[0] = os.environ["PYTHONPATH"] = str(COPY)
+            os.dup2(os.open(f"{COPY}.out", os.O_CREAT | os.O_WRONLY | os.O_TRUNC), 1)
+            if "-x" not in arguments:
+                threading.settrace(self.called)
+                sys.settrace(self.called)
+            options = [*OPTIONS.split(), "-m", "not long", f"--basetemp={COPY}.tmp", *arguments]
+            os._exit(pytest.main(options, plugins=[self]))
+        self.status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        os.system(f"kill -9 -{child} 2> {os.devnull}")
 
-def is_killed(mutant: dict[str, str | int], copy: Path) -> bool:
-    """Return whether a test fails while the mutant is in place; the file is restored."""
-    path = copy / str(mutant["file"])
-    text = path.read_text(encoding="utf-8")
-    lines = text.splitlines()
-    places = [number for number, line in enumerate(lines) if line == mutant["line"]]
-    lines[places[int(mutant.get("nth", 0))]] = str(mutant["becomes"])
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    try:
-        return fails(path.parent.name, copy)
-    finally:
-        path.write_text(text, encoding="utf-8")
+    def called(self, frame, *_):
+        self.codes[id(frame.f_code)] = frame.f_code
 
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items):
+        there = {item.nodeid: item for item in items}
+        left = there.keys() - self.done
+        items[:] = [there[name] for name in self.names or there if name in left]
 
-def fails(room: str, copy: Path) -> bool:
-    """Return whether the tests of a room fail, or never end."""
-    command = [sys.executable, "-m", "pytest", "-x", "-n", "0", "-m", "not long", *TESTS[room]]
-    try:
-        done = subprocess.run(
-            command, cwd=copy, check=False, capture_output=True, timeout=LONGEST_S
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef):
+        outer, self.codes = self.codes, {}
+        made = yield
+        self.of_fixture[fixturedef], self.codes = self.codes, outer | self.codes
+        return made
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item):
+        self.codes, failed, before_s = {}, item.session.testsfailed, sum(os.times()[:4])
+        done, s = (yield), sum(os.times()[:4]) - before_s
+        for fixture in chain(*item._fixtureinfo.name2fixturedefs.values()):
+            self.codes |= self.of_fixture.get(fixture, {})
+        found = {f"{code.co_filename}:{code.co_firstlineno}:" for code in [*self.codes.values()]}
+        calls = [name.removeprefix(f"{COPY}/") for name in sorted(found) if "merge_runner" in name]
+        note(
+            self.notes,
+            test=item.nodeid,
+            passed=failed == item.session.testsfailed,
+            s=s,
+            calls=calls,
         )
-    except subprocess.TimeoutExpired:
-        return True
-    if done.returncode not in (0, 1, 2):
-        sys.exit(done.stdout.decode() + done.stderr.decode())
-    return done.returncode != 0
+        return done
 
 
-if __name__ == "__main__":
-    main()
+def note(path, **facts):
+    with path.open("a") as file:
+        file.write(json.dumps(facts) + "\n")
+
+
+def kept(path, name):
+    return [facts for facts in map(json.loads, path.open()) if name in facts]
+
+
+def killer(tests):
+    """The first of these tests that fails, if one does."""
+    for first in range(0, len(tests), TOGETHER):
+        chosen = sorted(tests[first : first + TOGETHER], key=lambda name: name.split("::")[0])
+        modules = dict.fromkeys(name.split("::")[0] for name in chosen)
+        RAN.write_text("")
+        if (status := Watch(RAN, chosen, "-x", *modules).status) not in (0, 5):
+            failed = [test["test"] for test in kept(RAN, "test") if not test["passed"]]
+            return [f"status {status}", *failed][-1]
+    return ""
+
+
+def score(mutant, tests):
+    """Which test kills a mutant, of those that call its function, or any of its file or folder."""
+    file, line, starts = COPY / mutant["file"], re.escape(mutant["line"]), [0]
+    places = re.finditer(f"^{line}$", text := file.read_text(), re.M)
+    start, end = [*places][mutant.get("nth", 0)].span()
+    for node in ast.walk(ast.parse(text)):
+        is_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        if is_function and node.lineno <= text.count("\n", 0, start) + 1 <= node.end_lineno:
+            starts.append(min(each.lineno for each in [node, *node.decorator_list]))
+    path = re.sub("^analysis/", "merge_runner_analysis/", mutant["file"]).removeprefix("plugins/")
+    for near in (f"{path}:{max(starts)}:", f"{path}:", f"{os.path.dirname(path)}/"):
+        found = [test for test in tests if any(call.startswith(near) for call in test["calls"])]
+        if found:
+            break
+    found.sort(key=lambda test: test["s"])
+    times = accumulate(test["s"] for test in found)
+    chosen = [test["test"] for test, s in zip(found, times, strict=True) if s < SECONDS]
+    while True:
+        file.write_text(text[:start] + mutant["becomes"] + text[end:])
+        by = killer(chosen)
+        file.write_text(text)
+        if "::" not in by or not killer([by]):
+            return by
+        chosen.remove(by)  # it fails without the mutant
+
+
+list(map(__import__, HEAVY.split()))
+if not COPY.exists():
+    subprocess.run(["git", "clone", "-q", ROOT, COPY], check=True)
+subprocess.run(["git", "checkout", "-q", "."], cwd=COPY, check=True)
+NOTES.touch()
+if not kept(NOTES, "recorded"):
+    done = {test["test"] for test in kept(NOTES, "test")}
+    if (status := Watch(NOTES, None, *LANES, done=done).status) not in (0, 1, 5):
+        sys.exit(f"status {status}: {COPY}.out")
+    note(NOTES, recorded=status)
+tests = [test for test in kept(NOTES, "test") if test["passed"]]
+scored = {json.dumps(each["mutant"]): each["by"] for each in kept(NOTES, "mutant")}
+killed, of = Counter(), Counter()
+for mutant in tomllib.loads(Path(__file__).with_name("mutants.toml").read_text())["mutant"]:
+    key, folder = json.dumps(mutant), os.path.dirname(mutant["file"])
+    if PART in mutant["file"] and key not in scored:
+        scored[key] = score(mutant, tests)
+        note(NOTES, mutant=mutant, by=scored[key])
+    of[folder] += key in scored
+    killed[folder] += bool(scored.get(key))
+    if scored.get(key) == "":
+        print(f"survives in {mutant['file']}:\n{mutant['line']}\n{mutant['becomes']}", flush=True)
+print(*(f"{killed[each]:5} of {of[each]:4} killed in {each}" for each in sorted(of)), sep="\n")
