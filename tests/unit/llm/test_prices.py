@@ -1,11 +1,16 @@
+"""What a reply costs: by the registry's table, or by the figures of an entry."""
+
 import pytest
 
 from merge_runner.config import ModelEntry, Price
-from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.ledger import cost_usd, is_underpriced
 from merge_runner.records import Usage
 
 PRICE = Price(input=2.0, cached_input=0.5, output=8.0, source="contract")
+
+
+def price(**changes):
+    return PRICE.model_copy(update=changes)
 
 
 def entry(provider="openai", model="o3-2025-04-16", **changes):
@@ -34,92 +39,59 @@ def test_the_table_of_prices_knows_the_models_of_the_registry(provider, model, r
     assert cost_usd(priced, Usage(1000, None, 0)) == pytest.approx(1000 * new)
 
 
-def test_o3_with_half_the_input_cached():
-    usage = Usage(input_tokens=1000, cached_input_tokens=500, output_tokens=1000)
-    assert cost_usd(entry(), usage) == pytest.approx(0.001 + 0.00025 + 0.008)
-
-
-def test_thoughts_of_gemini_are_paid_for():
-    reading = FORMATS["gemini"].read(
-        {
-            "usageMetadata": {
-                "promptTokenCount": 100,
-                "candidatesTokenCount": 260,
-                "thoughtsTokenCount": 640,
-            }
-        }
-    )
-    priced = entry("gemini", "gemini-2.5-pro", format="gemini")
-    assert cost_usd(priced, reading.usage) == pytest.approx((100 * 1.25 + 900 * 10) / 1e6)
-
-
-def test_explicit_figures_are_believed():
-    priced = entry("local", "anything", price=PRICE)
-    assert cost_usd(priced, Usage(1000, 400, 100)) == (600 * 2.0 + 400 * 0.5 + 100 * 8.0) / 1e6
-
-
-def test_explicit_figures_go_before_the_table():
-    assert cost_usd(
-        entry(price=PRICE.model_copy(update={"output": 1.0})), Usage(0, None, 1_000_000)
-    ) == pytest.approx(1.0)
-
-
-def test_without_a_price_for_cached_input_it_costs_as_any_other():
-    plain = Price(input=2.0, output=8.0, source="contract")
-    assert cost_usd(entry(price=plain), Usage(1000, 400, 0)) == pytest.approx(0.002)
-    free = Price(input=2.0, cached_input=0.0, output=8.0, source="contract")
-    assert cost_usd(entry(price=free), Usage(1000, 400, 0)) == pytest.approx(0.0012)
-
-
 @pytest.mark.parametrize(
-    "model", [entry("openai", "no-such-model"), entry("local", "anything")], ids=str
-)
-def test_an_unknown_price_is_said_and_not_guessed(model):
-    assert cost_usd(model, Usage(1000, 0, 1000)) is None
-
-
-@pytest.mark.parametrize("model", [entry(), entry(price=PRICE)], ids=["table", "explicit"])
-@pytest.mark.parametrize("usage", [Usage(), Usage(1000), Usage(output_tokens=1000)], ids=str)
-def test_tokens_that_are_not_told_have_no_cost(model, usage):
-    assert cost_usd(model, usage) is None
-
-
-@pytest.mark.parametrize("usage", [Usage(), Usage(10**9, 0, 10**9)], ids=str)
-def test_what_is_free_costs_nothing(usage):
-    priced = entry("local", "anything", price="free")
-    assert cost_usd(priced, usage) == 0.0
-
-
-def test_more_cached_input_than_input_is_taken_for_none():
-    """A server that counts wrongly neither ends a sweep nor makes it cheap."""
-    priced = entry()
-    assert cost_usd(priced, Usage(100, 500, 10)) == cost_usd(priced, Usage(100, 0, 10))
-
-
-def test_a_service_tier_is_priced_where_the_registry_knows_it():
-    """The table of genai-prices knows OpenAI's tiers; explicit figures have factors."""
-    usage = Usage(1000, 0, 1000)
-    assert cost_usd(entry(), usage) == pytest.approx(0.010)
-    assert cost_usd(entry(), usage, "priority") == pytest.approx(0.0175)
-    assert cost_usd(entry(), usage, "flex") == pytest.approx(0.005)
-    assert cost_usd(entry(), usage, "default") == pytest.approx(0.010)
-    with_tiers = entry(price=PRICE.model_copy(update={"tiers": {"priority": 2.0}}))
-    assert cost_usd(with_tiers, usage, "priority") == pytest.approx(0.020)
-    assert cost_usd(with_tiers, usage, "flex") == pytest.approx(0.010)
-    assert not is_underpriced(entry(), "priority")
-    assert not is_underpriced(with_tiers, "priority")
-
-
-@pytest.mark.parametrize(
-    ("model", "tier", "expected"),
+    ("own", "usage", "usd"),
     [
-        (entry(price=PRICE), "priority", True),
-        (entry("gemini", "gemini-3.8-flash"), "priority", True),
-        (entry(price=PRICE), "default", False),
-        (entry(price=PRICE), None, False),
-        (entry(price="free"), "priority", False),
-        (entry("local", "anything"), "priority", False),  # that the price is unknown is said
+        (PRICE, Usage(1000, 400, 100), 600 * 2e-6 + 400 * 0.5e-6 + 100 * 8e-6),
+        (price(output=1.0), Usage(0, None, 1_000_000), 1.0),
+        # Without a price of its own cached input costs as any other.
+        (price(cached_input=None), Usage(1000, 400, 0), 0.002),
+        (price(cached_input=0.0), Usage(1000, 400, 0), 0.0012),
+        ("free", Usage(), 0.0),
+        ("free", Usage(10**9, 0, 10**9), 0.0),
+        # A server that counts wrongly neither ends a sweep nor makes it cheap.
+        (PRICE, Usage(100, 500, 10), 100 * 2e-6 + 10 * 8e-6),
+        # What is not told has no cost.
+        (PRICE, Usage(), None),
+        (PRICE, Usage(1000), None),
+        (PRICE, Usage(output_tokens=1000), None),
+    ],
+    ids=str,
+)
+def test_explicit_figures_are_believed_before_the_table(own, usage, usd):
+    cost = cost_usd(entry(price=own), usage)
+    assert cost == (None if usd is None else pytest.approx(usd))
+
+
+@pytest.mark.parametrize("usage", [Usage(), Usage(1000), Usage(output_tokens=1000)], ids=str)
+def test_tokens_that_are_not_told_have_no_cost(usage):
+    assert cost_usd(entry(), usage) is None
+
+
+@pytest.mark.parametrize("model", [("openai", "no-such-model"), ("local", "anything")])
+def test_a_price_that_nobody_knows_is_none(model):
+    assert cost_usd(entry(*model), Usage(1000, 0, 1000)) is None
+
+
+@pytest.mark.parametrize(
+    ("model", "tier", "usd", "underpriced"),
+    [
+        # The table of genai-prices knows OpenAI's tiers; explicit figures have factors.
+        (entry(), None, 0.010, False),
+        (entry(), "priority", 0.0175, False),
+        (entry(), "flex", 0.005, False),
+        (entry(), "default", 0.010, False),
+        (entry(price=price(tiers={"priority": 2.0})), "priority", 0.020, False),
+        (entry(price=price(tiers={"priority": 2.0})), "flex", 0.010, False),
+        (entry(price=PRICE), "priority", 0.010, True),
+        (entry(price=PRICE), "default", 0.010, False),
+        (entry(price=PRICE), None, 0.010, False),
+        (entry("gemini", "gemini-3.8-flash"), "priority", 0.0045, True),
+        (entry(price="free"), "priority", 0.0, False),
+        (entry("local", "anything"), "priority", None, False),  # that it is unknown is said
     ],
 )
-def test_a_dearer_tier_without_a_price_is_known_as_such(model, tier, expected):
-    assert is_underpriced(model, tier) == expected
+def test_a_service_tier_is_priced_where_the_registry_knows_it(model, tier, usd, underpriced):
+    cost = cost_usd(model, Usage(1000, 0, 1000), tier)
+    assert cost == (None if usd is None else pytest.approx(usd))
+    assert is_underpriced(model, tier) == underpriced
