@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner import records
@@ -174,12 +174,14 @@ def key_of_parts(endpoint, path, header, prompt, condition):
     return key(endpoint=endpoint, path=path, headers={"h": header}, body={"p": prompt}, slot=slot)
 
 
+@settings(max_examples=50)
 @given(two_cuts())
 def test_no_two_tuples_of_parts_share_a_key(two):
     one, other = two
     assert (key_of_parts(*one) == key_of_parts(*other)) == (one == other)
 
 
+@settings(max_examples=50)
 @given(prompt=st.text(), other=st.text())
 def test_a_prompt_cannot_pretend_to_be_another_part(prompt, other):
     spelt = f'{prompt}"}},"endpoint":{canonical_json(other)}'

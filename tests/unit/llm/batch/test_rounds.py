@@ -462,7 +462,7 @@ async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cac
 @in_virtual_time
 async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
     service = Memory()
-    service.states = [BatchFailed("again", "HTTP 503")] * 40
+    service.states = [BatchFailed("again", "HTTP 503")] * 12
     run = Run(cache, service)
     assert texts(await run.ask()) == ["batched 1"]
     assert run.said == ["m: HTTP 503; it is asked again until it answers"]
@@ -631,7 +631,7 @@ class Dear(Memory):
 
 
 @given(seed=st.integers(0, 1000), cents=st.integers(1, 12), runs=st.integers(1, 3))
-@settings(max_examples=6)
+@settings(max_examples=4)
 def test_the_bill_of_batches_never_exceeds_the_cap(seed, cents, runs):
     @in_virtual_time
     async def sweep():
