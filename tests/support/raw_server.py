@@ -18,9 +18,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import socket
 import ssl
-import struct
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 
@@ -111,12 +109,6 @@ class Talk:
     def close(self) -> None:
         """Close in order."""
         self.writer.close()
-
-    def reset(self) -> None:
-        """Close with a reset."""
-        linger = struct.pack("ii", 1, 0)
-        self.writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
-        self.writer.transport.abort()
 
     async def left(self) -> None:
         """Wait until the client has closed, whatever it sends before."""
