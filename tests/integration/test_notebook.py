@@ -9,7 +9,6 @@ import sys
 import pandas as pd
 import pytest
 
-import merge_runner
 from merge_runner import Study
 from merge_runner.drivers.constant import ConstantDriver
 from merge_runner.errors import UsageError
@@ -52,18 +51,15 @@ def folder(tmp_path, monkeypatch, emulator_url):
     return tmp_path
 
 
-@pytest.mark.slow
 async def test_trials_have_a_typed_column_for_each_factor_and_their_measures(folder):
     outcome = await Study("study.toml", only={"memory_s": 2.0}).arun()
     assert (outcome.ok, outcome.messages) == (True, [])
     trials = outcome.trials()
-    assert len(trials) == 8
-    assert trials["temperature"].dtype == "float64"
     assert dict(trials.groupby("temperature").size()) == {0.2: 4, 1.0: 4}
-    assert pd.api.types.is_string_dtype(trials["opponent"])
+    assert trials["temperature"].dtype == "float64"
+    assert all(pd.api.types.is_string_dtype(trials[name]) for name in ("opponent", "error"))
     assert trials["gap_m"].notna().any()
     assert trials["error"].isna().all()
-    assert pd.api.types.is_string_dtype(trials["error"])
     assert set(outcome.decisions()["trial_id"]) == set(trials["trial_id"])
     assert set(outcome.calls()["outcome"]) == {"ok"}
     assert set(outcome.states()["side"]) == {"left", "right"}
@@ -72,21 +68,20 @@ async def test_trials_have_a_typed_column_for_each_factor_and_their_measures(fol
     assert "left first" in repr(outcome)
 
 
-@pytest.mark.slow
 async def test_a_factor_of_numbers_and_other_levels_is_of_texts(folder):
     (folder / "study.toml").write_text(STUDY.replace("[0.2, 1.0]", '["default", 1]'))
-    outcome = await Study("study.toml", only={"opponent": "constant", "memory_s": 1.0}).arun()
+    wanted = {"opponent": "constant", "memory_s": 1.0}
+    outcome = await Study("study.toml", conditions=["N_0_0"], only=wanted).arun()
     assert set(outcome.trials()["temperature"]) == {"default", "1"}
 
 
-@pytest.mark.long
 async def test_an_outcome_holds_the_trials_of_its_own_sweep(folder):
-    first = await Study("study.toml", only={"temperature": 0.2, "memory_s": 2.0}).arun()
+    wanted = {"opponent": "constant", "temperature": 0.2, "memory_s": 2.0}
+    first = await Study("study.toml", only=wanted).arun()
     second = await Study("baseline", models="constant", repetitions=1).arun()
-    assert len(second.trials()) == 11
-    assert len(first.trials()) == 4
-    again = await Study("study.toml", only={"temperature": 0.2, "memory_s": 2.0}).arun()
-    assert (again.facts["trials"]["stored_before"], len(again.trials())) == (4, 4)
+    assert (len(first.trials()), len(second.trials())) == (2, 11)
+    again = await Study("study.toml", only=wanted).arun()
+    assert (again.facts["trials"]["stored_before"], len(again.trials())) == (2, 2)
 
 
 async def test_first_situations_are_asked_alone_in_the_conditions_or_on_a_grid(folder):
@@ -101,16 +96,17 @@ async def test_first_situations_are_asked_alone_in_the_conditions_or_on_a_grid(f
 
 
 async def test_a_replay_gives_the_same_results_without_a_call(folder):
-    study = Study("study.toml", only={"memory_s": 1.0})
+    wanted = {"opponent": "constant", "memory_s": 1.0}
+    study = Study("study.toml", only=wanted)
     await study.arun()
-    replayed = await Study("study.toml", only={"memory_s": 1.0}, db="again.duckdb").areplay()
+    replayed = await Study("study.toml", only=wanted, db="again.duckdb").areplay()
     assert replayed.ok
     assert replayed.facts["calls"]["live"] == 0
     assert results_digest(replayed.db) == results_digest(study.db)
 
 
 def test_a_script_runs_it_without_await(folder):
-    assert Study("study.toml", only={"opponent": "constant"}).run().ok
+    assert Study("baseline", models="constant", repetitions=1).run().ok
 
 
 async def test_a_running_loop_is_told_what_to_await(folder):
@@ -119,7 +115,6 @@ async def test_a_running_loop_is_told_what_to_await(folder):
             getattr(Study("study.toml"), call)()
 
 
-@pytest.mark.slow
 async def test_money_is_spent_only_with_leave(folder):
     study = Study("study.toml", models="dear", only={"opponent": "self", "memory_s": 2.0})
     with pytest.raises(UsageError, match=r"spends money; yes=True goes ahead: .*trials  4 "):
@@ -162,12 +157,9 @@ async def test_objects_are_registered_and_a_cell_that_runs_again_replaces_them(f
     assert "stops" in table(study.db, "ablation-quantitative")
     with pytest.raises(UsageError, match="there is a driver 'constant' already"):
         study.register_driver("constant", ConstantDriver, "keeps it")
-    assert "constant" in merge_runner.notebook.PROGRAMS
 
 
-def test_the_menu_is_small_and_an_import_is_cheap():
-    assert merge_runner.__all__ == ["Study", "StudyOutcome", "__version__"]
-    assert all(hasattr(merge_runner, name) for name in merge_runner.__all__)
+def test_an_import_is_cheap():
     heavy = "{'pandas', 'duckdb', 'pydantic', 'asyncio'} & {*sys.modules}"
     code = f"import sys, merge_runner; print({heavy} or 'cheap')"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "cheap"

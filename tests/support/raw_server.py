@@ -35,7 +35,7 @@ CHAT = json.dumps(
 ).encode()
 
 
-def a_request(number: int = 0) -> ChatRequest:
+def a_request(number: int = 0, prompt: str | None = None) -> ChatRequest:
     """What a client sends to any such server."""
     return make_request(
         provider="openai",
@@ -43,7 +43,7 @@ def a_request(number: int = 0) -> ChatRequest:
         model="m",
         path="/chat/completions",
         headers={},
-        body={"prompt": f"number {number}"},
+        body={"prompt": prompt or f"number {number}"},
         slot=Slot("N_0_0", 1, "left", number, 0),
     )
 

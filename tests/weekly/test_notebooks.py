@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 import nbformat
 import pytest
@@ -14,11 +15,8 @@ from nbclient import NotebookClient
 
 from tests.support.harness import CONFIGURING, PROJECT, asked_to_write
 
-pytestmark = pytest.mark.long
-
 NOTEBOOKS = sorted((PROJECT / "docs/notebooks").glob("*.ipynb"))
 PICTURE = "a picture"
-RUN_A_STUDY, OWN = "run-a-study", "own-driver-and-metric"
 
 
 def code(notebook):
@@ -50,13 +48,11 @@ def executed(tmp_path_factory, emulator_url):
         await execute(notebook, tmp_path_factory.mktemp("notebook"))
         return code(notebook)
 
-    before = dict(os.environ)
-    yield run
-    os.environ.clear()
-    os.environ.update(before)
+    with patch.dict(os.environ):
+        yield run
 
 
-def named(name: str):
+def named(name):
     return nbformat.read(PROJECT / f"docs/notebooks/{name}.ipynb", as_version=4)
 
 
@@ -73,8 +69,8 @@ def results(cells):
 
 
 async def test_a_study_is_run_in_a_notebook_and_looked_at_by_factor(executed):
-    cells = await executed(named(RUN_A_STUDY))
-    (estimate, run, types, means, *_, replayed, tables) = map(shown, cells)
+    cells = await executed(named("run-a-study"))
+    estimate, run, types, means, *_, replayed, tables = map(shown, cells)
     assert estimate == "(48, 0.0)"
     assert "trials: 48/48 ended" in run
     assert "\x1b" not in run
@@ -86,7 +82,7 @@ async def test_a_study_is_run_in_a_notebook_and_looked_at_by_factor(executed):
 
 
 async def test_an_edited_file_is_another_driver_and_a_metric_is_in_the_tables(executed):
-    _, _, played, again, _, table = map(shown, await executed(named(OWN)))
+    _, _, played, again, _, table = map(shown, await executed(named("own-driver-and-metric")))
     assert played.splitlines()[-1] == "22"
     assert again.splitlines()[-1] == "(0, set())"
     assert "hardest_braking_mps2" in table

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-import pytest
-
 from merge_runner.config import Perception
 from merge_runner.records import FAR_BEHIND_M
 from merge_runner.results.store import query
@@ -16,7 +14,6 @@ from tests.support.harness import FAST, PROJECT
 PAGE = (PROJECT / "docs/how-to/imperfect-perception.md").read_text()
 
 
-@pytest.mark.slow
 async def test_the_study_of_the_page_is_played_and_compared(merge_runner, tmp_path):
     (study,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     (tmp_path / "foggy.toml").write_text(study)

@@ -20,44 +20,34 @@ from tests.support.raw_server import a_request
 ENTRY = ModelEntry(provider="openai", format="openai-chat", id="m", max_output_tokens=10)
 SECRET = "sk-Zx81Qp55"
 PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "http_proxy", "https_proxy", "all_proxy")
+CHARACTERS = st.characters(exclude_categories=["Cs"], exclude_characters="\0")
 HOSTS = st.one_of(
     st.sampled_from(
         [
-            *(
-                "127.0.0.1",
-                "localhost",
-                "[::1]",
-                "[::1",
-                "::1",
-                "a" * 64,
-                "a" * 300,
-                "a." * 150,
-                "",
-            ),
+            *("127.0.0.1", "localhost", "[::1]", "[::1", "::1", ""),
+            *("a" * 64, "a" * 300, "a." * 150),
             *("999.1.1.1", "1.2.3", "..", ".a", "a..b", "xn--", "xn--\u00fc", "\u00fc", "*", "a b"),
             *("[fe80::1%25eth0]", "[v1.x]", "0x7f.1", "%41", "\\", "a\n", "\u2102", "a_b", "-"),
         ]
     ),
-    st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=12),
+    st.text(CHARACTERS, max_size=12),
 )
 PORTS = st.one_of(
     st.just(""),
     st.integers(-2, 70_000).map(lambda port: f":{port}"),
     st.sampled_from([":", ":a", ":\u0661", ":0", ":1:2", ":" + "9" * 5000]),
 )
+SCHEMES = ("http://", "https://", "ftp://", "socks5://", "socks5h://", "//", "", "HTTP://")
+PATHS = ("", "/", "/v1", "/v1/", "/ ", "/\u00fc", "?a", "#a", "/%", "/a b", "/" * 3000)
 URLS = st.builds(
     "{}{}{}{}{}".format,
-    st.sampled_from(
-        ["http://", "https://", "ftp://", "socks5://", "socks5h://", "//", "", "HTTP://"]
-    ),
+    st.sampled_from(SCHEMES),
     st.sampled_from(["", "", "", f"u:{SECRET}@", "@", "u@"]),
     HOSTS,
     PORTS,
-    st.sampled_from(
-        ["", "/", "/v1", "/v1/", "/ ", "/\u00fc", "?a", "#a", "/%", "/a b", "/" * 3000]
-    ),
+    st.sampled_from(PATHS),
 )
-TEXTS = URLS | st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"))
+TEXTS = URLS | st.text(CHARACTERS)
 ENVIRONMENTS = st.fixed_dictionaries(
     {},
     optional={
@@ -74,13 +64,8 @@ KEYS = st.sampled_from(["sk-0123456789", "a", "\n", "k\r\nx: y", "\u00fc", "\t"]
 @pytest.fixture(scope="module")
 def alone():
     """The environment without anything that concerns a network."""
-    before = dict(os.environ)
-    for name in before:
-        if name.lower().endswith("_proxy") or name.startswith("SSL_CERT"):
-            del os.environ[name]
     # The same files again and again take no time.
     chosen = ("SSL_CERT_FILE", "SSL_CERT_DIR")
-    monkeypatch = pytest.MonkeyPatch()
     made = httpx.create_ssl_context
     kept = functools.cache(lambda *_: made())
 
@@ -90,12 +75,13 @@ def alone():
     async def nowhere(*_, **__):
         raise OSError("there is no network here")
 
-    monkeypatch.setattr(httpx, "create_ssl_context", create)
-    monkeypatch.setattr(Connections, "_resolve_host", nowhere)
-    yield
-    monkeypatch.undo()
-    os.environ.clear()
-    os.environ.update(before)
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [*os.environ]:
+            if name.lower().endswith("_proxy") or name.startswith("SSL_CERT"):
+                patch.delenv(name)
+        patch.setattr(httpx, "create_ssl_context", create)
+        patch.setattr(Connections, "_resolve_host", nowhere)  # of aiohttp
+        yield
 
 
 async def asked(variables):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 
-import pytest
 from aiohttp import web
 from rich.console import Console
 
@@ -18,7 +17,6 @@ ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202e"
 ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "L_4_0")
 
 
-@pytest.mark.slow
 async def test_strange_characters_and_counts_are_stored_and_shown_harmlessly(merge_runner):
     async def middle(request, handler):
         body = json.loads((await handler(request)).body)
@@ -33,17 +31,14 @@ async def test_strange_characters_and_counts_are_stored_and_shown_harmlessly(mer
     assert run.code == 0, run.err
     told = await merge_runner(
         "sql",
-        "select count(*) as n, count(input_tokens) as counted, count(reply) as replies, "
-        "any_value(rationale) as words from calls "
+        "select count(*), count(input_tokens), count(reply), any_value(rationale) from calls "
         "join decisions using (trial_id, spec_hash, side, decision)",
     )
     assert "\x1b" not in told.out
     assert "\u202e" not in told.out
-    n, counted, replies = told.out.splitlines()[1].split()[:3]
-    assert (n, counted, replies) == (str(server.requests), "0", str(server.requests))
+    assert told.out.splitlines()[1].split()[:3] == [str(server.requests), "0", str(server.requests)]
 
 
-@pytest.mark.slow
 async def test_an_error_in_a_servers_words_speaks_to_no_terminal(merge_runner):
     async def middle(request, handler):
         if server.requests == answered_first:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
 
@@ -42,6 +43,11 @@ def stranger(tmp_path, monkeypatch):
 
 
 @pytest.fixture
+def study(stranger):
+    return str(stranger / "study.toml")
+
+
+@pytest.fixture
 def terminal(monkeypatch):
     """Puts a terminal in the place of standard input, at which these answers are typed."""
     opened = []
@@ -67,11 +73,7 @@ def models_file(folder, name, **keys):
 @pytest.mark.parametrize(
     ("name", "keys", "variable"),
     [
-        (
-            "nice",
-            {"provider": "local", "key_env": "AWS_SECRET_ACCESS_KEY"},
-            "AWS_SECRET_ACCESS_KEY",
-        ),
+        ("nice", {"provider": "local", "key_env": "AWS_SECRET"}, "AWS_SECRET"),
         ("nice", {"provider": "openai"}, "OPENAI_API_KEY"),
         ("o3", {"provider": "openai"}, "OPENAI_API_KEY"),
     ],
@@ -95,21 +97,12 @@ async def test_a_models_file_beside_a_study_sends_a_key_elsewhere_only_with_an_a
 @pytest.mark.parametrize(
     "command",
     [
-        ("sweep", "{}"),
-        ("sweep", "{}", "--dry-run"),
-        ("replay", "{}"),
-        ("sweep", "{}", "--first"),
-        ("power", "{}"),
-        ("tables", "--study", "{}"),
-        ("report", "--study", "{}"),
-        ("view", "--study", "{}"),
-        ("audit", "--study", "{}"),
+        *("sweep {}", "sweep {} --dry-run", "replay {}", "sweep {} --first", "power {}"),
+        *(f"{name} --study {{}}" for name in ("tables", "report", "view", "audit")),
     ],
-    ids=" ".join,
 )
-async def test_no_command_runs_a_studys_code_unasked(merge_runner, stranger, command):
-    study = str(stranger / "study.toml")
-    done = await merge_runner(*(word.format(study) for word in command))
+async def test_no_command_runs_a_studys_code_unasked(merge_runner, stranger, study, command):
+    done = await merge_runner(*command.format(study).split())
     assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
     assert f"{study} runs code (driver.py)" in done.err
     assert "--trust" in done.err
@@ -125,9 +118,9 @@ def test_a_notebook_runs_a_studys_code_where_it_is_told_to(state, stranger):
 
 
 def test_the_question_shows_the_code_and_comes_once_for_each_content(
-    state, stranger, terminal, capsys
+    state, stranger, study, terminal, capsys
 ):
-    study, code = str(stranger / "study.toml"), stranger / "driver.py"
+    code = stranger / "driver.py"
     terminal("n", "y", "n")
     with pytest.raises(UsageError, match="nothing was run"):
         load_study(study)
@@ -146,17 +139,15 @@ def test_the_question_shows_the_code_and_comes_once_for_each_content(
 
 
 def test_an_agreement_to_a_folder_is_none_to_the_registry_of_the_working_folder(
-    state, stranger, tmp_path
+    state, stranger, tmp_path, study
 ):
-    study = str(stranger / "study.toml")
     load_study(study, trust=True)
     models_file(tmp_path / "working", "nice", provider="openai", base_url=AT)
     with pytest.raises(UsageError, match="sends OPENAI_API_KEY to http:"):
         load_study(study, ["nice"])
 
 
-def test_a_folder_cannot_bring_the_agreement_to_itself(state, stranger, monkeypatch):
-    study = str(stranger / "study.toml")
+def test_a_folder_cannot_bring_the_agreement_to_itself(state, stranger, study, monkeypatch):
     load_study(study, trust=True)
     (kept,) = state.rglob("agreements")
     for place in (".", "state", ".local/state"):
@@ -173,13 +164,13 @@ def test_a_folder_cannot_bring_the_agreement_to_itself(state, stranger, monkeypa
 
 
 def test_a_script_may_agree_where_nothing_can_be_kept_but_a_person_is_told(
-    stranger, terminal, monkeypatch
+    study, terminal, monkeypatch
 ):
     monkeypatch.setenv("XDG_STATE_HOME", os.devnull)
-    load_study(str(stranger / "study.toml"), trust=True)
+    load_study(study, trust=True)
     terminal("y")
     with pytest.raises(UsageError, match=r"the agreement cannot be kept in .*XDG_STATE_HOME"):
-        load_study(str(stranger / "study.toml"))
+        load_study(study)
 
 
 def test_the_study_of_init_is_its_users_own_until_its_code_is_edited(state, tmp_path):
@@ -221,9 +212,8 @@ def test_a_plug_in_outside_of_the_studys_folder_is_refused(state, stranger, file
 )
 def test_what_a_registry_sends_and_where_is_said(state, stranger, keys, words):
     models_file(stranger, "nice", **keys)
-    with pytest.raises(UsageError) as refused:
+    with pytest.raises(UsageError, match=re.escape(words)):
         load_study(str(stranger / "study.toml"), [])
-    assert words in str(refused.value)
 
 
 @pytest.mark.parametrize(

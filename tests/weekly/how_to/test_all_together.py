@@ -1,11 +1,11 @@
-"""One of each kind, from five packages at once: the house takes them together."""
+"""One of each kind, from five installed packages at once."""
 
 from __future__ import annotations
 
 import duckdb
 import pytest
 
-from tests.integration.how_to.test_wire_format import KEY, MODELS, Talker, listening
+from tests.integration.how_to.test_wire_format import MODELS, Talker, listening
 from tests.support.harness import Run, how_to, plugin
 
 KINDS = ("condition", "driver", "metric", "prompt-block", "wire-format")
@@ -42,12 +42,10 @@ def run(merge_runner, tmp_path):
     return run
 
 
-@pytest.mark.long
-async def test_one_of_each_kind_goes_through_every_command(run, tmp_path):
+async def test_one_of_each_kind_goes_through_every_command(run, merge_runner, tmp_path):
     talker = Talker()
-    async with listening(talker) as url:
+    async with listening(talker) as there:
         asked = ("--model", PAIR, "--max-cost", 9, "--yes", "--json")
-        there = {"TALKER_BASE_URL": url, "TALKER_API_KEY": KEY}
         played = await run("sweep", "all", *asked, **there)
         assert played.summary["trials"]["planned"] == 6
         assert played.summary["audit"]["findings"] == []
@@ -69,11 +67,21 @@ async def test_one_of_each_kind_goes_through_every_command(run, tmp_path):
         ("view", "--export", "pages"),
     ):
         await run(*command)
-    assert "talker-1" in (tmp_path / "pages/files/trials.html").read_text()
+    pages = "".join(page.read_text() for page in (tmp_path / "pages").rglob("*.html"))
+    for text in ("talker-1", "mean |a|", "no human drove it", "with C6: warning of speed"):
+        assert text in pages
+    # Where the packages are not installed.
+    audit = (await merge_runner("audit", "--json")).out
+    assert "unknown driver 'impulsive'; valid: " in audit
+    assert "install the package that registers it, or name the study: --study FILE" in audit
+    bare = await merge_runner("view", "--export", "bare")
+    assert bare.code == 0, bare.err
+    assert "with C6:" not in "".join(p.read_text() for p in (tmp_path / "bare").rglob("*.html"))
     report = (tmp_path / "report.html").read_text()
-    for name in ("talker-1 at ", "+impulsive", "A8", "mean |a|"):
+    for name in ("talker-1 at ", "+impulsive", "A8", "mean |a|", "no human drove"):
         assert name in tables, name
         assert name in report, name
+    assert "(20 Hz); parameters: steady_from_m = 20.0, strength = 0.5" in (await run("models")).out
     with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
         rows = connection.execute(
             "SELECT condition, "

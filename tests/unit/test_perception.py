@@ -8,9 +8,8 @@ from random import Random
 from statistics import fmean, pstdev
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
 from merge_runner.config import PERFECT, Perception, ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
@@ -31,6 +30,14 @@ FOGGY = {
     "dropout": 0.2,
     "range_m": 7.0,
 }
+NOTHING_OF_THE_OTHER = {
+    "other_seen": True,
+    "other_speed_mps": 0,
+    "relative_distance_m": 0,
+    "other_speeds_mps": (),
+    "other_acceleration_mps2": 0,
+}
+few = settings(max_examples=20)
 names = st.sampled_from(sorted(CONDITIONS))
 seeds = st.integers(0, 2**64 - 1)
 actions = st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=8)
@@ -65,26 +72,14 @@ def truths(side="left", pairs=((0.4, -0.2), (-0.7, 0.9), (0.1, 0.3)), **options)
 
 
 def of_the_other(seen):
-    return (
-        seen.other_seen,
-        seen.other_speed_mps,
-        seen.relative_distance_m,
-        seen.other_speeds_mps,
-        seen.other_acceleration_mps2,
-    )
+    return {name: getattr(seen, name) for name in NOTHING_OF_THE_OTHER}
 
 
 def of_the_own(seen):
-    return replace(
-        seen,
-        other_seen=True,
-        other_speed_mps=0,
-        relative_distance_m=0,
-        other_speeds_mps=(),
-        other_acceleration_mps2=0,
-    )
+    return replace(seen, **NOTHING_OF_THE_OTHER)
 
 
+@few
 @given(names, scenarios, actions, seeds)
 def test_without_errors_delay_dropout_and_range_the_truth_is_told(condition, scenario, pairs, seed):
     """By the eyes themselves, which a trial with such a perception does without."""
@@ -93,6 +88,7 @@ def test_without_errors_delay_dropout_and_range_the_truth_is_told(condition, sce
     assert list(watched({}, true, seed)) == true
 
 
+@few
 @given(names, actions, seeds)
 def test_only_what_is_known_of_the_other_changes_unless_own_is_asked_for(condition, pairs, seed):
     true = truths("left", pairs, condition=condition)
@@ -104,22 +100,20 @@ def test_only_what_is_known_of_the_other_changes_unless_own_is_asked_for(conditi
 def test_own_errors_keep_the_position_and_the_distance_to_the_merge_point_together():
     true = truths()
     told = list(watched({"position_sd_m": 0.5, "speed_sd_mps": 0.3, "own": True}, true))
+    own, others = set(), set()
     for seen, so in zip(told, true, strict=True):
         error_m = seen.own_position_m - so.own_position_m
-        assert error_m != 0
+        own.add(error_m)
+        others.add(seen.relative_distance_m - so.relative_distance_m)
         assert seen.own_speed_mps != so.own_speed_mps
         assert seen.own_accelerations_mps2 == so.own_accelerations_mps2
         if so.distance_to_merge_m is not None:
             assert seen.distance_to_merge_m == pytest.approx(so.distance_to_merge_m - error_m)
-    others = {
-        seen.relative_distance_m - so.relative_distance_m
-        for seen, so in zip(told, true, strict=True)
-    }
-    own = {seen.own_position_m - so.own_position_m for seen, so in zip(told, true, strict=True)}
     assert len(others) == len(own) == len(true)
     assert not others & own
 
 
+@few
 @given(st.integers(1, 8), st.sampled_from([{}, {"position_sd_m": 0.5, "speed_sd_mps": 0.3}]))
 def test_a_delay_shows_of_the_other_what_was_seen_that_long_ago(steps, errors):
     true = truths()
@@ -142,34 +136,30 @@ def test_errors_have_the_stated_size_and_fade_at_the_stated_pace():
     sd, tau_s, step_s = 0.5, 0.8, 0.4
     series = [
         [error(k * step_s) for k in range(100)]
-        for error in (error_process((seed,), sd, tau_s) for seed in range(400))
+        for error in (error_process((seed,), sd, tau_s) for seed in range(150))
     ]
     flat = [value for values in series for value in values]
-    assert fmean(flat) == pytest.approx(0, abs=0.02)
-    assert pstdev(flat) == pytest.approx(sd, rel=0.02)
+    assert fmean(flat) == pytest.approx(0, abs=0.03)
+    assert pstdev(flat) == pytest.approx(sd, rel=0.03)
     for lag in (1, 2, 4):
         products = [a * b for values in series for a, b in zip(values, values[lag:], strict=False)]
         wanted = exp(-lag * step_s / tau_s)
-        assert fmean(products) / sd**2 == pytest.approx(wanted, abs=0.03)
+        assert fmean(products) / sd**2 == pytest.approx(wanted, abs=0.05)
 
 
 def test_without_autocorrelation_each_instant_has_an_error_of_its_own():
     error = error_process(("x",), 1.0, 0.0)
-    values = [error(k / 20) for k in range(4000)]
+    values = [error(k / 20) for k in range(2000)]
     assert pstdev(values) == pytest.approx(1, rel=0.03)
-    assert fmean(a * b for a, b in pairwise(values)) == pytest.approx(0, abs=0.04)
+    assert fmean(a * b for a, b in pairwise(values)) == pytest.approx(0, abs=0.06)
 
 
-@pytest.mark.long
-@given(seeds, st.sampled_from([0.0, 0.3, 2.0, 1e6]), st.randoms(use_true_random=False))
-def test_the_errors_do_not_depend_on_the_steps_and_the_order_in_which_they_are_asked(
-    seed, tau_s, chance: Random
-):
-    times = [k / 20 for k in range(-60, 600)]
-    coarse = {t: error_process((seed,), 1.0, tau_s)(t) for t in times[::40]}
-    fine = error_process((seed,), 1.0, tau_s)
-    chance.shuffle(times)
-    values = {t: fine(t) for t in times}
+@pytest.mark.parametrize("tau_s", [0.0, 0.3, 2.0, 1e6])
+def test_the_errors_do_not_depend_on_the_steps_and_the_order_in_which_they_are_asked(tau_s):
+    times = [k / 20 for k in range(-60, 200)]
+    coarse = {t: error_process((1,), 1.0, tau_s)(t) for t in times[::40]}
+    fine = error_process((1,), 1.0, tau_s)
+    values = {t: fine(t) for t in Random(2).sample(times, len(times))}
     assert {t: values[t] for t in coarse} == coarse
 
 
@@ -215,9 +205,9 @@ def test_dropped_observations_have_the_stated_share():
     true = truths(pairs=[(0.4, -0.2)])[:2]
     dropped = [
         of_the_other(list(watched({"dropout": 0.1}, true, seed))[1]) != of_the_other(true[1])
-        for seed in range(3000)
+        for seed in range(500)
     ]
-    assert fmean(dropped) == pytest.approx(0.1, abs=0.015)
+    assert fmean(dropped) == pytest.approx(0.1, abs=0.03)
 
 
 def test_the_other_is_seen_within_the_range_alone():
@@ -261,19 +251,8 @@ def test_no_speed_appears_negative():
 
 
 def spec_of(condition="L_4_-8", repetition=1, model="projected-order"):
-    return TrialSpec(
-        "trial",
-        "hash",
-        "driver",
-        model,
-        model,
-        "baseline",
-        condition,
-        repetition,
-        0,
-        0,
-        kinematics=CONDITIONS[condition],
-    )
+    told = ("trial", "hash", "driver", model, model, "baseline", condition, repetition, 0, 0)
+    return TrialSpec(*told, kinematics=CONDITIONS[condition])
 
 
 async def play(name="projected-order", spec=None, **scenario):
@@ -333,24 +312,6 @@ async def test_the_first_decision_of_a_program_at_20_hz_is_seen_as_the_first_of_
         observe = partial(World(task, CONDITIONS["N_0_0"], TRACK).observe, "left")
         seen.append(Eyes(task.perception("left"), seat.seed, task.step_s, observe).told(0))
     assert seen[0] == seen[1]
-
-
-@pytest.mark.parametrize(
-    ("perception", "said"),
-    [
-        ({"delay_s": 0.3}, "perception_right.delay_s = 0.3 s is no whole number of 0.2 s"),
-        ({"dropout": 1.5}, "less than or equal to 1"),
-        ({"speed_sd_mps": -1.0}, "greater than or equal to 0"),
-        ({"range_m": 0.0}, "greater than 0"),
-        ({"own": "yes"}, "valid boolean"),
-        ({"own": True}, "own need an error: set position_sd_m or speed_sd_mps"),
-        ({"own": True, "delay_s": 0.2}, "own need an error: set position_sd_m or speed_sd_mps"),
-        ({"autocorrelation_s": 2.0}, "own need an error: set position_sd_m or"),
-    ],
-)
-def test_a_perception_that_cannot_be_is_refused(perception, said):
-    with pytest.raises(ValidationError, match=said):
-        ScenarioConfig(perception_right=perception)
 
 
 def test_perfect_perception_is_no_part_of_a_spec():

@@ -1,4 +1,4 @@
-"""Rows and settings that somebody planted in a cache: only replies are read, each verified."""
+"""Caches and databases from others: only replies are read, each verified, and no name leads out."""
 
 from __future__ import annotations
 
@@ -6,31 +6,23 @@ import contextlib
 import json
 import shutil
 import sqlite3
+from dataclasses import asdict
 
 import diskcache
+import duckdb
 import pytest
 
 from merge_runner.errors import RecordingError, UsageError
-from merge_runner.llm.cache import CachedCall, ResponseCache, _behind_checksum, import_folder
-from merge_runner.records import Attempt, Slot, make_request
-
-pytestmark = pytest.mark.long
+from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
+from merge_runner.records import Attempt, make_request
+from tests.support.raw_server import a_request
 
 SECRET = "what nobody else may read"
 PART = ("baseline", "--reps", 1, "--conditions", "N_0_0")
 
 
-def entry(number=0, reply="{}"):
-    request = make_request(
-        provider="openai",
-        endpoint="openai",
-        model="m",
-        path="/chat/completions",
-        headers={},
-        body={"prompt": number},
-        slot=Slot("A1", 1, "left", number, 0),
-    )
-    return CachedCall(request, (Attempt(1, "ok", 200, reply=reply),))
+def entry(number):
+    return CachedCall(a_request(number), (Attempt(1, "ok", 200, reply="{}"),))
 
 
 FIRST, SECOND = entry(1), entry(2)
@@ -61,6 +53,14 @@ def victim(tmp_path):
     assert file.read_text() == SECRET
 
 
+@pytest.fixture
+def cache(folder):
+    """That folder, used as it is."""
+    cache = ResponseCache(folder)
+    yield cache
+    cache.close()
+
+
 @contextlib.contextmanager
 def database(folder):
     with contextlib.closing(sqlite3.connect(folder / "cache.db")) as opened, opened:
@@ -72,29 +72,21 @@ def everything_in(folder):
     return {each.name: each.read_bytes() for each in folder.iterdir()}
 
 
-def whole(folder):
-    """What is in a folder when its journal is written back."""
-    with database(folder) as opened:
-        opened.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    return b"".join(everything_in(folder).values())
-
-
 # diskcache's modes: a value in the row, bytes, a text, or a pickle in the file.
-@pytest.mark.parametrize("mode", [0, 1, 2, 3, 4])
-@pytest.mark.parametrize("leads", ["absolutely", "up", "inside"])
+@pytest.mark.parametrize(
+    ("mode", "leads"),
+    [*((mode, "absolutely") for mode in range(5)), (2, "up"), (4, "up"), (2, "inside")],
+)
 def test_a_file_that_a_row_names_is_neither_read_nor_deleted(folder, victim, mode, leads):
     inside = folder / "aa/bb/value.val"
     inside.parent.mkdir(parents=True)
-    name = {
-        "absolutely": str(victim),
-        "up": f"../{victim.name}",
-        "inside": "aa/bb/value.val",
-    }[leads]
     inside.write_text(SECRET)
+    names = {"absolutely": str(victim), "up": f"../{victim.name}", "inside": "aa/bb/value.val"}
     key = FIRST.request.key
     with database(folder) as opened:
         opened.execute(
-            "UPDATE Cache SET mode = ?, filename = ?, value = NULL WHERE key = ?", [mode, name, key]
+            "UPDATE Cache SET mode = ?, filename = ?, value = NULL WHERE key = ?",
+            [mode, names[leads], key],
         )
     cache = ResponseCache(folder)
     with pytest.raises(RecordingError, match="not ours"):
@@ -106,7 +98,9 @@ def test_a_file_that_a_row_names_is_neither_read_nor_deleted(folder, victim, mod
     cache.close()
     assert inside.read_text() == SECRET
     shutil.rmtree(folder / "aa")
-    assert SECRET.encode() not in whole(folder)
+    with database(folder) as opened:
+        opened.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    assert SECRET.encode() not in b"".join(everything_in(folder).values())
 
 
 def test_the_database_of_another_program_is_left_alone(tmp_path):
@@ -172,79 +166,58 @@ def test_a_folder_is_imported_with_what_its_last_run_has_not_written_back(folder
     assert import_folder(tmp_path / "copied", own) == (3, 0)
 
 
-MADE_UP = {
-    "an answer to another question": ("key", SECOND.request.key),
-    "a changed question": ("body", '{"prompt":7}'),
-    "another endpoint": ("endpoint", "http://elsewhere"),
-    "another model's path": ("path", "/responses"),
-    "another slot": ("slot", {"condition": "A1", "repetition": 2, "side": "left", "decision": 1,
-                              "sample_set": 0}),
-    "another version": ("headers", {"anthropic-version": "1"}),
-}  # fmt: skip
+FIELDS = {
+    "an answer to another question": {"key": SECOND.request.key},
+    "a changed question": {"body": '{"prompt":7}'},
+    "another endpoint": {"endpoint": "http://elsewhere"},
+    "another model's path": {"path": "/responses"},
+    "another slot": {"slot": {**asdict(FIRST.request.slot), "repetition": 2}},
+    "another version": {"headers": {"anthropic-version": "1"}},
+}
 
 
-@pytest.mark.parametrize(("field", "value"), MADE_UP.values(), ids=MADE_UP)
-def test_an_answer_is_never_used_for_another_question(folder, own, field, value):
-    """Whether the folder is used as it is, or imported."""
-    key = FIRST.request.key
+def plant(cache, key, /, **changes):
+    """An entry behind a checksum that fits, with other parts of its request or its attempt."""
     text = json.loads(FIRST.to_json())
-    text["entry"]["request"][field] = value
-    plant(folder, key, text)
-    cache = ResponseCache(folder)
+    for part in (text["entry"]["request"], text["entry"]["attempts"][0]):
+        part.update({name: value for name, value in changes.items() if name in part})
+    cache.run_now([lambda: cache.replace(key, json.dumps(text))])
+
+
+@pytest.mark.parametrize("changes", FIELDS.values(), ids=FIELDS)
+def test_an_answer_is_never_used_for_another_question(folder, cache, own, changes):
+    """Whether the folder is used as it is, or imported."""
+    plant(cache, FIRST.request.key, **changes)
     with pytest.raises(RecordingError, match="does not belong to its key"):
-        cache.get(key)
-    cache.close()
+        cache.get(FIRST.request.key)
     with pytest.raises(RecordingError, match=r"1 calls of .* 1 rows are left out"):
         import_folder(folder, own)
     assert list(own.entries()) == [SECOND]
 
 
-def plant(folder, key, content):
-    """An entry behind a checksum that fits."""
-    with database(folder) as opened:
-        done = opened.execute(
-            "UPDATE Cache SET value = ? WHERE key = ?", [_behind_checksum(json.dumps(content)), key]
-        )
-        assert done.rowcount == 1
-
-
-ODD_ATTEMPTS = [
-    {"reply": "no JSON"},
-    {"reply": "[]"},
-    {"reply": "[" * 100_000},
-    {"number": -1},
-    {"http_status": 2**40},
-    {"cost_usd": -5.0},
-    {"started_at": "yesterday"},
-    {"usage": {"input_tokens": -1}},
-]
-
-
-@pytest.mark.parametrize("odd", ODD_ATTEMPTS, ids=map(repr, range(len(ODD_ATTEMPTS))))
-def test_an_attempt_that_no_run_makes_is_refused(folder, own, odd):
-    text = json.loads(FIRST.to_json())
-    text["entry"]["attempts"][0].update(odd)
-    plant(folder, FIRST.request.key, text)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"reply": reply} for reply in ("no JSON", "[]", "[" * 100_000)),
+        *({"number": -1}, {"http_status": 2**40}, {"cost_usd": -5.0}, {"started_at": "yesterday"}),
+        {"usage": {"input_tokens": -1}},
+    ],
+    ids=range(8),
+)
+def test_an_attempt_that_no_run_makes_is_refused(folder, cache, own, changes):
+    plant(cache, FIRST.request.key, **changes)
     with pytest.raises(RecordingError, match="1 rows are left out"):
         import_folder(folder, own)
-    cache = ResponseCache(folder)
     with pytest.raises(RecordingError):
         cache.get(FIRST.request.key)
-    cache.close()
 
 
-def test_a_request_that_nobody_sends_is_refused(folder, own):
+def test_a_request_that_nobody_sends_is_refused(folder, cache, own):
     """Its key is right, but its body is no JSON object."""
-    made = make_request(
-        provider="openai", endpoint="openai", model="m", path="/p", headers={}, body=["x"],
-        slot=Slot("A1", 1, "left", 1, 0),
-    )  # fmt: skip
-    whole = CachedCall(made, FIRST.attempts)
-    with database(folder) as opened:
-        opened.execute(
-            "UPDATE Cache SET key = ?, value = ? WHERE key = ?",
-            [made.key, _behind_checksum(whole.to_json()), FIRST.request.key],
-        )
+    request = FIRST.request
+    parts = {"path": request.path, "headers": {}, "body": ["x"], "slot": request.slot}
+    made = make_request(provider="openai", endpoint="openai", model="m", **parts)
+    cache.put_now([CachedCall(made, FIRST.attempts)])
     with pytest.raises(RecordingError, match="not a canonical JSON object"):
         import_folder(folder, own)
 
@@ -270,3 +243,16 @@ async def test_the_command_takes_a_folder_and_says_what_it_left(merge_runner, tm
     assert "2 rows are left out" in taken.err
     replay = await merge_runner("replay", *PART, "--db", "new", "--json")
     assert replay.summary["calls"]["cached"] > 0
+
+
+async def test_no_name_of_a_condition_leads_out_of_the_folder_of_an_export(merge_runner, tmp_path):
+    both = (*PART[:-1], "N_0_0,L_4_0")
+    assert (await merge_runner("sweep", *both, "--model", "constant")).code == 0
+    with duckdb.connect(str(tmp_path / "results/merge.duckdb")) as opened:
+        opened.execute("UPDATE trials SET condition = if(condition = 'N_0_0', 'a/b', '../up')")
+    run = await merge_runner("view", "--trials", "*", "--export", "shared/pages")
+    assert run.code == 0, run.err
+    assert [path.name for path in (tmp_path / "shared").iterdir()] == ["pages"]
+    pages = [path for path in (tmp_path / "shared/pages").iterdir() if path.is_file()]
+    for name in both[-1].split(","):
+        assert any(f"constant/baseline/{name}/rep01" in page.read_text() for page in pages)

@@ -1,0 +1,107 @@
+"""The command line: its menu, its help, and what becomes of its options."""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import typer.main
+from typer.testing import CliRunner
+
+import merge_runner as package
+from merge_runner.cli.app import alone
+from merge_runner.run.plan import Options
+from merge_runner_analysis.commands import app
+
+COMMANDS = {
+    *("sweep", "replay", "sql", "digest", "models", "emulate", "recording", "audit"),
+    *("tables", "figures", "report", "explain", "human", "ledger", "view"),
+    *("init", "export", "forget", "power"),
+}
+# The promised options; more may be there.
+SWEEP_OPTIONS = {
+    *("--model", "--reps", "--conditions", "--variants", "--sample-set", "--db", "--cache"),
+    *("--in-flight", "--rpm", "--tpm", "--max-cost", "--dry-run", "--yes", "--replay", "--json"),
+    *("--dask", "--strict-model", "--order-seed", "--first", "--grid"),
+}
+PRINT_NO_RESULT = {
+    *("init", "export", "forget", "emulate", "figures", "report", "view", "human import"),
+    *("recording export", "recording import", "recording verify"),
+}
+STUDY = """
+conditions = ["N_0_0", "L_4_8"]
+repetitions = { baseline = 1, A1 = 1 }
+[factors]
+temperature = [0.2, 1.0]
+"""
+WORDS = """sweep mine.toml --first --grid h=0:1:1,dv=0:1:1 --model emulator+constant --mirror
+    --only temperature=0.2 --reps 3 --variants A1 --sample-set 4 --order-seed 5 --db d --cache c
+    --in-flight 6 --rpm 7 --tpm 8 --max-cost 9 --dask local:2 --batch --strict-model --keep-going
+    --yes --trust --quiet --json"""
+
+
+def test_the_menu_is_what_was_promised():
+    command = typer.main.get_command(app)
+    assert set(command.commands) == COMMANDS
+    assert {o for p in command.commands["sweep"].params for o in p.opts} >= SWEEP_OPTIONS
+    assert set(command.commands["recording"].commands) == {"export", "import", "verify", "info"}
+    assert package.__all__ == ["Study", "StudyOutcome", "__version__"]
+    assert all(hasattr(package, name) for name in package.__all__)
+    assert [e.value for e in entry_points(name="merge-runner")] == ["merge_runner.__main__:main"]
+
+
+def help_of(command: typer.main.TyperCommand) -> str:
+    return command.get_help(command.make_context("merge-runner", [], resilient_parsing=True))
+
+
+def test_a_command_has_its_options_where_those_of_the_others_are_left_out():
+    whole = typer.main.get_command(app)
+    for name, command in whole.commands.items():
+        light = typer.main.get_command(alone(name))
+        assert help_of(light.commands[name]) == help_of(command)
+        assert help_of(light) == help_of(whole)
+
+
+def every_command(command, path=()):
+    yield path, command
+    for name, inner in getattr(command, "commands", {}).items():
+        yield from every_command(inner, (*path, name))
+
+
+def test_every_command_that_prints_a_result_prints_it_as_json():
+    for path, command in every_command(typer.main.get_command(app)):
+        if not hasattr(command, "commands") and " ".join(path) not in PRINT_NO_RESULT:
+            assert any("--json" in parameter.opts for parameter in command.params), path
+
+
+def test_every_option_of_a_sweep_reaches_its_plan_or_its_run(monkeypatch, tmp_path):
+    """What is played in the end is held, and not played: it would take a cluster and money."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine.toml").write_text(STUDY)
+    played = []
+
+    async def play(plan, options, *, whole, **_):
+        played.append((plan, options, whole))
+        return {"messages": [], "exit_code": 0}
+
+    monkeypatch.setattr("merge_runner.run.sweep.play", play)
+    words = WORDS.split()
+    monkeypatch.setattr(sys, "argv", ["merge-runner", *words])
+    assert CliRunner().invoke(app, words).exit_code == 0
+    options = ("--conditions", "L_4_8", "--recording", "r.parquet", "--model", "emulator", "--json")
+    assert CliRunner().invoke(app, ["replay", "mine.toml", *options]).exit_code == 0
+    (plan, options, whole), (replayed, replaying, _) = played
+    assert whole
+    assert options == Options(
+        Path("d"), Path("c"), 6, 7, 8, 9, strict_model=True, keep_going=True, quiet=True,
+        dask="local:2", batch=True, typed=words,
+    )  # fmt: skip
+    assert (plan.seat, plan.sample_set, plan.order_seed) == ("first", 4, 5)
+    assert (len(plan.conditions), plan.repetitions) == (4, {"A1": 3})
+    assert {(arm.model, *arm.factors.values()) for arm in plan.arms} == {
+        ("emulator+constant", "0.2"),
+        ("constant+emulator", "0.2"),
+    }
+    assert (replayed.seat, replayed.conditions, len(replayed.arms)) == ("", ("L_4_8",), 4)
+    assert (replaying.replay, [*replaying.recordings]) == (True, [Path("r.parquet")])

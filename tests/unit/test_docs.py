@@ -1,0 +1,67 @@
+"""The docs and the program name the same things, and links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import typer.main
+
+from merge_runner_analysis.commands import app
+from merge_runner_analysis.data.reference_data import published
+from tests.support.harness import PROJECT
+
+DOCS = PROJECT / "docs"
+PAGES = [PROJECT / "README.md", *PROJECT.glob("plugins/*/README.md"), *DOCS.rglob("*.md")]
+LINKING = [*PAGES, *PROJECT.glob("*.md"), *PROJECT.glob("*/README.md")]
+
+
+def test_every_command_and_every_make_target_is_in_the_docs():
+    text = "\n".join(page.read_text() for page in PAGES)
+    command = typer.main.get_command(app)
+    for name in command.commands:
+        assert f"merge-runner {name}" in text or f"make {name}" in text, name
+    targets = re.findall(r"^([a-z]+):.*## ", (PROJECT / "Makefile").read_text(), re.MULTILINE)
+    for target in targets:
+        assert f"make {target}" in text, target
+
+
+def test_the_reference_of_commands_has_every_command_and_every_option_and_no_other():
+    text = (DOCS / "reference/commands.md").read_text()
+    whole = typer.main.get_command(app)
+    options = {"--help", *(option for p in whole.params for option in p.opts)}
+    for name, command in whole.commands.items():
+        for part, inner in getattr(command, "commands", {"": command}).items():
+            words = f"{name} {part}".strip()
+            assert re.search(rf"^\| `{words}[` ]", text, re.MULTILINE), words
+            shown = (p for p in inner.params if not getattr(p, "hidden", False))
+            options |= {option for p in shown for option in p.opts if option[:2] == "--"}
+    assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)) == options
+
+
+def test_every_how_to_is_in_the_list_of_them():
+    listed = (DOCS / "how-to/README.md").read_text()
+    for page in sorted((DOCS / "how-to").glob("*.md")):
+        assert f"{page.stem}.md" in listed or page.stem == "README"
+
+
+def test_the_readings_of_the_docs_are_those_of_the_report():
+    text = (PROJECT / "docs/explanation/reproduction.md").read_text(encoding="utf-8")
+    shown = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    readings = published("readings").itertuples(index=False)
+    assert shown == ["| " + " | ".join(c.replace("|", r"\|") for c in r) + " |" for r in readings]
+
+
+def anchors(page: Path) -> set[str]:
+    """What a link into a page can name: its headings, as GitHub spells them."""
+    headings = re.findall(r"^#+ (.*)", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h).strip().lower().replace(" ", "-") for h in headings}
+
+
+def test_links_of_the_docs_lead_somewhere():
+    for page in LINKING:
+        for target in re.findall(r"\]\((?!http)([^)]+)", page.read_text()):
+            path, _, heading = target.partition("#")
+            to = page.parent / path if path else page
+            assert to.exists(), f"{page}: {target}"
+            assert not heading or heading in anchors(to), f"{page}: {target}"
