@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache, TextDisk
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
+from tests.support.json_values import paths, replaced
 
 
 def entry(number=0, *, model="m", endpoint="openai", reply="{}", **attempt):
@@ -307,30 +308,18 @@ def test_a_file_with_settings_of_others_is_refused(folder, cache, name, value, r
     assert "\x1b" not in str(caught.value)
 
 
-def paths(value, path=()):
-    """The paths to all values inside a JSON value."""
-    if isinstance(value, dict | list):
-        for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            yield (*path, name)
-            yield from paths(inner, (*path, name))
+NEEDED = {"version", "entry", "request", "attempts", "number", "outcome", "slot", "condition"}
+NEEDED |= {"side", "decision", "repetition", "sample_set"}
+NEEDED |= {"key", "provider", "endpoint", "model", "path", "body"}
+WHOLE = json.loads(entry().to_json())
+PATHS = list(paths(WHOLE))
 
 
 def damaged(path, *value):
     """The text of an entry with one value replaced, or left out."""
-    whole = inner = json.loads(entry().to_json())
-    for name in path[:-1]:
-        inner = inner[name]
-    if value:
-        inner[path[-1]] = value[0]
-    else:
-        del inner[path[-1]]
-    return json.dumps(whole)
+    return json.dumps(replaced(WHOLE, path, *value))
 
 
-NEEDED = {"version", "entry", "request", "attempts", "number", "outcome", "slot", "condition"}
-NEEDED |= {"side", "decision", "repetition", "sample_set"}
-NEEDED |= {"key", "provider", "endpoint", "model", "path", "body"}
-PATHS = list(paths(json.loads(entry().to_json())))
 DAMAGED = [
     "",
     "no JSON",

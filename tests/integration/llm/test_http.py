@@ -12,21 +12,11 @@ from urllib.parse import unquote
 import pytest
 from aiohttp import web
 
-from merge_runner.config import Endpoint, ModelEntry, ScenarioConfig, resolve_endpoint
-from merge_runner.emulator.driver import answer
+from merge_runner.config import Endpoint, ModelEntry, resolve_endpoint
 from merge_runner.errors import UsageError
-from merge_runner.llm.cache import ResponseCache
-from merge_runner.llm.client import LlmClient
-from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import Connections, HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
-from merge_runner.llm.limiter import Limiter
-from merge_runner.prompts.blocks import prompt_of, render_prompt
-from merge_runner.prompts.parse import parse_reply
 from merge_runner.records import Slot, call_key, canonical_json, make_request
-from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.geometry import TRACK
-from merge_runner.scenarios.merge.world import World
 from tests.support.mock_server import FaultPlan
 from tests.support.raw_server import raw_server
 
@@ -244,6 +234,7 @@ async def test_other_hosts_go_through_the_proxy_of_the_environment(recorder, mon
     assert recorder.requests[0].headers["host"] == "model.invalid"
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:httpx_aiohttp")
 @pytest.mark.parametrize("user", ["fleet:s3cret-word", "fleet%40work:s3cret%2Fword", "me:pw"])
 async def test_nothing_of_a_proxys_user_info_is_left_of_what_it_answers(
     recorder, monkeypatch, user
@@ -387,36 +378,3 @@ async def test_no_more_connections_are_open_than_allowed(recorder):
         calls = [transport.send(request_for(), attempt=1, timeout_s=10) for _ in range(9)]
         await asyncio.gather(*calls)
     assert most == 3
-
-
-@pytest.mark.parametrize("wire", FORMATS)
-async def test_a_client_gets_its_answers_from_the_emulator(emulator, tmp_path, wire):
-    url = await emulator()
-    entry = ModelEntry(
-        provider="emulator",
-        format=wire,
-        id="scripted-driver",
-        max_output_tokens=4000,
-        price="free",
-        base_url=f"{url}/v1" if wire.startswith("openai") else url,
-    )
-    endpoint = resolve_endpoint("m", entry, {})
-    slots = [Slot("L_4_8", repetition, "left", 0, 0) for repetition in range(1, 5)]
-    scenario = ScenarioConfig()
-    seen = World(scenario, CONDITIONS["L_4_8"], TRACK).observe("left")
-    prompt = render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
-    with contextlib.closing(ResponseCache(tmp_path)) as cache:
-        async with transport_to(endpoint, connections=16) as transport:
-            ways = {"cache": cache, "transport": transport, "limiter": Limiter()}
-            client = LlmClient(name="m", entry=entry, endpoint=endpoint.identity, **ways)
-            replies = await asyncio.gather(*(client.ask(prompt, slot) for slot in slots))
-    for slot, reply in zip(slots, replies, strict=True):
-        # The slot arrived: the answer is the one of this slot, as by a call without HTTP.
-        assert (reply.outcome, reply.text) == ("ok", answer(prompt, slot))
-        assert parse_reply(reply.text, 20).plan
-        last = reply.attempts[-1]
-        assert (last.http_status, last.model_served) == (200, "scripted-driver")
-        assert last.finish_reason
-        assert last.usage.input_tokens == len(prompt.encode()) // 4
-        visible = len(reply.text.encode()) // 4
-        assert last.usage.output_tokens == last.usage.reasoning_tokens + visible

@@ -14,6 +14,7 @@ from merge_runner import records
 from merge_runner.config import ModelEntry
 from merge_runner.llm.formats import FORMATS
 from merge_runner.records import Slot, call_key, canonical_json, make_request
+from tests.support.json_values import paths, replaced
 
 SLOT = Slot(condition="A1", repetition=1, side="left", decision=0, sample_set=0)
 BASE = {
@@ -113,26 +114,11 @@ def test_any_other_part_is_another_key(changes):
     assert key(**changes) != key()
 
 
-def leaves(value, path=()):
-    """The paths to all values inside a JSON value."""
-    for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
-        if isinstance(inner, dict | list):
-            yield from leaves(inner, (*path, name))
-        else:
-            yield (*path, name)
-
-
-@pytest.mark.parametrize("path", list(leaves(BASE["body"])), ids=str)
+@pytest.mark.parametrize("path", list(paths(BASE["body"])), ids=str)
 def test_any_other_value_in_the_body_is_another_key(path):
-    body = inner = deepcopy(BASE["body"])
-    for name in path[:-1]:
-        inner = inner[name]
-    keys = {key()}
-    for inner[path[-1]] in ("other", 2, 1.5, True, {}, ["other"]):
-        keys.add(key(body=body))
-    del inner[path[-1]]
-    keys.add(key(body=body))
-    assert len(keys) == 8
+    values = ("other", 2, 1.5, True, {}, ["other"])
+    bodies = [replaced(BASE["body"], path), *(replaced(BASE["body"], path, v) for v in values)]
+    assert len({key(), *(key(body=body) for body in bodies)}) == 8
 
 
 def test_numbers_that_are_equal_but_spelt_differently_are_different_requests():

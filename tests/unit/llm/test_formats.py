@@ -1,7 +1,6 @@
 """What is sent and read in each wire format; the cases are in tests/cases/wire_bodies.toml."""
 
 import json
-from copy import deepcopy
 
 import pytest
 from hypothesis import given, settings
@@ -11,6 +10,7 @@ from merge_runner.config import ModelEntry
 from merge_runner.llm.formats import FORMATS
 from merge_runner.records import Usage
 from tests.support.cases import by_format, table
+from tests.support.json_values import paths, replaced
 
 OUTCOMES = {"ok", "refusal", "truncated", "empty", "error"}
 SAMPLES = {wire: json.loads(body) for wire, body in table("wire_bodies", "samples").items()}
@@ -88,23 +88,12 @@ def test_gemini_alone_is_known_to_send_empty_answers():
     assert [wire for wire in FORMATS if FORMATS[wire].retries_empty] == ["gemini"]
 
 
-def paths(value, path=()):
-    """The paths to all values inside a JSON value."""
-    if isinstance(value, dict | list):
-        for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            yield (*path, name)
-            yield from paths(inner, (*path, name))
-
-
 @pytest.mark.parametrize("wire", FORMATS)
 def test_no_value_in_the_place_of_another_makes_it_raise(wire):
     odd = [None, True, 7, -1, 1.5, "x", "", [], [None], ["x"], [[]], {}, {"text": None}]
-    for *above, last in paths(SAMPLES[wire]):
-        body = inner = deepcopy(SAMPLES[wire])
-        for name in above:
-            inner = inner[name]
-        for inner[last] in odd:
-            reading = FORMATS[wire].read(body)
+    for path in paths(SAMPLES[wire]):
+        for value in odd:
+            reading = FORMATS[wire].read(replaced(SAMPLES[wire], path, value))
             assert reading.outcome in OUTCOMES
             assert isinstance(reading.text, str)
 

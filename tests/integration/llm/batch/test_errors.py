@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import socket
 from datetime import UTC, datetime, timedelta
@@ -18,6 +17,7 @@ from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http_outcome import judge
 from tests.support.batch_fixtures import KEY, endpoint_at, lines
 from tests.support.cases import by_format, cases, table
+from tests.support.json_values import paths, replaced
 
 CREATE = {
     "openai-chat": "POST /v1/files",
@@ -349,14 +349,6 @@ values = st.recursive(
 )
 
 
-def places(value, at=()):
-    """The path of every value within a value."""
-    for key, each in value.items() if isinstance(value, dict) else enumerate(value):
-        yield (*at, key)
-        if isinstance(each, dict | list):
-            yield from places(each, (*at, key))
-
-
 SAMPLES = {
     form: {name: json.loads(text) for name, text in sample.items()}
     for form, sample in table("batches", "samples").items()
@@ -368,15 +360,11 @@ SAMPLES = {
 @given(data=st.data())
 async def test_no_value_of_a_wrong_type_is_a_traceback(server, service_at, form, data):
     """Whatever a server sends in place of what it should, a service ends in BatchFailed."""
-    told = copy.deepcopy(SAMPLES[form])
     more = {"has_more": False, "last_id": "b1", "nextPageToken": ""}
     where, member = LISTS.get(form, ("GET /none", "data"))
-    told["page"] = {member: [copy.deepcopy(told["batch"])], **more}
-    *above, last = data.draw(st.sampled_from(sorted(places(told), key=str)))
-    inner = told
-    for key in above:
-        inner = inner[key]
-    inner[last] = data.draw(values)
+    told = SAMPLES[form] | {"page": {member: [SAMPLES[form]["batch"]], **more}}
+    path = data.draw(st.sampled_from(sorted(paths(told), key=str)))
+    told = replaced(told, path, data.draw(values))
     lines = told["lines"] if isinstance(told["lines"], list) else [told["lines"]]
     server.replies[where] = (200, jsonl(told["page"]))
     server.replies[BATCH[form]] = (200, jsonl(told["batch"]))
