@@ -5,7 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from tests.support.harness import PROGRAM, environment, plugin
+from tests.support import program
+from tests.support.harness import PROGRAM, environment, how_to, plugin
 
 LOOKS = """
 from merge_runner.drivers.registry import PROGRAMS
@@ -39,3 +40,19 @@ def test_a_plug_in_that_fails_is_told_in_one_line_at_each_look(tmp_path):
 def test_a_plug_in_may_look_at_what_is_there_and_register(tmp_path):
     looks = with_plugin(tmp_path, REGISTERS, sys.executable, "-c", LOOKS)
     assert (looks.stdout, looks.stderr) == (6 * "found\n", "")
+
+
+def test_where_its_package_is_not_installed_a_driver_is_named_and_the_rest_is_checked(tmp_path):
+    (tmp_path / "fine.toml").write_text(
+        'conditions = ["N_0_0"]\nrepetitions = 1\n[scenario]\nstep_s = 0.05\nplan_step_s = 0.2\n'
+    )
+    sweep = ("sweep", "fine.toml", "--model", "constant+impulsive")
+    env = environment(**plugin(tmp_path / "installed", how_to("add-a-driver")))
+    assert program.run(sweep, cwd=tmp_path, env=env).code == 0
+    audit = program.run(("audit",), cwd=tmp_path, env=environment())
+    assert audit.code == 0
+    assert "not replayed: 1 trials, since unknown driver 'impulsive'; valid: " in audit.out
+    assert "(install the package that registers it, or name the study: --study FILE)" in audit.out
+    asked = program.run(sweep, cwd=tmp_path, env=environment())
+    assert asked.code == 2
+    assert "unknown model 'impulsive'; valid: " in asked.err

@@ -15,6 +15,7 @@ from merge_runner.errors import UsageError
 from merge_runner.study.file import write_folder
 from merge_runner.study.parts import load_study
 from tests.support.harness import PROJECT, watched
+from tests.unit.test_endpoints import CASES
 
 STUDY = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 CODE = STUDY + '[plugins]\nfiles = ["driver.py"]\n'
@@ -194,38 +195,14 @@ def test_a_plug_in_outside_of_the_studys_folder_is_refused(state, stranger, file
         load_study(str(stranger / "study.toml"), trust=True)
 
 
-@pytest.mark.parametrize(
-    ("keys", "words"),
-    [
-        ({"provider": "local", "base_url": AT}, "sends LOCAL_API_KEY to http://models.example "),
-        ({"provider": "emulator", "base_url": AT}, "sends prompts to http://models.example "),
-        ({"provider": "openai", "key_env": "HOME"}, "sends HOME to https://api.openai.com "),
-        (
-            {"provider": "gemini", "base_url": "http://generativelanguage.googleapis.com"},
-            "sends GOOGLE_API_KEY or GEMINI_API_KEY to http://generativelanguage.googleapis.com ",
-        ),
-        (
-            {"provider": "openai", "base_url": "http://[::1]:80/v1"},
-            "OPENAI_API_KEY to http://[::1]",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("keys", "words"), CASES["sends"])
 def test_what_a_registry_sends_and_where_is_said(state, stranger, keys, words):
     models_file(stranger, "nice", **keys)
     with pytest.raises(UsageError, match=re.escape(words)):
         load_study(str(stranger / "study.toml"), [])
 
 
-@pytest.mark.parametrize(
-    "keys",
-    [
-        {"provider": "openai"},
-        {"provider": "openai", "key_env": "OPENAI_API_KEY"},
-        {"provider": "openai", "base_url": "HTTPS://API.openai.com:443/v2/"},
-        {"provider": "local", "base_url": "http://127.0.0.1:11434/v1"},
-        {"provider": "local", "key_env": "LOCAL_API_KEY"},
-    ],
-)
+@pytest.mark.parametrize("keys", CASES["unasked"])
 def test_a_providers_key_goes_to_the_provider_and_any_call_to_loopback_unasked(
     state, stranger, keys
 ):
