@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import cache
 
 import numpy as np
@@ -19,15 +18,9 @@ from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS, who_first_logit
-from merge_runner_analysis.tables import table
 
 HURRIED = "You are in a hurry."
 REPETITIONS = range(1, 201)
-STUDY = """
-repetitions = 12
-[factors]
-x_relative_speed = [-2.0, 0.0]
-"""
 
 
 @cache
@@ -117,22 +110,6 @@ def test_the_registry_lets_every_planted_parameter_through_to_the_emulator_alone
     assert PROVIDERS["emulator"].parameters == PARAMETERS
 
 
-@pytest.mark.long
-async def test_a_study_finds_what_it_planted_and_replays_it(merge_runner, tmp_path):
-    (tmp_path / "planted.toml").write_text(STUDY)
-    run = await merge_runner("sweep", "planted.toml", "--json")
-    assert run.code == 0, run.err
-    found = table(tmp_path / "results/merge.duckdb", "who-first")
-    for speed in (-2.0, 0.0):
-        for term, planted in zip(WHO_FIRST_TERMS, (-0.30, 1.11, speed), strict=True):
-            row = found.loc[f"emulator [x_relative_speed={speed}]/baseline/{term}"]
-            assert abs(row.b - planted) < 3 * row.se
-    digest = (await merge_runner("digest")).out
-    again = await merge_runner("replay", "planted.toml", "--db", "again.duckdb")
-    assert again.code == 0, again.err
-    assert (await merge_runner("digest", "--db", "again.duckdb")).out == digest
-
-
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
@@ -153,35 +130,3 @@ async def test_an_effect_that_cannot_be_is_refused_in_words(
     run = await merge_runner("sweep", "baseline", "--model", "planted", "--reps", 1)
     assert run.code != 0
     assert said in run.err
-
-
-@pytest.mark.parametrize("form", ["openai-chat", "openai-responses", "gemini", "anthropic"])
-async def test_every_wire_format_plants(emulator, form):
-    import aiohttp
-
-    from merge_runner.config import ModelEntry
-    from merge_runner.llm.formats import FORMATS
-
-    url = await emulator()
-    slot = Slot("L_4_8", 1, "left", 0, 0)
-
-    async def letter(**parameters):
-        entry = ModelEntry(
-            provider="emulator",
-            format=form,
-            id="m",
-            max_output_tokens=4000,
-            parameters=parameters,
-        )
-        sent = FORMATS[form].request(entry, first_prompt("L_4_8", "left"))
-        base = url + ("" if form in ("gemini", "anthropic") else "/v1")
-        headers = {"x-merge-runner-slot": json.dumps(slot.as_dict())}
-        async with (
-            aiohttp.ClientSession() as session,
-            session.post(base + sent.path, json=sent.body, headers=headers) as reply,
-        ):
-            assert reply.status == 200
-            return FORMATS[form].read(await reply.json()).text[0]
-
-    assert await letter(x_left_first=1000) == "M"
-    assert await letter(x_left_first=-1000) == "Y"

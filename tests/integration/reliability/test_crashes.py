@@ -9,8 +9,6 @@ import random
 import signal
 import sqlite3
 
-import pytest
-
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.store import results_digest
 from tests.support.harness import watched
@@ -50,7 +48,6 @@ def kept(folder):
     }
 
 
-@pytest.mark.slow
 async def test_a_sweep_that_is_killed_at_20_instants_asks_nothing_answered_again(
     merge_runner, tmp_path
 ):
@@ -91,7 +88,6 @@ async def test_a_sweep_that_is_killed_at_20_instants_asks_nothing_answered_again
     assert digest[1] == 22
 
 
-@pytest.mark.long
 async def test_attempts_of_a_run_that_died_are_found_in_the_next_one(merge_runner):
     async def middle(request, handler):
         if "L_4_0" in request.headers.get(SLOT_HEADER, "") and not release.is_set():

@@ -25,7 +25,6 @@ def db(tmp_path):
     return write_study(tmp_path / "real" / "m.duckdb", yielding("m", reps=1))
 
 
-@pytest.mark.slow
 async def test_a_link_to_a_database_is_read_as_it_is(merge_runner, db, tmp_path):
     (tmp_path / "link.duckdb").symlink_to(db)
     for command in (("digest",), ("tables", "who-first"), ("sql", "from sweeps")):
@@ -43,7 +42,6 @@ async def test_a_table_that_is_not_there_is_told_in_one_line(merge_runner, db):
         assert "Table with name states does not exist" in line
 
 
-@pytest.mark.slow
 async def test_a_name_of_another_kind_of_database_is_that_of_a_file(merge_runner, tmp_path):
     sweep = ("baseline", "--model", "constant", "--reps", 1, "--conditions", "N_0_0")
     for name in ("md:x", ":memory:"):

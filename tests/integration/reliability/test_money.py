@@ -12,8 +12,6 @@ from aiohttp import web
 
 from tests.support.harness import FAST, PROJECT, as_a_model, watched
 
-pytestmark = pytest.mark.slow
-
 SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
 # o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.1 USD, and none can
 # cost more than 3.4 USD (2 x 12 prompts to the timeout, 16,000 tokens of output each).
@@ -110,7 +108,6 @@ async def test_one_cap_holds_over_several_sweeps(merge_runner, experiments):
     assert "USD of baseline/o3/set0 count against the budget, too" in run.err
 
 
-@pytest.mark.long
 async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(merge_runner):
     numbers = itertools.count()
 
@@ -139,7 +136,9 @@ async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(m
     assert done.summary["calls"]["cached"] >= first - run.summary["attempts_of_unknown_cost"] - 1
 
 
-async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(merge_runner):
+async def test_what_a_run_has_in_flight_is_not_released_and_stays_set_aside_when_it_is_killed(
+    merge_runner,
+):
     async def middle(request, handler):
         if 1 < server.requests <= 4:  # the first one goes alone
             if server.requests == 4:
@@ -153,10 +152,15 @@ async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(me
         env = account(server)
         process = await merge_runner.start(*sweep, **env)
         await arrived.wait()
+        told = await merge_runner("ledger")
+        refused = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes")
         process.kill()
         await process.wait()
         run = await merge_runner(*sweep, **env)
     assert run.code == 0, run.err
+    assert "  in flight  3  " in told.out
+    assert refused.code == 2
+    assert "another merge-runner works with" in refused.err
     assert run.summary["attempts_of_unknown_cost"] == 3
     assert 0.38 < run.summary["set_aside_usd"] < 0.45
     fates = await sql(
@@ -167,11 +171,13 @@ async def test_an_attempt_that_a_killed_process_had_in_flight_stays_set_aside(me
     assert fates == [{"outcome": "unknown", "fate": "retried", "cached": True, "n": 3}]
 
 
-async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner):
+async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner, tmp_path):
     async with watched(as_a_model, honest=False) as server:
         env = account(server)
         sweep = (*SWEEP, "--reps", 1, *FAST)
+        before = sorted(tmp_path.rglob("*"))
         assert not (await merge_runner(*sweep, "--dry-run", **env)).summary["measured"]
+        assert sorted(tmp_path.rglob("*")) == before, "a dry run makes no file"
         first = await merge_runner(*sweep, "--yes", **env)
         more = (*SWEEP, "--reps", 2, *FAST)
         dry = (await merge_runner(*more, "--dry-run", **env)).summary
@@ -230,10 +236,12 @@ async def test_runs_of_two_models_under_one_cap_never_pass_it_and_both_end(
     async with watched(bill.middle) as server:
         env = account(server)
         sweep = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--reps", 3, "--yes")
-        runs = await asyncio.gather(
-            *(merge_runner(*sweep, *FAST, "--model", model, **env) for model in ("o3", "twin"))
-        )
-    assert {run.code for run in runs} <= {0, 3}, [run.err for run in runs]
+        runs = [
+            await merge_runner.start(*sweep, *FAST, "--model", model, **env)
+            for model in ("o3", "twin")
+        ]
+        codes = [await run.wait() for run in runs]
+    assert {*codes} <= {0, 3}
     assert 0 < bill.usd <= 7
     (calls,) = await sql(merge_runner, "select count(distinct call_key) as n from calls")
     assert calls["n"] <= server.requests
@@ -262,13 +270,6 @@ async def test_a_gateways_error_may_be_charged_whatever_its_form(merge_runner, e
     assert run.summary["set_aside_usd"] == pytest.approx(0.137 * unknown, rel=0.1)
 
 
-async def test_a_dry_run_makes_no_file(merge_runner, tmp_path):
-    before = sorted(path.name for path in tmp_path.rglob("*"))
-    assert (await merge_runner(*SWEEP, "--dry-run")).code == 0
-    assert sorted(path.name for path in tmp_path.rglob("*")) == before
-
-
-@pytest.mark.long
 async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(merge_runner):
     async def middle(request, handler):
         if server.requests in (3, 5):
@@ -298,32 +299,3 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
     assert after["spent_usd"] == account_before["spent_usd"]
     shown = await merge_runner("ledger")
     assert "server_error" not in shown.out
-
-
-async def test_nothing_is_released_while_another_run_asks(merge_runner):
-    async def middle(request, handler):
-        if server.requests > 1:
-            arrived.set()
-            await asyncio.Event().wait()
-        return await handler(request)
-
-    arrived = asyncio.Event()
-    async with watched(middle) as server:
-        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
-        process = await merge_runner.start(*sweep, **account(server))
-        await arrived.wait()
-        told = await merge_runner("ledger")
-        refused = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes")
-        process.kill()
-        await process.wait()
-    assert "  in flight  1  " in told.out
-    assert refused.code == 2
-    assert "another merge-runner works with" in refused.err
-    done = await merge_runner("ledger", "--release", "baseline/o3/set0", "--yes")
-    assert (done.code, "in flight" in done.out) == (0, False)
-
-
-async def test_a_folder_without_a_cache_has_no_ledger(merge_runner, tmp_path):
-    run = await merge_runner("ledger", "--cache", tmp_path / "none")
-    assert (run.code, "there is no cache" in run.err) == (2, True)
-    assert not (tmp_path / "none").exists()

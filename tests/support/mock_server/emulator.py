@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import socket
 import struct
@@ -26,13 +27,19 @@ from merge_runner.emulator.handler import (
     as_json,
     as_response,
 )
+from merge_runner.llm.formats import FORMATS
 from merge_runner.records import SCRIPTED_HEADER
 from tests.support.mock_server.batches import MODES, Batches, BrokenOff
 from tests.support.mock_server.errors import ERRORS, as_error
 from tests.support.mock_server.plans import FaultPlan
 
 BREAKS = ("hang", "reset", "truncated_body")
-REFUSAL = "I cannot help with that."
+WIRES = {
+    CHAT.path: "openai-chat",
+    RESPONSES.path: "openai-responses",
+    GEMINI.path: "gemini",
+    MESSAGES.path: "anthropic",
+}
 PROSE = "M\n\nI would rather describe my plan in words than write a list of numbers."
 # A linger time of zero sends a reset instead of an orderly close.
 RESET_AT_CLOSE = struct.pack("ii", 1, 0)
@@ -94,38 +101,11 @@ class FaultyEmulator(Emulator):
         body = super().answer(asked, attempt)
         if fault not in (*ERRORS, *BREAKS, "rate_limit", "bad_gateway"):
             self._answered[asked.body_sha256, asked.slot, custom_id] += 1
-        if fault == "malformed":
-            _put_text(asked, body, PROSE)
-        if fault in ("empty", "refused"):
-            _say_nothing(asked, body, refused=fault == "refused")
+        if fault in ("malformed", "empty"):
+            text = json.dumps(FORMATS[WIRES[asked.wire.path]].read(body).text)
+            said = json.dumps(PROSE if fault == "malformed" else "")
+            body = json.loads(json.dumps(body).replace(text, said))
         return body
-
-
-def _put_text(asked: Asked, body: dict[str, Any], text: str) -> None:
-    """Put another text in the place of an answer's."""
-    if asked.wire is CHAT:
-        body["choices"][0]["message"]["content"] = text
-    elif asked.wire is RESPONSES:
-        body["output"][1]["content"][0]["text"] = text
-    elif asked.wire is GEMINI:
-        body["candidates"][0]["content"]["parts"][0]["text"] = text
-    elif asked.wire is MESSAGES:
-        body["content"][0]["text"] = text
-
-
-def _say_nothing(asked: Asked, body: dict[str, Any], *, refused: bool) -> None:
-    """Take the text out of an answer, or put a refusal in its place."""
-    if asked.wire is CHAT:
-        said = {"content": None, "refusal": REFUSAL} if refused else {"content": ""}
-        body["choices"][0]["message"] |= said
-    elif asked.wire is RESPONSES:
-        said = {"type": "refusal", "refusal": REFUSAL} if refused else {"type": "output_text"}
-        body["output"][1]["content"] = [{"text": "", "annotations": [], **said}]
-    elif asked.wire is GEMINI:
-        del body["candidates"][0]["content"]["parts"]
-        body["candidates"][0]["finishReason"] = "SAFETY" if refused else "STOP"
-    elif asked.wire is MESSAGES:
-        body |= {"content": [], "stop_reason": "refusal" if refused else "end_turn"}
 
 
 @web.middleware

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import httpx
 
-from merge_runner.emulator.handler import GEMINI, MESSAGES, ServedFormat, as_response
+from merge_runner.emulator.handler import GEMINI, MESSAGES, ServedFormat, as_json
 from merge_runner.records import SCRIPTED_FIELD
 
 # The faults that are errors of the provider, beside a rate limit.
@@ -29,30 +28,26 @@ def error_body(wire: ServedFormat, status: int, message: str) -> dict[str, Any]:
     openai, gemini, anthropic = NAMES[status]
     if wire is GEMINI:
         error = {"code": status, "message": message, "status": gemini, "details": []}
-        return {"error": error, SCRIPTED_FIELD: True}
-    if wire is MESSAGES:
+    elif wire is MESSAGES:
         error = {"type": anthropic, "message": message}
-        return {
-            "type": "error",
-            "error": error,
-            "request_id": "req_emulated",
-            SCRIPTED_FIELD: True,
-        }
-    error = {"message": message, "type": openai, "param": None, "code": openai}
+        return {"type": "error", "error": error, "request_id": "req_mock", SCRIPTED_FIELD: True}
+    else:
+        error = {"message": message, "type": openai, "param": None, "code": openai}
     return {"error": error, SCRIPTED_FIELD: True}
 
 
 def as_error(wire: ServedFormat, status: int, message: str, delay_s: float = 0.0) -> httpx.Response:
     """An error in a provider's form, which asks to wait where it does so."""
-    headers = {"content-type": "application/json"}
-    body = error_body(wire, status, message)
+    body, headers = error_body(wire, status, message), {}
     if delay_s and wire is GEMINI:
         body["error"]["message"] += f" Please retry in {delay_s:.9f}s."
         kind = "type.googleapis.com/google.rpc.RetryInfo"
         body["error"]["details"] = [{"@type": kind, "retryDelay": f"{delay_s:.9f}s"}]
     elif delay_s and wire is MESSAGES:
-        headers["retry-after"] = str(delay_s)
+        headers = {"retry-after": str(delay_s)}
     elif delay_s:
         body["error"]["message"] += f" Please try again in {delay_s * 1000:.0f}ms."
-        headers["x-ratelimit-remaining-requests"] = "0"
-    return as_response(json.dumps(body, ensure_ascii=False).encode(), status, headers)
+        headers = {"x-ratelimit-remaining-requests": "0"}
+    response = as_json(body, status)
+    response.headers.update(headers)
+    return response

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from merge_runner.chance import draw
 
-# A sweep with these, which asks again, ends like one without; the others change what it records.
+# A sweep with these ends like one without; answers that are ``empty`` or ``malformed`` are kept.
 TRANSIENT = (
     "rate_limit",
     "request_timeout",
@@ -20,26 +20,22 @@ TRANSIENT = (
     "truncated_body",
     "truncated_json",
 )
-FAULTS = (*TRANSIENT, "empty", "refused", "malformed")
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchPlan:
     """What becomes of batches; rates are probabilities per line, ``lost`` per creation.
 
-    A line has its result within ``delay_s``, and a share ``slow`` of them ``slow_factor`` times as
-    late; a batch ends with its last line, but not before its state was asked for ``polls`` times.
-    A share ``failed`` of the lines ends with a 429, 500 or 503 and ``expired`` without being asked.
-    Of a share ``lost`` of the creations the answer is lost. While more than ``enqueued_tokens``
-    would wait, a batch is refused. Whoever asks for a file of results is told ``late_results``
-    times that there is none, and then gets half of it ``short_results`` times. Lists have the
-    newest batch first, or with ``oldest_first`` the oldest.
+    A line has its result within ``delay_s``; a batch ends with its last line, but not before its
+    state was asked for ``polls`` times. A share ``failed`` of the lines ends with a 429, 500 or
+    503 and ``expired`` without being asked. Of a share ``lost`` of the creations the answer is
+    lost. While more than ``enqueued_tokens`` would wait, a batch is refused. Whoever asks for a
+    file of results is told ``late_results`` times that there is none, and then gets half of it
+    ``short_results`` times. Lists have the newest batch first, or with ``oldest_first`` the oldest.
     """
 
     delay_s: float = 0.0
     polls: int = 0
-    slow: float = 0.0
-    slow_factor: float = 10.0
     failed: float = 0.0
     expired: float = 0.0
     lost: float = 0.0
@@ -51,7 +47,7 @@ class BatchPlan:
 
 @dataclass(frozen=True, kw_only=True)
 class FaultPlan:
-    """Rates of any of FAULTS per attempt; a hang is silent for ``hang_s``, and then closes.
+    """Rates of faults per attempt; a hang is silent for ``hang_s``, and then closes.
 
     Every answer takes ``latency_s``. A rate limit asks to wait ``delay_s``.
     """

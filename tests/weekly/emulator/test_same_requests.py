@@ -21,17 +21,14 @@ from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.models import read_models
 from merge_runner.records import Slot, make_request
-from tests.integration.emulator.test_sdks import (
+from tests.support.harness import PROJECT, Watched, watched
+from tests.weekly.emulator.test_sdks import (
     _no_settings_of_the_user,  # noqa: F401 # a fixture of every test here
     gemini_client,
     openai_client,
 )
-from tests.support.harness import PROJECT, Watched, watched
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWarning"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore:Inheritance class:DeprecationWarning")
 MODELS = read_models(PROJECT / "experiments/models.toml")
 CAP = 16000
 # What stands for the key that both send.

@@ -8,8 +8,6 @@ from merge_runner.results.store import results_digest
 from tests.support.harness import watched
 from tests.support.mock_server import TRANSIENT, FaultPlan
 
-pytestmark = pytest.mark.long
-
 # What each fault is to the client.
 OUTCOMES = {
     "rate_limit": "rate_limited",

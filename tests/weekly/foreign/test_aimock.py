@@ -11,12 +11,9 @@ import pytest
 AIMOCK = shutil.which("aimock")
 CHAOS = {"dropRate": 0.1, "malformedRate": 0.1, "disconnectRate": 0.1, "rateLimitRate": 0.05}
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.skipif(
-        AIMOCK is None, reason="aimock is not installed: npm install --global @copilotkit/aimock"
-    ),
-]
+pytestmark = pytest.mark.skipif(
+    AIMOCK is None, reason="aimock is not installed: npm install --global @copilotkit/aimock"
+)
 
 
 @pytest.fixture

@@ -20,12 +20,9 @@ BROKEN = ("rate_limit", "server_error", "overloaded", "reset", "truncated_body")
 FAULTS = FaultPlan(seed=2, rates=dict.fromkeys(BROKEN, 0.04))
 STARTING_S = 60
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.skipif(
-        LITELLM is None, reason="litellm is not installed: pip install 'litellm[proxy]'"
-    ),
-]
+pytestmark = pytest.mark.skipif(
+    LITELLM is None, reason="litellm is not installed: pip install 'litellm[proxy]'"
+)
 
 
 @pytest.fixture

@@ -15,8 +15,6 @@ from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot
 
-pytestmark = pytest.mark.long
-
 WIRES = {
     "openai-chat": "openai",
     "openai-responses": "openai",

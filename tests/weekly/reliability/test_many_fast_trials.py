@@ -34,7 +34,6 @@ def tell():
 atexit.register(tell)
 runpy.run_module("merge_runner", run_name="__main__", alter_sys=True)
 """
-pytestmark = pytest.mark.long
 
 
 def run(folder, *arguments):
@@ -99,20 +98,3 @@ def test_tables_of_twenty_thousand_of_them_are_printed_in_less_than_1_gb(few):
     code, errors, used = run(few, "tables", "indicators", "--db", many)
     assert code == 0, errors[-1000:]
     assert used["peak_mb"] < 1000
-
-
-@pytest.mark.xfail(
-    strict=True,
-    raises=AssertionError,
-    reason="4.3: each row of a decision is hashed by itself, 14 ms for a trial",
-)
-def test_the_digest_of_twenty_thousand_of_them_would_take_a_minute(few):
-    """On any machine: one such trial takes 3 ms where the program starts in 1 s."""
-    many = multiplied(few / "few.duckdb", 20)
-    cpu_s = []
-    for db in (few / "few.duckdb", many):
-        code, errors, used = run(few, "digest", "--db", db)
-        if code:
-            pytest.fail(errors)
-        cpu_s.append(used["cpu_s"])
-    assert cpu_s[1] / cpu_s[0] < 8

@@ -9,10 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from merge_runner.results.database import SETTINGS
 from merge_runner.results.store import query
-
-pytestmark = pytest.mark.long
 
 OLDEST = "1.2.2"
 READ = """
@@ -70,7 +67,3 @@ async def test_an_old_duckdb_reads_every_table_and_view(merge_runner, tmp_path, 
     rows = read_by(old_client, tmp_path / "results/merge.duckdb")
     assert rows["trial_metrics"] == rows["trials"] == 1
     assert min(rows[name] for name in ("states", "attempts", "geometry")) > 0
-
-
-def test_the_promised_version_is_the_one_that_is_tested():
-    assert SETTINGS["storage_compatibility_version"] == f"v{OLDEST.rsplit('.', 1)[0]}.0"

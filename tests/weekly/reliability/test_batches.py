@@ -1,0 +1,112 @@
+"""Sweeps in batches that are killed, change their mode, or ask first situations alone."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import signal
+
+import pytest
+
+from merge_runner.results.store import results_digest
+from tests.integration.reliability.test_batches import (
+    account,
+    answered,
+    interrupted,
+    priced,  # noqa: F401 # a fixture
+    rows,
+)
+from tests.support.harness import watched
+from tests.support.mock_server import BatchPlan, FaultPlan
+
+KILLS = 20
+pytestmark = pytest.mark.usefixtures("priced")
+
+
+async def test_a_sweep_that_is_killed_at_20_instants_pays_nothing_twice(merge_runner, tmp_path):
+    """Half of the kills come when a batch is created and its id not told yet, or told and lost."""
+
+    async def middle(request, handler):
+        creates = request.method == "POST" and request.path == "/v1/batches"
+        if creates and at == "before":
+            process.kill()
+        reply = await handler(request)
+        if creates and at == "after":
+            process.kill()
+        return reply
+
+    study = "[repetitions]\nbaseline = 1\n[scenario]\ntimeout_s = 8\n"  # enough rounds to die in
+    (tmp_path / "long.toml").write_text(study)
+    sweep = ("sweep", "long.toml", "--reps", 2, "--model", "priced", "--batch", "--yes", "--json")
+    chance, killed = random.Random(5), 0
+    plan = BatchPlan(delay_s=0.5, failed=0.1, expired=0.05)
+    async with watched(middle, FaultPlan(seed=3, batch=plan)) as server:
+        env = account(server)
+        for number in range(KILLS):
+            at = ("before", "after", "anywhere", "anywhere")[number % 4]
+            process = await merge_runner.start(*sweep, **env)
+            ended = asyncio.create_task(process.wait())
+            patience_s = chance.uniform(0.3, 3) if at == "anywhere" else 15
+            await asyncio.wait([ended], timeout=patience_s)
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            killed += await ended == -signal.SIGKILL
+        at = "never"
+        last = await merge_runner(*sweep, **env)
+        batched, alone = await answered(server)
+    assert last.code == 0, last.err
+    assert killed >= KILLS / 4
+    assert max(batched.values()) == 1, "a call was answered in two batches"
+    # As in any sweep, an answer is lost that was on its way to a call made singly.
+    query = "select count(*) as n from calls where outcome = 'unknown'"
+    (lost,) = await rows(merge_runner, query)
+    assert len(batched.keys() & alone.keys()) <= lost["n"] <= KILLS
+    assert last.summary["trials"]["failed"] == 0
+    quiet = ("sweep", "long.toml", "--reps", 2, "--model", "priced", "--yes")
+    async with watched() as server:
+        plain = await merge_runner(*quiet, "--db", "quiet", "--cache", "new", **account(server))
+    assert plain.code == 0, plain.err
+    digest = results_digest(tmp_path / "results/merge.duckdb")
+    assert digest == results_digest(tmp_path / "quiet")
+    assert digest[1] == 22
+    query = "select count(*) as n from calls where outcome = 'ok' and batch_id is not null"
+    (used,) = await rows(merge_runner, query)
+    assert used["n"] == batched.total()
+
+
+async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path):
+    sweep = ("sweep", "short.toml", "--model", "priced", "--yes")
+    plan = FaultPlan(latency_s=0.02, batch=BatchPlan(delay_s=0.5))
+    async with watched(faults=plan) as server:
+        env = account(server)
+        process = await merge_runner.start(*sweep, "--in-flight", 2, **env)
+        while server.requests < 20:  # another process asks
+            await asyncio.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        assert await process.wait() == 130
+        await interrupted(merge_runner, server, *sweep, "--batch", **env)
+        last = await merge_runner(*sweep, **env)
+        batched, alone = await answered(server)
+        plain = await merge_runner(*sweep, "--db", "plain", "--cache", "new", **env)
+    assert (last.code, plain.code) == (0, 0), last.err
+    assert "are not asked again" in last.err
+    assert batched
+    assert max(batched.values()) == 1
+    assert not batched.keys() & alone.keys()
+    digest = results_digest(tmp_path / "results/merge.duckdb")
+    assert digest == results_digest(tmp_path / "plain")
+
+
+async def test_first_situations_take_one_batch(merge_runner, tmp_path):
+    first = ("sweep", "baseline", "--first", "--reps", 1)
+    async with watched(faults=FaultPlan(batch=BatchPlan(polls=8))) as server:
+        env = account(server)
+        left = await interrupted(merge_runner, server, *first, "--batch", **env)
+        run = await merge_runner(*first, "--batch", **env)
+        plain = await merge_runner(*first, "--db", "plain", "--cache", "new", **env)
+    assert [run.code, plain.code] == [0, 0], run.err
+    assert left.count("open batch: 22 calls of emulator wait in batch ") == 1
+    (batches,) = await rows(merge_runner, "select count(distinct batch_id) as n from calls")
+    assert batches["n"] == 1
+    assert results_digest(tmp_path / "results/merge.duckdb") == results_digest(tmp_path / "plain")
