@@ -1,10 +1,8 @@
 """Trials of the model: played by the runner, and simulated."""
 
-from __future__ import annotations
-
 from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.registry import PROGRAMS, Program
-from merge_runner.records import SIDES, TrialRecord
+from merge_runner.drivers.registry import PROGRAMS
+from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_cei.agents import Model
@@ -14,31 +12,28 @@ from merge_runner_cei.parameters import SETS, Habits, offsets_of
 from tests.support.driven_trials import both, play, spec
 
 
-def scenario(**changes) -> ScenarioConfig:
+def scenario(**changes):
     usual = {"step_s": 0.05, "collision_rule": "rectangle", "resistance": "human"}
     return ScenarioConfig(**usual | changes)
 
 
-def model(task: ScenarioConfig, name: str = "K0", habits: Habits | None = None) -> Model:
-    return Model(task_of(task, TRACK), SETS[name], habits or Habits())
+def model(task, **habits):
+    return Model(task_of(task, TRACK), SETS["K0"], Habits(**habits))
 
 
-def cei(**changes) -> Program:
+def cei(*, clock=None, **changes):
     """The program as a study may change it."""
-    clock = changes.pop("clock", None)
     return PROGRAMS["cei"].with_changes("cei", changes, clock)
 
 
-async def played(
-    condition: str, repetition: int, task: ScenarioConfig, program: Program
-) -> TrialRecord:
+async def played(condition, repetition, task, program):
     return await play(both(program), condition, repetition, scenario=task)
 
 
-def simulated(condition: str, repetition: int, task: ScenarioConfig, name: str = "K0") -> Trial:
+def simulated(condition, repetition, task):
     """The same trial for the batch: same seeds, same pair."""
     one = spec(condition, repetition)
     left, right = (PROGRAMS["cei"].seat(task, one, side).seed for side in SIDES)
     offsets = offsets_of(0, repetition)
-    drivers = SETS[name].base(offsets.left), SETS[name].base(offsets.right)
+    drivers = SETS["K0"].base(offsets.left), SETS["K0"].base(offsets.right)
     return Trial(CONDITIONS[condition], drivers, (left, right))

@@ -1,10 +1,7 @@
 """Trials that programs drive, without a study."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
-from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES, TrialSpec
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
@@ -12,7 +9,7 @@ from merge_runner.trial import play_trial
 OTHER = {"left": "right", "right": "left"}
 
 
-def spec(condition: str, repetition: int = 1) -> TrialSpec:
+def spec(condition, repetition=1):
     trial_id = f"test/baseline/{condition}/rep{repetition:02d}"
     who = (trial_id, "test", "driver", "a", "b", "baseline", condition, repetition, 0, 0)
     return TrialSpec(*who, kinematics=CONDITIONS[condition])
@@ -22,9 +19,7 @@ def both(program):
     return dict.fromkeys(SIDES, program)
 
 
-async def play(
-    programs, condition: str, repetition: int = 1, *, scenario: ScenarioConfig, seeds=None
-):
+async def play(programs, condition, repetition=1, *, scenario, seeds=None):
     """A trial of these programs by side; ``seeds`` by side in place of the slot's."""
     trial, drivers = spec(condition, repetition), {}
     for side, program in programs.items():

@@ -12,15 +12,7 @@ from merge_runner.errors import UsageError
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.support.driven_trials import both, play
 
-MERGE_POINT_M = 100.0
-LENGTH_M = 4.5
-
-
-@pytest.mark.parametrize("condition", CONDITIONS)
-async def test_two_constant_drivers_keep_their_speed_and_collide(condition):
-    trial = await play(both(PROGRAMS["constant"]), condition, scenario=ScenarioConfig())
-    assert (trial.status, trial.merged_first) == ("collided", None)
-    assert {row.acceleration_mps2 for row in trial.states} == {0.0}
+CONSTANT = PROGRAMS["constant"].driver
 
 
 @pytest.mark.parametrize("rule", ["euclid2d", "rectangle", "shared_lane"])
@@ -37,38 +29,33 @@ async def test_the_projected_order_opens_a_human_gap_behind_the_earlier_arrival(
     assert -1.5 - 1e-9 <= min(row.acceleration_mps2 for row in second) < 0
     # Net of the vehicle length, at the moment when the first car is at the merge point, which
     # lies within a step, during which the cars drive at nearly constant speed.
-    step = next(k for k, row in enumerate(first) if row.position_m >= MERGE_POINT_M)
+    step = next(k for k, row in enumerate(first) if row.position_m >= 100)
     (first_m, first_on_m), (second_m, second_on_m) = (
         [row.position_m for row in rows[step - 1 : step + 1]] for rows in (first, second)
     )
-    share = (MERGE_POINT_M - first_m) / (first_on_m - first_m)
+    share = (100 - first_m) / (first_on_m - first_m)
     behind_m = second_m + share * (second_on_m - second_m)
-    assert MERGE_POINT_M - behind_m - LENGTH_M == pytest.approx(3.85, abs=0.01)
+    assert 100 - behind_m - 4.5 == pytest.approx(3.85, abs=0.01)
 
 
 @pytest.mark.parametrize("driver", ["constant", "projected-order"])
-async def test_a_program_holds_one_action_over_a_whole_plan(driver):
+async def test_a_program_holds_one_action_over_a_whole_plan_and_constant_none(driver):
     trial = await play(both(PROGRAMS[driver]), "L_4_-8", scenario=ScenarioConfig())
     for decision in (row.decision for row in trial.decisions):
         action = decision.plan[0]
         assert (decision.plan, decision.applied) == ((action,) * 20, (action,) * 5)
-        assert abs(action) <= 1
+        assert action == 0 if driver == "constant" else abs(action) <= 1
         assert (decision.valid, decision.prompt) == (True, None)
-
-
-class Undecided:
-    def __init__(self, seat):
-        self.seat = seat
 
 
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (lambda: Program(partial(Undecided), "x"), "is no class"),
-        (lambda: Program(Undecided, "x", rate_hz=0), "needs a rate_hz above 0"),
-        (lambda: Program(Undecided, "x", rate_hz=float("inf")), "needs a rate_hz above 0"),
-        (lambda: Program(Undecided, "x", {"g": float("nan")}), "must be finite numbers"),
-        (lambda: Program(Undecided, "x", {"g": {1}}), "must be finite numbers"),
+        (lambda: Program(partial(CONSTANT), "x"), "is no class"),
+        (lambda: Program(CONSTANT, "x", rate_hz=0), "needs a rate_hz above 0"),
+        (lambda: Program(CONSTANT, "x", rate_hz=float("inf")), "needs a rate_hz above 0"),
+        (lambda: Program(CONSTANT, "x", {"g": float("nan")}), "must be finite numbers"),
+        (lambda: Program(CONSTANT, "x", {"g": {1}}), "must be finite numbers"),
         (lambda: PROGRAMS.register("a+b", PROGRAMS["constant"]), "needs a name of letters"),
     ],
 )

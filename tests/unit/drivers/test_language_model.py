@@ -9,8 +9,8 @@ from merge_runner.drivers.base import Seat
 from merge_runner.drivers.language_model import LlmDriver
 from merge_runner.drivers.pace import model_pace
 from merge_runner.prompts.blocks import prompt_of
-from merge_runner.records import ChatReply, ChatRequest, Observation, Slot, TrialSpec
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.records import ChatReply, ChatRequest, Observation, Slot
+from tests.support.driven_trials import spec
 
 PLAN = tuple(round(0.01 * k, 2) for k in range(1, 21))  # 0.01 to 0.20, no two alike
 OTHER_PLAN = tuple(-a for a in PLAN)
@@ -18,16 +18,10 @@ ZEROS = (0.0,) * 5
 INVALID = "I would rather not say."
 
 SEEN = Observation("merge", 10.0, 10.0, 0.0, 50.0, (0.0,) * 10, (10.0,) * 10, 50.0, 0.0)
-REQUEST = ChatRequest(
-    key="key",
-    provider="test",
-    endpoint="test",
-    model="model",
-    path="/chat",
-    headers={},
-    body="{}",
-    slot=Slot("N_0_0", 1, "left", 0, 0),
-)
+SLOT = Slot("N_0_0", 1, "left", 0, 0)
+REQUEST = ChatRequest("key", "test", "test", "model", "/chat", {}, "{}", SLOT)
+STRAIGHT = replace(SEEN, road="straight", distance_to_merge_m=None)
+GO_ON = f"I go on.\n{list(PLAN)}"
 
 
 def valid(plan):
@@ -39,10 +33,7 @@ def chat_reply(text, outcome="ok"):
 
 
 async def decide(*replies, seen=SEEN, variant="baseline", known=None, begins=0, **scenario):
-    """One decision per reply, a text or a ChatReply; ``known`` says what was asked earlier.
-
-    ``begins`` is the number of the first decision.
-    """
+    """One decision per reply, from number ``begins`` on; ``known`` says what was asked earlier."""
     asked = []
 
     async def ask(prompt, slot, _):
@@ -51,11 +42,8 @@ async def decide(*replies, seen=SEEN, variant="baseline", known=None, begins=0, 
         return chat_reply(reply) if isinstance(reply, str) else reply
 
     scenario = ScenarioConfig(**scenario)
-    spec = TrialSpec(
-        "t", "s", "llm", "m", "m", variant, "N_0_0", 1, 0, 0, kinematics=CONDITIONS["N_0_0"]
-    )
     seat = Seat(scenario, "left", model_pace(scenario), 0)
-    driver = LlmDriver(ask, spec, seat, prompt_of(variant), known=known)
+    driver = LlmDriver(ask, spec("N_0_0"), seat, prompt_of(variant), known=known)
     decisions = [await driver.decide(seen, begins + n) for n in range(len(replies))]
     assert [prompt for prompt, _ in asked] == [decision.prompt for decision in decisions]
     assert [number - begins for _, number in asked] == list(range(len(replies)))
@@ -104,11 +92,8 @@ async def test_a_prompt_that_an_earlier_version_has_asked_stays_as_it_was(asked,
     assert [remaining(d) for d in decisions[1:]] == [expected, "none"]
 
 
-STRAIGHT = replace(SEEN, road="straight", distance_to_merge_m=None)
-
-
 async def test_a_plan_without_the_decision_that_was_asked_for_is_driven_and_named():
-    (decision,) = await decide(f"I go on.\n{list(PLAN)}")
+    (decision,) = await decide(GO_ON)
     assert (decision.valid, decision.failure, decision.tactical) == (True, "no_decision", None)
     assert (decision.plan, decision.applied, decision.fallback) == (PLAN, PLAN[:5], False)
 
@@ -116,14 +101,12 @@ async def test_a_plan_without_the_decision_that_was_asked_for_is_driven_and_name
 @pytest.mark.parametrize(
     ("seen", "variant", "text"),
     [
-        (STRAIGHT, "baseline", f"I go on.\n{list(PLAN)}"),
-        (SEEN, "A7", f"I go on.\n{list(PLAN)}"),
+        (STRAIGHT, "baseline", GO_ON),
+        (SEEN, "A7", GO_ON),
         (SEEN, "baseline", f"Decision: Merge first\n{list(PLAN)}"),
     ],
 )
-async def test_nothing_is_missing_where_no_decision_is_asked_for_or_one_is_given(
-    seen, variant, text
-):
+async def test_nothing_is_missing_where_none_is_asked_for_or_one_is_given(seen, variant, text):
     (decision,) = await decide(text, seen=seen, variant=variant)
     assert (decision.valid, decision.failure) == (True, None)
 
@@ -186,5 +169,5 @@ async def test_an_answer_that_is_not_ok_is_named_and_not_searched_for_a_plan(out
 
 async def test_the_variant_and_what_is_seen_decide_the_prompt():
     (baseline,), (ablated,) = await decide(INVALID), await decide(INVALID, variant="A2")
-    assert ["Previous plan" in each.prompt for each in (baseline, ablated)] == [True, False]
+    assert ("Previous plan" in baseline.prompt, "Previous plan" in ablated.prompt) == (True, False)
     assert "Your distance to the merge point: 50.00 m" in baseline.prompt

@@ -1,5 +1,7 @@
 """Replies as models write them: what is read, what is refused by name, and nothing is run."""
 
+import re
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,8 +12,12 @@ from tests.support.cases import table
 N = 20
 PLAN = tuple(round(0.05 * k - 0.5, 2) for k in range(N))
 LIST = str(list(PLAN))
-OTHER = str([-0.5] * N)
-TIMES = str([round(0.2 * k, 1) for k in range(N)])  # out of range
+WORDS = {
+    "@LIST": LIST,
+    "@OTHER": str([-0.5] * N),
+    "@TIMES": str([round(0.2 * k, 1) for k in range(N)]),
+    "@ZEROS": ", ".join(["0.0"] * (N - 1)),
+}
 REFUSALS = {*table("replies", "entries").values(), "no_array", "several_arrays"}
 MANY = 250_000
 
@@ -22,7 +28,11 @@ def fenced(code, tag="python"):
 
 def with_first(entry):
     """A plan of the right length whose first entry is ``entry``."""
-    return fenced(f"[{entry}, {', '.join(['0.0'] * (N - 1))}]")
+    return fenced(f"[{entry}, {WORDS['@ZEROS']}]")
+
+
+def spelt(reply):
+    return re.sub("@[A-Z]+", lambda word: WORDS[word[0]], reply)
 
 
 @pytest.mark.parametrize("tag", ["python", "Python", "py", "json", "", " python "])
@@ -61,31 +71,9 @@ def test_a_sloppily_written_list_is_read(code):
     assert (parsed.plan, parsed.failure) == (PLAN, None)
 
 
-@pytest.mark.parametrize(
-    "reply",
-    [
-        LIST,
-        f"M\nI go first.\n{LIST}",
-        f"M\nI go first: {LIST} is my plan.",
-        f"M\nI go first.\n```python\n{LIST}",
-        f"M\n```\n{LIST}\n```\nI stay ahead by about 5 m [see above].",
-        f"M\nThe [other] car, at [0.1, 0.2], is behind.\n```python\n{LIST}\n```",
-        f"```python\n{LIST}\n```\nAgain:\n```python\n{LIST}\n```",
-        f"[a safe gap] {LIST}",
-        f"{fenced(LIST)}\n{fenced('[0.0]')}",
-        f"{fenced('headways = [4.5, 9.1]')}\n{fenced(LIST)}",
-        fenced(f"times = {TIMES}\nplan = {LIST}"),
-        fenced(f"[{TIMES}, {LIST}]"),
-        fenced("") + LIST,
-        f"{LIST}\nIn a terminal, run\n```sh\nls [a-z]*\n```",
-        # What stands in code comes before what stands in prose.
-        f"An array like {list(range(20))} is asked for.\n{fenced(LIST)}",
-        f"An array like {[0] * 20} would keep my speed.\n{fenced(LIST)}",
-        f"{fenced(LIST)}\nI could also have braked: {OTHER}.",
-    ],
-)
+@pytest.mark.parametrize("reply", table("replies", "valid"))
 def test_one_valid_list_is_enough_wherever_it_stands(reply):
-    assert parse_reply(reply, N).plan == PLAN
+    assert parse_reply(spelt(reply), N).plan == PLAN
 
 
 def test_line_endings_change_nothing():
@@ -93,47 +81,16 @@ def test_line_endings_change_nothing():
     assert parse_reply(reply.replace("\n", "\r\n"), N) == parse_reply(reply, N)
 
 
-def test_whole_numbers_and_both_bounds_are_valid():
-    assert parse_reply(with_first("-1"), N).plan == (-1.0,) + (0.0,) * (N - 1)
-    assert parse_reply(with_first("1"), N).plan == (1.0,) + (0.0,) * (N - 1)
-
-
-def test_the_length_that_is_wanted_is_the_callers():
+def test_whole_numbers_and_both_bounds_are_valid_and_the_length_is_the_callers():
+    for bound in (-1, 1):
+        assert parse_reply(with_first(bound), N).plan == (bound,) + (0.0,) * (N - 1)
     assert parse_reply("[0.1, 0.2]", 2).plan == (0.1, 0.2)
     assert parse_reply("[0.1, 0.2]", 3).failure == "wrong_length"
 
 
-@pytest.mark.parametrize(
-    ("reply", "failure"),
-    [
-        ("", "no_array"),
-        ("I cannot help with that.", "no_array"),
-        (fenced("0.1, 0.2"), "no_array"),
-        (fenced("(" + LIST[1:-1] + ")"), "no_array"),
-        (fenced(LIST[:-1]), "no_array"),  # cut off in the middle of the list
-        (fenced(LIST + LIST.replace("0.45", "0.46")), "several_arrays"),
-        (f"{fenced(LIST)}\n{fenced(OTHER)}", "several_arrays"),
-        (f"Either {LIST} or {OTHER}.", "several_arrays"),
-        (f"Either {LIST} or {OTHER}.\n{fenced('[0.0]')}", "several_arrays"),
-        (f"{fenced(f'[{LIST}, {OTHER}]')}\nI take {LIST}.", "several_arrays"),
-        # Of several lists that are no plan, the one that comes nearest says what is wrong.
-        (fenced("[0.5] * 5 + [0.0] * 15"), "wrong_length"),
-        (f"[a safe gap] {[0.0] * 19}", "wrong_length"),
-        (fenced(f"[x for x in y] {[0.0] * 19} {TIMES}"), "out_of_range"),
-        (f"{fenced(str([0.0] * 19))}\nAt {TIMES} s.", "out_of_range"),
-        (f"[0.1] {with_first('None')}", "not_a_number"),
-        (f"[0.1] {with_first('nan')} {with_first('None')}", "not_finite"),
-        (fenced(str([[0.1]] * N)), "wrong_length"),
-        (fenced(f"[{[0.1] * 10}, {[0.2] * 10}]"), "wrong_length"),
-        (fenced("[]"), "wrong_length"),
-        (fenced("[0.1]*20"), "wrong_length"),
-        (fenced(str([0.0] * 19)), "wrong_length"),
-        (fenced("[0.1 for _ in range(20)]"), "not_a_number"),
-        (fenced(LIST.replace(", ", "; ")), "not_a_number"),
-    ],
-)
+@pytest.mark.parametrize(("reply", "failure"), table("replies", "refused").items())
 def test_what_holds_not_one_plan_is_refused_by_name(reply, failure):
-    parsed = parse_reply(reply, N)
+    parsed = parse_reply(spelt(reply), N)
     assert (parsed.plan, parsed.failure) == (None, failure)
 
 

@@ -1,7 +1,5 @@
 """Imported human trials that are driven again: what they were, to the last digit."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -74,23 +72,12 @@ def recorded(db, trial_id):
 
 
 def driven(trial, sides=SIDES):
-    return {
-        (row.time_s, row.side): [row.position_m, row.velocity_mps]
-        for row in trial.states
-        if row.side in sides
-    }
+    rows = [row for row in trial.states if row.side in sides]
+    return {(row.time_s, row.side): [row.position_m, row.velocity_mps] for row in rows}
 
 
 # A human who is told a wrong own speed keeps its trace, too.
-BLURRED = """
-[factors]
-perception = ["blurred"]
-[perception.blurred]
-speed_sd_mps = 0.5
-own = true
-"""
-
-
+BLURRED = '[factors]\nperception = ["b"]\n[perception.b]\nspeed_sd_mps = 0.5\nown = true\n'
 TEXTS = {"human": HUMAN, "none": HUMAN.replace('"human"', '"none"'), "blurred": HUMAN + BLURRED}
 
 
@@ -210,6 +197,8 @@ async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
     page = explored.get("/trials/human-replay+idm/baseline/L_4_0/rep01").text
     assert f"Note: {said}." in page
     assert "baseline: no prompt, since only programs drive." in page
+    looked = (await merge_runner("sweep", *command, "--first")).summary["first_looks"]
+    assert {look["model"] for look in looked} == {"human-replay", "idm"}
     # A replay needs the same import, and says so.
     assert (await merge_runner("replay", *command)).summary["trials"]["failed"] == 0
     elsewhere = await merge_runner("replay", *command, "--db", "none.duckdb")
@@ -218,10 +207,3 @@ async def test_a_sweep_of_them_is_stored_audited_and_shown_with_a_caution(
         connection.execute("DELETE FROM trials WHERE source = 'human'")
     notes = [note for sweep in audit_database(db) for note in sweep.notes]
     assert any("other data: left.data" in note for note in notes)
-
-
-async def test_imported_humans_are_asked_what_they_do_first(merge_runner, db, tmp_path):
-    (tmp_path / "mine.toml").write_text(HUMAN)
-    ask = ("mine.toml", "--model", "human-replay+idm", "--reps", 1, "--conditions", "L_4_0")
-    run = await merge_runner("sweep", *ask, "--first", "--json")
-    assert {look["model"] for look in run.summary["first_looks"]} == {"human-replay", "idm"}

@@ -1,7 +1,5 @@
 """The track and the vehicles in SQL are those of the simulator, for vehicles of any size."""
 
-from __future__ import annotations
-
 import json
 
 import duckdb
@@ -9,7 +7,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from merge_runner.config import ScenarioConfig
 from merge_runner.results.database import schema_sql
 from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import MEAN_SPEED_MPS
@@ -34,8 +31,8 @@ def geometry(database, spec):
 
 
 def of_size(database, length_m, width_m):
-    scenario = {"vehicle_length_m": length_m, "vehicle_width_m": width_m}
-    return geometry(database, {"scenario": scenario})
+    size = {"vehicle_length_m": length_m, "vehicle_width_m": width_m}
+    return geometry(database, {"scenario": size})
 
 
 def test_the_track_in_sql_is_the_simulators(database):
@@ -46,22 +43,15 @@ def test_the_track_in_sql_is_the_simulators(database):
 
 @pytest.mark.parametrize("spec", [{"source": "human"}, {"scenario": {}}])
 def test_a_size_that_a_spec_does_not_say_is_that_of_the_experiment(database, spec):
-    found, usual = geometry(database, spec), ScenarioConfig()
-    size = (usual.vehicle_length_m, usual.vehicle_width_m)
-    assert (found["length_m"], found["width_m"]) == size
+    found = geometry(database, spec)
+    assert (found["length_m"], found["width_m"]) == (4.5, 1.8)
 
 
 def test_the_bounds_of_the_experiments_vehicles_are_the_known_ones(database):
     found = of_size(database, 4.5, 1.8)
-    expected = {
-        "front_m": 97.75,
-        "rear_m": 102.25,
-        "contact_m": 90.6065,
-        "contact_high_m": 95.1065,
-        "merge_low_m": 95.3471,
-        "merge_high_m": 104.5949,
-    }
-    assert {name: round(found[name], 4) for name in expected} == expected
+    names = ("front_m", "rear_m", "contact_m", "contact_high_m", "merge_low_m", "merge_high_m")
+    bounds = [97.75, 102.25, 90.6065, 95.1065, 95.3471, 104.5949]
+    assert [round(found[name], 4) for name in names] == bounds
 
 
 @given(st.floats(0.5, 30), st.floats(0.2, 6))
@@ -72,10 +62,11 @@ def test_the_bounds_of_the_experiments_vehicles_are_the_known_ones(database):
 @example(0.5, 6.0)
 def test_boxes_overlap_between_the_bounds_and_nowhere_else(database, length_m, width_m):
     found = of_size(database, length_m, width_m)
+    contact_m, merge_m, end_m = found["contact_m"], TRACK.merge_point_m, TRACK.end_m
     points = (
-        (found["contact_m"] + HAIR_M / 1000, found["contact_m"], found["contact_high_m"]),
-        (TRACK.merge_point_m, found["merge_low_m"], found["merge_high_m"]),
-        (TRACK.end_m, TRACK.end_m - length_m, TRACK.end_m + length_m),
+        (contact_m + HAIR_M / 1000, contact_m, found["contact_high_m"]),
+        (merge_m, found["merge_low_m"], found["merge_high_m"]),
+        (end_m, end_m - length_m, end_m + length_m),
     )
     for at_m, low_m, high_m in points:
         inside = [low_m + HAIR_M, high_m - HAIR_M]

@@ -1,7 +1,5 @@
 """Which version of the measures a database has."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path

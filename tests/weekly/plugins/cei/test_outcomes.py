@@ -1,6 +1,7 @@
 """What a simulation is summed up by is what the analysis says of the same trials."""
 
 import asyncio
+from itertools import product
 
 import numpy as np
 import pytest
@@ -14,11 +15,7 @@ from merge_runner_cei.calibration.outcomes import measured, summary
 from tests.support.cei_trials import cei, model, played, scenario, simulated
 
 # Among them are trials that collide.
-TRIALS = [
-    (condition, repetition)
-    for condition in ("N_0_0", "L_0_-8", "R_-4_8", "L_4_8")
-    for repetition in range(1, 4)
-] + [("N_0_0", 18), ("N_0_0", 25)]
+TRIALS = [*product(("N_0_0", "L_0_-8", "R_-4_8", "L_4_8"), (1, 2, 3)), ("N_0_0", 18), ("N_0_0", 25)]
 MEASURES = ("gap_mean100_m", "conflict_resolution_s")
 
 
@@ -28,12 +25,8 @@ def both(tmp_path_factory):
     task = scenario()
     db = tmp_path_factory.mktemp("cei") / "merge.duckdb"
 
-    async def play():
-        return [await played(*trial, task, cei(set="K0")) for trial in TRIALS]
-
-    Store(db).add_recorded(
-        asyncio.run(play()), {"test": canonical_json({"scenario": task.model_dump()})}
-    )
+    records = [asyncio.run(played(*trial, task, cei(set="K0"))) for trial in TRIALS]
+    Store(db).add_recorded(records, {"test": canonical_json({"scenario": task.model_dump()})})
     trials = [simulated(*trial, task) for trial in TRIALS]
     study = model(task)
     frame = measured(study.task, trials, simulate(study, trials))
@@ -82,9 +75,6 @@ async def test_drivers_that_see_each_other_late_mostly_still_avoid_a_collision(
 ):
     eyes = {f"perception_{side}": Perception(**perception) for side in SIDES}
     task, driver = scenario(resistance=resistance, **eyes), cei(clock=clock_s)
-    trials = [
-        await played(condition, repetition, task, driver)
-        for condition in ("L_4_-8", "N_0_0", "R_-4_8")
-        for repetition in range(1, 4)
-    ]
+    slots = product(("L_4_-8", "N_0_0", "R_-4_8"), (1, 2, 3))
+    trials = [await played(*slot, task, driver) for slot in slots]
     assert sum(trial.status == "collided" for trial in trials) <= 4

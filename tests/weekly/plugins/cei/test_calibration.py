@@ -1,0 +1,148 @@
+"""The calibration of cei: the authors' fit of known drivers, the search, and what the docs tell."""
+
+import re
+import subprocess
+import sys
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+from merge_runner.errors import UsageError
+from merge_runner.records import SIDES
+from merge_runner.results.store import Store
+from merge_runner_analysis.data.load import load
+from merge_runner_analysis.data.reference_data import PAIRS
+from merge_runner_analysis.human.record import SPEC, SPEC_HASH, Trace, trial_record
+from merge_runner_cei.batch import simulate
+from merge_runner_cei.calibration import __main__ as calibration
+from merge_runner_cei.calibration.authors_fit import GRID, REACTIONS, estimated, grid_speeds
+from merge_runner_cei.calibration.design import design, experiment, model_of
+from merge_runner_cei.calibration.search import MISSING, cost, search, targets
+from merge_runner_cei.calibration.searches import SEARCHES
+from merge_runner_cei.driver import check
+from merge_runner_cei.parameters import OFFSETS, SETS, TICK_S, Base
+from tests.support.cei_trials import scenario, simulated
+from tests.support.harness import PROJECT, environment
+
+ENDS = {"finished": "Finished", "collided": "Collided", "timeout": "Time ran out"}
+
+
+@pytest.fixture(scope="module")
+def humans(tmp_path_factory):
+    """A database in which each pair of the model's has driven each condition, as humans."""
+    trials = design(SETS["K0"], experiment(), 0, 5)
+    traces = simulate(model_of(SETS["K0"], experiment()), trials, tunnel=True)
+
+    def record(n):
+        until, experiments = traces.ended_at[n] + 1, [*PAIRS]
+        positions, speeds = (
+            {side: of[:until, i, n].tolist() for i, side in enumerate(SIDES)}
+            for of in (traces.positions_m, traces.speeds_mps)
+        )
+        trace = Trace(TICK_S, ENDS[str(traces.status[n])], positions, speeds)
+        # The pairs of the design take turns.
+        return trial_record(trace, experiments[n % len(OFFSETS)], n)
+
+    db = tmp_path_factory.mktemp("humans") / "merge.duckdb"
+    Store(db).add_recorded([record(n) for n in range(len(trials))], {SPEC_HASH: SPEC})
+    return db
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["calibration", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            calibration.main()
+        printed = capsys.readouterr()
+        return ended.value.code, printed.out + printed.err
+
+    return run
+
+
+def test_the_command_prints_a_driver_that_a_study_can_play(humans, command):
+    code, printed = command("fit", "--db", humans)
+    assert (code, printed.count("pair9-right")) == (0, 2)
+    assert 'program = "cei"' in printed
+    assert "upper_product = " in printed
+
+
+def test_a_database_without_humans_or_an_unknown_set_says_what_to_type(tmp_path, command):
+    Store(tmp_path / "merge.duckdb").add_recorded([], {})
+    code, printed = command("fit", "--db", tmp_path / "merge.duckdb")
+    assert (code, "human import PATH" in printed) == (2, True)
+    code, printed = command("check", "K9")
+    assert (code, "K0" in printed) == (UsageError.exit_code, True)
+
+
+def test_the_order_of_the_drivers_is_found_again(humans):
+    estimates = estimated(load(REACTIONS, humans))
+    for n, threshold in enumerate(("lower", "upper")):
+        planted = {
+            f"pair{pair}-{side}": SETS["K0"].base(offset)[n]
+            for pair, offsets in enumerate(OFFSETS, 1)
+            for side, offset in zip(SIDES, offsets, strict=True)
+        }
+        found = estimates.groupby("driver")[threshold].mean()
+        assert spearmanr(found, [planted[name] for name in found.index])[0] > 0.8
+
+
+def test_an_agent_of_the_grid_is_given_its_own_thresholds_or_equal_ones():
+    speeds = grid_speeds()
+    assert {len(found) for found in speeds.values()} == {len(GRID)} == {625}
+    # Mirrored conditions are one for the two sides.
+    np.testing.assert_array_equal(speeds["L_4_8", "left"], speeds["R_-4_-8", "right"])
+    agent = GRID.index(min(GRID, key=lambda one: abs(one.lower - 0.2) + abs(one.upper - 0.4)))
+    assert speeds["N_0_0", "left"][agent] < 9.5
+    assert isinstance(GRID[agent], Base)
+
+
+def test_the_design_has_each_pair_ten_times_in_each_condition_with_the_seeds_of_the_slots():
+    trials = design(SETS["K0"], experiment(), 0)
+    assert len(trials) == 990
+    assert len({seed for one in trials for seed in one.seeds}) == 2 * 990
+    assert trials[:90] == [simulated("R_-4_-8", n, scenario()) for n in range(1, 91)]
+
+
+def test_a_miss_by_its_tolerance_costs_one_and_a_number_without_a_fit_much():
+    wanted = targets()
+    exact = {(one.measure, one.term): one.value for one in wanted}
+    assert cost(exact, wanted) == 0
+    assert cost({**exact, ("collisions", "count"): 33.0}, wanted) == pytest.approx(1)
+    del exact["who_first", "intercept"]
+    assert cost(exact, wanted) == MISSING**2
+
+
+def test_a_search_looks_only_for_thresholds_that_a_study_may_set():
+    edge = replace(SETS["K0"], lower_spread=0.0, upper_spread=0.0, upper_mean=1.0)
+    small = {"generations": 1, "size": 6, "seed": 1, "trials_of_a_pair": 1}
+    for found in search(edge, experiment(), targets(), **small):
+        check({"pair": 0, **asdict(found.thresholds)})
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_the_search_for_a_set_can_be_repeated(name):
+    small = replace(SEARCHES[name], generations=1, size=3, trials_of_a_pair=1)
+    (*_, found), (*_, again) = small.run(), small.run()
+    assert found == again
+    assert found.thresholds != SEARCHES[name].start
+
+
+SHOWN = [(3, ["K0"]), (4, ["F1"]), (5, ["drag-free"]), (6, ["K0", "--tunnel"])]
+
+
+@pytest.mark.parametrize(("column", "command"), SHOWN)
+def test_the_docs_tell_what_the_driver_cei_comes_to(column, command):
+    program = [sys.executable, "-m", "merge_runner_cei.calibration", "check", *command]
+    out = subprocess.check_output(program, cwd=PROJECT, env=environment(), text=True)
+    # Each line ends with the mean, its spread, the tolerance and by how many of these it is off.
+    found = [tuple(map(float, line.split()[-4:-2])) for line in out.splitlines()[1:]]
+    text = (PROJECT / "docs/reference/cei.md").read_text("utf-8").replace("\N{MINUS SIGN}", "-")
+    rows = re.findall(r"^\| (?:collisions|time-outs|who|gap|largest|conflict|first).*", text, re.M)
+    cells = [re.split(r"(?<!\\)\|", row)[column].replace("*", "") for row in rows]
+    shown = [tuple(map(float, re.findall(r"-?\d+(?:\.\d+)?", cell))) for cell in cells]
+    # Counts are shown with one decimal of two.
+    assert shown[:2] == [pytest.approx(pair, abs=0.051) for pair in found[:2]]
+    assert shown[2:] == found[2:]
