@@ -17,6 +17,11 @@ PROVIDERS = {
 KEYS = dict.fromkeys(("OPENAI_API_KEY", "GOOGLE_API_KEY", "ANTHROPIC_API_KEY"), "a-dummy-key")
 
 
+def urls_at(url):
+    """The base URL of each format at a server of all of them."""
+    return {wire: f"{url}/v1" if wire.startswith("openai") else url for wire in PROVIDERS}
+
+
 @pytest.fixture
 def plan():
     """An answer that keeps the speed."""
@@ -39,22 +44,9 @@ def sweeps(merge_runner, tmp_path):
         )
 
         async def sweep(wire):
-            return await merge_runner(
-                *(
-                    "sweep",
-                    "short",
-                    "--model",
-                    wire,
-                    "--conditions",
-                    "R_-4_8",
-                    "--json",
-                    "--yes",
-                    "--trust",
-                ),
-                *("--db", f"{wire}.duckdb", "--cache", wire),
-                *FAST,
-                **KEYS,
-            )
+            where = ("--db", f"{wire}.duckdb", "--cache", wire)
+            one = ("--model", wire, "--conditions", "R_-4_8", "--json", "--yes", "--trust")
+            return await merge_runner("sweep", "short", *one, *where, *FAST, **KEYS)
 
         runs = dict(zip(urls, await asyncio.gather(*map(sweep, urls)), strict=True))
         for run in runs.values():

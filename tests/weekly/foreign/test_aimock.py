@@ -8,6 +8,8 @@ import subprocess
 
 import pytest
 
+from tests.weekly.foreign.conftest import urls_at
+
 AIMOCK = shutil.which("aimock")
 CHAOS = {"dropRate": 0.1, "malformedRate": 0.1, "disconnectRate": 0.1, "rateLimitRate": 0.05}
 
@@ -33,14 +35,7 @@ def url(tmp_path, plan):
 
 
 async def test_a_sweep_in_each_format_passes_the_chaos_of_a_foreign_server(url, sweeps):
-    runs = await sweeps(
-        {
-            "openai-chat": f"{url}/v1",
-            "openai-responses": f"{url}/v1",
-            "gemini": url,
-            "anthropic": url,
-        }
-    )
+    runs = await sweeps(urls_at(url))
     outcomes = set().union(*(run.summary["attempts"] for run in runs.values()))
     assert outcomes > {"ok"}
     assert outcomes <= {"ok", "server_error", "bad_body", "connection_lost", "rate_limited"}

@@ -14,6 +14,7 @@ import pytest
 
 from tests.support.harness import environment, watched
 from tests.support.mock_server import FaultPlan
+from tests.weekly.foreign.conftest import urls_at
 
 LITELLM = shutil.which("litellm")
 BROKEN = ("rate_limit", "server_error", "overloaded", "reset", "truncated_body")
@@ -49,16 +50,9 @@ def url(tmp_path, upstream):
         LITELLM_DANGEROUSLY_PERMIT_WEAK_OR_UNSET_MASTER_KEY="true",
         LITELLM_LOCAL_MODEL_COST_MAP="true",
     )
+    config = ("--config", tmp_path / "litellm.yaml")
     with subprocess.Popen(
-        [
-            LITELLM,
-            "--config",
-            tmp_path / "litellm.yaml",
-            "--port",
-            str(port),
-            "--host",
-            "127.0.0.1",
-        ],
+        [LITELLM, *config, "--port", str(port), "--host", "127.0.0.1"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=env,
@@ -81,14 +75,7 @@ def until_alive(url):
 
 
 async def test_a_sweep_in_each_format_passes_a_gateway_to_what_fails(url, upstream, sweeps):
-    runs = await sweeps(
-        {
-            "openai-chat": f"{url}/v1",
-            "openai-responses": f"{url}/v1",
-            "gemini": url,
-            "anthropic": url,
-        }
-    )
+    runs = await sweeps(urls_at(url))
     attempts = [run.summary["attempts"] for run in runs.values()]
     assert set().union(*attempts) > {"ok"}
     # It asks again by itself where a connection breaks.

@@ -14,13 +14,8 @@ from merge_runner.llm.client import LlmClient
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.limiter import Limiter
 from merge_runner.records import Slot
+from tests.weekly.foreign.conftest import PROVIDERS
 
-WIRES = {
-    "openai-chat": "openai",
-    "openai-responses": "openai",
-    "gemini": "gemini",
-    "anthropic": "anthropic",
-}
 PASSING = (408, 409, 429, 500, 502, 503, 504, 529)
 LASTING = {
     400: CallFailed,
@@ -41,7 +36,7 @@ async def client_of(llmock, tmp_path, monkeypatch):
     cache = ResponseCache(tmp_path / "responses")
     transports = {
         wire: HttpTransport(Endpoint("openai", wire, llmock.base_url(name), {}), connections=16)
-        for wire, name in WIRES.items()
+        for wire, name in PROVIDERS.items()
     }
 
     def make(wire, model, **changes):
@@ -77,7 +72,7 @@ async def test_answers_are_read_as_a_foreign_server_writes_them(llmock, client_o
     endings = {"ok": None, "truncated": "length", "refusal": "content_filter"}
     known = {
         (wire, outcome)
-        for wire in WIRES
+        for wire in PROVIDERS
         for outcome in endings
         if (wire, outcome) != ("openai-responses", "refusal")  # LLMock knows none of these
     }
@@ -92,7 +87,7 @@ async def test_answers_are_read_as_a_foreign_server_writes_them(llmock, client_o
 
 async def test_what_passes_is_tried_again_as_the_server_asks(llmock, client_of):
     clients = {(wire, status): client_of(wire, f"{wire}-{status}")
-               for wire in WIRES for status in PASSING}  # fmt: skip
+               for wire in PROVIDERS for status in PASSING}  # fmt: skip
     for wire, status in clients:
         told_s = 0.2 if status in (429, 503, 529) else None
         llmock.add(Fail(status, retry_after=told_s, match=Match(model=f"{wire}-{status}")))
@@ -112,7 +107,7 @@ async def test_waits_grow_where_the_server_names_none(llmock, client_of):
 async def test_what_no_attempt_mends_is_asked_once(llmock, client_of):
     for status in LASTING:
         llmock.add(Fail(status, times=None, match=Match(model=f"*-{status}")))
-    for wire in WIRES:
+    for wire in PROVIDERS:
         for status, error in LASTING.items():
             model = f"{wire}-{status}"
             with pytest.raises(error, match=model):
@@ -122,10 +117,10 @@ async def test_what_no_attempt_mends_is_asked_once(llmock, client_of):
 
 
 async def test_an_answer_that_comes_too_late_is_nobodys(llmock, client_of):
-    for wire in WIRES:
+    for wire in PROVIDERS:
         llmock.add(Delay(0.6, match=Match(model=wire)), Reply("late", match=Match(model=wire)))
         llmock.add(Reply("in time", times=None, match=Match(model=wire)))
-    clients = [client_of(wire, wire, timeout_s=0.3) for wire in WIRES]
+    clients = [client_of(wire, wire, timeout_s=0.3) for wire in PROVIDERS]
     replies = await asyncio.gather(*map(ask, clients))
     later = await asyncio.gather(*(ask(client, decision=1) for client in clients))
     assert {reply.attempts[0].outcome for reply in replies} == {"timeout"}
@@ -145,12 +140,12 @@ async def test_a_real_quota_costs_few_refusals(llmock, llmock_server, client_of)
 
 
 async def test_a_sweep_in_each_format_passes_what_a_foreign_server_breaks(llmock, sweeps, plan):
-    for wire in WIRES:
+    for wire in PROVIDERS:
         for status in (429, 503):
             llmock.add(Fail(status, retry_after=0.1, match=Match(model=wire)))
     llmock.reply(plan, times=None)
     for wire, run in (
-        await sweeps({w: llmock.base_url(name) for w, name in WIRES.items()})
+        await sweeps({w: llmock.base_url(name) for w, name in PROVIDERS.items()})
     ).items():
         attempts = run.summary["attempts"]
         assert attempts.keys() == {"ok", "rate_limited", "overloaded"}

@@ -1,1 +1,0 @@
-from tests.support.disks import read_only, small_disk, stock
