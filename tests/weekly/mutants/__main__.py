@@ -1,8 +1,7 @@
 """Count the mutants that tests kill: ``python tests/weekly/mutants ROOT RESULTS PART LANE...``.
 
-The tests of the lanes run in a copy of the commit at ROOT, and RESULTS keeps what each calls. Then
-each mutant with PART in its path is tried: tests of its function run, quickest first, until one
-fails. The same command goes on where it ended.
+Tests of the lanes run in a copy of the commit at ROOT, and RESULTS keeps what each calls. Then the
+tests of the function of each mutant with PART in its path run, quickest first. A rerun goes on.
 """
 
 import ast
@@ -140,7 +139,8 @@ scored = {json.dumps(each["mutant"]): each["by"] for each in kept(NOTES, "mutant
 killed, of = Counter(), Counter()
 for mutant in tomllib.loads(Path(__file__).with_name("mutants.toml").read_text())["mutant"]:
     key, folder = json.dumps(mutant), os.path.dirname(mutant["file"])
-    if PART in mutant["file"] and key not in scored:
+    is_there = mutant["line"] in (COPY / mutant["file"]).read_text()
+    if PART in mutant["file"] and key not in scored and is_there:
         scored[key] = score(mutant, tests)
         note(NOTES, mutant=mutant, by=scored[key])
     of[folder] += key in scored
