@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -20,7 +21,6 @@ from merge_runner.prompts.blocks import VARIANTS, Variant
 from merge_runner.registry import NO_STUDY, in_use
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
-from merge_runner.study import parts
 from merge_runner_analysis import table
 from merge_runner_analysis.metrics import METRICS, Metric
 from tests.support.harness import CONFIGURING
@@ -85,6 +85,8 @@ def check(name, outcome):
     assert driven["action"].tolist() == [BRAKING[name]]
     assert len(outcome.sql("from specs")) == 2
     assert [audit.findings for audit in audit_database(outcome.db)] == [[], []]
+    assert in_use() is NO_STUDY
+    assert ("X" in CONDITIONS, "hurry" in VARIANTS) == (False, False)
 
 
 @dataclass
@@ -104,17 +106,6 @@ class Meanwhile:
             return await decide(driver, observation, number)
 
         monkeypatch.setattr(LlmDriver, "decide", counted)
-
-
-@pytest.mark.slow
-async def test_a_study_that_is_planned_meanwhile_changes_nothing_of_one_that_runs(
-    folder, monkeypatch
-):
-    other = study("b")
-    meanwhile = Meanwhile(other.plan)
-    meanwhile.patch(monkeypatch)
-    check("a", await study("a").arun())
-    assert meanwhile.count > 10
 
 
 async def test_a_cell_that_runs_again_changes_nothing_of_its_study_that_runs(folder, monkeypatch):
@@ -137,23 +128,20 @@ async def test_a_cell_that_runs_again_changes_nothing_of_its_study_that_runs(fol
 def test_a_driver_finds_the_modules_of_its_plug_in_while_its_study_is_planned_again(
     folder, monkeypatch
 ):
-    mine, found, run_plugin = study("a"), [], parts._run_plugin
+    plugin = folder / "a/plugin.py"
+    plugin.write_text(f"import probe\nprobe.meanwhile()\n{plugin.read_text()}")
+    probe = SimpleNamespace(meanwhile=lambda: None)
+    monkeypatch.setitem(sys.modules, "probe", probe)
+    mine, found = study("a"), []
     braking = mine.plan().parts.programs["mine"].driver(SimpleNamespace(held=lambda action: action))
-
-    def run(*arguments):
-        found.append(asyncio.run(braking.decide(None, 0)))
-        run_plugin(*arguments)
-
-    monkeypatch.setattr(parts, "_run_plugin", run)
+    probe.meanwhile = lambda: found.append(asyncio.run(braking.decide(None, 0)))
     mine.plan()
-    assert found == [BRAKING["a"]] * 2
+    assert found == [BRAKING["a"]]
 
 
-@pytest.mark.slow
 async def test_two_studies_run_in_one_event_loop(folder):
-    for name, outcome in zip(
-        WORDS, await asyncio.gather(*(study(name).arun() for name in WORDS)), strict=True
-    ):
+    outcomes = await asyncio.gather(*(study(name).arun() for name in WORDS))
+    for name, outcome in zip(WORDS, outcomes, strict=True):
         check(name, outcome)
 
 
@@ -185,16 +173,6 @@ def test_nothing_is_registered_outside_of_a_study(folder):
         assert [*registry] == before
 
 
-@pytest.mark.slow
-async def test_an_audit_leaves_nothing_of_the_audited_study_behind(folder):
-    outcome = await study("a").arun()
-    assert [audit.findings for audit in audit_database(outcome.db)] == [[], []]
-    assert in_use() is NO_STUDY
-    assert "X" not in CONDITIONS
-    assert "hurry" not in VARIANTS
-
-
-@pytest.mark.slow
 async def test_a_table_has_the_metrics_and_titles_of_the_study_of_its_database(folder):
     mine = Study("baseline", models="constant", repetitions=1, db="mine.duckdb")
     stops = Metric(name="stops", label="stops", unit="", meaning="m", value="end_time_s")
@@ -209,15 +187,6 @@ async def test_a_table_has_the_metrics_and_titles_of_the_study_of_its_database(f
     assert "stops" not in table(other.db, "ablation-quantitative")
 
 
-@pytest.mark.slow
-async def test_a_study_runs_in_any_thread(folder):
-    loop = asyncio.get_running_loop()
-    with ThreadPoolExecutor(1) as thread:
-        outcome = await loop.run_in_executor(thread, study("a").run)
-    check("a", outcome)
-
-
-@pytest.mark.slow
 async def test_two_studies_run_in_two_threads_while_both_are_planned(folder, monkeypatch):
     Meanwhile(lambda: [study(name).plan() for name in WORDS]).patch(monkeypatch)
     loop = asyncio.get_running_loop()
@@ -251,7 +220,6 @@ def test_the_handlers_of_signals_are_those_of_the_host_during_a_run_and_after_it
     assert all(each == theirs for each in seen)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("how", ["event", "cancel"])
 async def test_a_run_that_is_stopped_saves_what_is_answered(folder, monkeypatch, how):
     event = asyncio.Event()

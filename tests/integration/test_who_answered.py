@@ -17,6 +17,8 @@ from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import SCRIPTED_FIELD, Attempt, Slot, is_scripted, make_request
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.recording import export_recording, read_recording
+from merge_runner.results.store import results_digest
+from merge_runner.run.stored_replay import audit_database
 from tests.support.harness import FAST, PROJECT, as_a_model, watched
 
 MACRO = re.search(r"CREATE MACRO[^;]*driver_name[^;]*;", schema_sql())[0]
@@ -46,44 +48,58 @@ def marks(db):
         ).fetchall()
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("model", POINTED)
-async def test_the_emulator_behind_a_models_name_is_stored_as_what_it_is(
-    merge_runner, emulator_url, tmp_path, model
-):
-    pointed = pointed_at(emulator_url, model)
-    run = await merge_runner("sweep", "baseline", "--model", model, *SMALL, *FAST, "--yes",
-                             **pointed)  # fmt: skip
+@pytest.fixture(scope="module", params=POINTED)
+def pointed(request, prepare, emulator_url, tmp_path_factory):
+    """A folder in which the emulator played a trial under a model's name, and its summary."""
+    folder = tmp_path_factory.mktemp("pointed")
+    sweep = ("sweep", "baseline", "--model", request.param, *SMALL, *FAST)
+    env = pointed_at(emulator_url, request.param)
+    without = prepare(folder, *sweep)
+    assert without.code == 2
+    assert "_API_KEY" in without.err
+    assert "`merge-runner sweep baseline` runs" in without.err
+    unasked = prepare(folder, *sweep, **env)
+    assert (unasked.code, "--yes" in unasked.err) == (2, True)
+    run = prepare(folder, *sweep, "--yes", **env)
     assert run.code == 0, run.err
-    assert marks(tmp_path / "results/merge.duckdb") == [(True, True, 200)]
-    await merge_runner("recording", "export", "told.parquet")
+    assert run.summary["calls"]["cached"] == 0, "money was spent without a question"
+    return request.param, folder, run.summary
+
+
+def test_the_emulator_behind_a_models_name_is_stored_as_what_it_is(pointed, prepare, tmp_path):
+    """Also where a recording lacks the flags; its replay needs neither the server nor a key."""
+    model, folder, summary = pointed
+    assert (summary["scripted"], summary["cost_usd"] > 0) == (True, True)
+    assert marks(folder / "results/merge.duckdb") == [(True, True, 200)]
+    assert prepare(folder, "recording", "export", tmp_path / "told.parquet").code == 0
     with_flags = list(read_recording(tmp_path / "told.parquet"))
     assert all(a.scripted for entry in with_flags for a in entry.attempts)
-    stripped = ResponseCache(tmp_path / "stripped")
+    stripped, untold = ResponseCache(tmp_path / "stripped"), tmp_path / "untold.parquet"
     stripped.put_now(
         replace(entry, attempts=tuple(replace(a, scripted=False) for a in entry.attempts))
         for entry in with_flags
     )
-    export_recording(tmp_path / "untold.parquet", stripped,
-                     [entry.request.key for entry in with_flags], {})  # fmt: skip
-    for recording in ("told", "untold"):
-        info = (await merge_runner("recording", "info", f"{recording}.parquet")).summary
-        assert info["scripted"] == info["calls"] == len(with_flags)
-        replay = await merge_runner(
-            "replay", "baseline", "--model", model, *SMALL, "--cache", "empty",
-            "--recording", f"{recording}.parquet", "--db", f"{recording}.duckdb",
-        )  # fmt: skip
-        assert replay.code == 0, replay.err
-        assert replay.summary["scripted"] is True
-        assert marks(tmp_path / f"{recording}.duckdb") == [(True, True, 200)]
-
-
-@pytest.mark.slow
-async def test_so_it_is_where_dask_workers_ask(merge_runner, emulator_url, tmp_path):
-    run = await merge_runner("sweep", "baseline", "--model", "o3", *SMALL, *FAST, "--yes",
-                             "--dask", "local:1", **pointed_at(emulator_url, "o3"))  # fmt: skip
-    assert run.code == 0, run.err
+    export_recording(untold, stripped, [entry.request.key for entry in with_flags], {})
+    info = prepare(tmp_path, "recording", "info", untold).summary
+    assert info["scripted"] == info["calls"] == len(with_flags) == summary["calls"]["live"]
+    replay = prepare(tmp_path, "replay", "baseline", "--model", model, *SMALL,
+                     "--recording", untold)  # fmt: skip
+    assert replay.code == 0, replay.err
+    assert replay.summary["scripted"] is True
     assert marks(tmp_path / "results/merge.duckdb") == [(True, True, 200)]
+    digests = [results_digest(each / "results/merge.duckdb") for each in (folder, tmp_path)]
+    assert digests[0] == digests[1]
+
+
+def test_each_format_is_read_anew_as_it_was_read(pointed, tmp_path):
+    _, folder, _ = pointed
+    db = shutil.copy(folder / "results/merge.duckdb", tmp_path / "copy.duckdb")
+    audits = audit_database(db, cache=folder / "cache/responses")
+    assert [audit.findings for audit in audits] == [[], []]
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("UPDATE calls SET output_tokens = output_tokens + 1 WHERE decision = 3")
+    findings = [finding for audit in audit_database(db) for finding in audit.findings]
+    assert {finding.text.split(" is ")[0] for finding in findings} == {"calls.output_tokens"}
 
 
 @pytest.mark.parametrize(
@@ -121,7 +137,6 @@ def estimated(merge_runner):
     return estimate
 
 
-@pytest.mark.long
 async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
     merge_runner, emulator_url, estimated
 ):
@@ -138,7 +153,6 @@ async def test_a_stand_in_does_not_change_what_a_model_is_estimated_at(
     assert 0.9 * before[0] < there < before[0]
 
 
-@pytest.mark.long
 async def test_answers_at_another_effort_or_place_do_not_change_it_either(
     merge_runner, estimated, tmp_path
 ):
@@ -157,7 +171,6 @@ async def test_answers_at_another_effort_or_place_do_not_change_it_either(
     assert not (await estimated(**there))[1]
 
 
-@pytest.mark.slow
 async def test_a_summary_says_who_answered_and_where(merge_runner, emulator_url, tmp_path):
     host = emulator_url.removeprefix("http://").removesuffix("/v1")
     sweep = ("sweep", "baseline", "--model", "o3+constant", *SMALL[:-1], *FAST, "--yes")
@@ -170,7 +183,6 @@ async def test_a_summary_says_who_answered_and_where(merge_runner, emulator_url,
     assert f"driver  o3 at {host}+constant\n" in dry.out
 
 
-@pytest.mark.slow
 async def test_the_emulator_by_its_own_name_is_said_to_be_one(merge_runner):
     run = await merge_runner("sweep", "baseline", *SMALL[:-1])
     assert "The model `emulator` is a scripted stand-in, no language model.\n" in run.out
@@ -192,7 +204,6 @@ urls = st.builds(
 )
 
 
-@pytest.mark.long
 @given(st.none() | st.sampled_from(["openai", "emulator", "emulator#faults-1-{}"]) | urls)
 def test_the_program_and_the_database_name_a_driver_alike(endpoint):
     with in_memory({}) as connection:

@@ -21,23 +21,11 @@ from merge_runner.records import (
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.rows import PLACES, rows_of, stored_rows
 from merge_runner.results.store import OF_A_RUN
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
+from tests.support.specs import spec_of
 
 CLOCK = "2026-01-01T00:00:00.000+00:00"
-SPEC = TrialSpec(
-    "m/baseline/L_4_0/rep01",
-    "h",
-    "llm",
-    "m",
-    "constant",
-    "baseline",
-    "L_4_0",
-    1,
-    0,
-    0,
-    kinematics=CONDITIONS["L_4_0"],
-)
+SPEC = spec_of(source="llm", model_right="constant")
 KEY = (SPEC.trial_id, SPEC.spec_hash)
 ANOTHER = {
     "VARCHAR": "coalesce({0}, '') || 'x'", "JSON": "'[0]'", "BOOLEAN": "NOT coalesce({0}, false)",

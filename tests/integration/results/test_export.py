@@ -9,70 +9,58 @@ import pytest
 
 from merge_runner.results.export import FACTORS, tables
 from merge_runner.results.recording import COLUMNS
+from merge_runner.results.store import query
 from tests.support.harness import PROJECT
 
 
 def rows(path):
+    csv.field_size_limit(2**24)  # the golden study has a long reply
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.slow
-async def test_every_table_and_view_is_written_as_parquet_and_csv(merge_runner, tmp_path):
-    part = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0")
-    assert (await merge_runner(*part)).code == 0
-    for _ in range(2):  # an earlier export is replaced
-        run = await merge_runner("export", "out")
-        assert run.code == 0, run.err
+@pytest.fixture(scope="module")
+def exported(prepare, golden, tmp_path_factory):
+    """The folder of an export that has replaced an earlier one."""
+    folder = tmp_path_factory.mktemp("exported")
+    for _ in range(2):
+        run = prepare(folder, "export", "out", "--db", golden / "golden.duckdb")
         said = "wrote every table into out: begin with out/dictionary.csv\n"
-        assert (run.out, run.err) == (said, "")
-    folder, db = tmp_path / "out", str(tmp_path / "results/merge.duckdb")
-    dictionary = rows(folder / "dictionary.csv")
-    with duckdb.connect(db, read_only=True) as connection:
-        for table in tables():
-            ((there,),) = connection.execute(f"SELECT count(*) FROM {table.name}").fetchall()
-            parquet = duckdb.read_parquet(str(folder / f"{table.name}.parquet"))
-            assert parquet.shape == (there, len(table.columns))
-            assert len(rows(folder / f"{table.name}.csv")) == there
-            told = [row["column"] for row in dictionary if row["table"] == table.name]
-            assert told == ["", *parquet.columns]
-    (gap,) = [
-        row for row in dictionary if (row["table"], row["column"]) == ("trial_metrics", "gap_m")
-    ]
-    assert gap["type"] == "DOUBLE"
-    assert gap["meaning"].startswith("net gap, ")
+        assert (run.code, run.out, run.err) == (0, said, "")
+    return folder / "out"
 
 
-STUDY = """
-models = ["constant", "human-odds"]
-repetitions = 1
-conditions = ["N_0_0", "L_4_0"]
-[factors]
-memory_s = [1, 2.0]
-history_start = ["empty", "cruise"]
-"""
+def test_every_table_and_view_is_written_as_parquet_and_csv(exported, golden):
+    dictionary = rows(exported / "dictionary.csv")
+    for table in tables():
+        ((there,),) = query(golden / "golden.duckdb", f"SELECT count(*) FROM {table.name}")[1]
+        parquet = duckdb.read_parquet(str(exported / f"{table.name}.parquet"))
+        assert parquet.shape == (there, len(table.columns))
+        assert len(rows(exported / f"{table.name}.csv")) == there
+        told = [row["column"] for row in dictionary if row["table"] == table.name]
+        assert told == ["", *parquet.columns]
+    (gap,) = (r for r in dictionary if (r["table"], r["column"]) == ("trial_metrics", "gap_m"))
+    assert (gap["type"], gap["meaning"][:9]) == ("DOUBLE", "net gap, ")
 
 
-@pytest.mark.slow
-async def test_the_wide_trials_have_metrics_and_typed_factors_and_humans_stand_beside_them(
-    merge_runner, tmp_path
+def test_the_wide_trials_have_metrics_and_typed_factors_and_humans_stand_beside_them(
+    exported, golden
 ):
-    (tmp_path / "study.toml").write_text(STUDY)
-    assert (await merge_runner("sweep", "study.toml", "--quiet")).code == 0
-    assert (await merge_runner("export", "out")).code == 0
-    wide = duckdb.read_parquet(str(tmp_path / "out/trials_wide.parquet"))
+    wide = duckdb.read_parquet(str(exported / "trials_wide.parquet"))
     types = dict(zip(wide.columns, map(str, wide.types), strict=True))
-    assert (types["memory_s"], types["history_start"]) == ("DOUBLE", "VARCHAR")
+    assert (types["temperature"], types["opponent"]) == ("DOUBLE", "VARCHAR")
     assert (types["gap_m"], types["joint"], types["driver"]) == ("DOUBLE", "BOOLEAN", "VARCHAR")
-    counts = wide.aggregate("driver, memory_s, history_start, count(*)").fetchall()
-    assert len(counts) == 8
-    assert {count for *_, count in counts} == {2}
-    assert len(rows(tmp_path / "out/trials_wide.csv")) == 16
-    described = rows(tmp_path / "out/dictionary.csv")
+    ((humans,),) = wide.filter("source = 'human'").aggregate("count(*)").fetchall()
+    crossed = wide.filter("temperature IS NOT NULL").aggregate(
+        "driver, temperature, opponent, count(*)"
+    )
+    assert humans == 33
+    assert len(crossed.fetchall()) > 4
+    described = rows(exported / "dictionary.csv")
     assert {row["meaning"] != "" for row in described if row["table"] == "trials_wide"} == {True}
-    with duckdb.connect(str(tmp_path / "results/merge.duckdb"), read_only=True) as connection:
-        trials = connection.execute("SELECT trial_id, gap_m FROM trial_metrics ORDER BY ALL")
-        assert wide.select("trial_id, gap_m").order("ALL").fetchall() == trials.fetchall()
+    sql = "SELECT trial_id, gap_m FROM trial_metrics ORDER BY ALL"
+    trials = query(golden / "golden.duckdb", sql)
+    assert wide.select("trial_id, gap_m").order("ALL").fetchall() == trials[1]
 
 
 @pytest.mark.parametrize(
@@ -93,22 +81,20 @@ def test_a_factor_has_the_type_that_all_its_levels_have(levels, kind):
         assert connection.execute(FACTORS.format(only="")).fetchall() == [("f", kind)]
 
 
-@pytest.mark.slow
-async def test_a_folder_with_anything_else_is_left_as_it_is(merge_runner, tmp_path):
-    part = ("sweep", "baseline", "--model", "constant", "--reps", 1, "--conditions", "N_0_0")
-    assert (await merge_runner(*part)).code == 0
-    for name, content in (
-        ("notes.txt", "mine"),
-        ("dictionary.csv", "# mine"),
-        ("trials.csv", "mine"),
-    ):
-        folder = tmp_path / name.partition(".")[0]
-        folder.mkdir()
-        (folder / name).write_text(content)
-        run = await merge_runner("export", folder)
-        assert run.code == 2
-        assert "is there and no earlier export: name another folder" in run.err
-        assert [path.read_text() for path in folder.iterdir()] == [content]
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("notes.txt", "mine"), ("dictionary.csv", "# mine"), ("trials.csv", "mine")],
+)
+async def test_a_folder_with_anything_else_is_left_as_it_is(
+    merge_runner, golden, tmp_path, name, content
+):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / name).write_text(content)
+    run = await merge_runner("export", "out", "--db", golden / "golden.duckdb")
+    assert run.code == 2
+    assert "is there and no earlier export: name another folder" in run.err
+    assert [path.read_text() for path in folder.iterdir()] == [content]
 
 
 def test_every_column_of_a_table_and_of_the_metrics_has_a_meaning():

@@ -48,52 +48,36 @@ def copied(tmp_path):
 
 def said_in(packages, **changes):
     env = environment(PYTHONPATH=str(packages), **changes)
-    done = subprocess.run(
-        [sys.executable, "-c", SAY],
-        cwd=packages,
-        env=env,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    code = [sys.executable, "-c", SAY]
+    done = subprocess.run(code, cwd=packages, env=env, capture_output=True, text=True, check=True)
     return done.stdout.splitlines()
 
 
 INSTALLED = ["('merge-runner 0.1.0', None)", "merge-runner 0.1.0, installed"]
 
 
-@pytest.mark.parametrize("tracked", [(), (".venv",)])
-def test_a_users_repository_around_the_environment_is_not_the_programs(tmp_path, copied, tracked):
-    packages = copied(tmp_path / ".venv/lib/site-packages")
+@pytest.mark.parametrize(
+    ("place", "tracked"),
+    [("", ()), (".venv/lib/site-packages", ()), (".venv/lib/site-packages", (".venv",))],
+)
+def test_a_users_repository_around_an_installed_copy_is_not_the_programs(
+    tmp_path, copied, place, tracked
+):
+    packages = copied(tmp_path / place)
     committed(tmp_path, *tracked)
-    assert said_in(packages) == INSTALLED
     # A hook of that repository names it to everything that it runs.
-    assert said_in(packages, GIT_DIR=str(tmp_path / ".git")) == INSTALLED
-
-
-def test_a_repository_that_only_holds_an_installed_copy_is_not_either(tmp_path, copied):
-    packages = copied(tmp_path)
-    committed(tmp_path)
-    assert said_in(packages) == INSTALLED
+    assert said_in(packages, GIT_DIR=str(tmp_path / ".git")) == said_in(packages) == INSTALLED
 
 
 def test_a_checkout_is_named_by_its_commit_and_whether_it_is_changed(tmp_path, copied):
-    checkout = copied(tmp_path)
+    checkout = copied(tmp_path / "main")
     commit = committed(checkout, "merge_runner")
-    assert said_in(checkout) == [f"('{commit}', False)", f"merge-runner at commit {commit}"]
     (checkout / "my-study").mkdir()
     (checkout / "my-study/study.toml").write_text("a user's own")
-    assert said_in(checkout)[0] == f"('{commit}', False)"
-    (checkout / "study.txt").write_text("changed")
-    assert said_in(checkout) == [
-        f"('{commit}', True)",
-        f"merge-runner at commit {commit}, with changes that are not committed",
-    ]
-
-
-def test_a_worktree_is_a_checkout_too(tmp_path, copied):
-    main = tmp_path / "main"
-    main.mkdir()
-    commit = committed(copied(main), "merge_runner")
-    git(main, "worktree", "add", "--quiet", tmp_path / "other")
+    named = f"merge-runner at commit {commit}"
+    assert said_in(checkout) == [f"('{commit}', False)", named]
+    git(checkout, "worktree", "add", "--quiet", tmp_path / "other")
     assert said_in(tmp_path / "other")[0] == f"('{commit}', False)"
+    (checkout / "study.txt").write_text("changed")
+    changed = f"{named}, with changes that are not committed"
+    assert said_in(checkout) == [f"('{commit}', True)", changed]

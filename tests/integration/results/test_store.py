@@ -16,13 +16,14 @@ import pytest
 from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreLocked, UsageError
-from merge_runner.records import TrialRecord, TrialSpec
+from merge_runner.records import TrialRecord
 from merge_runner.results.database import Instance, open_database
 from merge_runner.results.store import Store, query, results_digest, sweep_facts
 from merge_runner.run.local_runner import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
 from tests.support.harness import environment
+from tests.support.specs import spec_of
 
 SCENARIO = ScenarioConfig()
 SWEEP = {"sweep_id": "s1", "name": "baseline", "started_at": datetime(2026, 1, 1)}  # noqa: DTZ001
@@ -41,29 +42,12 @@ with in_memory({**SETTINGS, "memory_limit": "50MB"}) as connection:
 LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True); input()"
 
 
-def spec(condition="L_4_0", repetition=1, spec_hash="h"):
-    trial_id = f"m/baseline/{condition}/rep{repetition:02d}"
-    return TrialSpec(
-        trial_id,
-        spec_hash,
-        "driver",
-        "m",
-        "m",
-        "baseline",
-        condition,
-        repetition,
-        0,
-        0,
-        kinematics=CONDITIONS[condition],
-    )
-
-
 def keyed(record: TrialRecord) -> dict:
     return {(record.spec.trial_id, record.spec.spec_hash): record.spec}
 
 
 def played(condition="L_4_0", *, driver="projected-order", **of_spec) -> TrialRecord:
-    trial = spec(condition, **of_spec)
+    trial = spec_of(condition, **of_spec)
     drivers = {side: PROGRAMS[driver].make(SCENARIO, trial, side) for side in ("left", "right")}
     return asyncio.run(play_trial(trial, SCENARIO, drivers))
 
@@ -150,31 +134,25 @@ def test_the_digest_sees_every_result_and_no_order(tmp_path):
     for table, change in (
         ("states", "velocity_mps = velocity_mps + 1e-15 * velocity_mps"),
         ("trials", "merged_first = 'nobody'"),
-        ("decisions", "plan[1] = plan[1]"),
+        ("decisions", "applied = [0.125]"),
     ):
-        name = f"changed-{table}"
-        digest(name, records)
-        with duckdb.connect(str(tmp_path / name)) as connection:
-            if table == "decisions":
-                connection.execute("UPDATE decisions SET applied = [0.125]")
-            else:
-                connection.execute(f"UPDATE {table} SET {change}")
-        assert results_digest(tmp_path / name)[0] != base, table
+        digest(table, records)
+        with duckdb.connect(str(tmp_path / table)) as connection:
+            connection.execute(f"UPDATE {table} SET {change}")
+        assert results_digest(tmp_path / table)[0] != base, table
 
 
 def test_the_metrics_are_those_computed_by_hand(store, path):
     record = played("L_4_-8")
     store.write("s1", [record, played("N_0_0", driver="constant")], patience_s=1)
-    left = [s for s in record.states if s.side == "left"]
-    right = [s for s in record.states if s.side == "right"]
+    left, right = ([s for s in record.states if s.side == side] for side in ("left", "right"))
     first = next(k for k in range(len(left)) if max(left[k].position_m, right[k].position_m) >= 100)
-    leader = left if left[first].position_m >= 100 else right
-    part = (100 - leader[first - 1].position_m) / (
-        leader[first].position_m - leader[first - 1].position_m
-    )
+    before, after = max(left[first - 1 : first + 1], right[first - 1 : first + 1],
+                        key=lambda pair: pair[1].position_m)  # fmt: skip
+    part = (100 - before.position_m) / (after.position_m - before.position_m)
 
     def at_merge(trace):
-        before, after = trace[first - 1].position_m, trace[first].position_m
+        before, after = (state.position_m for state in trace[first - 1 : first + 1])
         return before + part * (after - before)
 
     def rmse(trace, initial_mps):
@@ -257,12 +235,8 @@ def holder(path):
     """Another process that holds the database until its standard input closes."""
 
     def hold():
-        process = subprocess.Popen(
-            [sys.executable, "-c", LOCK, str(path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        command, pipe = [sys.executable, "-c", LOCK, str(path)], subprocess.PIPE
+        process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
         assert process.stdout.readline() == "held\n"
         return process
 
@@ -319,17 +293,11 @@ def test_a_slow_query_draws_no_bar_on_the_output():
     assert run.stdout == b"(False,)\n"
 
 
-@pytest.mark.slow
 def test_what_does_not_fit_into_memory_goes_to_a_private_folder_that_ends_with_the_process(
     tmp_path,
 ):
-    done = subprocess.run(
-        [sys.executable, "-c", SPILL],
-        env=environment(TMPDIR=str(tmp_path)),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command, env = [sys.executable, "-c", SPILL], environment(TMPDIR=str(tmp_path))
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
     folder, pid, mode = done.stdout.split()
     assert Path(folder).parent == tmp_path
     assert pid not in folder

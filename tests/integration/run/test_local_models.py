@@ -11,10 +11,8 @@ from aiohttp import web
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.models import load_models
-from merge_runner.run.sweep import _served_name
 from tests.support.gate import HANGS_S
 from tests.support.harness import watched
-from tests.support.virtual_time import in_virtual_time
 
 ONE = ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0", "--json")
 LOCAL = (*ONE, "--model", "local")
@@ -35,6 +33,7 @@ price = "free"
 """
 # Nothing listens at this port, which is one of the system's.
 DEAD = "http://127.0.0.1:9/v1"
+LISTED = "serves scripted-driver, which is asked"
 
 
 def serving(*names, status=200):
@@ -62,7 +61,6 @@ def models_asked(folder):
     return [name for (name,) in found]
 
 
-@pytest.mark.long
 async def test_the_one_model_that_a_server_lists_is_asked_and_found_again_in_a_replay(
     merge_runner, tmp_path
 ):
@@ -86,7 +84,6 @@ async def test_the_one_model_that_a_server_lists_is_asked_and_found_again_in_a_r
         assert (await merge_runner("digest", "--db", db)).out == played.out
 
 
-@pytest.mark.long
 async def test_of_several_models_one_must_be_chosen(merge_runner, tmp_path):
     async with watched(serving("qwen3-8b", "llama3.2:latest")) as server:
         at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
@@ -103,23 +100,14 @@ async def test_of_several_models_one_must_be_chosen(merge_runner, tmp_path):
     assert (await merge_runner(*replay, LOCAL_MODEL="qwen3-8b")).code == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("takes_s", "waits"), [(4, []), (9, ["local has not listed its models"])])
-@in_virtual_time
 async def test_a_server_that_is_slow_to_list_its_models_is_waited_for_with_a_line(
-    monkeypatch, takes_s, waits
+    merge_runner, emulator_url, monkeypatch
 ):
-    async def listed(endpoint):
-        await asyncio.sleep(takes_s)
-        return ["m"]
-
-    monkeypatch.setattr("merge_runner.llm.http.listed_models", listed)
-    said = []
-    assert await _served_name("local", load_models()["local"], say=said.append) == "m"
-    await asyncio.sleep(9)
-    *told, last = said
-    assert [line.partition(" yet")[0] for line in told] == waits
-    assert last == "local serves m, which is asked"
+    monkeypatch.setattr("merge_runner.run.sweep.LONG_WAIT_S", 0)
+    run = await merge_runner(*LOCAL, LOCAL_BASE_URL=emulator_url)
+    assert run.code == 0, run.err
+    waits, asked = (run.err.index(said) for said in (" has not listed its models yet: ", LISTED))
+    assert waits < asked
 
 
 async def test_a_server_without_a_list_needs_a_name(merge_runner, registry):
@@ -132,7 +120,6 @@ async def test_a_server_without_a_list_needs_a_name(merge_runner, registry):
         assert "name one with LOCAL_MODEL" in run.err
 
 
-@pytest.mark.long
 async def test_where_nothing_listens_the_run_ends_within_seconds_with_what_to_start(
     merge_runner, tmp_path
 ):
@@ -144,17 +131,13 @@ async def test_where_nothing_listens_the_run_ends_within_seconds_with_what_to_st
     assert "or set LOCAL_BASE_URL" in line
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("where", [(), ("--dask", "local:1")])
-async def test_no_trial_has_failed_where_nothing_was_ever_answered(
-    merge_runner, registry, tmp_path, where
-):
-    run = await merge_runner(*NAMED, *where, LOCAL_BASE_URL=DEAD)
+async def test_no_trial_has_failed_where_nothing_was_ever_answered(merge_runner, registry):
+    run = await merge_runner(*NAMED, LOCAL_BASE_URL=DEAD)
     assert run.code == 1
     assert run.err.count("start a server (docs/how-to/local-models.md)") == 1
     assert run.summary["trials"]["failed"] == 0
     async with watched(serving("qwen3")) as server:
-        again = await merge_runner(*NAMED, *where, LOCAL_BASE_URL=f"{server.url}/v1")
+        again = await merge_runner(*NAMED, LOCAL_BASE_URL=f"{server.url}/v1")
         assert again.code == 0, again.err
         # And when all has been played, no server is needed.
     stored = await merge_runner(*NAMED, LOCAL_BASE_URL=f"{server.url}/v1")
@@ -162,7 +145,6 @@ async def test_no_trial_has_failed_where_nothing_was_ever_answered(
     assert stored.summary["trials"]["stored_before"] == 1
 
 
-@pytest.mark.long
 async def test_a_host_that_there_is_not_is_named(merge_runner):
     run = await merge_runner(*LOCAL, LOCAL_BASE_URL="http://gpu.invalid:8000/v1")
     assert run.code == 1
@@ -176,12 +158,6 @@ async def test_a_dry_run_asks_nobody_for_a_name(merge_runner):
         assert server.requests == 0
     assert run.code == 0, run.err
     assert run.summary["trials"] == 1
-
-
-async def test_the_emulator_lists_its_model_as_real_servers_do(merge_runner, emulator_url):
-    run = await merge_runner(*LOCAL, LOCAL_BASE_URL=emulator_url)
-    assert run.code == 0, run.err
-    assert "serves scripted-driver, which is asked" in run.err
 
 
 def test_only_a_server_of_ones_own_can_be_asked_for_a_name(tmp_path):

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import re
-import signal
 
 import pytest
 from aiohttp import web
 
-from merge_runner.errors import UsageError
 from merge_runner.records import SLOT_HEADER
-from merge_runner.results.store import results_digest
-from merge_runner.run.plan import USUAL_GRID, grid_conditions, make_plan
+from merge_runner.results.store import query, results_digest
+from merge_runner.run.plan import USUAL_GRID
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from tests.support.harness import FAST, RECORDING, watched
 
 DB = "results/merge.duckdb"
 TWO = ("--conditions", "N_0_0,L_4_8")
+POINT = ("--conditions", "N_0_0,h2_dv-1.2")  # one of a grid
 # A reply of 1000 tokens costs 1 USD at most.
 FIRST = ("sweep", "baseline", "--first")
 PRICED = """
@@ -31,111 +29,77 @@ price = { input = 0.0, output = 1000.0, source = "test" }
 """
 
 
-@pytest.mark.slow
 async def test_22_situations_are_asked_as_often_as_wanted_and_nothing_else_is(merge_runner):
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(*FIRST, "--reps", 3, "--json", **env)
+        run = await merge_runner(*FIRST, "--reps", 2, "--json", **env)
         assert run.code == 0, run.err
-        assert server.requests == 22 * 3
-        assert run.summary["calls"] == {"live": 66, "cached": 0}
+        assert run.summary["calls"] == {"live": 44, "cached": 0}
         slots = [json.loads(headers[SLOT_HEADER]) for headers in server.headers]
-    assert {slot["decision"] for slot in slots} == {0}
-    places = {(slot["condition"], slot["side"], slot["repetition"]) for slot in slots}
-    assert places == {(c, s, r) for c in CONDITIONS for s in ("left", "right") for r in (1, 2, 3)}
+    assert sorted((s["decision"], s["condition"], s["side"], s["repetition"]) for s in slots) == (
+        sorted((0, c, s, r) for c in CONDITIONS for s in ("left", "right") for r in (1, 2))
+    )
     looks = run.summary["first_looks"]
-    assert sum(look["asked"] for look in looks) == 66
+    assert sum(look["asked"] for look in looks) == 44
     assert {look["relative_velocity_mps"] for look in looks} == {-0.8, 0.0, 0.8}
-    assert "66 live" in run.err
+    assert "44 live" in run.err
 
 
-@pytest.mark.long
-async def test_a_sweep_answers_the_situations_and_they_answer_its_first_decisions(merge_runner):
-    sweep = ("sweep", "baseline", "--reps", 2, *TWO, "--json")
-    first = (*FIRST, "--reps", 2, *TWO, "--json")
-    swept = (await merge_runner(*sweep)).summary
-    asked = (await merge_runner(*first)).summary
-    assert asked["calls"] == {"live": 0, "cached": 8}
-    elsewhere = ("--db", "other.duckdb", "--cache", "other")
-    before = (await merge_runner(*first, *elsewhere)).summary
-    assert before["calls"] == {"live": 8, "cached": 0}
-    after = (await merge_runner(*sweep, *elsewhere)).summary
-    assert after["calls"] == {"live": swept["calls"]["live"] - 8, "cached": 8}
+@pytest.fixture(scope="module")
+def both(prepare, tmp_path_factory):
+    """A folder with a sweep and its situations, its tables before and after, and what was asked."""
+    folder = tmp_path_factory.mktemp("both")
+    part = ("--reps", 1, *POINT, "--json")
+    shown = ("tables", "ablation-quantitative", "attempts", "--format", "csv")
+    swept = prepare(folder, "sweep", "baseline", *part).summary
+    before = prepare(folder, *shown).out
+    asked = prepare(folder, *FIRST, *part).summary
+    return folder, swept, asked, (before, prepare(folder, *shown).out)
+
+
+def test_a_sweep_answers_the_situations_and_they_answer_its_first_decisions(prepare, both):
+    folder, swept, asked, _ = both
+    assert asked["calls"] == {"live": 0, "cached": 4}
+    elsewhere = ("--reps", 1, *POINT, "--json", "--db", "other.duckdb", "--cache", "other")
+    before = prepare(folder, *FIRST, *elsewhere).summary
+    assert before["calls"] == {"live": 4, "cached": 0}
+    after = prepare(folder, "sweep", "baseline", *elsewhere).summary
+    assert after["calls"] == {"live": swept["calls"]["live"] - 4, "cached": 4}
     for places in ((), ("--db", "other.duckdb")):
-        audit = await merge_runner("audit", *places)
+        audit = prepare(folder, "audit", *places)
         assert (audit.code, audit.out.count("all holds")) == (0, 3), audit.out
 
 
-@pytest.mark.slow
-async def test_a_situation_is_driven_for_a_second_as_its_trial_begins(merge_runner):
-    await merge_runner("sweep", "baseline", "--reps", 1, *TWO)
-    await merge_runner(*FIRST, "--reps", 1, *TWO)
-    query = (
+def test_a_situation_is_driven_for_a_second_as_its_trial_begins(both):
+    sql = (
         "select condition, side, step, time_s, position_m, velocity_mps, acceleration_mps2 "
         "from states join trials using (trial_id, spec_hash) where step <= 5 and source {} 'seat' "
         "order by all"
     )
-    trial, asked = [
-        (await merge_runner("sql", query.format(which), "--format", "csv")).out
-        for which in ("<>", "=")
-    ]
+    db = both[0] / DB
+    trial, asked = (query(db, sql.format(which))[1] for which in ("<>", "="))
     assert asked == trial
-    assert len(asked.splitlines()) == 1 + 2 * 2 * 6
-    last = "select max(end_time_s) from trials where source = 'seat'"
-    assert (await merge_runner("sql", last, "--format", "csv")).out.split()[1] == "1.0"
+    assert len(asked) == 2 * 2 * 6
+    assert query(db, "select max(end_time_s) from trials where source = 'seat'")[1] == [(1.0,)]
 
 
-@pytest.mark.slow
-async def test_the_trials_that_were_driven_are_shown_as_before(merge_runner, tmp_path):
-    await merge_runner("sweep", "baseline", "--reps", 1, *TWO)
-    shown = ("tables", "ablation-quantitative", "attempts", "--format", "csv")
-    before = await merge_runner(*shown)
-    await merge_runner(*FIRST, "--reps", 1)
-    after = await merge_runner(*shown)
-    assert (after.code, after.out) == (0, before.out)
+def test_the_trials_that_were_driven_are_shown_as_before(both):
+    before, after = both[3]
+    assert before == after != ""
 
 
-@pytest.mark.slow
 async def test_what_is_forgotten_is_asked_again_without_a_call(merge_runner):
-    await merge_runner(*FIRST, "--reps", 1, *TWO)
+    ask = (*FIRST, "--reps", 1, *TWO, "--json")
+    await merge_runner(*ask)
     stored = await merge_runner("digest")
     assert "2 trials" in stored.out
-    again = (await merge_runner(*FIRST, "--reps", 1, *TWO, "--json")).summary
-    assert again["trials"]["stored_before"] == 2
+    assert (await merge_runner(*ask)).summary["trials"]["stored_before"] == 2
     assert (await merge_runner("forget", "*", "--yes")).code == 0
     assert "0 trials" in (await merge_runner("digest")).out
-    anew = (await merge_runner(*FIRST, "--reps", 1, *TWO, "--json")).summary
-    assert anew["calls"] == {"live": 0, "cached": 4}
+    assert (await merge_runner(*ask)).summary["calls"] == {"live": 0, "cached": 4}
     assert (await merge_runner("digest")).out == stored.out
 
 
-@pytest.mark.long
-async def test_a_killed_run_goes_on_without_asking_anything_again(merge_runner, tmp_path):
-    async def slow(request, handler):
-        await asyncio.sleep(0.05)
-        return await handler(request)
-
-    async with watched(slow) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        ask = (*FIRST, "--reps", 2, "--in-flight", 3, "--json")
-        process = await merge_runner.start(*ask, **env)
-        while server.requests < 12:
-            await asyncio.sleep(0.02)
-        process.send_signal(signal.SIGKILL)
-        await process.wait()
-        run = await merge_runner(*ask, **env)
-        assert run.code == 0, run.err
-        assert run.summary["calls"]["live"] < 44
-        assert run.summary["trials"]["timeout"] == 22
-        # Only what was on its way when the process died may have been asked twice.
-        assert 44 <= server.requests <= 44 + 6
-    assert (await merge_runner("audit")).code == 0
-    whole = ("--db", "whole.duckdb", "--cache", "whole")
-    await merge_runner(*FIRST, "--reps", 2, *whole)
-    assert results_digest(tmp_path / DB) == results_digest(tmp_path / "whole.duckdb")
-
-
-@pytest.mark.slow
 async def test_a_sealed_replay_and_an_imported_recording_give_the_same_digest(
     merge_runner, tmp_path
 ):
@@ -154,14 +118,12 @@ async def test_a_sealed_replay_and_an_imported_recording_give_the_same_digest(
     assert len(digests) == 1
 
 
-@pytest.mark.slow
 async def test_a_replay_without_a_number_plays_the_repetitions_that_a_sweep_recorded(merge_runner):
     run = await merge_runner(*FIRST, "--replay", "--recording", RECORDING, "--json")
     assert run.code == 0, run.err
     assert run.summary["calls"] == {"live": 0, "cached": 220}
 
 
-@pytest.mark.slow
 async def test_a_recording_of_situations_is_no_recording_of_the_sweep(merge_runner):
     await merge_runner(*FIRST, "--reps", 1, *TWO)
     await merge_runner("recording", "export", "asked.parquet")
@@ -208,28 +170,11 @@ async def test_a_cap_that_leaves_more_of_one_prompt_than_of_another_says_so(merg
     assert f"3 trials wait for money {waiting}: " in run.err
 
 
-async def test_a_study_with_a_budget_pays_for_its_situations_from_it(merge_runner, tmp_path):
-    (tmp_path / "mine.toml").write_text("repetitions = 1\n[budget]\ntotal_usd = 5\n")
-    for first in (True, False):
-        plan = make_plan(str(tmp_path / "mine.toml"), "emulator", first=first)
-        assert plan.ledger == "mine"
-
-
 async def test_an_estimate_counts_one_call_a_situation(merge_runner):
     run = await merge_runner(*FIRST, "--reps", 2, "--dry-run", "--json")
     assert (run.summary["trials"], run.summary["calls"]) == (22, 44)
 
 
-@pytest.mark.slow
-async def test_a_program_is_asked_too_and_has_no_word(merge_runner):
-    run = await merge_runner(*FIRST, "--model", "constant", "--reps", 1, "--json")
-    assert run.code == 0, run.err
-    assert {look["share_m"] for look in run.summary["first_looks"]} == {None}
-    assert {look["first_action_mps2"] for look in run.summary["first_looks"]} == {0.0}
-    assert (await merge_runner("audit")).code == 0
-
-
-@pytest.mark.slow
 async def test_the_two_drivers_of_a_pair_are_summed_up_apart(merge_runner):
     pair = ("--model", "emulator+constant", "--mirror", "--reps", 1, "--conditions", "N_0_0")
     run = await merge_runner(*FIRST, *pair, "--json")
@@ -242,12 +187,13 @@ async def test_the_two_drivers_of_a_pair_are_summed_up_apart(merge_runner):
         ("emulator", "right", 1),
     ]
     assert [look["with_a_word"] for look in looks] == [0, 0, 1, 1]
+    of_a_program = [(look["share_m"], look["first_action_mps2"]) for look in looks[:2]]
+    assert of_a_program == [(None, 0.0)] * 2
     again = await merge_runner(*FIRST, *pair)
     for model in ("constant", "emulator"):
         assert f"\nemulator+constant  baseline  {model} " in again.out
 
 
-@pytest.mark.slow
 async def test_factors_and_prompts_of_a_study_are_asked(merge_runner, tmp_path):
     (tmp_path / "mine.toml").write_text(
         'repetitions = 1\nmodels = ["emulator"]\nconditions = ["N_0_0"]\n'
@@ -269,36 +215,6 @@ async def test_the_usual_grid_is_the_one_that_help_tells(merge_runner):
     assert "usual: {} and {}".format(*re.findall(r"=([^,]+)", USUAL_GRID)) in told
 
 
-def test_a_grid_has_every_pair_of_its_values_in_decimals():
-    assert grid_conditions("h=-4:4:4,dv=-0.8:0.4:0.4") == [
-        "R_-4_-8", "h-4_dv-0.4", "R_-4_0", "h-4_dv0.4",
-        "L_0_-8", "h0_dv-0.4", "N_0_0", "h0_dv0.4",
-        "L_4_-8", "h4_dv-0.4", "L_4_0", "h4_dv0.4",
-    ]  # fmt: skip
-    assert len(grid_conditions("usual")) == len(grid_conditions(USUAL_GRID)) == 7 * 9
-    assert grid_conditions("dv=0") == [
-        "h-6_dv0", "R_-4_0", "h-2_dv0", "N_0_0", "h2_dv0", "L_4_0", "h6_dv0",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("grid", "said"),
-    [
-        ("h=1:2", "--grid usual"),
-        ("x=1", "'x=1' is no axis"),
-        ("h=nan", "'h=nan' is no axis"),
-        ("h=2:1:1", "'h=2:1:1' is no axis"),
-        ("h=0:1:0", "'h=0:1:0' is no axis"),
-        ("h=0:1:-1", "'h=0:1:-1' is no axis"),
-        ("h=0:9999:0.01", "is no axis of 1 to 100 values"),
-        ("h=0,dv=20", "both vehicles must drive forwards"),
-    ],
-)
-def test_a_grid_that_is_none_is_refused_with_what_to_type(grid, said):
-    with pytest.raises(UsageError, match=said):
-        make_plan("baseline", "emulator", first=True, grid=grid)
-
-
 async def test_situations_that_cannot_be_asked_are_refused_before_anything_is(
     merge_runner, tmp_path
 ):
@@ -318,23 +234,12 @@ async def test_situations_that_cannot_be_asked_are_refused_before_anything_is(
     assert not (tmp_path / "results").exists()
 
 
-@pytest.mark.slow
-async def test_a_sweep_plays_the_points_of_a_grid_and_takes_what_was_asked(merge_runner):
-    point = ("--conditions", "h2_dv-1.2")
-    assert (await merge_runner(*FIRST, "--reps", 1, *point)).code == 0
-    run = await merge_runner("sweep", "baseline", "--reps", 1, *point, "--json")
-    assert (run.code, run.summary["calls"]["cached"]) == (0, 2), run.err
-    audit = await merge_runner("audit")
-    assert audit.code == 0, audit.out
-
-
 async def wordless(request: web.Request, handler) -> web.StreamResponse:
     body = json.loads((await handler(request)).body)
     body["choices"][0]["message"]["content"] = "I would rather not say."
     return web.json_response(body)
 
 
-@pytest.mark.slow
 async def test_no_question_depends_on_an_answer_and_replies_without_a_plan_are_counted(
     merge_runner,
 ):
@@ -343,17 +248,7 @@ async def test_no_question_depends_on_an_answer_and_replies_without_a_plan_are_c
     for middle, name in ((None, "usual"), (wordless, "wordless")):
         async with watched(middle) as server:
             places = ("--cache", name, "--db", f"{name}.duckdb")
-            ask = (
-                "sweep",
-                "baseline",
-                "--first",
-                "--reps",
-                2,
-                "--keep-going",
-                *TWO,
-                "--json",
-                *places,
-            )
+            ask = (*FIRST, "--reps", 1, "--keep-going", *TWO, "--json", *places)
             run = await merge_runner(*ask, EMULATOR_BASE_URL=f"{server.url}/v1")
             assert run.code == 0, run.err
             asked.append(server.asked)

@@ -9,25 +9,12 @@ from dataclasses import replace
 import pytest
 
 from merge_runner.errors import StoreError, StoreLocked
-from merge_runner.records import (
-    Attempt,
-    ChatReply,
-    Decision,
-    DecisionRow,
-    TrialRecord,
-    TrialSpec,
-)
-from merge_runner.run.local_runner import (
-    MOST_PENDING,
-    MOST_PENDING_BYTES,
-    Flusher,
-)
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.records import Attempt, ChatReply, Decision, DecisionRow, TrialRecord
+from merge_runner.run.local_runner import MOST_PENDING, MOST_PENDING_BYTES, Flusher
 from tests.support.gate import HANGS_S
+from tests.support.specs import spec_of
 
-SPEC = TrialSpec(
-    "t", "h", "llm", "m", "m", "baseline", "L_4_0", 1, 0, 0, kinematics=CONDITIONS["L_4_0"]
-)
+SPEC = spec_of()
 MB = 2**20
 
 
@@ -50,13 +37,14 @@ class Refusing:
 
 @pytest.mark.parametrize("error", [StoreLocked("somebody reads"), KeyError("a fault of ours")])
 async def test_trials_wait_for_no_reader_and_no_flusher_that_is_gone(error):
-    flusher = Flusher(Refusing(error), "sweep", lambda line: None)
+    store = Refusing(error)
+    flusher = Flusher(store, "sweep", lambda line: None)
     for _ in range(2 * MOST_PENDING):
         flusher.add(trial(0))
-    async with asyncio.timeout(10):
-        await flusher.room()
-    flusher._task.cancel()
-    await asyncio.gather(flusher._task, return_exceptions=True)
+    await asyncio.wait_for(flusher.room(), HANGS_S)
+    store.error = StoreError("that is the end")
+    with pytest.raises(StoreError):
+        await asyncio.wait_for(flusher.close(), HANGS_S)
 
 
 class Slow:
@@ -75,7 +63,8 @@ class Slow:
 async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     store = Slow()
     flusher = Flusher(store, "sweep", lambda line: None)
-    while flusher._bytes <= MOST_PENDING_BYTES:
+    most = MOST_PENDING_BYTES // (5 * MB) + 1
+    for _ in range(most):
         await asyncio.wait_for(flusher.room(), HANGS_S)
         flusher.add(trial(5 * MB))
     waiting = asyncio.create_task(flusher.room())
@@ -85,9 +74,7 @@ async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     async with asyncio.timeout(HANGS_S):
         await waiting
     await flusher.close()
-    assert sum(store.written) == MOST_PENDING_BYTES // (5 * MB) + 1
-    assert max(store.written) == 3
-    assert flusher._bytes == 0
+    assert (sum(store.written), max(store.written)) == (most, 3)
 
 
 async def test_trials_are_stored_in_few_transactions():
@@ -132,7 +119,6 @@ async def test_while_the_database_is_held_256_trials_stay_in_memory_and_the_fail
         flusher.add(ended(order, "failed" if order in (300, 400) else "collided"))
         await asyncio.wait_for(flusher.room(), HANGS_S)
     await is_refused(flusher)
-    assert [record.spec.order for record, _ in flusher._pending] == [*range(256), 300, 400]
     assert [spec.order for spec in flusher.dropped] == [*range(256, 300), *range(301, 400),
                                                         *range(401, 500)]  # fmt: skip
     assert flusher.problem == "500 trials wait to be stored: somebody reads"
@@ -143,14 +129,14 @@ async def test_while_the_database_is_held_256_trials_stay_in_memory_and_the_fail
         store.go_on.set()
         await closing
     assert store.written == [*range(256), 300, 400]
-    assert (flusher.left, flusher._bytes, flusher.problem) == (242, 0, "")
+    assert (flusher.left, flusher.problem) == (242, "")
     # They may come again, and are stored by the next call.
     flusher.add(ended(256))
     await asyncio.wait_for(flusher.close(), HANGS_S)
     assert store.written[-1] == 256
 
 
-async def test_while_the_database_is_held_long_replies_stay_up_to_a_bound_and_a_first_one_always():
+async def test_while_the_database_is_held_a_first_long_reply_stays_always():
     store = Held()
     flusher = Flusher(store, "sweep", lambda line: None)
     flusher.add(ended(0, size=MOST_PENDING_BYTES + 1))
@@ -159,12 +145,19 @@ async def test_while_the_database_is_held_long_replies_stay_up_to_a_bound_and_a_
     assert [spec.order for spec in flusher.dropped] == [1]
     store.go_on.set()
     await flusher.close()
-    store.go_on.clear()
-    for order in range(2, 8):
+    assert store.written == [0]
+
+
+async def test_while_the_database_is_held_replies_stay_in_memory_up_to_a_bound():
+    store = Held()
+    flusher = Flusher(store, "sweep", lambda line: None)
+    for order in range(6):
         flusher.add(ended(order, size=MOST_PENDING_BYTES // 4))
-    await asyncio.gather(flusher._flush())
-    assert [record.spec.order for record, _ in flusher._pending] == [2, 3, 4]
-    assert [spec.order for spec in flusher.dropped] == [1, 5, 6, 7]
+        await is_refused(flusher)
+    store.go_on.set()
+    await flusher.close()
+    assert store.written == [0, 1, 2]
+    assert [spec.order for spec in flusher.dropped] == [3, 4, 5]
 
 
 async def test_what_is_dropped_counts_as_not_stored_where_the_disk_is_full():

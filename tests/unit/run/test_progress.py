@@ -6,7 +6,6 @@ from datetime import UTC, datetime, timedelta
 
 from merge_runner.llm.client import Meter
 from merge_runner.records import Attempt, Usage
-from merge_runner.run.progress import _results
 from tests.support.standings import progress, runner
 
 
@@ -61,10 +60,3 @@ def test_replies_that_cost_more_than_is_counted_are_a_warning():
     warning = dict(rows(progress(runner(meter))))["WARNING"]
     assert warning.startswith("0: replies are of the service tier 'priority'")
     assert "tiers = { priority = 2.0 }" in warning
-
-
-def test_the_summary_says_of_no_fallback_that_an_earlier_plan_was_there():
-    """A model of which no reply is valid has none."""
-    counts = {"decisions": 92, "invalid_decisions": 92, "fallbacks": 92, "no_decision": 0}
-    (line,) = _results({"first_looks": [], "outcomes_by_level": [], **counts})
-    assert line == "decisions: 92, 92 invalid (100.0%), 92 fallbacks"

@@ -13,18 +13,6 @@ from merge_runner.run.plan import make_plan
 HEAD = 'description = "x"\nrepetitions = 2\nconditions = ["N_0_0"]\n'
 
 
-@pytest.fixture
-def plan_of(tmp_path):
-    """Makes the plan of a study's text."""
-
-    def plan(text, models=(), **asked):
-        file = tmp_path / "mine.toml"
-        file.write_text(HEAD + text)
-        return make_plan(str(file), models, **asked)
-
-    return plan
-
-
 def arms(plan):
     return {arm.label for arm in plan.arms}
 
@@ -54,11 +42,11 @@ def test_models_factors_and_prompts_are_crossed_and_named_by_what_varies(plan_of
 
 
 def test_more_trials_than_can_be_played_are_refused_before_they_are_built(plan_of):
-    many = f"[factors]\nseed = {[*range(10_000)]}\nmax_output_tokens = {[*range(1, 10_001)]}\n"
+    many = f"[factors]\nseed = {[*range(1_100)]}\nmax_output_tokens = {[*range(1, 1_001)]}\n"
     with pytest.raises(UsageError) as refused:
         plan_of(many)
     assert str(refused.value) == (
-        "these are 200,000,000 trials, and at most 1,000,000 can be played: leave out "
+        "these are 2,200,000 trials, and at most 1,000,000 can be played: leave out "
         "levels, conditions or repetitions, in the file or by --only, --conditions or --reps"
     )
     part = {"seed": ["7", "8"], "max_output_tokens": ["300"]}
@@ -168,46 +156,6 @@ def test_plain_sweeps_have_one_arm_for_each_prompt():
     assert all(not spec.factors for spec in plan.trial_specs())
 
 
-@pytest.mark.parametrize(
-    ("text", "models", "says"),
-    [
-        (
-            "[factors]\ntemprature = [1]\n",
-            ["o3"],
-            "unknown factor 'temprature'; valid: prompt, opp",
-        ),
-        (
-            "[factors]\ntop_k = [1]\n",
-            ["o3"],
-            "o3 takes no parameter top_k; valid: max_output_tokens",
-        ),
-        ("[factors]\nskip = [1]\n", [], "unknown factor 'skip'; valid: prompt, opp"),
-        (
-            'skip = [{ model = "emulator+random", opponent = "random" }]\n'
-            '[factors]\nseed = [1]\nopponent = ["self", "random"]\n',
-            ["emulator+random", "emulator"],
-            "have the same names, and are asked otherwise: leave one out",
-        ),
-        ("[factors]\ntemperature = [0.2]\n", ["o3"], "no parameter temperature but its default"),
-        ("[factors]\ntemperature = [0.2]\n", ["constant"], "is a program and takes no temperature"),
-        ("[factors]\ntemperature = []\n", ["o3"], "nothing is left to play: look at [factors]"),
-        ('[factors]\nmodel = ["o3"]\n', [], "unknown factor 'model'; valid: prompt, opp"),
-        ('[factors]\nprompt = ["A9"]\n', [], "unknown variant 'A9'; valid: baseline, A1"),
-        ('[factors]\nopponent = ["nobody"]\n', [], "unknown model 'nobody'; valid: emulator"),
-        ('[factors]\nopponent = ["constant"]\n', ["o3+local"], "is a pair already"),
-        ('[factors]\ncollision_rule = ["round"]\n', [], "collision_rule"),
-        ("skip = [{ speed = 1 }]\n[factors]\nseed = [1]\n", [], "unknown factor 'speed'; valid"),
-        ("skip = [{ seed = 2 }]\n[factors]\nseed = [1]\n", [], "unknown level of seed '2'; valid"),
-        ("skip = [{ seed = 1 }]\n[factors]\nseed = [1]\n", [], "nothing is left to play"),
-    ],
-)
-def test_what_cannot_be_is_refused_with_the_valid_choices(plan_of, text, models, says):
-    with pytest.raises(UsageError) as caught:
-        plan_of(text, models)
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 FOGGY = "[perception.foggy]\nspeed_sd_mps = 0.3\ndelay_s = 0.4\n"
 
 
@@ -241,23 +189,6 @@ def test_a_parameter_within_what_is_no_table_takes_its_place(plan_of, tmp_path):
     assert entry.parameters == {"reasoning": {"effort": "low"}}
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('[factors]\nperception = ["fog"]\n' + FOGGY, "'fog'; valid: perfect, foggy"),
-        (
-            '[factors]\nperception = ["late"]\n[perception.late]\ndelay_s = 0.3\n',
-            "no whole number of 0.2 s: set step_s ",
-        ),
-        ("[perception.perfect]\ndelay_s = 0.2\n", r"perception.perfect\] needs another name"),
-        ("[perception.foggy]\nspeed_sd = 1\n", "'perception.foggy.speed_sd'; valid: position_sd"),
-    ],
-)
-def test_a_perception_that_there_is_not_is_refused_with_those_that_there_are(plan_of, text, said):
-    with pytest.raises(UsageError, match=said):
-        plan_of(text)
-
-
 @pytest.mark.parametrize("scenario", ["", "[scenario]\nstep_s = 0.05\nplan_step_s = 0.2\n"])
 def test_a_delay_has_to_fit_the_step_of_the_world_that_is_played(plan_of, scenario):
     late = '[factors]\nperception = ["late"]\n[perception.late]\ndelay_s = 0.3\n'
@@ -275,15 +206,3 @@ def test_the_reference_of_a_factor_is_its_first_level_or_the_one_that_is_named(p
     chosen = {"model": ["local", "emulator"], "prompt": ["A2", "baseline"], "seed": ["1", "7"]}
     assert plan.model_dump(mode="json")["levels"] == chosen
     assert next(iter(plan.arms)).model == "local", "power compares with the first arm"
-
-
-@pytest.mark.parametrize(
-    ("reference", "says"),
-    [
-        ("seed = 3", "unknown level of seed '3'; valid: 7, 1"),
-        ('mood = "good"', "unknown factor 'mood'; valid: model, seed, prompt"),
-    ],
-)
-def test_a_reference_that_is_no_level_is_refused(plan_of, reference, says):
-    with pytest.raises(UsageError, match=says):
-        plan_of(f"reference = {{ {reference} }}\n[factors]\nseed = [7, 1]\n")

@@ -5,21 +5,8 @@ from __future__ import annotations
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner.run.plan import make_plan
 
 HEAD = 'repetitions = 2\nconditions = ["N_0_0", "L_4_0"]\n'
-
-
-@pytest.fixture
-def plan_of(tmp_path):
-    """Makes the plan of a study's text."""
-
-    def plan(text, models=(), **asked):
-        file = tmp_path / "mine.toml"
-        file.write_text(HEAD + text)
-        return make_plan(str(file), models, **asked)
-
-    return plan
 
 
 def seats(plan):

@@ -9,46 +9,23 @@ import pytest
 
 from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.errors import UsageError
 from merge_runner.records import SIDES, ChatReply, ChatRequest
 from merge_runner.registry import using
 from merge_runner.run.plan import make_plan
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.trial import play_trial
-
-PLUGIN = """
-from merge_runner.drivers.registry import PROGRAMS, Program
-
-class Braking:
-    def __init__(self, seat):
-        self.seat = seat
-
-    async def decide(self, observation, number):
-        return self.seat.held(-self.seat.number("strength"))
-
-def check(parameters):
-    from merge_runner.errors import UsageError
-    if parameters["strength"] > 1:
-        raise UsageError("strength is at most 1")
-
-SETS = {"mild": {"strength": 0.1, "unused": 1.0}, "hard": {"strength": 0.9, "unused": 2.0}}
-PROGRAMS.register(
-    "braking",
-    Program(Braking, "brakes", {"set": "mild"}, 20.0, settable=True, sets=SETS, check=check),
-)
-"""
+from tests.support.braking import BRAKING, HEAD
 
 
 @pytest.fixture
 def plan_of(tmp_path):
     """Makes the plan of a study's text beside a plug-in with a program of 20 Hz."""
-    (tmp_path / "mine.py").write_text(PLUGIN)
+    (tmp_path / "mine.py").write_text(BRAKING)
 
     def plan(text, models=(), scenario=""):
         file = tmp_path / "mine.toml"
-        head = f'repetitions = 1\nconditions = ["N_0_0"]\n{text}\n{scenario}\n'
-        file.write_text(f'{head}[plugins]\nfiles = ["mine.py"]\n')
+        file.write_text(f'{HEAD}{text}\n{scenario}\n[plugins]\nfiles = ["mine.py"]\n')
         return make_plan(str(file), models, trust=True)
 
     return plan
@@ -109,43 +86,6 @@ async def test_a_clock_holds_each_action(plan_of):
     assert specs(plan)[0]["left"]["rate_hz"] == 1.0
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (MINE + "force = 1\n", r"\[drivers\.mine\]: unknown parameter of braking 'force'; valid: "),
-        (MINE + 'strength = "1"\n', "strength of braking is a finite number, as 0.1, not '1'"),
-        (MINE + "strength = true\n", "strength of braking is a finite number"),
-        (MINE + "strength = nan\n", "strength of braking is a finite number"),
-        (MINE + "set = 1\n", "set of braking is a text, as 'mild'"),
-        (MINE + 'set = "soft"\n', "unknown set of the driver Braking 'soft'; valid: mild, hard"),
-        (MINE + "strength = 2\n", r"\[drivers\.mine\]: strength is at most 1"),
-        (MINE + "clock = 0\n", "clock: Input should be greater than 0"),
-        (
-            '[drivers.mine]\nprogram = "cei"\nclock = 0.12\n',
-            r"\[drivers\.mine\]: the driver cei perceives every 0\.05 s: clock = 0\.12 s",
-        ),
-        (
-            '[drivers.mine]\nprogram = "cei"\nupper_mean = 0.8\n',
-            r"\[drivers\.mine\]: unknown parameter of cei 'upper_mean'; valid: set, pair \(each",
-        ),
-        (
-            '[drivers.mine]\nprogram = "quantal"\nclock = 2.0\nhorizon_s = 1.5\n',
-            r"\[drivers\.mine\]: horizon_s of quantal is at least its clock, 2 s",
-        ),
-        ('[drivers.mine]\nprogram = "brake"\n', "unknown driver 'brake'; valid: constant, "),
-        ('[drivers.braking]\nprogram = "constant"\n', "there is a driver 'braking' already"),
-        ('[drivers.o3]\nprogram = "constant"\n', "needs another name: there is one"),
-        (
-            '[drivers.mine]\nprogram = "projected-order"\ntarget_gap_m = 5\n',
-            "the parameters of projected-order stand in its source and cannot be set",
-        ),
-    ],
-)
-def test_what_cannot_be_a_driver_is_refused_with_the_valid_choices(plan_of, text, said):
-    with pytest.raises(UsageError, match=said):
-        plan_of(text, "constant")
-
-
 def test_a_stored_study_has_its_drivers_without_running_its_plugins(plan_of):
     text = plan_of(MINE + '[drivers.slow]\nprogram = "constant"\nclock = 2.0\n', "mine").study.text
     plan_of("", "constant")
@@ -175,12 +115,6 @@ def test_a_world_is_as_fine_as_its_drivers_need_and_otherwise_as_it_was(plan_of)
 def test_what_a_sweep_stores_of_its_world_is_what_its_trials_are_played_in(plan_of):
     plan = plan_of("", "braking")
     assert plan.model_dump(mode="json")["arms"][0]["scenario"] == specs(plan)[0]["scenario"]
-
-
-def test_a_step_that_is_given_and_does_not_fit_is_refused(plan_of):
-    for text, scenario in (("", "[scenario]\nstep_s = 0.2\n"), ("[factors]\nstep_s = [0.2]\n", "")):
-        with pytest.raises(UsageError, match=r"cannot decide 20\.0 times a second"):
-            plan_of(text, "braking", scenario)
 
 
 async def test_a_model_is_told_the_same_in_the_finer_world(plan_of):

@@ -11,39 +11,14 @@ from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import model_pace, program_pace
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import CallFailed, SweepStopped, TrialSuspended, UsageError
-from merge_runner.records import SIDES, Attempt, ChatRequest, Decision, Slot, TrialSpec
+from merge_runner.records import SIDES, Attempt, ChatRequest, Decision, Slot
 from merge_runner.results.database import SCHEMA
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
+from tests.support.specs import spec_of
 
 EXECUTED = 5
 ATTEMPTS = (Attempt(1, "http_500"), Attempt(2, "timeout"))
-REQUEST = ChatRequest(
-    key="key",
-    provider="test",
-    endpoint="test",
-    model="model",
-    path="/chat",
-    headers={},
-    body="{}",
-    slot=Slot("N_0_0", 1, "left", 0, 0),
-)
-
-
-def spec_of(condition):
-    return TrialSpec(
-        trial_id="test",
-        spec_hash="test",
-        source="driver",
-        model_left="test",
-        model_right="test",
-        variant="baseline",
-        condition=condition,
-        repetition=1,
-        sample_set=0,
-        order=0,
-        kinematics=CONDITIONS[condition],
-    )
+REQUEST = ChatRequest("key", "test", "test", "model", "/", {}, "{}", Slot("N_0_0", 1, "left", 0, 0))
 
 
 async def play(left, right, condition="N_0_0", *, in_turn=False, **scenario):
@@ -181,17 +156,21 @@ async def test_the_prompt_rate_decides_when_the_drivers_are_asked():
     assert times[:4] == [0.0, 0.4, 0.8, 1.2]
 
 
+ACTIONS = (0.1, -0.2, 0.3, -0.4, 0.5)
+
+
+class Wavering(Holding):
+    """Decides on the same five actions each time."""
+
+    async def decide(self, observation, number):
+        return Decision(plan=ACTIONS * 4, applied=ACTIONS)
+
+
 async def test_the_actions_of_a_decision_are_driven_in_their_order():
-    actions = (0.1, -0.2, 0.3, -0.4, 0.5)
-
-    class Wavering:
-        async def decide(self, observation, number):
-            return Decision(plan=actions * 4, applied=actions)
-
-    trial = await play(Wavering(), Holding(-1.0))
+    trial = await play(Wavering(0), Holding(-1.0))
     driven = [row.acceleration_mps2 for row in trial.states if row.side == "left"]
     # The row of step 0 is the start of control; steps 1 to 10 are two decisions.
-    assert driven[1:11] == pytest.approx([2.5 * a for a in actions * 2])
+    assert driven[1:11] == pytest.approx([2.5 * a for a in ACTIONS * 2])
 
 
 async def test_a_trial_ends_within_a_second_when_the_cars_collide():
@@ -309,26 +288,15 @@ async def test_each_driver_decides_at_its_own_rate_and_counts_its_own_decisions(
 
 
 async def test_a_plan_in_steps_of_its_own_drives_the_same_way_in_a_finer_world():
-    actions = (0.1, -0.2, 0.3, -0.4, 0.5)
-
-    class Wavering(Holding):
-        async def decide(self, observation, number):
-            return Decision(plan=actions * 4, applied=actions)
-
     coarse = await play(Wavering(0), Holding(-1.0))
     fine = await play(Wavering(0), Fast(-1.0), **FINE)
-    for side in SIDES:
-        one, other = (
-            {
-                row.time_s: (row.position_m, row.velocity_mps)
-                for row in trial.states
-                if row.side == side
-            }
-            for trial in (coarse, fine)
-        )
-        shared = sorted(one.keys() & other.keys())
-        assert len(shared) > 40
-        assert [other[t] for t in shared] == [pytest.approx(one[t]) for t in shared]
+    one, other = (
+        {(row.side, row.time_s): (row.position_m, row.velocity_mps) for row in trial.states}
+        for trial in (coarse, fine)
+    )
+    shared = sorted(one.keys() & other.keys())
+    assert len(shared) > 80
+    assert [other[t] for t in shared] == [pytest.approx(one[t]) for t in shared]
 
 
 async def test_a_slow_driver_is_not_asked_while_a_fast_one_is():
@@ -353,38 +321,35 @@ async def test_a_failed_call_has_the_number_of_its_own_driver(failing):
 
 
 def test_a_seed_is_that_of_the_slot_and_of_no_driver():
-    spec = spec_of("N_0_0")
-    seed = take_seat(ScenarioConfig(), spec, "left", model_pace(ScenarioConfig())).seed
+    spec, task = spec_of("N_0_0"), ScenarioConfig()
+    seed = take_seat(task, spec, "left", model_pace(task)).seed
     assert seed == 4387192367012543550
-    others = [
-        take_seat(ScenarioConfig(), other, side, model_pace(ScenarioConfig())).seed
+    others = {
+        take_seat(task, other, side, model_pace(task)).seed
         for other, side in (
             (spec, "right"),
             (replace(spec, condition="L_4_0"), "left"),
             (replace(spec, repetition=2), "left"),
             (replace(spec, sample_set=1), "left"),
         )
-    ]
+    }
     assert len({seed, *others}) == 5
     renamed = replace(spec, model_left="another", variant="A1", order=7)
-    assert take_seat(ScenarioConfig(), renamed, "left", model_pace(ScenarioConfig())).seed == seed
+    assert take_seat(task, renamed, "left", model_pace(task)).seed == seed
 
 
-async def test_an_action_that_cannot_be_driven_is_refused():
-    with pytest.raises(UsageError, match=r"^the left driver decided 1\.5: -1 to 1 can be driven$"):
-        await play(Holding(1.5), Holding(0.0))
-
-
-class Short:
+class Short(Holding):
     """Decides on less than is to be driven."""
 
     async def decide(self, observation, number):
         return Decision(plan=None, applied=(0.5,))
 
 
-async def test_a_decision_that_cannot_be_driven_is_refused_in_one_line():
+async def test_what_cannot_be_driven_is_refused_in_one_line():
+    with pytest.raises(UsageError, match=r"^the left driver decided 1\.5: -1 to 1 can be driven$"):
+        await play(Holding(1.5), Holding(0.0))
     with pytest.raises(UsageError, match=r"the left driver decided on \(0.5,\), and is to drive 5"):
-        await play(Short(), Short())
+        await play(Short(0), Holding(0.0))
 
 
 @pytest.mark.parametrize("kind", [TrialSuspended, SweepStopped, UsageError, KeyError])

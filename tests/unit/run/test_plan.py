@@ -10,7 +10,7 @@ import pytest
 from merge_runner.errors import UsageError
 from merge_runner.records import Usage
 from merge_runner.run.estimate import estimate
-from merge_runner.run.plan import PROGRAMS, Options, make_plan
+from merge_runner.run.plan import PROGRAMS, USUAL_GRID, Options, grid_conditions, make_plan
 
 
 def hashes(plan):
@@ -93,30 +93,6 @@ def test_the_spec_hash_of_the_baseline_is_pinned():
     assert hashes(make_plan("baseline", "emulator")) == {"baseline": "60fac55280b8ebe3"}
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("[repetitions]\nA9 = 1", "unknown variant 'A9'; valid: baseline, A1"),
-        ("[repetitions]\nbaseline = 0", "repetitions.baseline"),
-        ("[repetitions]\nbaseline = 1.5", "repetitions.baseline"),
-        ("[repetitions]", "has no variant"),
-        ("conditions = []\n[repetitions]\nbaseline = 1", "no condition is left"),
-        ("repetition = 3", "unknown key 'repetition'; valid: description, models, rep"),
-        ("[repetitions]\nbaseline = 1\n[scenario]\nstep = 1", "valid: horizon_s"),
-        ("[repetitions]\nbaseline = 1\n[scenario]\nstep_s = 0.3", "no whole number"),
-        ("conditions = ['L_9_9']\n[repetitions]\nbaseline = 1", "unknown condition 'L_9_9'"),
-        ("[repetitions", "Expected ']'"),
-    ],
-)
-def test_a_bad_sweep_file_gets_one_line_with_the_valid_choices(tmp_path, text, says):
-    file = tmp_path / "mine.toml"
-    file.write_text(text)
-    with pytest.raises(UsageError) as caught:
-        make_plan(str(file), "emulator")
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def test_a_program_is_known_by_the_parameters_of_its_rule(monkeypatch):
     plan = make_plan("baseline", "projected-order")
     before = hashes(plan)
@@ -169,3 +145,39 @@ def test_the_estimate_is_by_what_was_measured():
     assert (expected.trials, expected.calls) == (40, 840)
     assert expected.singly_usd == pytest.approx(840 * each, abs=0.01)
     assert expected.cost_usd == 5.46
+
+
+def test_a_grid_has_every_pair_of_its_values_in_decimals():
+    assert grid_conditions("h=-4:4:4,dv=-0.8:0.4:0.4") == [
+        "R_-4_-8", "h-4_dv-0.4", "R_-4_0", "h-4_dv0.4",
+        "L_0_-8", "h0_dv-0.4", "N_0_0", "h0_dv0.4",
+        "L_4_-8", "h4_dv-0.4", "L_4_0", "h4_dv0.4",
+    ]  # fmt: skip
+    assert len(grid_conditions("usual")) == len(grid_conditions(USUAL_GRID)) == 7 * 9
+    assert grid_conditions("dv=0") == [
+        "h-6_dv0", "R_-4_0", "h-2_dv0", "N_0_0", "h2_dv0", "L_4_0", "h6_dv0",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("grid", "said"),
+    [
+        ("h=1:2", "--grid usual"),
+        ("x=1", "'x=1' is no axis"),
+        ("h=nan", "'h=nan' is no axis"),
+        ("h=2:1:1", "'h=2:1:1' is no axis"),
+        ("h=0:1:0", "'h=0:1:0' is no axis"),
+        ("h=0:1:-1", "'h=0:1:-1' is no axis"),
+        ("h=0:9999:0.01", "is no axis of 1 to 100 values"),
+        ("h=0,dv=20", "both vehicles must drive forwards"),
+    ],
+)
+def test_a_grid_that_is_none_is_refused_with_what_to_type(grid, said):
+    with pytest.raises(UsageError, match=said):
+        make_plan("baseline", "emulator", first=True, grid=grid)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_study_with_a_budget_pays_for_its_situations_from_it(tmp_path, first):
+    (tmp_path / "mine.toml").write_text("repetitions = 1\n[budget]\ntotal_usd = 5\n")
+    assert make_plan(str(tmp_path / "mine.toml"), "emulator", first=first).ledger == "mine"

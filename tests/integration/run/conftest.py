@@ -1,0 +1,7 @@
+"""Fixtures for sweeps on a cluster."""
+
+from __future__ import annotations
+
+from tests.support.cluster import scheduler, started
+
+__all__ = ["scheduler", "started"]

@@ -1,0 +1,24 @@
+"""A plug-in with a program of 20 Hz that brakes by a parameter, and the head of its study."""
+
+HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
+BRAKING = """
+from merge_runner.drivers.registry import PROGRAMS, Program
+
+class Braking:
+    def __init__(self, seat):
+        self.seat = seat
+
+    async def decide(self, observation, number):
+        return self.seat.held(-self.seat.number("strength"))
+
+def check(parameters):
+    from merge_runner.errors import UsageError
+    if parameters["strength"] > 1:
+        raise UsageError("strength is at most 1")
+
+SETS = {"mild": {"strength": 0.1, "unused": 1.0}, "hard": {"strength": 0.9, "unused": 2.0}}
+PROGRAMS.register(
+    "braking",
+    Program(Braking, "brakes", {"set": "mild"}, 20.0, settable=True, sets=SETS, check=check),
+)
+"""

@@ -1,0 +1,130 @@
+"""What takes long on a Dask cluster: who is gone or stands still, and the limits of all workers."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import shutil
+import time
+
+import pytest
+
+from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, workers_of
+from tests.support.gate import HANGS_S, Gate
+from tests.support.harness import FAST, PROJECT, watched
+from tests.support.mock_server import FaultPlan
+from tests.support.virtual_time import fullest_window
+
+
+async def test_where_no_scheduler_listens_it_says_so_soon(merge_runner):
+    async with asyncio.timeout(HANGS_S):
+        run = await merge_runner(*SMALL, "--dask", "127.0.0.1:1")
+    assert run.code == 2
+    assert run.err.startswith("error: no Dask scheduler answers at 127.0.0.1:1 within 10 s")
+    assert len(run.err.splitlines()) == 1
+
+
+async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, scheduler):
+    async def middle(request, handler):
+        if server.requests == 10:
+            scheduler.process.kill()
+        return await handler(request)
+
+    await scheduler("--no-nanny")
+    async with watched(middle, FaultPlan(latency_s=0.2)) as server:
+        url = f"{server.url}/v1"
+        run = await merge_runner(*SMALL, "--dask", scheduler.file, EMULATOR_BASE_URL=url)
+        assert run.code == 1
+        assert "error: the Dask scheduler is gone" in run.err
+        assert "Traceback" not in run.err
+        again = await merge_runner(*SMALL, EMULATOR_BASE_URL=url)
+    assert again.code == 0, again.err
+
+
+async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
+    merge_runner, started, tmp_path
+):
+    gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
+    async with watched(gate.middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await started(*SIX, "--in-flight", 3, "--dask", "local:3", **env)
+        await all_held(gate, trials=3)
+        still = next(w for w in workers_of(process.pid) if held_from(gate, w))
+        still.suspend()
+        gate.open()
+        # Each worker has two trials of 19 calls, one at a time; those of the others are made.
+        async with asyncio.timeout(HANGS_S):
+            while len(gate.asked) < 76:
+                await asyncio.sleep(0.1)
+        still.resume()
+        code, _, err = await ended(process)
+    assert code == 0, err
+    assert not gate.asked_again
+
+
+async def test_requests_a_minute_hold_over_all_workers(merge_runner):
+    times = []
+
+    async def middle(request, handler):
+        times.append(time.monotonic())
+        return await handler(request)
+
+    async with watched(middle) as server:
+        run = await merge_runner(
+            *SIX, "--in-flight", 3, "--dask", "local:3", "--rpm", 600,
+            EMULATOR_BASE_URL=f"{server.url}/v1",
+        )  # fmt: skip
+    assert run.code == 0, run.err
+    # Half a second's worth goes at a time at each worker, and may come a little late; one limiter
+    # of 600 for each would let three times as many through.
+    assert fullest_window(times, [1] * len(times), length=1.0) <= 1.5 * 10 + 3
+
+
+async def test_the_cost_cap_holds_over_all_workers_and_a_higher_one_goes_on(merge_runner, tmp_path):
+    # Trials end after 12 s at the latest, so that none can cost more than 3.4 USD.
+    shutil.copytree(PROJECT / "experiments", tmp_path / "experiments")
+    short = "[repetitions]\nbaseline = 10\n[scenario]\ntimeout_s = 12\n"
+    (tmp_path / "experiments/baseline.toml").write_text(short)
+    cap, usd = 3.7, 0.0
+
+    async def middle(request, handler):
+        nonlocal usd
+        reply = await handler(request)
+        usage = json.loads(reply.body)["usage"]
+        usd += (2 * usage["prompt_tokens"] + 8 * usage["completion_tokens"]) / 1e6
+        return reply
+
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        sweep = (*SIX, "--reps", 18, "--model", "o3", "--yes", *FAST)
+        run = await merge_runner(*sweep, "--dask", "local:3", "--max-cost", cap, **env)
+        assert run.code == 3, run.err
+        assert 0 < usd <= cap
+        assert run.summary["cost_usd"] == pytest.approx(usd)
+        assert run.summary["sweep_cost_usd"] == pytest.approx(usd)
+        assert run.summary["trials"]["suspended"] > 0
+        done = await merge_runner(*sweep, "--max-cost", 50, **env)
+        assert done.code == 0, done.err
+        calls = await merge_runner("sql", "select count(*) from calls", "--format", "csv")
+        assert int(calls.out.split()[1]) == server.requests, "nothing was paid for twice"
+    assert done.summary["sweep_cost_usd"] == pytest.approx(usd)
+    assert done.summary["set_aside_usd"] == 0
+
+
+async def test_no_valid_decision_ends_a_run_on_a_cluster_too(merge_runner):
+    async with watched(faults=FaultPlan(rates={"malformed": 1.0})) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        sweep = ("sweep", "baseline", "--reps", 4, "--in-flight", 2, "--dask", "local:1", "--json")
+        stopped = await merge_runner(*sweep, **env)
+    assert stopped.code == 1, stopped.err
+    assert "decisions of emulator is valid" in stopped.summary["messages"][0]
+    assert server.requests < 100, "it asked all"
+
+
+async def test_who_answers_a_worker_is_known_and_where_nobody_does(merge_runner, emulator_url):
+    o3 = (*SMALL, "--model", "o3", "--yes", *FAST, "--dask", "local:1")
+    dead = await merge_runner(*o3, OPENAI_API_KEY="x", OPENAI_BASE_URL="http://127.0.0.1:9/v1")
+    assert (dead.code, dead.summary["trials"]["failed"]) == (1, 0)
+    run = await merge_runner(*o3, OPENAI_API_KEY="x", OPENAI_BASE_URL=emulator_url)
+    assert (run.code, run.summary["scripted"]) == (0, True), run.err
