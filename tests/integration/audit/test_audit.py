@@ -289,7 +289,7 @@ def test_one_sweep_can_be_audited_alone_and_a_finding_names_its_place(db):
     whole = audit("--db", db, "--sweep", sweep_of(db, PAIR))
     assert (whole.findings, len(whole.audits)) == ([], 1)
     sweep = sweep_of(db, MIXED)
-    assert sweep.startswith("baseline-emulator+constant-")
+    assert sweep.startswith("baseline-emulator+constant,projected-order-")
     ((finding,), (told,)) = (found := audit("--db", db, "--sweep", sweep)).findings, found.audits
     assert (told["subject"], finding["sweep"], finding["kind"]) == (sweep, sweep, "replay")
     assert (finding["trial"], finding["side"], finding["decision"]) == (MIXED, "left", 2)
