@@ -1,19 +1,124 @@
-"""An explorer in a thread of the tests' own process, and a program that holds its database."""
+"""The explorer in the tests' own process, what a page says, and a program that holds a database."""
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from html.parser import HTMLParser
 from pathlib import Path
 
 import uvicorn
+from starlette.testclient import TestClient
 
 from merge_runner_analysis.explorer.app import explorer, listen
+from merge_runner_analysis.explorer.computing import Computing, Numbers, Worker
 from merge_runner_analysis.explorer.site import Site
+from tests.support.gate import HANGS_S
+
+HOST = "127.0.0.1:8700"
+INLINE = {
+    "a",
+    "abbr",
+    "b",
+    "code",
+    "del",
+    "i",
+    "ins",
+    "kbd",
+    "mark",
+    "q",
+    "small",
+    "span",
+    "strong",
+}
+
+
+class InProcess(Worker):
+    """Computes in a thread of this process."""
+
+    def __init__(self, db):
+        self.numbers = Numbers(db)
+        self.thread = ThreadPoolExecutor(1)
+
+    def answer(self, request):
+        return self.numbers.answer(request)
+
+    def submit(self, request):
+        return self.thread.submit(self.answer, request)
+
+    def close(self):
+        self.thread.shutdown(wait=False, cancel_futures=True)
+
+
+class Awaited(Computing):
+    """Has a page wait for what is computed, so that it need not be asked again and again."""
+
+    def ask(self, request, state, wait_s=0.0):
+        return super().ask(request, state, HANGS_S)
+
+
+def client_of(db: Path, computing: Computing | None = None, **options) -> TestClient:
+    """A client without a server, which has the ``site`` and awaits its numbers."""
+    site = Site(db, **options)
+    site.computing = computing or Awaited(db, InProcess)
+    client = TestClient(explorer(site), base_url=f"http://{HOST}", raise_server_exceptions=False)
+    client.site = site
+    return client
+
+
+def listed(html: str) -> int:
+    """How many trials a list says there are."""
+    return int(re.search(r"<strong>([\d,]+)</strong> trials", html)[1])
+
+
+class Page(HTMLParser):
+    """What a page says, titles of pictures too, and its links: addresses with their words."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.said: list[str] = []
+        self.links: list[tuple[str, str]] = []
+        self.inline: list[tuple[str, str]] = []
+        self._link: str | None = None
+        self._script = False
+        self.feed(html)
+        self.text = " ".join("".join(self.said).split())
+
+    def handle_starttag(self, tag, attrs):
+        self._script = tag in {"script", "style"}
+        self._link = dict(attrs).get("href") if tag == "a" else self._link
+        if tag == "small":
+            self.said.append(" ")
+        if self._link is not None and tag == "a":
+            self.links.append((self._link, ""))
+        for name, value in attrs:
+            if name in {"aria-label", "title"}:
+                self.said.append(f" {value} ")
+            if name == "style" or name.startswith("on"):
+                self.inline.append((tag, name))
+
+    def handle_endtag(self, tag):
+        self._script = False
+        self._link = None if tag == "a" else self._link
+        self.said.append("" if tag in INLINE else " ")
+
+    def handle_data(self, data):
+        if self._script:
+            return
+        self.said.append(data)
+        if self._link is not None:
+            address, words = self.links[-1]
+            self.links[-1] = address, " ".join(f"{words}{data}".split())
+
+    def to(self, start: str) -> list[tuple[str, str]]:
+        """The links to addresses that begin so."""
+        return [link for link in self.links if link[0].startswith(start)]
 
 
 @contextmanager

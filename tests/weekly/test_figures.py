@@ -18,7 +18,6 @@ from tests.integration.test_installed import built, checkout_in
 from tests.support.harness import PROJECT
 from tests.support.serving import served
 
-pytestmark = pytest.mark.long
 DOCS = PROJECT / "docs"
 NUMBER = r"-?\d+(?:\.\d+)?"
 WHO_FIRST = ("intercept", "projected_headway", "relative_velocity")

@@ -8,21 +8,22 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 import pytest
-from playwright.sync_api import expect
-from starlette.testclient import TestClient
 
 from merge_runner.errors import UsageError
-from merge_runner_analysis.explorer.app import MOST_NOTED, explorer
+from merge_runner_analysis.explorer.app import MOST_NOTED
 from merge_runner_analysis.explorer.notes import LONGEST_NAME, LONGEST_TEXT, Notes, reader_of
-from merge_runner_analysis.explorer.site import Site
-from tests.integration.explorer.test_listing import HOST, Texts
-from tests.support.axe import serious
-from tests.support.exporting import export, export_with_a_table
+from tests.support.exporting import export
 from tests.support.hostile import HOSTILE
-from tests.support.serving import served
+from tests.support.serving import HOST, Page, client_of
+from tests.support.studies import write_study, yielding
 
-TRIAL = "emulator/baseline/N_0_0/rep01"
+TRIAL, OTHER = (f"o3/baseline/{name}/rep01" for name in ("N_0_0", "L_4_0"))
 OURS = {"origin": f"http://{HOST}"}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    return write_study(tmp_path_factory.mktemp("noted") / "study.duckdb", yielding("o3", reps=1))
 
 
 @pytest.fixture
@@ -32,8 +33,10 @@ def db(study, tmp_path):
 
 
 def asking(db, reader="anna"):
-    app = explorer(Site(db, reader=reader))
-    return TestClient(app, base_url=f"http://{HOST}", headers=OURS, follow_redirects=False)
+    client = client_of(db, reader=reader)
+    client.headers.update(OURS)
+    client.follow_redirects = False
+    return client
 
 
 def noted(client, **given):
@@ -64,7 +67,7 @@ def test_notes_are_shown_on_the_trial_in_the_list_and_on_a_page_of_their_own(db)
     client = asking(db)
     noted(client, text="It hesitates. #late")
     assert "It hesitates." in client.get(f"/trials/{TRIAL}").text
-    assert "It hesitates." not in client.get("/trials/emulator/baseline/N_0_0/rep02").text
+    assert "It hesitates." not in client.get(f"/trials/{OTHER}").text
     assert "It hesitates." in client.get("/notes").text
     listed = client.get("/trials?tag=late").text
     assert "<strong>1</strong> trials" in listed
@@ -122,7 +125,7 @@ def test_what_a_reader_wrote_is_text_everywhere(db):
     for address in (f"/trials/{TRIAL}", "/notes", "/trials"):
         text = client.get(address).text
         assert "<script>document" not in text
-        assert "\u202e" not in "".join(Texts(text).said)
+        assert "\u202e" not in "".join(Page(text).said)
 
 
 @pytest.mark.parametrize("damage", [b'{"at": "1', b"\xff\xfe", b'{"reader": 3}', b"null", b""])
@@ -151,11 +154,10 @@ def test_where_nothing_can_be_written_a_line_says_so(db):
 
 def _write(db, reader):
     notes = Notes(db, reader)
-    for number in range(100):
+    for number in range(30):
         notes.add(TRIAL, "spec", "", None, f"#t{number} {'x' * 3000}")
 
 
-@pytest.mark.long
 def test_two_explorers_that_write_at_once_lose_nothing(tmp_path):
     db = tmp_path / "t.duckdb"
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
@@ -163,7 +165,7 @@ def test_two_explorers_that_write_at_once_lose_nothing(tmp_path):
     kept = Notes(db).kept()
     assert kept.damage == ()
     assert sorted((note.reader, note.text.split()[0]) for note in kept.notes) == sorted(
-        (reader, f"#t{number}") for reader in ("anna", "ben") for number in range(100)
+        (reader, f"#t{number}") for reader in ("anna", "ben") for number in range(30)
     )
 
 
@@ -187,63 +189,15 @@ def test_a_reader_has_a_name():
             reader_of(odd)
 
 
-# ---- in a browser
-
-
-@pytest.fixture
-def site(db):
-    """An explorer of this test's own copy."""
-    with served(db) as address:
-        yield address
-
-
-def test_notes_are_written_from_the_keyboard(page, db):
-    page.goto(f"/trials/{TRIAL}")
-    page.keyboard.press("n")
-    expect(page.locator("#note-text")).to_be_focused()
-    page.keyboard.type("The whole trial")
-    page.keyboard.press("Enter")
-    expect(page.locator("#noted")).to_contain_text("The whole trial")
-    page.keyboard.press("]")
-    page.keyboard.press("n")
-    expect(page.locator("#note-about")).to_have_text("on the left decision 0")
-    page.keyboard.type("#late and #odd")
-    page.keyboard.press("Enter")
-    expect(page.locator("#noted")).to_contain_text("#late and #odd")
-    assert [(line["side"], line["decision"], line["text"]) for line in lines(db)] == [
-        (None, None, "The whole trial"),
-        ("left", 0, "#late and #odd"),
-    ]
-    page.keyboard.press("n")
-    page.keyboard.press("Escape")
-    expect(page.locator("#note-text")).not_to_be_focused()
-    assert serious(page) == []
-    page.keyboard.press("]")
-    page.locator("#noted a").click()
-    expect(page.locator(".decision-panel h2")).to_contain_text("left decision 0")
-    page.goto("/notes")
-    assert serious(page) == []
-    expect(page.locator(".all-notes tbody tr")).to_have_count(2)
-
-
-@pytest.mark.long
-def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(page, db, tmp_path):
-    client = asking(db)
-    noted(client, text="It hesitates. #late", side="left", decision="1")
-    other = "emulator/baseline/L_4_0/rep01"
-    noted(asking(db, "ben"), trial=other, text="not of these trials")
-    files = export_with_a_table(db, tmp_path / "pages")
-    page.goto(f"file://{files}/notes.html")
-    expect(page.locator(".all-notes tbody tr")).to_have_count(2)
-    page.locator(".all-notes tbody a").last.click()
-    expect(page.locator("#noted")).to_contain_text("It hesitates.")
-    expect(page.locator("#note")).to_have_count(0)
-    files = export(db, tmp_path / "few", ["emulator/baseline/N_0_0/*"])
+def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(db, tmp_path):
+    noted(asking(db), text="It hesitates. #late", side="left", decision="1")
+    noted(asking(db, "ben"), trial=OTHER, text="not of these trials")
+    files = export(db, tmp_path / "few", [TRIAL])
     pages = {path.name: path.read_text() for path in files.glob("*.html")}
-    assert "It hesitates." in pages["trials-emulator-baseline-N_0_0-rep01.html"]
+    assert "It hesitates." in pages["trials-o3-baseline-N_0_0-rep01.html"]
     assert "not of these trials" not in "".join(pages.values())
     assert "notes.html" not in pages
-    noted(client, text="sk-proj-abcdefghijklmnop0123")
+    noted(asking(db), text="sk-proj-abcdefghijklmnop0123")
     with pytest.raises(UsageError, match="looks like a key"):
-        export(db, tmp_path / "more", ["emulator/baseline/N_0_0/*"])
+        export(db, tmp_path / "more", [TRIAL])
     assert not (tmp_path / "more").exists()

@@ -16,11 +16,13 @@ REFUSED = 45
 
 
 @pytest.fixture
-async def site(merge_runner, study):
+async def site(merge_runner, golden_copy):
     """A server of its own that has read its trials, and its process."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    process = await merge_runner.start("view", "--db", study, "--port", port)
+    process = await merge_runner.start(
+        "view", "--db", golden_copy / "golden.duckdb", "--port", port
+    )
     try:
         async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{port}", timeout=120) as client:
             while not await is_ready(client):
@@ -39,7 +41,6 @@ async def is_ready(client):
     return "refresh" not in reply.headers
 
 
-@pytest.mark.long
 async def test_forty_five_refused_queries_take_less_of_the_server_than_25_lists_of_trials(site):
     client, process = site
 

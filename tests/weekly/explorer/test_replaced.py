@@ -15,8 +15,6 @@ from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.site import Site
 from tests.support.studies import write_study, yielding
 
-pytestmark = pytest.mark.long
-
 HOST = "127.0.0.1:8700"
 TRIAL = "/trials/o3/baseline/N_0_0/rep01"
 PAGES = ("/", "/sweeps", "/trials", TRIAL)

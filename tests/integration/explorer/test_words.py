@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import re
+import shutil
 from html import unescape
 
 import duckdb
 import pytest
-from playwright.sync_api import expect
-from starlette.testclient import TestClient
 
-from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.search import PAGE
-from merge_runner_analysis.explorer.site import Site
-from tests.integration.explorer.test_listing import HOST, Texts
-from tests.support.axe import serious
-from tests.support.serving import held
+from tests.support.serving import Page, client_of, held
 from tests.support.studies import Drive, Said, write_study
 
 TALKING = Drive(
@@ -48,8 +43,12 @@ def db(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def client(db):
-    with TestClient(explorer(Site(db)), base_url=f"http://{HOST}") as client:
-        yield client
+    return client_of(db)
+
+
+@pytest.fixture
+def copy(db, tmp_path):
+    return shutil.copy(db, tmp_path / "t.duckdb")
 
 
 def found(client, **asked):
@@ -85,7 +84,7 @@ def test_matches_are_marked_and_what_a_model_wrote_stays_text(client):
     text = client.get("/words", params={"q": "brake"}).text
     assert "<mark>brake</mark>" in text
     assert "&amp; I &lt;b&gt;<mark>brake</mark>&lt;/b&gt; hard" in text
-    assert "[U+202E]" in "".join(Texts(text).said)
+    assert "[U+202E]" in Page(text).text
     assert "\u202e" not in text
 
 
@@ -95,7 +94,8 @@ def test_facets_choose_among_what_is_found_and_count_it(client):
     # Between them nothing was said about who goes first: it is a change of mind all the same.
     assert found(client, switch="M to Y") == [("o3", "left", 2)]
     assert found(client, switch="Y to M") == [("o3", "left", 4)]
-    assert {trial for trial, *_ in found(client, condition="N_0_0", q="clear")} == {"o4"}
+    # A program says nothing.
+    assert {trial for trial, *_ in found(client, condition="N_0_0")} == {"o4"}
     text = client.get("/words", params={"q": "brak"}).text
     assert re.findall(r'value="(M|Y|none)"[^>]*>([^<]+)<', text) == [
         ("Y", "Y (2)"),
@@ -103,33 +103,25 @@ def test_facets_choose_among_what_is_found_and_count_it(client):
     ]
 
 
-def test_what_is_said_is_chosen_beside_what_is_planned_and_driven(db, tmp_path):
-    path = tmp_path / "t.duckdb"
-    path.write_bytes(db.read_bytes())
-    with duckdb.connect(str(path)) as connection:
+def test_what_is_said_is_chosen_beside_what_is_planned_and_driven(copy):
+    with duckdb.connect(str(copy)) as connection:
         connection.execute(
             "UPDATE decisions SET plan = [0.5, 0.1], applied = [-0.2] WHERE trial_id LIKE 'o3/%' "
             "AND side = 'left' AND decision = 2; UPDATE decisions SET plan = [0.0], applied = [0.0]"
             " WHERE trial_id NOT LIKE 'o3/%'"
         )
-    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
-        assert found(client, tactical="Y", planned="go") == [("o3", "left", 2)]
-        assert found(client, driven="brake", planned="go") == [("o3", "left", 2)]
-        assert found(client, tactical="Y", planned="hold") == []
-        assert {trial for trial, *_ in found(client, planned="hold", model="o4")} == {"o4"}
-        assert found(client, planned_from="0.25", planned_to="0.35") == [("o3", "left", 2)]
-        assert found(client, planned_from="0.35", model="o3", tactical="Y") == []
-        text = client.get("/words", params={"model": "o3", "tactical": "Y"}).text
-        shares = re.findall(
-            r'href="([^"]*planned=(?:go|brake|hold)[^"]*)">(\d+)</a>\s*<small>', text
-        )
-        assert shares
-        for link, count in shares:
-            assert f"<strong>{count}</strong> decisions" in client.get(unescape(link)).text
-
-
-def test_a_program_says_nothing(client):
-    assert "idm" not in {trial for trial, *_ in found(client, condition="N_0_0")}
+    client, that = client_of(copy), [("o3", "left", 2)]
+    assert found(client, tactical="Y", planned="go") == that
+    assert found(client, driven="brake", planned="go") == that
+    assert found(client, tactical="Y", planned="hold") == []
+    assert {trial for trial, *_ in found(client, planned="hold", model="o4")} == {"o4"}
+    assert found(client, planned_from="0.25", planned_to="0.35") == that
+    assert found(client, planned_from="0.35", model="o3", tactical="Y") == []
+    page = Page(client.get("/words", params={"model": "o3", "tactical": "Y"}).text)
+    shares = [(to, n) for to, n in page.to("/words?") if "planned=" in to and n.isdigit()]
+    assert shares
+    for link, count in shares:
+        assert f"<strong>{count}</strong> decisions" in client.get(link).text
 
 
 def test_what_is_found_comes_in_pages(client, db):
@@ -144,38 +136,15 @@ def test_what_is_found_comes_in_pages(client, db):
     assert found(client, page=99) == every[PAGE:]
 
 
-def test_words_of_new_trials_are_found_and_those_of_removed_ones_are_not(db, tmp_path):
-    path = tmp_path / "t.duckdb"
-    path.write_bytes(db.read_bytes())
-    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
+def test_words_of_new_trials_are_found_and_those_of_removed_ones_are_not(copy):
+    client = client_of(copy)
+    assert len(found(client, q="brake")) == 2
+    with held(copy):  # what was read is searched meanwhile
         assert len(found(client, q="brake")) == 2
-        with duckdb.connect(str(path)) as connection:
-            connection.execute("DELETE FROM trials WHERE trial_id LIKE 'o3/%'")
-        assert found(client, q="brake") == []
-        write_study(path, [Drive("o5", "baseline", "N_0_0", 1, (0.1,), (-0.1,), {})])
-        with duckdb.connect(str(path)) as connection:
-            connection.execute(
-                "UPDATE decisions SET rationale = 'I brake.' WHERE trial_id LIKE 'o5/%'"
-            )
-        assert {trial for trial, *_ in found(client, q="brake")} == {"o5"}
-
-
-def test_while_another_program_holds_the_database_what_was_read_is_searched(db, tmp_path):
-    path = tmp_path / "t.duckdb"
-    path.write_bytes(db.read_bytes())
-    with TestClient(explorer(Site(path)), base_url=f"http://{HOST}") as client:
-        assert len(found(client, q="brake")) == 2
-        with held(path):
-            assert len(found(client, q="brake")) == 2
-
-
-def test_words_are_searched_from_the_keyboard_and_lead_to_the_decision(page):
-    page.goto("/words")
-    page.keyboard.press("/")
-    page.keyboard.type("SCRIPT")
-    expect(page.locator("mark").first).to_have_text("script")
-    expect(page).to_have_url(re.compile("q=SCRIPT"))
-    assert serious(page) == []
-    page.locator(".hits tbody a").first.click()
-    expect(page.locator(".decision-panel")).to_contain_text("<script>document.title='owned'")
-    assert "owned" not in page.title()
+    with duckdb.connect(str(copy)) as connection:
+        connection.execute("DELETE FROM trials WHERE trial_id LIKE 'o3/%'")
+    assert found(client, q="brake") == []
+    write_study(copy, [Drive("o5", "baseline", "N_0_0", 1, (0.1,), (-0.1,), {})])
+    with duckdb.connect(str(copy)) as connection:
+        connection.execute("UPDATE decisions SET rationale = 'I brake.'")
+    assert {trial for trial, *_ in found(client, q="brake")} == {"o5"}

@@ -10,49 +10,58 @@ from concurrent.futures import ThreadPoolExecutor
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
-from starlette.testclient import TestClient
 
 from merge_runner.errors import UsageError
 from merge_runner.results.export import tables
 from merge_runner.results.store import query
-from merge_runner_analysis.explorer.app import explorer
 from merge_runner_analysis.explorer.pages.sql import EXAMPLES
 from merge_runner_analysis.explorer.queries import QueryResult
-from merge_runner_analysis.explorer.site import Site
+from tests.support.gate import HANGS_S
 from tests.support.harness import PROJECT
+from tests.support.serving import client_of
 from tests.support.studies import write_study, yielding
 
-HOST = "127.0.0.1:8700"
 FIRST = next(iter(EXAMPLES.values()))
 NAVIGATION = {"sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
 
 
+class Asked:
+    """Runs no query: it finds ``found``, and keeps what was asked."""
+
+    found = QueryResult([("x", "INTEGER")], [[("1", 0)]], False, 0.0)
+
+    def __init__(self):
+        self.queries = []
+
+    def result(self, sql):
+        self.queries.append(sql)
+        return self.found
+
+    def csv(self, sql):
+        self.queries.append(sql)
+        return "x\n1\n"
+
+
 @pytest.fixture(scope="module")
-def site(tmp_path_factory):
+def running(tmp_path_factory):
+    """A client whose queries are run."""
     folder = tmp_path_factory.mktemp("sql")
-    site = Site(write_study(folder / "study.duckdb", yielding("o3", reps=1)[:2]))
-    site.queries.longest_s = 60  # others may use the machine
-    return site
+    client = client_of(write_study(folder / "study.duckdb", yielding("o3", reps=1)[:2]))
+    client.site.queries.longest_s = HANGS_S  # others may use the machine
+    return client
 
 
 @pytest.fixture
-def client(site):
-    with TestClient(explorer(site), base_url=f"http://{HOST}") as client:
-        yield client
+def client(running):
+    """A client whose queries are only asked."""
+    client = client_of(running.site.db)
+    client.site.queries = Asked()
+    return client
 
 
 @pytest.fixture
-def asked(site, monkeypatch):
-    """The queries that would have been run; each finds one row."""
-    queries = []
-
-    def result(sql):
-        queries.append(sql)
-        return QueryResult([("x", "INTEGER")], [[("1", 0)]], False, 0.0)
-
-    monkeypatch.setattr(site.queries, "result", result)
-    monkeypatch.setattr(site.queries, "csv", lambda sql: queries.append(sql) or "x\n1\n")
-    return queries
+def asked(client):
+    return client.site.queries.queries
 
 
 def box(page):
@@ -73,12 +82,12 @@ def one_line(sql):
     return " ".join(sql.split())
 
 
-def test_the_examples_are_the_queries_of_the_readme_and_run(site):
+def test_the_examples_are_the_queries_of_the_readme_and_run(running):
     text = (PROJECT / "README.md").read_text()
     commands = [shlex.split(line) for line in re.findall(r"^make sql Q=.*$", text, re.MULTILINE)]
     written = [command[2].removeprefix("Q=") for command in commands]
     assert [one_line(sql) for sql in EXAMPLES.values()] == written
-    assert all(query(site.db, sql)[0] for sql in EXAMPLES.values())
+    assert all(query(running.site.db, sql)[0] for sql in EXAMPLES.values())
 
 
 def test_without_a_query_the_first_example_waits_to_be_run(client, asked):
@@ -122,17 +131,16 @@ def test_a_query_of_another_site_is_refused(client, asked):
 
 
 @pytest.mark.parametrize("spec", [True, False])
-def test_a_result_is_a_table_with_types_and_links_to_trials(client, site, monkeypatch, spec):
+def test_a_result_is_a_table_with_types_and_links_to_trials(client, spec):
     name = "o3/baseline/L_0_8/rep01"
     columns = {"trial_id": ("VARCHAR", name), "rep": ("INTEGER", "1")}
     columns |= {"spec_hash": ("VARCHAR", "o3-baseline")} if spec else {"x": ("INTEGER[]", None)}
-    result = QueryResult(
+    client.site.queries.found = QueryResult(
         [(name, kind) for name, (kind, _) in columns.items()],
         [[text and (text, 0) for _, text in columns.values()]],
         False,
         0.0123,
     )
-    monkeypatch.setattr(site.queries, "result", lambda sql: result)
     page = client.get("/sql?q=select").text
     assert '<th scope="col" class="n">rep <small>INTEGER</small>' in page
     assert '<td class="n">1</td>' in page
@@ -142,60 +150,48 @@ def test_a_result_is_a_table_with_types_and_links_to_trials(client, site, monkey
     assert (found.path, found.query) == (f"/trials/{name}", "spec=o3-baseline" if spec else "")
 
 
-def test_a_cut_result_says_so(client, site, monkeypatch):
-    result = QueryResult([("trial_id", "VARCHAR")], [[("x" * 2000, 1234)]] * 2, True, 0.0)
-    monkeypatch.setattr(site.queries, "result", lambda sql: result)
+def test_a_cut_result_says_so(client):
+    cut = [[("x" * 2000, 1234)]] * 2
+    client.site.queries.found = QueryResult([("trial_id", "VARCHAR")], cut, True, 0.0)
     page = client.get("/sql?q=select").text
     assert "The first <strong>2</strong> rows of more" in page
     assert "… 1,234 characters more" in page
     assert 'href="/trials/' not in page
 
 
-def test_nothing_in_a_result_or_an_error_is_more_than_text(client, site, monkeypatch):
-    hostile = "'<script>alert(1)</script>' || chr(8238) || chr(0)"
-    address = {"q": f'select {hostile} as x, 1 as "<img src=x>\u202e"'}
-    pages = [client.get("/sql", params=address).text]
-
-    def failing(sql):
-        raise UsageError("no <script>alert(1)</script>\u202e\0")
-
-    monkeypatch.setattr(site.queries, "result", failing)
-    pages.append(client.get("/sql", params=address).text)
-    for page in pages:
+def test_nothing_in_a_result_or_an_error_is_more_than_text(running):
+    text = "'<script>alert(1)</script>' || chr(8238) || chr(0)"
+    for asked in (f'select {text} as x, 1 as "<img src=x>\u202e"', f"select error({text})"):
+        page = running.get("/sql", params={"q": asked}).text
         shown = page[page.index('id="result"') : page.index("</section>")]
-        assert "&lt;script&gt;alert(1)&lt;/script&gt;[U+202E][U+0000]" in shown
+        assert "&lt;script&gt;alert(1)&lt;/script&gt;[U+202E]" in shown
         assert not re.search("<script|<img|\u202e|\0", shown)
+        assert not re.search(r"\bstyle=|<style|\bon\w+=|<script(?![^>]* src=)", page)
 
 
-def test_the_page_holds_no_style_and_no_script_of_its_own(client, asked):
-    page = client.get("/sql?q=select+1").text
-    assert not re.search(r"\bstyle=|<style|\bon\w+=|<script(?![^>]* src=)", page)
-    assert "style-src 'self'" in client.get("/sql").headers["content-security-policy"]
-
-
-@pytest.mark.slow
-def test_a_download_is_a_file_or_says_why_not(client):
-    reply = client.get("/sql.csv", params={"q": "select 1 as x, 'a' as y"})
+def test_a_download_is_a_file_or_says_why_not(running):
+    reply = running.get("/sql.csv", params={"q": "select 1 as x, 'a' as y"})
     assert (reply.status_code, reply.text) == (200, "x,y\n1,a\n")
     assert reply.headers["content-type"] == "text/csv; charset=utf-8"
     assert reply.headers["content-disposition"] == 'attachment; filename="query.csv"'
-    reply = client.get("/sql.csv", params={"q": "selekt"})
+    reply = running.get("/sql.csv", params={"q": "selekt"})
     assert reply.status_code == 503
     assert "syntax error at or near &#34;selekt&#34;</p>" in reply.text
 
 
-def test_a_slow_query_keeps_nobody_waiting(client, site, monkeypatch):
-    running, answered = threading.Event(), threading.Event()
+def test_a_slow_query_keeps_nobody_waiting(client):
+    runs, answered = threading.Event(), threading.Event()
 
-    def result(sql):
-        running.set()
-        assert answered.wait(60)
-        raise UsageError("stopped after 10 s")
+    class Slow(Asked):
+        def result(self, sql):
+            runs.set()
+            assert answered.wait(HANGS_S)
+            raise UsageError("stopped after 10 s")
 
-    monkeypatch.setattr(site.queries, "result", result)
+    client.site.queries = Slow()
     with ThreadPoolExecutor() as others:
         slow = others.submit(client.get, "/sql?q=select")
-        assert running.wait(60)
+        assert runs.wait(HANGS_S)
         assert client.get("/sql").status_code == 200
         assert client.get("/trials").status_code == 200
         assert not slow.done()
@@ -203,10 +199,10 @@ def test_a_slow_query_keeps_nobody_waiting(client, site, monkeypatch):
         assert "stopped after 10 s" in slow.result().text
 
 
-def test_the_schema_stands_beside_with_what_is_said_of_it(site, client, asked):
+def test_the_schema_stands_beside_with_what_is_said_of_it(client):
     found = {table.name: table for table in tables()}
     rows = query(
-        site.db,
+        client.site.db,
         "SELECT table_name, list(column_name ORDER BY column_index) FROM duckdb_columns() "
         "WHERE NOT internal AND database_name = current_database() GROUP BY ALL",
     )[1]

@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 import threading
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 import duckdb
@@ -17,6 +18,7 @@ from merge_runner.results.database import open_database
 from merge_runner_analysis.explorer import queries as module
 from merge_runner_analysis.explorer.database_copy import Copies
 from merge_runner_analysis.explorer.queries import Queries
+from tests.support.gate import HANGS_S
 from tests.support.studies import write_study, yielding
 
 ENDLESS = "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM r) SELECT max(n) FROM r"
@@ -45,7 +47,7 @@ def study(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def queries(study):
-    return Queries(Copies(study), longest_s=60)
+    return Queries(Copies(study), longest_s=HANGS_S)
 
 
 @pytest.fixture
@@ -69,11 +71,13 @@ def texts(rows):
     return [[cell and cell[0] for cell in row] for row in rows]
 
 
-def test_what_is_more_than_a_query_of_the_database_is_refused_and_changes_nothing(queries):
-    before = contents(queries._copies.db.parent)
-    for sql, words in REFUSED.items():
-        assert words in refusal(queries, sql), sql
-    assert contents(queries._copies.db.parent) == before
+@pytest.mark.parametrize(("sql", "words"), REFUSED.items(), ids=str)
+def test_what_is_more_than_a_query_of_the_database_is_refused_and_changes_nothing(
+    study, queries, sql, words
+):
+    before = contents(study.parent)
+    assert words in refusal(queries, sql)
+    assert contents(study.parent) == before
 
 
 def test_values_of_all_kinds_become_texts(queries):
@@ -135,16 +139,16 @@ def test_an_endless_query_is_stopped_in_time(study):
 
 
 def test_a_sweep_writes_while_a_query_runs(own):
-    queries = Queries(Copies(own), longest_s=1)
-    copy = queries._copies.current()
-    said = []
+    copies = Copies(own)
+    copy, said = copies.current(), []
+    queries = Queries(copies, longest_s=1)
     asking = threading.Thread(target=lambda: said.append(refusal(queries, ENDLESS)))
     asking.start()
     with open_database(own, read_only=False, patience_s=0) as connection:
         connection.execute("DELETE FROM sweeps")
-    asking.join(60)
+    asking.join(HANGS_S)
     assert said == ["stopped after 1 s"]
-    assert queries._copies.current() is not copy
+    assert copies.current() is not copy
 
 
 def test_a_value_that_python_has_not_is_told(queries):
@@ -159,7 +163,9 @@ def test_what_lies_in_the_log_beside_the_database_is_read(own, tmp_path):
             shutil.copy(f"{own}{end}", f"{crashed}{end}")
     assert Path(f"{crashed}.wal").stat().st_size > 0
     # Read by a copy of its own: the database is not read first, for what lies there is damaged.
-    result = Queries(Copies(crashed), longest_s=60).result("SELECT min(schema_version) FROM meta")
+    result = Queries(Copies(crashed), longest_s=HANGS_S).result(
+        "SELECT min(schema_version) FROM meta"
+    )
     assert texts(result.rows) == [["-1"]]
 
 
@@ -183,10 +189,21 @@ def test_a_copy_lasts_while_the_file_stays_and_leaves_nothing(own, tmp_path, mon
 
 
 def test_who_is_one_too_many_is_told_at_once(study):
-    queries = Queries(Copies(study))
-    for _ in range(module.AT_ONCE + module.WAITING):
-        queries._places.acquire()
-    assert "too many queries are waiting" in refusal(queries, "SELECT 1")
+    going = threading.Event()
+
+    class Held(Copies):
+        def current(self):
+            going.wait(HANGS_S)
+            return super().current()
+
+    queries = Queries(Held(study), longest_s=HANGS_S)
+    many = module.AT_ONCE + module.WAITING
+    with ThreadPoolExecutor(many + 1) as others:
+        asked = [others.submit(queries.result, "SELECT 1") for _ in range(many + 1)]
+        ((first,), _) = wait(asked, HANGS_S, "FIRST_COMPLETED")
+        assert "too many queries are waiting" in str(first.exception())
+        going.set()
+    assert [each.exception() for each in asked if each is not first] == [None] * many
 
 
 def test_what_is_no_database_is_said(tmp_path):

@@ -1,0 +1,172 @@
+"""An exported study refers to nothing but itself; no secret leaves with it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from html.parser import HTMLParser
+from urllib.parse import unquote, urlsplit
+
+import duckdb
+import pytest
+
+from merge_runner.config import ScenarioConfig
+from merge_runner.errors import UsageError
+from merge_runner.results.store import Store
+from merge_runner_analysis.explorer.export import export_page
+from merge_runner_analysis.explorer.notes import Notes
+from merge_runner_analysis.figures import FIGURES
+from merge_runner_analysis.tables import TABLES
+from tests.support.exporting import export
+from tests.support.hostile import hostile_trial
+from tests.support.studies import Drive, as_humans, write_study, yielding
+
+TRIAL = "o3/baseline/N_0_0/rep01"
+FEW = {  # which stand for all
+    "TABLES": {"attempts": TABLES["attempts"]},
+    "FIGURES": {"first-action": FIGURES["first-action"]},
+}
+
+
+class References(HTMLParser):
+    """What the attributes of a page refer to."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        names = {"href", "src", "action", "data-back", "data-others"}
+        self.found += [v for name, v in attrs if name in names or name.startswith("hx-")]
+
+
+def broken(page):
+    """What a page refers to that is no file beside it; a picture in the page itself is there."""
+    return [
+        address
+        for address in References(page.read_text()).found
+        if not address.startswith("data:image/")
+        and (
+            (parts := urlsplit(address)).scheme
+            or parts.netloc
+            or not (page.parent / unquote(parts.path) if parts.path else page).is_file()
+        )
+    ]
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """A driver with words, a collision, a hostile trial and a human one."""
+    path = tmp_path_factory.mktemp("study") / "study.duckdb"
+    crash = Drive("o3", "baseline", "N_0_0", 9, (0.0,), (0.0,), {})
+    human = Drive("human", "baseline", "N_0_0", 1, (0.4, 0.4), (-0.4, -0.4))
+    write_study(path, [*yielding("o3", reps=1), crash, human])
+    Store(path).write("sweep-1", [hostile_trial()], patience_s=5)
+    as_humans(path)
+    return path
+
+
+def test_all_that_an_export_of_a_study_refers_to_lies_in_it_and_asks_no_server(study, tmp_path):
+    db = shutil.copy(study, tmp_path / "study.duckdb")
+    Notes(db, "anna").add(TRIAL, "o3-baseline", "", None, "It hesitates.")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, few in FEW.items():
+            patch.setattr(f"merge_runner_analysis.explorer.pages.tables.{name}", few)
+        export(db, tmp_path / "made")
+    exported = (tmp_path / "made").rename(tmp_path / "moved")
+    names = {path.relative_to(exported).as_posix() for path in exported.rglob("*")}
+    assert {name.partition("/")[0] for name in names} == {"index.html", "files"}
+    assert names > {
+        *("files/trials.html", "files/trials-o3-baseline-N_0_0-rep01.html", "files/sweeps.html"),
+        *("files/conditions-N_0_0.html", "files/tables-attempts.csv", "files/tables-attempts.tex"),
+        *("files/figures-first-action.svg", "files/notes.html", "files/prompts.html"),
+    }
+    pages = {page: page.read_text() for page in exported.rglob("*.html")}
+    assert {str(page): found for page in pages if (found := broken(page))} == {}
+    assert len(pages) > 30
+    assert not [page for page, text in pages.items() if "<form" in text]
+    assert not [page for page, text in pages.items() if "<script>document" in text]
+    assert "It hesitates." in pages[exported / "files/notes.html"]
+    scripts = {name.partition("static/")[2] for name in names if name.endswith(".js")}
+    assert scripts.isdisjoint({"vendor/htmx-2.0.11.min.js", "notes.js", "lost.js"})
+    assert "replay/start.js" in scripts
+
+
+def test_a_page_of_its_own_refers_to_nothing_but_itself(study, tmp_path):
+    for name, wanted in (("one.html", TRIAL), ("several.html", "o3/baseline/N_0_0/*")):
+        page = export_page(study, tmp_path / name, [wanted])
+        assert broken(page) == []
+        text = page.read_text()
+        assert {urlsplit(address).path for address in References(text).found} == {""}
+        assert "trials like" not in text
+        assert "the traces of" not in text
+    with duckdb.connect(str(study), read_only=True) as connection:
+        (plan,) = connection.execute(
+            f"SELECT plan FROM decisions WHERE trial_id = '{TRIAL}' AND side = 'left' "
+            "AND decision = 0"
+        ).fetchone()
+    hardest = ScenarioConfig().max_acceleration_mps2
+    shown = " ".join(f"{value * hardest:+.2f}" for value in plan)
+    assert f"<dd>{shown}" in text.replace("−", "-").replace("&minus;", "-")
+
+
+def test_an_earlier_export_in_the_folder_goes_and_nothing_else(study, tmp_path):
+    (tmp_path / "mine.html").write_text("<title>mine</title>")
+    for trial in (TRIAL, TRIAL.replace("N_0_0", "L_4_0")):
+        export(study, tmp_path, [trial])
+        trials = {path.name for path in tmp_path.glob("files/trials-*rep01.html")}
+        assert trials == {f"trials-{trial.replace('/', '-')}.html"}
+        export_page(study, tmp_path / "one.html", [TRIAL])
+    there = {path.name for path in tmp_path.iterdir()}
+    assert there == {"index.html", "files", "mine.html", "one.html"}
+
+
+@pytest.mark.parametrize("name", ["index.html", "files"])
+def test_what_is_no_export_is_not_replaced(study, tmp_path, name):
+    if name == "files":
+        (tmp_path / name).mkdir()
+    else:
+        (tmp_path / name).write_text("<!DOCTYPE html>\n<html><title>mine</title>")
+    told = f"{name} is there, and is no exported study.*name another"
+    with pytest.raises(UsageError, match=told):
+        export(study, tmp_path, [TRIAL])
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_of_too_many_trials_a_line_says_how_else_to_send_them(study, tmp_path, monkeypatch):
+    monkeypatch.setattr("merge_runner_analysis.explorer.export.MOST", 2)
+    told = "13 trials, .* for 2: .*--trials, or send study.duckdb .*view --db study.duckdb"
+    with pytest.raises(UsageError, match=told):
+        export(study, tmp_path / "pages")
+    assert export(study, tmp_path / "pages", ["*/N_0_0/*"]).exists(), "humans do not count"
+    with pytest.raises(UsageError, match="holds no trial called o5/"):
+        export_page(study, tmp_path / "one.html", ["o5/*"])
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("my-dummy-secret-key", "the value of OPENAI_API_KEY"),
+        ("sk-proj-abcdefghijklmnop0123", "what looks like a key: sk-pro"),
+        ("{cwd}/notes.txt", "names the path"),
+        ("ghp_abcdefghijklmnopqrstuvwxyz0123456789", "what looks like a key: ghp_ab"),
+        ("/home/somebody/notes.txt", "names the path /home/somebody/"),
+    ],
+)
+def test_a_secret_or_a_path_in_a_reply_stops_the_export_and_leaves_an_earlier_one(
+    study, tmp_path, monkeypatch, said, told
+):
+    monkeypatch.setenv("OPENAI_API_KEY", "my-dummy-secret-key")
+    monkeypatch.chdir(tmp_path)
+    db, folder = shutil.copy(study, tmp_path / "study.duckdb"), tmp_path / "pages"
+    export(db, folder, [TRIAL])
+    earlier = {path: path.read_bytes() for path in folder.rglob("*.html")}
+    with duckdb.connect(str(db)) as connection:
+        said = said.format(cwd=tmp_path)
+        connection.execute("UPDATE decisions SET rationale = ? WHERE decision = 2", [said])
+    with pytest.raises(UsageError, match=re.escape(told)):
+        export(db, folder, [TRIAL])
+    assert {path: path.read_bytes() for path in folder.rglob("*.html")} == earlier
+    assert {path.name for path in tmp_path.iterdir()} >= {"pages", "study.duckdb"}
+    assert not [path for path in tmp_path.iterdir() if path.is_dir() and path != folder]

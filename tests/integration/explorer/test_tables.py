@@ -1,0 +1,360 @@
+"""Tables, figures and prompts: every number leads to its trials; and the process that computes."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import closing
+from dataclasses import replace
+from html import unescape
+from urllib.parse import parse_qs, urlsplit
+
+import duckdb
+import psutil
+import pytest
+
+from merge_runner.errors import UsageError
+from merge_runner.results.store import results_digest
+from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.explorer import computing as worker
+from merge_runner_analysis.explorer.computing import Computing, Numbers, Worker
+from merge_runner_analysis.explorer.display_text import with_minus
+from merge_runner_analysis.explorer.reading import stamp_of
+from merge_runner_analysis.figures import FIGURES
+from merge_runner_analysis.figures.gallery import MAKERS
+from merge_runner_analysis.tables import make_tables
+from merge_runner_analysis.tables.formats import printed
+from tests.support.gate import HANGS_S
+from tests.support.serving import InProcess, Page, client_of, listed
+from tests.support.studies import Said, write_study, yielding
+
+HOSTILE = '<img src=x onerror="alert(1)">'
+ASK = """
+import sys
+from pathlib import Path
+from merge_runner_analysis.explorer.computing import Worker
+from merge_runner.registry import use
+from merge_runner.study.parts import load_study
+
+use(load_study(sys.argv[2], trust=True)[1])
+Path(sys.argv[2]).with_name("mine.py").write_text("raise RuntimeError('nobody agreed to this')")
+worker = Worker(Path(sys.argv[1]))
+found = worker.submit(("table", "factors")).result(timeout=300)
+worker.close()
+print(found["table"])
+"""
+
+
+@pytest.fixture(scope="module")
+def db(tmp_path_factory):
+    """o3 with a variant that did some trials otherwise and lost one; a hostile name."""
+    variant = yielding("o3", "A1", reps=2)
+    variant[0] = replace(variant[0], left=(0.0,), right=(0.0,))
+    variant[3] = replace(variant[3], left=(0.0,), right=(0.5,) * 3)
+    variant[7] = replace(variant[7], left=variant[7].right, right=variant[7].left)
+    variant[4] = replace(variant[4], said={1: Said(("timeout",), lost=True)})
+    drives = [*yielding("o3", reps=3), *variant, *yielding(HOSTILE, reps=1)]
+    return write_study(tmp_path_factory.mktemp("pages") / "study.duckdb", drives)
+
+
+@pytest.fixture(scope="module")
+def ask(db):
+    """Gets a page; returns its text."""
+    client = client_of(db)
+
+    def get(address, code=200):
+        reply = client.get(address)
+        assert reply.status_code == code, reply.text
+        return reply.text
+
+    yield get
+    client.site.close()
+
+
+@pytest.fixture(scope="module")
+def asked_alone(prepare, tmp_path_factory):
+    """A client of the emulator, which was asked and drove, and of a pair, which was asked."""
+    folder = tmp_path_factory.mktemp("asked")
+    sweep = ("sweep", "baseline", "--conditions", "L_4_8,N_0_0", "--reps", 1, "--db", "t.duckdb")
+    for more in ((), ("--first",), ("--first", "--model", "emulator+idm", "--mirror")):
+        run = prepare(folder, *sweep, *more)
+        assert run.code == 0, run.err
+    client = client_of(folder / "t.duckdb")
+    yield client
+    client.site.close()
+
+
+def cells(text):
+    return [to for to, _ in Page(text).to("/trials?cell=")]
+
+
+def answering(db, *answers):
+    """A computation that gives these answers, or raises them, and what it was asked."""
+    asked, left = [], iter(answers)
+
+    class Scripted(InProcess):
+        def answer(self, request):
+            asked.append(request)
+            answer = next(left)
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+
+    return Computing(db, Scripted), asked
+
+
+@pytest.mark.parametrize(("name", "every"), [("ablation-quantitative", 9), ("contrasts", 25)])
+def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, every):
+    study = Study(db)
+    (table,) = make_tables(study, [name])
+    links = cells(ask(f"/tables/{name}"))
+    assert len(links) > 20
+    for link in links[::every]:
+        (cell,) = parse_qs(urlsplit(link).query)["cell"]
+        assert cell.startswith(f"{name}/")
+        found = explain(study, table, cell.removeprefix(f"{name}/"))
+        page = ask(link)
+        counted = any(c.counts for c in table.columns if cell.endswith(f":{c.name}"))
+        trials = [source.numerator if counted else source.trials for source in found.sources]
+        assert listed(page) == sum(map(len, trials))
+        assert found.value in unescape(page)
+
+
+def test_numbers_of_first_decisions_lead_to_what_they_rest_on_and_no_cell_leads_nowhere(
+    asked_alone,
+):
+    text = asked_alone.get("/tables/first-action").text
+    found = [link for link in cells(text) if "asked" in link]
+    assert len(found) > 10
+    reply = asked_alone.get(found[-1])
+    page = Page(reply.text)
+    assert "first decisions that were asked for alone" in page.text
+    ((query, _),) = page.to("/sql?q=")
+    trials = re.search(r"(\d+) of \d+ trials;", page.text)[1]
+    assert f"<strong>{trials}</strong> rows" in asked_alone.get(query).text
+    one_a_row = {link.rpartition("%3A")[0]: link for link in cells(text)}
+    assert {asked_alone.get(link).status_code for link in one_a_row.values()} == {200}
+
+
+def test_a_table_leaves_out_columns_by_its_address_and_no_head_is_empty(ask):
+    heads = [
+        re.findall(r'<th scope="col"[^>]*>(.*?)</th>', ask(f"/tables/attempts{without}"))
+        for without in ("", "?without=calls")
+    ]
+    assert len(heads[0]) - 1 == len(heads[1])
+    assert all(Page(head).text for head in heads[0])
+
+
+def test_facets_sorting_and_exports_keep_the_cell(ask):
+    cell = "attempts/o3/A1:lost"
+    text = ask(f"/trials?cell={cell}")
+    assert listed(text) == 1
+    page = Page(text)
+    kept = [to for to, _ in [*page.to("/trials?"), *page.to("/trials.")]]
+    assert len(kept) >= 8
+    assert all(parse_qs(urlsplit(to).query)["cell"] == [cell] for to in kept)
+    assert f'name="cell" value="{cell}"' in text
+    assert listed(ask(f"/trials?cell={cell}&outcome=collided")) == 0
+    assert len(ask(f"/trials.csv?cell={cell}").splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("address", "told"),
+    [
+        ("/trials?cell=attempts/nobody:n", "unknown row of attempts 'nobody'"),
+        ("/trials.csv?cell=attempts/nobody:n", "unknown row of attempts 'nobody'"),
+        ("/trials?cell=attempts/o3/A1:nothing", "unknown column of attempts 'nothing'"),
+        ("/trials?cell=nothing", "TABLE/ROW:COLUMN"),
+        ("/tables/nothing", "who-first"),
+        ("/figures/nothing.svg", "first-action"),
+    ],
+)
+def test_what_is_none_says_what_there_is(ask, address, told):
+    assert told in unescape(ask(address, 404))
+
+
+def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at_once(db):
+    computing, asked = answering(db, {"absent": "no such row"})
+    client = client_of(db, computing)
+    address = "/trials?cell=attempts/nobody:n"
+    while (waited := client.get(address)).status_code == 200:
+        pass
+    assert (waited.status_code, waited.headers["hx-refresh"]) == (404, "true")
+    assert client.get(address).status_code == 404
+    assert len(asked) == 1
+    client.site.close()
+
+
+def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_in(db):
+    absent, there = {"absent": "no such row"}, {"value": "7"}
+    computing, _ = answering(db, absent, there)
+    cell = ("cell", "attempts", "o3/A9", "n")
+    for state, content in (((1, 1), absent), ((1, 1), absent), ((2, 2), there)):
+        assert computing.ask(cell, state, wait_s=HANGS_S).content == content
+    computing.close()
+
+
+def test_a_fault_in_a_computation_does_not_stay(db):
+    computing, _ = answering(db, ValueError("a fault"), {"counted": 1})
+    with pytest.raises(ValueError, match="a fault"):
+        computing.ask(("tables",), (1, 1), wait_s=HANGS_S)
+    assert computing.ask(("tables",), (1, 1), wait_s=HANGS_S).content == {"counted": 1}
+    computing.close()
+
+
+def test_the_database_is_read_anew_where_it_changed(db):
+    first = worker.numbers(db, stamp_of(db))
+    assert worker.numbers(db, stamp_of(db)) is first
+    os.utime(db)
+    assert worker.numbers(db, stamp_of(db)) is not first
+
+
+def test_discordant_trials_are_the_pairs_that_differ(ask, db):
+    text = ask("/discordant?model=o3&variant=A1")
+    with duckdb.connect(str(db), read_only=True) as connection:
+        pairs = connection.execute(
+            "SELECT a.trial_id, b.trial_id FROM trials AS a JOIN trials AS b "
+            "ON a.condition = b.condition AND a.rep = b.rep AND a.model_left = b.model_left "
+            "WHERE a.model_left = 'o3' AND a.variant = 'A1' AND b.variant = 'baseline' "
+            "AND (a.status, a.merged_first) IS DISTINCT FROM (b.status, b.merged_first)"
+        ).fetchall()
+    assert len(pairs) >= 3
+    shown = [
+        (
+            urlsplit(to).path.removeprefix("/trials/"),
+            parse_qs(urlsplit(to).query)["compare"][0].partition("@")[0],
+        )
+        for to, _ in Page(text).links
+        if "compare=" in to
+    ]
+    assert sorted(shown) == sorted(pairs)
+    assert f"<strong>{len(pairs)}</strong> of 22 ended differently" in text
+    assert "no trial of this variant" in ask("/discordant?model=o3&variant=A7")
+
+
+def test_the_page_of_prompts_has_the_differences_of_the_table(ask, db):
+    (contrasts,) = make_tables(Study(db), ["contrasts"])
+    page = Page(ask("/prompts"))
+    shown = [row for row in contrasts.rows if row.values["difference"] is not None]
+    assert shown
+    for row in shown:
+        told = {name: with_minus(value) for name, value in printed(contrasts, row).items()}
+        assert f"{told['difference']} {told['ci']}, Holm {told['p_holm']}" in page.text
+    assert page.to("/discordant?model=o3&variant=A1")
+
+
+@pytest.mark.parametrize("address", ["/tables/attempts", "/prompts", "/tables"])
+def test_a_name_is_shown_as_text_and_nothing_is_inline(ask, address):
+    text = ask(address)
+    assert HOSTILE not in text
+    assert Page(text).inline == []
+
+
+def test_every_figure_is_offered_and_comes_as_svg_and_png_and_is_cited(db):
+    client = client_of(db)
+    offered = {to for to, _ in Page(client.get("/tables").text).to("/figures/")}
+    assert offered == {f"/figures/{name}{end}" for name in MAKERS for end in ("", ".svg")}
+    assert list(FIGURES) == list(MAKERS)
+    reply = client.get("/figures/first-action.svg")
+    assert reply.headers["content-type"].startswith("image/svg+xml")
+    assert "</svg>" in reply.text
+    policy = reply.headers["content-security-policy"]
+    assert "style-src 'unsafe-inline'; img-src data:; sandbox" in policy
+    assert client.get("/figures/first-action.png").content.startswith(b"\x89PNG")
+    text = client.get("/figures/first-action").text
+    assert 'src="data:image/svg+xml;base64,' in text
+    page = Page(text)
+    assert page.to("/tables/first-action.csv")
+    assert results_digest(db)[0] in page.text
+    assert "arXiv:2604.09609" in page.text
+    client.site.close()
+
+
+def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
+    going, asked = threading.Event(), threading.Event()
+
+    class Slow(InProcess):
+        def answer(self, request):
+            asked.set()
+            going.wait()
+            raise UsageError("it broke <off>")
+
+    client = client_of(db, Computing(db, Slow))
+    assert "Computing, " in client.get("/tables/attempts").text
+    assert asked.wait(HANGS_S)
+    assert listed(client.get("/trials").text) == 66
+    assert "Computing, " in client.get("/prompts").text
+    going.set()
+    while "Computing, " in (later := client.get("/tables/attempts").text):
+        pass
+    assert "This could not be computed:</strong> it broke &lt;off&gt;" in later
+    client.site.close()
+
+
+def test_an_older_answer_stands_for_a_while_and_until_there_is_a_newer_one(db, monkeypatch):
+    made, going = [], threading.Event()
+
+    class Counting(InProcess):
+        def answer(self, request):
+            made.append(request)
+            assert len(made) == 1 or going.wait(HANGS_S)
+            return {"counted": len(made)}
+
+    computing = Computing(db, Counting)
+    first = computing.ask(("home", ""), (1, 1), wait_s=HANGS_S)
+    assert computing.ask(("home", ""), (2, 2)) == replace(first, older=True)
+    assert len(made) == 1
+    monkeypatch.setattr(worker, "STANDS_S", 0.0)
+    assert computing.ask(("home", ""), (1, 1)) == first
+    assert computing.ask(("home", ""), (2, 2)) == replace(first, older=True)
+    going.set()
+    second = computing.ask(("home", ""), (2, 2), wait_s=HANGS_S)
+    assert (second.state, second.content) == ((2, 2), {"counted": 2})
+    computing.close()
+
+
+def test_a_process_of_its_own_answers_alike_takes_no_file_of_the_users_and_is_replaced(
+    db, tmp_path, monkeypatch
+):
+    (tmp_path / "analysis.py").write_text("print('MINE')")
+    monkeypatch.chdir(tmp_path)
+    computing, request = Computing(db), ("table", "attempts")
+    before = set(psutil.Process().children(recursive=True))
+    found = computing.ask(request, (1, 1), wait_s=HANGS_S)
+    assert found.content == Numbers(db).answer(request)
+    failed = computing.ask(("nothing",), (1, 1), wait_s=HANGS_S)
+    assert failed.failure == "nothing answers ('nothing',)"
+    computing.ask(("table", "gap"), (1, 1))
+    for child in set(psutil.Process().children(recursive=True)) - before:
+        if "spawn_main" in " ".join(child.cmdline()):
+            child.send_signal(signal.SIGKILL)
+    failed = computing.ask(("table", "gap"), (1, 1), wait_s=HANGS_S)
+    assert "ended without an answer" in failed.failure
+    found = computing.ask(("table", "criticality"), (1, 1), wait_s=HANGS_S)
+    assert found.content == Numbers(db).answer(("table", "criticality"))
+    computing.close()
+
+
+def test_a_worker_that_is_closed_leaves_no_thread_that_a_program_could_stumble_over(db):
+    before = set(threading.enumerate())
+    with closing(Worker(db)) as worker:
+        worker.submit(("table", "attempts"))
+    assert set(threading.enumerate()) <= before
+
+
+def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(played, tmp_path):
+    for name in ("mine.toml", "mine.py"):
+        shutil.copy(played.folder / name, tmp_path)
+    told = subprocess.run(
+        [sys.executable, "-c", ASK, played.db, tmp_path / "mine.toml"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "opponent=sleepy/duration_s" in told.stdout
