@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import replace
 
 import pytest
 
-from merge_runner_analysis.commands import main
+from merge_runner.results.store import Store
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.human.archive import open_files
+from merge_runner_analysis.human.load import import_trials, sort_files
 from merge_runner_analysis.tables import make_tables
-from tests.support.harness import CONFIGURING
+from tests.support.recordings import drive, write_folder
 from tests.support.studies import ANSWERS, Said, write_study, yielding
 
 CONFIG = {"models": {"o3": {"id": "o3", "aliases": ["o3-alias"]}}}
@@ -32,25 +33,6 @@ def asked(drives, said=()):
         replace(drive, said={1: troubles[i]} if i in troubles else {})
         for i, drive in enumerate(drives)
     ]
-
-
-@pytest.fixture
-def in_process(tmp_path, monkeypatch):
-    """Runs ``merge-runner`` in an empty folder, in this process; returns the exit code.
-
-    For tests of what it stored: starting a process takes longer than most of them.
-    """
-    monkeypatch.chdir(tmp_path)
-    for name in [name for name in os.environ if name.endswith(CONFIGURING)]:
-        monkeypatch.delenv(name)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["merge-runner", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code
-
-    return run
 
 
 @pytest.fixture(scope="session")
@@ -85,3 +67,22 @@ def small(tmp_path_factory):
 def tables(study):
     """All tables of the study by name."""
     return {table.name: table for table in make_tables(study)}
+
+
+@pytest.fixture(scope="session")
+def imported(tmp_path_factory):
+    """Three pairs of humans, two trials each in every condition, beside a driver."""
+    folder = tmp_path_factory.mktemp("imported")
+    files = {}
+    for experiment in (4, 6, 8):
+        for number in range(2 * len(CONDITIONS)):
+            played, condition = [*CONDITIONS.items()][number // 2]
+            rep = number % 2
+            ahead = condition.projected_headway_m + 0.1 * experiment - 0.5 + 0.3 * (rep - 1)
+            yields = "both" if rep and experiment == 8 else "right" if ahead > 0 else "left"
+            name = f"experiment_{experiment}/experiment_{experiment}_iter_{number + 1}.csv"
+            files[name] = drive(played, yields=yields).csv()
+    db = write_study(folder / "t.duckdb", yielding("o3", reps=2))
+    with open_files(write_folder(folder / "recordings", files)) as found:
+        import_trials(sort_files(found), Store(db))
+    return Study(db)

@@ -22,12 +22,7 @@ EXAMPLES = {
 
 # The gap is 2.0 m, and then the follower closes in until it touches the other within 0.95 s.
 CLOSING_IN = Drive(
-    "o5",
-    "baseline",
-    "N_0_0",
-    1,
-    (0.15,) * 3 + (-0.2,) * 2,
-    (-0.15,) * 3 + (0.0,) * 2 + (0.3,) * 3,
+    "o5", "baseline", "N_0_0", 1, (0.15,) * 3 + (-0.2,) * 2, (-0.15,) * 3 + (0.0,) * 2 + (0.3,) * 3
 )
 
 

@@ -1,35 +1,18 @@
-"""Odd databases of every kind, each with its report and its pages, to be looked at.
-
-``python tests/support/odd_databases.py DIR`` makes them all; test_odd_databases.py reads what
-they say.
-"""
+"""Odd databases of every kind."""
 
 from __future__ import annotations
 
-import argparse
-import atexit
-import os
 import random
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.results.database import open_database
-from merge_runner.results.store import Store
-from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.reference_data import PAIRS, published
-from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.explorer.export import export_folder
-from merge_runner_analysis.human.archive import open_files
-from merge_runner_analysis.human.load import import_trials, sort_files
-from merge_runner_analysis.report.page import write_report
-from tests.support.recordings import drive, write_folder
-from tests.support.studies import Drive, Said, as_humans, write_study, yielding
+from tests.support import program
+from tests.support.harness import PROJECT, environment
+from tests.support.studies import Drive, Said, as_humans, changed, write_study, yielding
 
-RECORDINGS = Path(__file__).parents[2] / "cache/recordings"
 # A study of its own drivers and factors, of a model that another sweep drives too.
 STUDY = """
 models = ["emulator"]
@@ -49,41 +32,18 @@ repetitions = 4
 [factors]
 prompt = ["baseline", "A1"]
 """
-IMPORTED = 129
-BASELINE = ("sweep", "baseline")
-UNLIMITED = ("--rpm", "100000", "--tpm", "1000000000")
 
 
-def two_trials(db: Path) -> None:
-    """Two trials of one condition each."""
-    write_study(db, yielding("o3", reps=1)[:2], asked=OWN)
+def killed(db: Path) -> None:
+    """A sweep that was killed: two trials, and no end."""
+    write_study(db, yielding("o3", reps=1)[5:7], asked=OWN)
+    changed(db, "UPDATE sweeps SET ended_at = NULL, exit_code = NULL")
 
 
 def stand_in_behind_o3(db: Path) -> None:
     """The emulator at OPENAI_BASE_URL, asked for o3."""
-    url = {"OPENAI_BASE_URL": f"{_emulator()}/v1", "OPENAI_API_KEY": "no-key"}
-    _run(db, *BASELINE, "--model", "o3", "--reps", "2", "--yes", *UNLIMITED, **url)
-
-
-def another_endpoint(db: Path) -> None:
-    """A model that was asked at a gateway."""
-    asked = OWN | {"endpoint": "http://localhost:8080/v1"}
-    write_study(db, yielding("o3", reps=3), asked=asked)
-
-
-def partial_import(db: Path) -> None:
-    """A driver beside 129 human trials of five pairs."""
-    write_study(db, yielding("o3", reps=5), asked=OWN)
-    files = {}
-    for number in range(IMPORTED):
-        experiment = (4, 5, 6, 8, 9)[number % 5]
-        played, condition = list(CONDITIONS.items())[number // 5 % len(CONDITIONS)]
-        ahead = condition.projected_headway_m - condition.relative_velocity_mps
-        yields = "right" if ahead > 0 or (ahead == 0 and number % 2) else "left"
-        name = f"experiment_{experiment}/experiment_{experiment}_iter_{number + 1}.csv"
-        files[name] = drive(played, yields=yields).csv()
-    with open_files(write_folder(db.parent / "recordings", files)) as found:
-        import_trials(sort_files(found), Store(db))
+    write_study(db, yielding("o3", reps=1), asked=OWN)
+    changed(db, "UPDATE trials SET scripted = true")
 
 
 def other_vehicle_length(db: Path) -> None:
@@ -97,55 +57,10 @@ def temperature(db: Path) -> None:
     write_study(db, yielding("gpt", reps=3), asked={"endpoint": "openai", "body": body})
 
 
-def programs(db: Path) -> None:
-    """Drivers that are programs, each with repetitions, and one against the emulator."""
-    for model in ("projected-order", "constant", "emulator+constant"):
-        _run(db, *BASELINE, "--model", model, "--reps", "2")
-
-
 def only_failed(db: Path) -> None:
     """Every trial failed for want of an answer."""
-    drives = yielding("o3", reps=1)
-    write_study(
-        db, [replace(d, said={1: Said(("timeout",), lost=True)}) for d in drives], asked=OWN
-    )
-
-
-def killed(db: Path) -> None:
-    """A sweep that was killed: two trials, and no end."""
-    write_study(db, yielding("o3", reps=1)[5:7], asked=OWN)
-    with open_database(db, read_only=False, patience_s=5) as connection:
-        connection.execute("UPDATE sweeps SET ended_at = NULL, exit_code = NULL")
-
-
-def word_for_word(db: Path) -> None:
-    """A model that goes the same way each time."""
-    once = [drive for drive in yielding("o3", reps=2) if drive.rep == 1]
-    drives = [replace(drive, rep=rep, said={}) for drive in once for rep in (1, 2, 3)]
-    write_study(db, drives, asked=OWN)
-
-
-def two_studies(db: Path) -> None:
-    """A sweep of the paper and a study with factors, of one model, in one database."""
-    _run(db, *BASELINE, "--reps", "3")
-    db.with_name("study.toml").write_text(STUDY)
-    _run(db, "sweep", "study.toml")
-
-
-def crossed_programs(db: Path) -> None:
-    """Programs that draw by chance, each with two prompts."""
-    db.with_name("study.toml").write_text(CROSSED)
-    _run(db, "sweep", "study.toml")
-
-
-def mirrored_chance(db: Path) -> None:
-    """A pair in which one draws by chance and the other does not, both ways round."""
-    _run(db, *BASELINE, "--model", "human-odds+constant", "--mirror", "--reps", "10")
-
-
-def no_valid_reply(db: Path) -> None:
-    """A language model of whose replies none was valid."""
-    replayed(db, "smollm2-free")
+    lost = {1: Said(("timeout",), lost=True)}
+    write_study(db, [replace(d, said=lost) for d in yielding("o3", reps=1)], asked=OWN)
 
 
 def separated(db: Path) -> None:
@@ -155,11 +70,24 @@ def separated(db: Path) -> None:
 
 def all_tied(db: Path) -> None:
     """Every other trial of each condition collides."""
-    drives = [
-        drive if drive.rep % 2 else replace(drive, left=(), right=())
-        for drive in yielding("o3", reps=4)
-    ]
-    write_study(db, drives, asked=OWN)
+    drives = yielding("o3", reps=4)
+    write_study(db, [d if d.rep % 2 else replace(d, left=(), right=()) for d in drives], asked=OWN)
+
+
+def two_studies(db: Path) -> None:
+    """A sweep of the paper and a study with factors, of one model, in one database."""
+    _run(db, "sweep", "baseline", "--reps", "3")
+    _study(db, STUDY)
+
+
+def crossed_programs(db: Path) -> None:
+    """Programs that draw by chance, each with two prompts."""
+    _study(db, CROSSED)
+
+
+def mirrored_chance(db: Path) -> None:
+    """A pair in which one draws by chance and the other does not, both ways round."""
+    _run(db, "sweep", "baseline", "--model", "human-odds+constant", "--mirror", "--reps", "10")
 
 
 def complete_import(db: Path) -> None:
@@ -188,76 +116,31 @@ def complete_import(db: Path) -> None:
 KINDS: dict[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
-        two_trials,
-        stand_in_behind_o3,
-        another_endpoint,
-        partial_import,
-        complete_import,
-        other_vehicle_length,
-        temperature,
-        programs,
-        only_failed,
-        killed,
-        word_for_word,
-        two_studies,
-        crossed_programs,
-        mirrored_chance,
-        no_valid_reply,
-        separated,
-        all_tied,
+        killed, stand_in_behind_o3, other_vehicle_length, temperature, only_failed, separated,
+        all_tied, two_studies, crossed_programs, mirrored_chance, complete_import,
     )
-}
+}  # fmt: skip
 
 
 def made(folder: Path, kind: str) -> Path:
-    """The database of a kind, in a folder of its own."""
+    """The database of a kind, or of the shipped recording of a model, in a folder of its own."""
     db = folder / kind / "merge.duckdb"
     db.parent.mkdir(parents=True)
-    KINDS[kind](db)
+    if kind in KINDS:
+        KINDS[kind](db)
+    else:
+        recording = PROJECT / f"cache/recordings/{kind}-baseline.parquet"
+        _run(db, "replay", "baseline", "--model", kind, "--recording", recording)
     return db
 
 
-def replayed(db: Path, model: str) -> None:
-    """Replay the shipped recording of a model."""
-    recording = str(RECORDINGS / f"{model}-baseline.parquet")
-    _run(db, "replay", "baseline", "--model", model, "--recording", recording)
+def _study(db: Path, text: str) -> None:
+    db.with_name("study.toml").write_text(text)
+    _run(db, "sweep", "study.toml")
 
 
-def _emulator() -> str:
-    """The URL of an emulator, which ends with this process."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "merge_runner", "emulate", "--port", "0"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    atexit.register(process.terminate)
-    assert process.stdout is not None
-    return process.stdout.readline().strip()
-
-
-def _run(db: Path, *arguments: str, **environment: str) -> None:
-    subprocess.run(
-        [sys.executable, "-m", "merge_runner", *arguments, "--db", db.name, "--cache", "cache"],
-        cwd=db.parent,
-        env={**os.environ, **environment},
-        check=True,
-        capture_output=True,
-    )
-
-
-def main() -> None:
-    """Make the kinds that are named after the folder, else all, and say what they are."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("kinds", nargs="*", help=f"of {', '.join(KINDS)}; all if none is named")
-    asked = parser.parse_args()
-    for kind in asked.kinds or KINDS:
-        db = made(asked.folder, kind)
-        for _ in write_report(Study(db), db.with_name("report.html"), db.with_name("files")):
-            pass
-        export_folder(db, db.with_name("pages"))
-        sys.stdout.write(f"{db.parent}: {KINDS[kind].__doc__}\n")
-
-
-if __name__ == "__main__":
-    main()
+def _run(db: Path, *arguments: object) -> None:
+    own = ("--db", db.name, "--cache", "cache")
+    env = environment(EMULATOR_BASE_URL="")
+    done = program.invoke((*arguments, *own), cwd=db.parent, env=env)
+    assert done.code == 0, done.err

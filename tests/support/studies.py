@@ -216,14 +216,6 @@ def yielding(driver: str, variant: str = "baseline", reps: int = 3) -> list[Driv
                 left = not left
             strength = 0.30 + 0.04 * rep + 0.02 * abs(condition.projected_headway_m)
             faster, slower = (strength,) * 3, (-strength,) * 3
-            drives.append(
-                Drive(
-                    driver,
-                    variant,
-                    name,
-                    rep,
-                    faster if left else slower,
-                    slower if left else faster,
-                )
-            )
+            actions = (faster, slower) if left else (slower, faster)
+            drives.append(Drive(driver, variant, name, rep, *actions))
     return drives

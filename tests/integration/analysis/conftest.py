@@ -1,1 +1,1 @@
-from tests.support.analysis_fixtures import in_process, small, study, tables
+from tests.support.analysis_fixtures import imported, small, study, tables

@@ -15,8 +15,8 @@ from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.report.page import design
-from merge_runner_analysis.tables import make_tables
 from tests.support.studies import changed
+from tests.support.tables import by_id, made, notes_with, values_of
 
 MOOD = """
 description = "Does the mood matter?"
@@ -41,8 +41,7 @@ def folder(prepare, tmp_path_factory):
     (folder / "other/mood.toml").write_text(OTHER_MOOD)
     for study in ("baseline", "mood.toml", "other/mood.toml"):
         sweep = ("sweep", study, "--model", "human-odds", "--reps", 4, "--db", "t.duckdb")
-        run = prepare(folder, *sweep)
-        assert run.code == 0, run.err
+        assert prepare(folder, *sweep).code == 0
     return folder
 
 
@@ -51,45 +50,44 @@ def db(folder):
     return folder / "t.duckdb"
 
 
-def rows(study, name):
-    (table,) = make_tables(study, [name])
-    return {row.id: row.values for row in table.rows}, table
+@pytest.fixture
+def copy(db, tmp_path):
+    (tmp_path / "t.duckdb").write_bytes(db.read_bytes())
+    return tmp_path / "t.duckdb"
 
 
-@pytest.mark.slow
-def test_a_study_that_is_named_is_shown_by_its_own_trials_alone(db, folder, prepare):
-    found = prepare(
-        folder, "tables", "factors", "--study", "mood.toml", "--db", db, "--format", "json"
-    )
-    (table,) = json.loads(found.out)["tables"]
-    known = {row["row"]: row for row in table["rows"]}
-    assert known["prompt=baseline/left_first_percent"]["trials"] == 8
+def test_a_study_that_is_named_is_shown_by_its_own_trials_alone(db, folder):
+    study = Study(db, file=str(folder / "mood.toml"))
+    table = made(study, "factors")
+    rows = by_id(table)
+    assert rows["prompt=baseline/left_first_percent"].values["trials"] == 8
     for metric in ("left_first_percent", "collided_percent"):
-        row = known[f"prompt=A1/{metric}"]
-        assert (row["trials"], row["difference"], row["p"]) == (8, None, None)
-        assert "programs play no trial at one of both levels" in row["note"]
-    assert "memory_s" not in {row["factor"] for row in table["rows"]}
-    assert "several studies" not in json.dumps(table["notes"])
+        row = rows[f"prompt=A1/{metric}"]
+        assert [row.values.get(n) for n in ("trials", "difference", "p")] == [8, None, None]
+        assert "programs play no trial at one of both levels" in row.note
+    assert "memory_s" not in {row.values["factor"] for row in table.rows}
+    assert not notes_with(table, "several studies")
+    (source,) = explain(study, table, "prompt=baseline/left_first_percent:trials").sources
+    assert len(source.trials) == 8
+    assert load(source.query, db)["trial_id"].tolist() == list(source.trials)
+    assert design(study)[0] == ["Does the mood matter?"]
 
 
-@pytest.mark.slow
 def test_without_a_choice_tables_say_what_they_pool_and_test_nothing_across_studies(db):
     study = Study(db)
-    known, table = rows(study, "factors")
-    level = known["prompt=A1/left_first_percent"]
-    assert known["prompt=baseline/left_first_percent"]["trials"] == 44
+    table = made(study, "factors")
+    rows = {name: row.values for name, row in by_id(table).items()}
+    level = rows["prompt=A1/left_first_percent"]
+    assert rows["prompt=baseline/left_first_percent"]["trials"] == 44
     assert level["trials"] == 8, "three times the same 8 trials"
     assert {level.get(name) for name in ("difference", "difference_ci", "p", "p_holm")} == {None}
-    (note,) = (note for note in table.notes if note.startswith("trials of several studies"))
+    (note,) = notes_with(table, "trials of several studies")
     for named in ("baseline (44 trials)", "mood (16 trials)", "mood (memory_s) (16 trials)"):
         assert named in note
-    contrasted, _ = rows(study, "contrasts")
-    assert not any("/A1/baseline/" in name for name in contrasted)
+    assert not any("/A1/baseline/" in name for name in by_id(made(study, "contrasts")))
 
 
-def test_a_second_study_changes_no_reference(db, tmp_path):
-    copy = tmp_path / "t.duckdb"
-    copy.write_bytes(db.read_bytes())
+def test_a_second_study_changes_no_reference(copy):
     levels = {"perception": ["perfect", "foggy"], "prompt": ["A1"], "model": ["human-odds"]}
     study = changed(
         copy,
@@ -98,29 +96,9 @@ def test_a_second_study_changes_no_reference(db, tmp_path):
         f"UPDATE sweeps SET config = json_merge_patch(config, '{json.dumps({'levels': levels})}') "
         "WHERE started_at = (SELECT max(started_at) FROM sweeps)",
     )
-    known, _ = rows(study, "factors")
-    assert [name for name in known if name.endswith("=perfect/gap_m") or "=foggy/gap" in name] == [
-        "perception=perfect/gap_m",
-        "perception=foggy/gap_m",
-    ]
+    shown = [n for n in values_of(study, "factors") if re.match("perception=.*/gap_m", n)]
+    assert shown == ["perception=perfect/gap_m", "perception=foggy/gap_m"]
     assert study.reference == "baseline", "a study of one prompt lists it first, and says nothing"
-
-
-@pytest.mark.slow
-def test_the_trials_behind_a_cell_are_those_of_the_study(db, folder):
-    study = Study(db, file=str(folder / "mood.toml"))
-    _, table = rows(study, "factors")
-    (source,) = explain(study, table, "prompt=baseline/left_first_percent:trials").sources
-    assert len(source.trials) == 8
-    assert design(study)[0] == ["Does the mood matter?"]
-    assert load(source.query, db)["trial_id"].tolist() == list(source.trials)
-
-
-@pytest.mark.slow
-def test_tables_that_are_kept_are_those_of_their_study(db, folder, prepare):
-    for study, n in (("mood.toml", 8), ("baseline", 44), ("mood.toml", 8)):
-        found = prepare(folder, "tables", "attempts", "--study", study, "--db", db)
-        assert re.search(rf"human-odds +Baseline +{n} ", found.out), found.out
 
 
 def test_a_study_that_was_not_played_is_named_beside_those_that_were(db):
@@ -128,21 +106,15 @@ def test_a_study_that_was_not_played_is_named_beside_those_that_were(db):
         Study(db, file="ablations")
 
 
-@pytest.mark.slow
-def test_a_run_of_the_same_study_is_no_other_study(db, folder, prepare, tmp_path):
-    copy = tmp_path / "t.duckdb"
-    copy.write_bytes(db.read_bytes())
+def test_a_run_of_the_same_study_is_no_other_study(copy, prepare, tmp_path):
     (tmp_path / "mood.toml").write_text(MOOD.replace('"A1"]', '"A1", "A2"]'))
     sweep = ("sweep", "mood.toml", "--only", "prompt=A2", "--db", copy)
     assert prepare(tmp_path, *sweep).code == 0
-    known, _ = rows(Study(copy, file=str(tmp_path / "mood.toml")), "factors")
+    known = values_of(Study(copy, file=str(tmp_path / "mood.toml")), "factors")
     assert [known[f"prompt={name}/gap_m"]["trials"] for name in ("baseline", "A1", "A2")] == [8] * 3
 
 
-def test_trials_of_no_sweep_are_of_no_study(db, tmp_path):
-    copy = tmp_path / "t.duckdb"
-    copy.write_bytes(db.read_bytes())
-    study = changed(copy, "DELETE FROM sweep_trials", "DELETE FROM sweeps")
-    known, table = rows(study, "factors")
-    assert known["prompt=A1/left_first_percent"]["trials"] == 8
-    assert not any("several studies" in note for note in table.notes)
+def test_trials_of_no_sweep_are_of_no_study(copy):
+    table = made(changed(copy, "DELETE FROM sweep_trials", "DELETE FROM sweeps"), "factors")
+    assert by_id(table)["prompt=A1/left_first_percent"].values["trials"] == 8
+    assert not notes_with(table, "several studies")

@@ -7,11 +7,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import duckdb
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner_analysis.data import derived_cache as kept
+from merge_runner_analysis.data import derived_cache
 from merge_runner_analysis.data.derived_cache import (
     finished,
     keep_finished,
@@ -19,12 +18,13 @@ from merge_runner_analysis.data.derived_cache import (
     present_state,
 )
 from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.names import TableFormat
 from merge_runner_analysis.report.page import finished_figures
-from merge_runner_analysis.tables import TABLES, finished_tables, make_tables
+from merge_runner_analysis.tables import TABLES, finished_tables
 from merge_runner_analysis.tables.formats import render
 from merge_runner_analysis.tables.model import from_text, to_text
-from tests.support.studies import write_study, yielding
+from tests.support.studies import changed, write_study, yielding
 
 # Changes of the results that tables show, and one of each table that they are made of.
 CHANGES = {
@@ -45,176 +45,125 @@ CHANGES = {
 UNSEEN = "UPDATE decisions SET prompt = 'other'; UPDATE calls SET reply = '{}'"
 
 
-@pytest.fixture
-def db(tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def asked(tmp_path_factory):
     """o3 once in every condition, and asked."""
     drives = [replace(drive, said={}) for drive in yielding("o3", reps=1)]
-    return write_study(tmp_path / "t.duckdb", drives)
+    return write_study(tmp_path_factory.mktemp("asked") / "t.duckdb", drives)
 
 
 @pytest.fixture
-def made(monkeypatch):
-    """Notes which tables are made."""
-    names = []
-
-    def make(study, missing):
-        names.extend(missing)
-        return make_tables(study, missing)
-
-    monkeypatch.setattr("merge_runner_analysis.tables.make_tables", make)
-    return names
+def db(asked, tmp_path) -> Path:
+    (tmp_path / "t.duckdb").write_bytes(asked.read_bytes())
+    return tmp_path / "t.duckdb"
 
 
-def change(db, sql):
-    with duckdb.connect(str(db)) as connection:
-        connection.execute(sql)
+def mark(db, name="attempts"):
+    """Make a table, and mark the one that is kept."""
+    (table,) = finished_tables(db, [name])
+    state = present_state(db)
+    kept = from_text(finished(db, state, options_text(db), [name])[name])
+    assert to_text(kept) == to_text(table)
+    kept.notes.append("kept")
+    db.with_name(f"{db.name}.derived").unlink()
+    keep_finished(db, state, options_text(db), {name: to_text(kept)})
+    return state
+
+
+def is_read(db, study=None, **options) -> bool:
+    """Whether the marked table is read, and not made anew."""
+    (table,) = finished_tables(db, ["attempts"], study, options)
+    return "kept" in table.notes
 
 
 @pytest.mark.parametrize("name", TABLES)
-@pytest.mark.parametrize("form", TableFormat)
-def test_a_table_reads_the_same_after_it_was_a_text(tables, name, form):
+def test_a_table_reads_the_same_after_it_was_a_text(tables, name):
     again = from_text(to_text(tables[name]))
-    assert render([again], form) == render([tables[name]], form)
+    for form in TableFormat:
+        assert render([again], form) == render([tables[name]], form)
     assert to_text(again) == to_text(tables[name])
 
 
-@pytest.mark.slow
-def test_tables_are_made_once_and_then_read(db, made):
-    first = finished_tables(db, ["gap", "attempts"])
-    assert made == ["gap", "attempts"]
-    again = finished_tables(db, ["attempts", "factors", "gap"])
-    assert made == ["gap", "attempts", "factors"]
-    assert [to_text(t) for t in (again[2], again[0])] == [to_text(t) for t in first]
-    assert finished_tables(db, ["gap"], options={"models": ["o3"]})
-    assert made[3:] == ["gap"]
+def test_tables_are_made_once_beside_the_database_and_then_read(db):
+    before = db.read_bytes()
+    mark(db)
+    assert is_read(db)
+    assert not is_read(db, models=["o3"])
+    other, again = finished_tables(db, ["criticality", "attempts"])
+    assert (other.name, "kept" in other.notes, "kept" in again.notes) == (
+        "criticality",
+        False,
+        True,
+    )
+    assert db.read_bytes() == before
+    with pytest.raises(UsageError, match="unknown table 'gaps'"):
+        finished_tables(db, ["gaps"])
+    with pytest.raises(UsageError, match="unknown driver 'o4'"):
+        finished_tables(db, ["attempts"], options={"models": ["o4"]})
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("what", CHANGES)
-def test_after_any_change_of_the_results_tables_are_made_anew(db, made, what):
-    finished_tables(db, ["attempts"])
-    state = present_state(db)
-    change(db, UNSEEN)
-    assert present_state(db) == state
-    change(db, CHANGES[what])
-    assert present_state(db) != state
-    finished_tables(db, ["attempts"])
-    assert made == ["attempts", "attempts"]
-
-
-@pytest.mark.slow
-def test_another_program_makes_tables_anew(db, made, monkeypatch):
-    for name in ("one", "one", "other", "other"):
-        monkeypatch.setattr(
-            "merge_runner_analysis.data.derived_cache.program", lambda name=name: name
-        )
-        finished_tables(db, ["criticality"])
-    assert made == ["criticality"] * 2
+def test_after_any_change_of_the_results_tables_are_made_anew(db):
+    states = [mark(db)]
+    study = Study(db)
+    changed(db, UNSEEN)
+    assert present_state(db) == states[0]
+    for change in CHANGES.values():
+        changed(db, change)
+        states.append(present_state(db))
+    assert len({*states}) == len(states)
+    assert not is_read(db)
+    # What was read before the change is not kept for the state after it.
+    finished_tables(db, ["criticality"], study)
+    assert finished(db, states[-1], options_text(db), ["criticality"]) == {}
 
 
 def test_the_program_is_told_by_its_code_its_values_and_its_libraries(tmp_path, monkeypatch):
-    (tmp_path / "a.py").write_text("x = 1")
-    monkeypatch.setattr("merge_runner_analysis.data.derived_cache.PACKAGES", (tmp_path,))
-    found = {kept.program.__wrapped__()}
-    (tmp_path / "a.py").write_text("x = 2")
-    found.add(kept.program.__wrapped__())
-    (tmp_path / "b.csv").write_text("1")
-    found.add(kept.program.__wrapped__())
-    monkeypatch.setattr("merge_runner_analysis.data.derived_cache.version", lambda _: "0")
-    found.add(kept.program.__wrapped__())
+    program = derived_cache.program.__wrapped__  # it is remembered as long as the process lives
+    monkeypatch.setattr(derived_cache, "PACKAGES", (tmp_path,))
+    found = set()
+    for name, text in (("a.py", "x = 1"), ("a.py", "x = 2"), ("b.csv", "1")):
+        (tmp_path / name).write_text(text)
+        found.add(program())
+    monkeypatch.setattr(derived_cache, "LIBRARIES", ("pytest",))
+    found.add(program())
     assert len(found) == 4
 
 
-@pytest.mark.slow
-def test_what_is_kept_is_not_in_the_database(db):
-    before = db.read_bytes()
-    finished_tables(db, ["criticality"])
-    assert db.read_bytes() == before
-
-
-def test_tables_of_results_that_changed_meanwhile_are_not_kept(db):
-    state = present_state(db)
-    change(db, CHANGES["an outcome"])
-    keep_finished(db, state, "x", {"gap": "old"})
-    now = present_state(db)
-    assert finished(db, now, "x", ["gap"]) == finished(db, state, "x", ["gap"]) == {}
-    keep_finished(db, now, "x", {"gap": "new"})
-    assert finished(db, now, "x", ["gap"]) == {"gap": "new"}
-
-
-def test_tables_of_a_study_that_was_read_before_a_change_are_not_kept(db):
+def test_a_study_that_was_read_before_a_change_takes_no_table_of_the_later_state(db):
     study = Study(db)
-    change(db, CHANGES["an outcome"])
-    finished_tables(db, ["attempts"], study)
-    assert finished(db, present_state(db), options_text(db), ["attempts"]) == {}
+    changed(db, CHANGES["an outcome"])
+    mark(db)
+    assert not is_read(db, study)
+    assert is_read(db)
 
 
-@pytest.mark.slow
-def test_a_study_that_was_read_before_a_change_takes_no_table_of_the_later_state(db, made):
-    study = Study(db)
-    change(db, CHANGES["an outcome"])
-    finished_tables(db, ["attempts"])
-    finished_tables(db, ["attempts"], study)
-    assert made == ["attempts", "attempts"]
-
-
-def test_what_cannot_be_kept_is_made_and_said_once(db, made, caplog):
+def test_what_cannot_be_kept_is_made_and_said_once(db, caplog):
     before = db.read_bytes()
     db.with_name(f"{db.name}.derived").mkdir()
     for _ in range(2):
         assert finished_tables(db, ["criticality"])
-    assert made == ["criticality"] * 2
     assert caplog.text.count("is not kept for the next time") == 1
     assert db.read_bytes() == before
 
 
-def test_a_figure_is_not_taken_for_the_table_of_its_name(db, monkeypatch):
-    monkeypatch.setattr("merge_runner_analysis.report.page.FIGURES", {"attempts": None})
-    monkeypatch.setattr("merge_runner_analysis.report.page.rendered", lambda *_: b"<svg/>")
-    (table,) = finished_tables(db, ["attempts"])
-    assert finished_figures(Study(db)) == {"attempts": "PHN2Zy8+"}
-    (again,) = finished_tables(db, ["attempts"])
-    assert to_text(again) == to_text(table)
+def test_figures_that_are_kept_are_not_taken_for_tables_and_not_drawn_again(db):
+    study = Study(db)
+    kept = {f"{name}.svg": "PHN2Zy8+" for name in FIGURES}
+    keep_finished(db, study.state, study.options, kept)
+    assert finished_figures(study) == dict.fromkeys(FIGURES, "PHN2Zy8+")
+    assert finished_tables(db, ["first-action"])[0].rows
 
 
-@pytest.mark.slow
-def test_figures_are_drawn_once_and_renewed(db, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(
-        "merge_runner_analysis.report.page.FIGURES", {"figure2": None, "first-action": None}
-    )
-    monkeypatch.setattr(
-        "merge_runner_analysis.report.page.rendered",
-        lambda *wanted: drawn.append(wanted[1:]) or b"<svg/>",
-    )
-    first = finished_figures(Study(db))
-    assert finished_figures(Study(db)) == first == dict.fromkeys(first, "PHN2Zy8+")
-    assert drawn == [("figure2", "svg"), ("first-action", "svg")]
-    change(db, CHANGES["an outcome"])
-    finished_figures(Study(db))
-    assert drawn == [("figure2", "svg"), ("first-action", "svg")] * 2
-
-
-@pytest.mark.long
-def test_a_warm_table_waits_for_no_heavy_library(db, tmp_path):
+def test_a_warm_table_waits_for_no_heavy_library(db):
     check = (
         "import sys; from merge_runner_analysis.commands import app; "
         "app(['tables', 'gap', '--db', sys.argv[1]], standalone_mode=False); "
         "heavy = {'pandas', 'scipy', 'statsmodels', 'matplotlib', 'numpy'} & sys.modules.keys(); "
         "assert not heavy, heavy"
     )
-    for warm in (False, True):  # in a process of its own: a test here may have a study in use
-        done = subprocess.run(
-            [sys.executable, "-c", check, str(db)], capture_output=True, text=True, check=False
-        )
-        assert "Table IV" in done.stdout
-        assert (done.returncode == 0) == warm, done.stderr
-
-
-@pytest.mark.slow
-def test_unknown_names_are_refused_also_beside_kept_tables(db):
-    finished_tables(db, ["attempts"])
-    with pytest.raises(UsageError, match="unknown table 'gaps'"):
-        finished_tables(db, ["gaps"])
-    with pytest.raises(UsageError, match="unknown driver 'o4'"):
-        finished_tables(db, ["attempts"], options={"models": ["o4"]})
+    finished_tables(db, ["gap"])
+    done = subprocess.run(
+        [sys.executable, "-c", check, str(db)], capture_output=True, text=True, check=False
+    )
+    assert "Table IV" in done.stdout
+    assert done.returncode == 0, done.stderr

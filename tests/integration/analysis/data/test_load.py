@@ -1,35 +1,23 @@
-"""Results as data frames."""
+"""Results as data frames, and what is remembered of a study."""
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
+import weakref
 from pkgutil import iter_modules
 
 import numpy as np
 import pandas as pd
-import pytest
 
 import merge_runner_analysis
 from merge_runner.results.store import Store
 from merge_runner_analysis import Study, load, load_trials, table
-
-
-@pytest.mark.slow
-def test_a_notebook_gets_one_row_a_trial_with_its_metrics(in_process, tmp_path):
-    assert in_process("sweep", "baseline", "--model", "projected-order", "--reps", 1) == 0
-    frame = load_trials(tmp_path / "results/merge.duckdb")
-    assert len(frame) == 11
-    assert frame["gap_m"].between(0, 30).all()
-    assert set(frame["merged_first"]) == {"left", "right"}
-
-
-@pytest.mark.slow
-def test_a_notebook_gets_the_tables_at_full_precision(study):
-    frame = table(Study(study.db), "ablation-quantitative")
-    assert list(frame.index) == ["human", "o3/baseline", "o3/A1", "o3/A2", "other/baseline"]
-    assert frame.equals(table(study.db, "ablation-quantitative"))
-    assert frame.loc["o3/A1", "gap_m_ci_low"] < frame.loc["o3/A1", "gap_m"]
+from merge_runner_analysis.explain import explain
+from merge_runner_analysis.figures.gallery import rendered
+from merge_runner_analysis.stats.indicators import fits
+from merge_runner_analysis.tables import TABLES, make_tables
 
 
 def test_the_menu_is_small_and_loads_nothing_before_it_is_used():
@@ -44,23 +32,21 @@ def test_the_menu_is_small_and_loads_nothing_before_it_is_used():
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
 
 
-def test_columns_have_their_types_also_where_there_is_no_value(in_process, tmp_path):
-    db = tmp_path / "results/merge.duckdb"
-    part = ("sweep", "baseline", "--model", "projected-order", "--reps", 1)
-    assert in_process(*part, "--conditions", "N_0_0") == 0
+def test_columns_have_their_types_also_where_there_is_no_value(small):
     text = pd.StringDtype(na_value=np.nan)
     expected = {
         "pair": text, "error": text, "scripted": np.dtype(bool), "rep": np.dtype("int64"),
         "end_time_s": np.dtype("float64"), "joint": np.dtype(bool), "min_ttc_s": np.dtype(float),
     }  # fmt: skip
-    trials = load_trials(db)
-    assert trials["pair"].isna().all()
-    assert trials["error"].isna().all()
+    trials = load_trials(small.db)
+    assert len(trials) == 11
+    assert trials[["pair", "error"]].isna().all(axis=None)
     assert {name: trials[name].dtype for name in expected} == expected
-    none = load("select * from trials join trial_metrics using (trial_id, spec_hash) limit 0", db)
+    every = "select * from trials join trial_metrics using (trial_id, spec_hash) limit 0"
+    none = load(every, small.db)
     assert {name: none[name].dtype for name in expected} == expected
-    sweeps = load("select exit_code, started_at, versions, null::int as exit_code from sweeps", db)
-    assert [str(dtype) for dtype in sweeps.dtypes] == ["int64", "datetime64[us]", "str", "Int64"]
+    sweeps = load("select started_at, versions, null::int as exit_code from sweeps", small.db)
+    assert [str(dtype) for dtype in sweeps.dtypes] == ["datetime64[us]", "str", "Int64"]
 
 
 def test_a_missing_truth_value_or_number_is_neither_false_nor_a_fraction(tmp_path):
@@ -69,3 +55,24 @@ def test_a_missing_truth_value_or_number_is_neither_false_nor_a_fraction(tmp_pat
     assert [str(dtype) for dtype in frame.dtypes] == ["boolean", "Int64"]
     assert frame.iloc[0].tolist() == [True, 2]
     assert frame.iloc[1].isna().all()
+
+
+def used(db):
+    """References to a study and to its groups, after all of its tables have been made."""
+    study = Study(db)
+    for name in TABLES:
+        table(study, name)
+    for made in make_tables(study, ["who-first", "gap", "attempts", "verdicts"]):
+        for row in made.rows:
+            explain(study, made, row.id)
+    rendered(study, "first-action", "svg")
+    (group,) = study.models
+    assert fits(group) is fits(group), "what is computed of a group is computed once"
+    assert fits(group) is not fits(study.human)
+    return [weakref.ref(one) for one in (study, group, *study.asked)]
+
+
+def test_a_study_is_remembered_while_it_is_used_and_then_freed(small):
+    references = used(small.db)
+    gc.collect()
+    assert [one() for one in references if one() is not None] == []

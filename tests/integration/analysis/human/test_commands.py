@@ -1,10 +1,12 @@
-"""``merge-runner human`` on the real command line: outputs and exit codes."""
+"""``merge-runner human`` on the command line: outputs and exit codes."""
 
 from __future__ import annotations
 
 import pytest
 
 from merge_runner.results.store import query
+from merge_runner_analysis.data.study import Study
+from tests.support.pages import velocity_page
 from tests.support.recordings import drive, write_folder, write_zip
 
 GOOD = {
@@ -12,26 +14,28 @@ GOOD = {
     "copy/experiment_6/experiment_6_iter_2.csv": drive("N_0_0", yields="nobody").csv(),
     "data/experiment_4/experiment_4_training_1.csv": b"",
     "data/experiment_4/participant_info.txt": b"left",
-    "data/experiment_4/auto_save.pkl": b"",
 }
 BAD = {
     "data/experiment_5/experiment_5_iter_1.csv": b"dt,end_state\r\n50,Finished\r\n",
-    "data/experiment_5/experiment_5_iter_2.pkl": b"",
     "simulated/experiment_4/simulation_4_iter_0.pkl": b"",
     **{f"cut/experiment_8_iter_{m}.csv": b"" for m in range(21)},
 }
 
 
-@pytest.mark.slow
+@pytest.fixture
+def human(prepare, tmp_path):
+    return lambda *arguments: prepare(tmp_path, "human", *arguments)
+
+
 def test_a_zip_is_imported_once_and_the_status_counts_it(human, tmp_path):
     path = write_zip(tmp_path / "download.zip", GOOD)
     run = human("import", path)
-    assert run.code == 0
-    assert run.out == ("2 trials added, 0 there already, 0 files could not be read\n")
-    (few,) = run.err.splitlines()
-    assert few.startswith(
-        "note: 2 of 990 trials are imported; who merged first and collisions are "
+    assert (run.code, run.out) == (
+        0,
+        "2 trials added, 0 there already, 0 files could not be read\n",
     )
+    (few,) = run.err.splitlines()
+    assert few.startswith("note: 2 of 990 trials are imported; who merged first and collisions are")
     again = human("import", path)
     assert (again.code, again.out[:33]) == (0, "0 trials added, 2 there already, ")
     late = {"experiment_4_iter_1.csv": drive("L_4_0", late=True).csv()}
@@ -39,10 +43,9 @@ def test_a_zip_is_imported_once_and_the_status_counts_it(human, tmp_path):
     assert other.code == 1
     assert "error: human/pair1/L_4_0/iter001 is stored with other values, which stay" in other.err
     status = human("status")
-    assert status.code == 0
     lines = [line.split() for line in status.out.splitlines()]
+    assert status.code == 0
     assert ["pair1", "1", "1", "0", "0"] in lines
-    assert ["pair3", "1", "0", "0", "1"] in lines
     assert ["L_4_0", "1", "1", "0", "0", "88", "0", "2"] in lines
     assert ["N_0_0", "1", "0", "0", "1", "37", "48", "5"] in lines
     assert lines[-1][:4] == ["2", "of", "990", "trials"]
@@ -89,3 +92,18 @@ def test_the_status_of_nothing_says_what_to_type(human):
     assert run.code == 0
     assert run.out.startswith("no human recordings are imported: merge-runner human import PATH")
     assert "10.4121/19550377" in run.out
+
+
+def test_the_source_of_a_trial_is_told_and_none_is_stored_twice(human, tmp_path):
+    driven = {"1-1": drive("L_4_0"), "3-12": drive("L_4_0", yields="left")}
+    recorded = {"experiment_4_iter_1.csv": driven["1-1"].csv()}
+    folder = write_folder(tmp_path / "both", {"4_0.html": velocity_page(driven), **recorded})
+    run = human("import", folder)
+    assert (run.code, run.out[:32]) == (0, "2 trials added, 1 there already,")
+    says = "1 of 2 trials are of the public velocity pages"
+    assert says in run.err
+    assert says in human("status").out
+    assert human("import", folder).out.startswith("0 trials added, 3 there already, ")
+    study = Study(tmp_path / "results/merge.duckdb")
+    assert len(study.human.trials) == 2
+    assert any(said.startswith(says) for said in study.findings)

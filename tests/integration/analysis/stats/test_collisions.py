@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import duckdb
+import numpy as np
+import pandas as pd
 import pytest
 
 from merge_runner.config import ScenarioConfig
+from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.load import load_trials
 from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.data.trials import judged
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.metrics import BOXES, COLLISIONS
 from merge_runner_analysis.stats.intervals import wilson
 from merge_runner_analysis.stats.measures import counts
 from merge_runner_analysis.tables import make_tables
-from tests.support.studies import Drive, changed, write_study, yielding
+from tests.support.studies import Drive, changed, write_study
 
 # So strong vehicles reach the end of the track within one plan.
 STRONG = ScenarioConfig(max_acceleration_mps2=5.0)
@@ -99,26 +105,47 @@ def test_explain_lists_the_trials_that_are_decided(study, measure):
     assert tuple(trial_id for trial_id, *_ in rows) == source.trials
 
 
-def test_humans_have_no_rate_by_the_drivers_rule_before_an_import_and_the_row_says_why(study):
-    (table,) = make_tables(study, ["ablation-quantitative"])
-    human = next(row for row in table.rows if row.id == "human")
-    assert human.values.get("collided_percent") is None
-    assert human.values["collided_boxes_percent"] == pytest.approx(100 * 28 / 990)
-    assert "coll. (%): published human collisions are boxes that overlap" in human.note
+@pytest.fixture
+def chance_drives():
+    """Trials of accelerations by chance, of which many collide."""
+    chance = np.random.default_rng(7)
+    names = [*CONDITIONS]
+    return [
+        Drive("o3", "baseline", str(chance.choice(names)), rep, *chance.uniform(-0.3, 0.3, (2, 12)))
+        for rep in range(100)
+    ]
 
 
-@pytest.mark.slow
-def test_longer_boxes_touch_where_shorter_ones_do_not(tmp_path):
-    drives = [Drive("o3", "baseline", "L_4_0", 1, (0.1, 0.1), ())]
-    for length_m, touching in ((4.5, False), (8.0, True)):
-        scenario = ScenarioConfig(vehicle_length_m=length_m, collision_rule="shared_lane")
-        path = write_study(tmp_path / f"{length_m}.duckdb", drives, scenario)
-        (group,) = Study(path).models
-        assert group.trials["collided_boxes"].tolist() == [touching]
+def judged_by(path, drives, **scenario):
+    """The trials as driven under such a scenario, by repetition."""
+    db = write_study(path, drives, ScenarioConfig(**scenario))
+    return judged(db, load_trials(db)).set_index("rep").sort_index()
 
 
-def test_where_nothing_comes_near_both_rules_agree(tmp_path):
-    db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=2))
-    (group,) = Study(db).models
-    assert len(load_trials(db)) == 22
-    assert counts(group, BOXES) == counts(group, COLLISIONS) == (0, 22)
+@pytest.mark.parametrize("length_m", [4.5, 7.0])
+def test_boxes_are_those_of_the_humans_rule_up_to_where_another_ended_the_trial(
+    tmp_path, chance_drives, length_m
+):
+    fine = {"step_s": 0.05, "vehicle_length_m": length_m}
+    truth = judged_by(tmp_path / "a", chance_drives, **fine, collision_rule="rectangle")
+    cut_off = judged_by(tmp_path / "b", chance_drives, **fine)
+    assert truth["collided_boxes"].equals(truth["collided"])
+    undecided = cut_off["collided_boxes"].isna()
+    assert 0 < undecided.sum() < 100
+    assert cut_off["collided"][undecided].all()
+    pd.testing.assert_series_equal(
+        cut_off["collided_boxes"][~undecided], truth["collided_boxes"][~undecided]
+    )
+
+
+def test_what_is_seen_between_steps_is_what_a_finer_simulation_sees(tmp_path, chance_drives):
+    """Four steps of 0.05 s with one action are one of 0.2 s."""
+    rule = {"collision_rule": "rectangle"}
+    finer = [
+        replace(one, left=np.repeat(one.left, 4), right=np.repeat(one.right, 4))
+        for one in chance_drives
+    ]
+    coarse = judged_by(tmp_path / "a", chance_drives, **rule)
+    fine = judged_by(tmp_path / "b", finer, **rule, step_s=0.05)
+    assert coarse["collided_boxes"].equals(fine["collided"])
+    assert 0 < fine["collided"].sum() < 100

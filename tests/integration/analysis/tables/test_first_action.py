@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
-import duckdb
 import numpy as np
 import pytest
 
@@ -17,22 +16,11 @@ from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.figures.gallery import figure_of_first_actions
-from merge_runner_analysis.tables import make_tables
-from tests.support.studies import Drive, write_study
+from tests.support.studies import Drive, changed, write_study
+from tests.support.tables import by_id, made, values_of
 
-MIRRORED = {
-    name: next(
-        other
-        for other, image in CONDITIONS.items()
-        if image
-        == replace(
-            one,
-            projected_headway_m=-one.projected_headway_m,
-            relative_velocity_mps=-one.relative_velocity_mps,
-        )
-    )
-    for name, one in CONDITIONS.items()
-}
+BY_PLACE = {(c.projected_headway_m, c.relative_velocity_mps): n for n, c in CONDITIONS.items()}
+MIRRORED = {name: BY_PLACE[-h, -dv] for (h, dv), name in BY_PLACE.items()}
 FIRSTS = np.random.default_rng(8).uniform(-0.4, 0.4, (len(CONDITIONS), 4, 2))
 
 
@@ -56,18 +44,17 @@ def db(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rows(db):
-    return {row.id: row for row in make_tables(Study(db), ["first-action"])[0].rows}
+    return values_of(Study(db), "first-action")
 
 
 def test_the_human_slope_stands_beside_each_drivers(rows):
-    human = rows["human"].values
-    assert human["slope"] == -0.338
+    human = rows["human"]
+    names = ("slope", "mean_slower", "mean_equal", "mean_faster")
+    assert [human[name] for name in names] == [-0.338, 0.211, -0.013, -0.330]
     assert human["slope_ci"] == pytest.approx((-0.375, -0.301))
-    means = ("mean_slower", "mean_equal", "mean_faster")
-    assert [human[name] for name in means] == [0.211, -0.013, -0.330]
     assert human["exchange_rate"] == pytest.approx(2.97, abs=5e-3)
     for driver, slope in (("alike", -0.34), ("blind", 0.0)):
-        low, high = rows[f"{driver}/baseline"].values["slope_ci"]
+        low, high = rows[f"{driver}/baseline"]["slope_ci"]
         assert low < slope < high
 
 
@@ -79,24 +66,21 @@ def test_the_numbers_of_a_driver_are_those_of_the_states(db, rows):
         "WHERE model_left = 'alike' AND step = 1",
         db,
     )
-    values = rows["alike/baseline"].values
+    values, a, v = rows["alike/baseline"], found["a"], found["v"]
     assert values["n"] == len(found) == 88
-    for name, there in (
-        ("slower", found["v"] < 0),
-        ("equal", found["v"] == 0),
-        ("faster", found["v"] > 0),
-    ):
-        assert values[f"mean_{name}"] == pytest.approx(found["a"][there].mean())
-    assert values["brake_percent"] == pytest.approx(100 * (found["a"] < -0.2).mean())
-    assert values["hold_percent"] == pytest.approx(100 * (found["a"].abs() <= 0.2).mean())
-    assert values["go_percent"] == pytest.approx(100 * (found["a"] > 0.2).mean())
-    assert values["slope"] == pytest.approx(np.polyfit(found["v"], found["a"], 1)[0])
+    expected = {
+        "mean_slower": a[v < 0].mean(), "mean_equal": a[v == 0].mean(),
+        "mean_faster": a[v > 0].mean(), "slope": np.polyfit(v, a, 1)[0],
+        "brake_percent": 100 * (a < -0.2).mean(), "hold_percent": 100 * (a.abs() <= 0.2).mean(),
+        "go_percent": 100 * (a > 0.2).mean(),
+    }  # fmt: skip
+    assert {name: values[name] for name in expected} == pytest.approx(expected)
     assert "exchange_rate" not in values, "there is no word"
 
 
 def test_a_row_leads_to_its_trials(db):
     study = Study(db)
-    (table,) = make_tables(study, ["first-action"])
+    table = made(study, "first-action")
     (source,) = explain(study, table, "alike/baseline:slope").sources
     assert len(source.trials) == 44
     (human,) = explain(study, table, "human:slope").sources
@@ -104,181 +88,140 @@ def test_a_row_leads_to_its_trials(db):
 
 
 def test_drag_counts_as_it_was_realised(tmp_path):
-    db = write_study(
-        tmp_path / "t.duckdb",
-        [Drive("o3", "baseline", name, 1, (0.0,), (0.0,)) for name in CONDITIONS],
-        ScenarioConfig(resistance="human"),
+    drives = [Drive("o3", "baseline", name, 1, (0.0,), (0.0,)) for name in CONDITIONS]
+    db = write_study(tmp_path / "t.duckdb", drives, ScenarioConfig(resistance="human"))
+    row = values_of(Study(db), "first-action")["o3/baseline"]
+    assert row["mean_equal"] == pytest.approx(-1.0)
+    assert row["brake_percent"] == 100
+
+
+def test_the_two_drivers_of_a_mixed_pair_have_rows_as_its_ego_saw_them(tmp_path):
+    drives = following("alike", -0.34)
+    turned = [
+        replace(d, condition=MIRRORED[d.condition], left=d.right, right=d.left) for d in drives
+    ]
+    one, other = (
+        values_of(
+            changed(
+                write_study(tmp_path / f"{left}.duckdb", played),
+                f"UPDATE trials SET model_left = '{left}', model_right = '{right}'",
+            ),
+            "first-action",
+        )
+        for played, left, right in ((drives, "alike", "other"), (turned, "other", "alike"))
     )
-    rows = {row.id: row.values for row in make_tables(Study(db), ["first-action"])[0].rows}
-    assert rows["o3/baseline"]["mean_equal"] == pytest.approx(-1.0)
-    assert rows["o3/baseline"]["brake_percent"] == 100
-
-
-def test_the_two_drivers_of_a_mixed_pair_have_rows_of_their_own(db, tmp_path):
-    mixed = tmp_path / "t.duckdb"
-    mixed.write_bytes(db.read_bytes())
-    with duckdb.connect(str(mixed)) as connection:
-        connection.execute("UPDATE trials SET model_right = 'other' WHERE model_left = 'alike'")
-    (table,) = make_tables(Study(mixed), ["first-action"])
-    rows = {row.id: row.values for row in table.rows}
-    left, right = (rows[f"alike+other/baseline/{side}"] for side in ("left", "right"))
+    left, right = (one[f"alike+other/baseline/{side}"] for side in ("left", "right"))
     assert (left["n"], right["n"]) == (44, 44)
     assert left["driver"] == "alike of alike+other"
     assert left["slope"] != right["slope"]
-
-
-@pytest.mark.slow
-def test_a_pair_that_changed_its_sides_is_as_its_ego_saw_it(tmp_path):
-    drives = following("alike", -0.34)
-    turned = [
-        replace(
-            drive,
-            condition=MIRRORED[drive.condition],
-            left=drive.right,
-            right=drive.left,
-        )
-        for drive in drives
-    ]
-    tables = []
-    for name, played, sides in (
-        ("one", drives, ("alike", "other")),
-        ("other", turned, ("other", "alike")),
-    ):
-        db = write_study(tmp_path / f"{name}.duckdb", played)
-        with duckdb.connect(str(db)) as connection:
-            connection.execute("UPDATE trials SET model_left = ?, model_right = ?", sides)
-        (table,) = make_tables(Study(db), ["first-action"])
-        tables.append(table.rows)
-    for one, other in zip(*tables, strict=True):
-        assert one.id == other.id
-        assert one.values == {
-            name: value if isinstance(value, str) else pytest.approx(value)
-            for name, value in other.values.items()
-        }
+    for name, values in one.items():
+        numbers = {k: v for k, v in values.items() if not isinstance(v, str)}
+        assert numbers == {k: pytest.approx(other[name][k]) for k in numbers}, name
+        assert values["driver"] == other[name]["driver"]
 
 
 def test_a_driver_without_chance_in_a_mixed_pair_counts_once_in_each_situation(tmp_path):
     drives = [replace(drive, right=(0.1,) * 3) for drive in following("alike", -0.34)]
-    db = write_study(tmp_path / "t.duckdb", drives)
-    with duckdb.connect(str(db)) as connection:
-        connection.execute("UPDATE trials SET model_right = 'zero'")
-        spec = {"left": {"body": {}}, "right": {"program": "zero"}}
-        connection.execute("UPDATE specs SET spec = ?", [json.dumps(spec)])
-    (table,) = make_tables(Study(db), ["first-action"])
-    rows = {row.id: row.values for row in table.rows}
-    assert rows["alike+zero/baseline/left"]["n"] == 44
-    assert rows["alike+zero/baseline/right"]["n"] == 11
-    assert rows["alike+zero/baseline/right"]["mean_equal"] == pytest.approx(0.25)
-    (note,) = {row.note for row in table.rows if "declares no chance" in row.note}
+    spec = json.dumps({"left": {"body": {}}, "right": {"program": "zero"}})
+    study = changed(
+        write_study(tmp_path / "t.duckdb", drives),
+        "UPDATE trials SET model_right = 'zero'",
+        f"UPDATE specs SET spec = '{spec}'",
+    )
+    rows = by_id(made(study, "first-action"))
+    left, right = (rows[f"alike+zero/baseline/{side}"] for side in ("left", "right"))
+    assert (left.values["n"], right.values["n"]) == (44, 11)
+    assert right.values["mean_equal"] == pytest.approx(0.25)
+    (note,) = {row.note for row in rows.values() if "declares no chance" in row.note}
     assert note.startswith("zero of alike+zero declares no chance, and does the same")
 
 
-@pytest.mark.slow
-def test_a_program_of_a_scripted_pair_is_no_stand_in(prepare, tmp_path):
-    pair = ("--model", "emulator+projected-order", "--reps", 1)
-    assert prepare(tmp_path, "sweep", "baseline", *pair, "--conditions", "N_0_0").code == 0
-    (table,) = make_tables(Study(tmp_path / "results/merge.duckdb"), ["first-action"])
-    names = {row.values["driver"] for row in table.rows} - {"human"}
-    assert names == {
-        "emulator of emulator+projected-order*",
-        "projected-order of emulator+projected-order",
-    }
-
-
-@pytest.mark.long
-def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_actions(
-    prepare, tmp_path
-):
-    pair = ("--model", "emulator+idm", "--mirror", "--conditions", "L_4_8,R_-4_-8,N_0_0")
-    for played in (("sweep", "baseline", "--reps"), ("sweep", "baseline", "--first", "--reps")):
-        for models in ((), pair):
-            run = prepare(tmp_path, *played, 2, *models)
-            assert run.code == 0, run.err
-    study = Study(tmp_path / "results/merge.duckdb")
-    (table,) = make_tables(study, ["first-action"])
-    driven = {row.id: row for row in table.rows if row.id != "human"}
-    asked = {name: row for name, row in driven.items() if " [asked]/" in name}
-    assert len(asked) == len(driven) / 2 == 3
-    for name, row in asked.items():
-        twin = driven[name.replace(" [asked]", "")]
-        assert " [asked]" in row.values["driver"]
-        assert row.values | {"driver": twin.values["driver"]} == twin.values
-    note = driven["emulator [asked]/baseline"].note
-    assert "asked without the loop" in note
-    assert "in 22 trials" in note
-    (source,) = explain(study, table, "emulator [asked]/baseline:slope").sources
-    assert len(source.trials) == len(load(source.query, study.db)) == 22
-    assert all(trial.startswith("seat/") for trial in source.trials)
-    narrowed = make_tables(Study(study.db, ["emulator"]), ["first-action"])[0].rows
-    assert {row.groups[0] for row in narrowed} == {"emulator/baseline", "emulator [asked]/baseline"}
-    of_model = Study(study.db, where={"model": ["emulator"]})
-    assert [group.id for group in of_model.asked] == ["emulator [asked]/baseline"]
+# Who was only asked
 
 
 @pytest.fixture(scope="module")
 def asked(prepare, tmp_path_factory):
-    """The emulator and a program, asked on a grid, and a trial that was driven."""
+    """The emulator, a program and a pair, driven and asked alone; and asked on a grid."""
     folder = tmp_path_factory.mktemp("asked")
-    grid = ("--grid", "h=-6:6:2,dv=-1.6:1.6:0.8")
+    baseline, few = ("sweep", "baseline"), ("--conditions", "L_4_8,R_-4_-8,N_0_0")
+    pair = ("--model", "emulator+projected-order", "--mirror")
     for ask in (
-        ("sweep", "baseline", "--first", "--reps", 4, *grid),
-        ("sweep", "baseline", "--first", "--model", "projected-order", "--reps", 2, *grid),
-        ("sweep", "baseline", "--reps", 1, "--conditions", "N_0_0"),
+        (*baseline, "--reps", 2, *few),
+        (*baseline, "--reps", 2, *few, *pair),
+        (*baseline, "--first", "--reps", 2, *few),
+        (*baseline, "--first", "--reps", 2, *few, *pair),
     ):
-        run = prepare(folder, *ask)
+        run = prepare(folder, *ask, "--db", "t.duckdb")
         assert run.code == 0, run.err
-    return Study(folder / "results/merge.duckdb")
+    grid = ("--reps", 4, "--grid", "h=-6:6:2,dv=-1.6:1.6:0.8", "--db", "grid.duckdb")
+    for model in ("emulator", "projected-order"):
+        assert prepare(folder, *baseline, "--first", "--model", model, *grid).code == 0
+    return folder
 
 
-@pytest.mark.slow
+def test_who_was_only_asked_has_rows_beside_who_drove_with_the_same_first_actions(asked):
+    study = Study(asked / "t.duckdb")
+    table = made(study, "first-action")
+    rows = by_id(table)
+    alone = {name: row for name, row in rows.items() if " [asked]/" in name}
+    assert len(alone) == (len(rows) - 1) / 2 == 3
+    for name, row in alone.items():
+        twin = rows[name.replace(" [asked]", "")]
+        assert " [asked]" in row.values["driver"]
+        assert row.values | {"driver": twin.values["driver"]} == twin.values
+    # A program of a scripted pair is no stand-in.
+    assert {row.values["driver"] for row in rows.values()} >= {
+        "emulator of emulator+projected-order*", "projected-order of emulator+projected-order",
+    }  # fmt: skip
+    note = rows["emulator [asked]/baseline"].note
+    assert "asked without the loop" in note
+    assert "in 6 trials" in note
+    (source,) = explain(study, table, "emulator [asked]/baseline:slope").sources
+    assert len(source.trials) == len(load(source.query, study.db)) == 6
+    assert all(trial.startswith("seat/") for trial in source.trials)
+
+
+def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
+    db = asked / "t.duckdb"
+    narrowed = made(Study(db, ["emulator"]), "first-action").rows
+    assert {row.groups[0] for row in narrowed} == {"emulator/baseline", "emulator [asked]/baseline"}
+    of_model = Study(asked / "grid.duckdb", where={"model": ["projected-order"]})
+    assert [group.name for group in of_model.asked] == ["projected-order [asked]"]
+    assert of_model.models == []
+    with pytest.raises(UsageError, match=r"valid: human, emulator, .*projected-order"):
+        Study(db, ["idm"])
+
+
 def test_the_planted_exchange_rate_of_who_was_only_asked_is_found_beside_the_humans(asked):
-    (table,) = make_tables(asked, ["first-action"])
-    rows = {row.id: row.values for row in table.rows}
-    own = rows["emulator [asked]/baseline"]
+    rows = values_of(Study(asked / "grid.duckdb"), "first-action")
+    own, program = (rows[f"{name} [asked]/baseline"] for name in ("emulator", "projected-order"))
     assert own["n"] == 7 * 5 * 2 * 4
     assert own["exchange_rate_ci"][0] < 3.30 / 1.11 < own["exchange_rate_ci"][1]
-    program = rows["projected-order [asked]/baseline"]
     assert program["n"] == 7 * 5 * 2, "each answer counts once"
 
 
-@pytest.mark.slow
-def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
-    study = Study(asked.db, ["projected-order"], where={"model": ["projected-order"]})
-    assert [group.name for group in study.asked] == ["projected-order [asked]"]
-    assert study.models == []
-    with pytest.raises(UsageError, match=r"valid: human, emulator, .*projected-order"):
-        Study(asked.db, ["idm"])
-
-
-@pytest.mark.slow
-def test_the_explorer_lists_no_situation_and_no_run_that_only_asked(asked):
-    catalogue = Catalogue(asked.db)
+def test_the_explorer_and_the_figure_tell_who_was_only_asked(asked):
+    catalogue = Catalogue(asked / "t.duckdb")
     catalogue.refresh()
-    assert [row["source"] for row in catalogue.ask("SELECT source FROM listed")] == ["llm"]
-    (sweep,) = catalogue.ask("SELECT config::VARCHAR AS config FROM sweeps")
-    assert not json.loads(sweep["config"])["seat"]
-
-
-@pytest.mark.slow
-def test_the_figure_has_one_panel_with_each_driver_also_one_that_was_only_asked(asked):
-    figure = figure_of_first_actions(asked)
-    (axis,) = figure.axes
-    (legend,) = figure.legends
+    listed = catalogue.ask("SELECT DISTINCT source FROM listed")
+    assert [row["source"] for row in listed] == ["llm"]
+    configs = catalogue.ask("SELECT config::VARCHAR AS config FROM sweeps")
+    assert [bool(json.loads(sweep["config"])["seat"]) for sweep in configs] == [False, False]
+    figure = figure_of_first_actions(Study(asked / "t.duckdb"))
+    (axis,), (legend,) = figure.axes, figure.legends
     names = [text.get_text().split("\n")[0] for text in legend.get_texts()]
     assert names[0] == "humans"
-    assert len(names) == len(axis.containers) == 4
+    assert len(names) == len(axis.containers)
+    assert any("[asked]" in name for name in names)
 
 
-@pytest.mark.slow
 def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(prepare, tmp_path):
     (tmp_path / "mine.toml").write_text(
-        'repetitions = 2\nconditions = ["L_4_8", "R_-4_-8"]\n'
+        'repetitions = 1\nconditions = ["L_4_8", "R_-4_-8"]\n'
         '[scenario]\ncontrol_start = "own_exit"\n'
     )
-    run = prepare(tmp_path, "sweep", "mine.toml")
-    assert run.code == 0, run.err
-    study = Study(tmp_path / "results/merge.duckdb")
-    (table,) = make_tables(study, ["first-action"])
-    (row,) = [row for row in table.rows if row.id.startswith("emulator")]
+    assert prepare(tmp_path, "sweep", "mine.toml").code == 0
+    rows = by_id(made(Study(tmp_path / "results/merge.duckdb"), "first-action"))
+    (row,) = (row for name, row in rows.items() if name.startswith("emulator"))
     assert row.values["n"] == 0
     assert '"own_exit" one driver acts while' in row.note

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from merge_runner.records import SIDES
 from merge_runner_analysis.accounts import Mark, account
 from tests.support.crashes import EXAMPLES, course_of, crash, decided, drive
 from tests.support.studies import played
@@ -59,10 +58,3 @@ def test_a_change_of_mind_is_marked_once():
         Mark(1.6, "left", "last chance", "last moment to brake"),
         Mark(2.0, "right", "last chance", "last moment to brake"),
     ]
-
-
-def test_humans_have_no_decisions_and_an_account():
-    course, _ = crash(*EXAMPLES["both insisted"])
-    found = account(course, [], {"account": "both insisted"})
-    assert len(found.sentences) == 3
-    assert {mark.side for mark in found.marks} == set(SIDES)

@@ -23,26 +23,30 @@ def patched(path, signature, offset, layout, value):
     return path
 
 
+def unreadable(path, says):
+    with open_files(path) as files, pytest.raises(Unreadable, match=says):
+        files[0].read()
+
+
 def test_a_folder_and_a_zip_of_it_hold_the_same_files(tmp_path):
     for path in (write_folder(tmp_path / "d", FILES), write_zip(tmp_path / "d.zip", FILES)):
         with open_files(path) as files:
-            assert {found.name: found.read() for found in files} == FILES
-            assert {found.name: found.size for found in files} == {
-                name: len(content) for name, content in FILES.items()
+            assert {f.name: (f.size, f.read()) for f in files} == {
+                name: (len(content), content) for name, content in FILES.items()
             }
 
 
-def test_a_zip_made_on_windows_has_the_same_names(tmp_path):
-    path = write_zip(tmp_path / "d.zip", {"a\\experiment_4_iter_1.csv": b"x"})
-    with open_files(path) as files:
-        assert [found.name for found in files] == ["a/experiment_4_iter_1.csv"]
+@pytest.mark.parametrize(
+    ("member", "name"),
+    [("a\\experiment_4_iter_1.csv", "a/experiment_4_iter_1.csv"), ("a..b/x...csv", "a..b/x...csv")],
+)
+def test_names_of_windows_and_dots_within_a_name_are_safe(tmp_path, member, name):
+    with open_files(write_zip(tmp_path / "d.zip", {member: b"x"})) as files:
+        assert [found.name for found in files] == [name]
 
 
 def test_a_path_that_is_not_there_or_no_zip_is_refused(tmp_path):
-    with (
-        pytest.raises(UsageError, match=r"there is no .*nowhere"),
-        open_files(tmp_path / "nowhere"),
-    ):
+    with pytest.raises(UsageError, match="there is no "), open_files(tmp_path / "nowhere"):
         pass
     whole = write_zip(tmp_path / "d.zip", FILES).read_bytes()
     for content in (b"", b"no zip", whole[:-30]):
@@ -53,15 +57,7 @@ def test_a_path_that_is_not_there_or_no_zip_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "../x.csv",
-        "a/../../x.csv",
-        "/etc/x.csv",
-        "..\\x.csv",
-        "C:\\x.csv",
-        "c:x.csv",
-        "\\\\s\\x.csv",
-    ],
+    ["../x.csv", "a/../../x.csv", "/etc/x.csv", "..\\x.csv", "C:\\x.csv", "c:x.csv", "\\\\s\\x"],
 )
 def test_a_name_that_leads_out_of_the_folder_is_refused_before_anything_is_read(tmp_path, name):
     path = write_zip(tmp_path / "d.zip", {**FILES, name: b"x"})
@@ -69,28 +65,26 @@ def test_a_name_that_leads_out_of_the_folder_is_refused_before_anything_is_read(
         pass
 
 
-def test_dots_within_a_name_are_no_way_out(tmp_path):
-    with open_files(write_zip(tmp_path / "d.zip", {"a..b/x...csv": b"x"})) as files:
-        assert len(files) == 1
-
-
 @pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_a_damaged_member_is_unreadable_and_the_others_are_not(tmp_path, compression):
     path = write_zip(tmp_path / "d.zip", FILES, compression)
     name = next(iter(FILES)).encode()
     patched(path, name, len(name) + 2, "B", 0x55)
+    unreadable(path, "it is damaged")
     with open_files(path) as files:
-        with pytest.raises(Unreadable, match="it is damaged"):
-            files[0].read()
         assert files[1].read() == b"second"
 
 
-def test_a_member_that_is_shorter_or_longer_than_declared_is_unreadable(tmp_path):
-    for size in (249, 251):
-        path = write_zip(tmp_path / "d.zip", FILES)
-        patched(path, b"PK\1\2", 24, "<I", size)
-        with open_files(path) as files, pytest.raises(Unreadable, match="it is damaged"):
-            files[0].read()
+@pytest.mark.parametrize(
+    ("field", "says"),
+    [
+        ((24, "<I", 249), "it is damaged"),  # shorter than it is
+        ((24, "<I", 251), "it is damaged"),
+        ((8, "<H", 1), "is encrypted"),
+    ],
+)
+def test_a_member_that_is_not_what_the_zip_declares_is_unreadable(tmp_path, field, says):
+    unreadable(patched(write_zip(tmp_path / "d.zip", FILES), b"PK\1\2", *field), says)
 
 
 def test_no_more_is_unpacked_than_declared(tmp_path, monkeypatch):
@@ -101,23 +95,13 @@ def test_no_more_is_unpacked_than_declared(tmp_path, monkeypatch):
     monkeypatch.setattr(
         zipfile.ZipExtFile, "read", lambda self, n=-1: asked.append(n) or read(self, n)
     )
-    with open_files(path) as files, pytest.raises(Unreadable, match="it is damaged"):
-        files[0].read()
+    unreadable(path, "it is damaged")
     assert asked == [10_000]
-
-
-def test_an_encrypted_member_says_so(tmp_path):
-    path = write_zip(tmp_path / "d.zip", FILES)
-    patched(path, b"PK\1\2", 8, "<H", 1)
-    with open_files(path) as files, pytest.raises(Unreadable, match="is encrypted"):
-        files[0].read()
 
 
 @pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
 def test_a_compression_that_cannot_be_bounded_is_not_unpacked(tmp_path, compression):
-    path = write_zip(tmp_path / "d.zip", FILES, compression)
-    with open_files(path) as files, pytest.raises(Unreadable, match="is not deflate"):
-        files[0].read()
+    unreadable(write_zip(tmp_path / "d.zip", FILES, compression), "is not deflate")
 
 
 def test_a_bomb_is_refused_by_its_declared_sizes():
@@ -133,5 +117,4 @@ def test_a_bomb_is_refused_by_its_declared_sizes():
 
 def test_a_file_that_cannot_be_read_says_why(tmp_path):
     (tmp_path / "experiment_4_iter_1.csv").symlink_to(tmp_path / "gone")
-    with open_files(tmp_path) as files, pytest.raises(Unreadable, match="No such file"):
-        files[0].read()
+    unreadable(tmp_path, "No such file")

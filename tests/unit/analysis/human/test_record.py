@@ -6,9 +6,17 @@ from itertools import pairwise
 
 import pytest
 
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.scenarios.merge.conditions import CONDITIONS, HUMAN_CONDITIONS
 from merge_runner_analysis.human.archive import Unreadable
-from merge_runner_analysis.human.record import SPEC_HASH, parse_csv, trial_record
+from merge_runner_analysis.human.record import (
+    SPEC_HASH,
+    condition_of,
+    parse_csv,
+    trace_of,
+    trial_record,
+    trials_of,
+)
+from tests.support.pages import velocity_page
 from tests.support.recordings import drive
 
 
@@ -16,9 +24,10 @@ def record(recording, experiment=6, iteration=1):
     return trial_record(parse_csv(recording.csv()), experiment, iteration)
 
 
-def moved(recording, *, position=0.0, velocity=0.0):
-    recording.columns["travelled_distance.right"][0] += position
-    recording.columns["velocities.left"][0] += velocity
+def changed(name, values, condition="L_4_0", **how):
+    """A recording of which the first values of a column are others."""
+    recording = drive(condition, **how)
+    recording.columns[name][: len(values)] = values
     return recording
 
 
@@ -31,12 +40,15 @@ def test_every_condition_is_known_by_its_start_also_one_step_late(condition, lat
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_start_is_a_condition_s_within_the_tolerance_alone(sign):
-    for near in ({"position": sign * 0.59}, {"velocity": sign * 0.099}):
-        assert record(moved(drive("N_0_0"), **near)).spec.condition == "N_0_0"
-    for far in ({"position": sign * 0.61}, {"velocity": sign * 0.101}):
-        with pytest.raises(Unreadable, match="starts like none of the conditions: left"):
-            record(moved(drive("N_0_0"), **far))
+@pytest.mark.parametrize(
+    ("name", "near", "far"),
+    [("travelled_distance.right", 0.59, 0.61), ("velocities.left", 0.099, 0.101)],
+)
+def test_a_start_is_a_condition_s_within_the_tolerance_alone(name, near, far, sign):
+    (start,) = drive("N_0_0").columns[name][:1]
+    assert record(changed(name, [start + sign * near], "N_0_0")).spec.condition == "N_0_0"
+    with pytest.raises(Unreadable, match="starts like none of the conditions: left"):
+        record(changed(name, [start + sign * far], "N_0_0"))
 
 
 @pytest.mark.parametrize(
@@ -52,44 +64,43 @@ def test_pairs_are_numbered_as_in_the_publications(experiment, pair):
 
 
 @pytest.mark.parametrize(
-    ("condition", "yields", "status", "first"),
+    ("recording", "status", "first", "error"),
     [
-        ("L_4_0", "right", "finished", "left"),
-        ("L_4_0", "left", "finished", "right"),
-        ("N_0_0", "nobody", "collided", None),
-        ("N_0_0", "both", "timeout", None),
+        (drive(), "finished", "left", None),
+        (drive(yields="left"), "finished", "right", None),
+        (drive("N_0_0", yields="nobody"), "collided", None, None),
+        (drive("N_0_0", yields="both"), "timeout", None, None),
+        # Also past the merge point.
+        (changed("end_state", ["Collided"]), "collided", None, None),
+        (changed("end_state", ["Time ran out"]), "timeout", "left", None),
+        (changed("end_state", ["Beyond track bounds"]), "failed", None, "Beyond track bounds"),
     ],
 )
-def test_outcomes_are_those_of_the_trial(condition, yields, status, first):
-    found = record(drive(condition, yields=yields))
-    assert (found.status, found.merged_first, found.error) == (status, first, None)
-
-
-def test_a_collision_has_no_first_even_past_the_merge_point():
-    recording = drive("L_4_0")
-    recording.columns["end_state"] = ["Collided"]
-    assert record(recording).merged_first is None
-
-
-def test_a_timeout_has_a_first_if_anyone_merged():
-    recording = drive("L_4_0")
-    recording.columns["end_state"] = ["Time ran out"]
+def test_outcomes_are_those_of_the_trial(recording, status, first, error):
     found = record(recording)
-    assert (found.status, found.merged_first) == ("timeout", "left")
+    assert (found.status, found.merged_first, found.error) == (status, first, error)
 
 
-def test_leaving_the_track_is_a_failure_that_says_so():
-    recording = drive("L_4_0")
-    recording.columns["end_state"] = ["Beyond track bounds"]
-    found = record(recording)
-    assert (found.status, found.merged_first) == ("failed", None)
-    assert found.error == "Beyond track bounds"
-
-
-def test_an_unknown_end_is_refused():
+def unfinished():
     recording = drive()
-    recording.columns["end_state"] = ["Won"]
-    with pytest.raises(Unreadable, match="end_state is 'Won'; known: Finished, Collided, Time"):
+    for name, values in recording.columns.items():
+        recording.columns[name] = values[:-3] if len(values) > 1 else values
+    return recording
+
+
+@pytest.mark.parametrize(
+    ("recording", "says"),
+    [
+        (changed("end_state", ["Won"]), "end_state is 'Won'; known: Finished, Collided, Time"),
+        (unfinished(), r"Finished, but ends with no vehicle beyond 14[0-8]\.\d m"),
+        (
+            changed("travelled_distance.left", [4.0, *[20.0] * 600], yields="both"),
+            "never both beyond the tunnels",
+        ),
+    ],
+)
+def test_a_trial_that_ends_like_none_is_refused(recording, says):
+    with pytest.raises(Unreadable, match=says):
         record(recording)
 
 
@@ -121,54 +132,57 @@ def test_times_count_from_the_first_sample_with_both_out_of_the_tunnel():
     assert right[-first - 1] > 50
     for step in (first, -1, 0, 1, 3):
         for side, positions in (("left", left), ("right", right)):
-            assert states[step, side].time_s == round(step / 20, 9)
-            assert states[step, side].position_m == positions[step - first]
-            speeds = recording.columns[f"velocities.{side}"]
-            assert states[step, side].velocity_mps == speeds[step - first]
+            state, speeds = states[step, side], recording.columns[f"velocities.{side}"]
+            assert (state.time_s, state.position_m, state.velocity_mps) == (
+                round(step / 20, 9), positions[step - first], speeds[step - first],
+            )  # fmt: skip
     assert found.end_time_s == found.states[-1].time_s == round((len(left) - 1 + first) / 20, 9)
 
 
-def test_50_m_itself_is_in_the_tunnel():
-    recording = drive("N_0_0")
-    left, right = (recording.columns[f"travelled_distance.{side}"] for side in ("left", "right"))
-    k = next(k for k, s in enumerate(left) if s > 50)
-    left[k] = 50.0
-    first = record(recording).states[0].step
-    assert (k + 1) == -first
-    assert right[k] > 50
-
-
-def test_accelerations_are_those_realised_over_the_step_before():
-    recording = drive("L_4_0")
+@pytest.mark.parametrize("step_s", [0.05, 0.02])
+def test_accelerations_are_those_realised_over_the_step_before_which_the_file_names(step_s):
+    recording = changed("dt", [1000 * step_s])
     speeds = recording.columns["velocities.left"]
-    found = [s.acceleration_mps2 for s in record(recording).states if s.side == "left"]
-    assert found[0] == 0
-    assert found[1:] == pytest.approx([(b - a) / 0.05 for a, b in pairwise(speeds)])
+    states = [s for s in record(recording).states if s.side == "left"]
+    assert states[1].time_s - states[0].time_s == pytest.approx(step_s)
+    assert [s.acceleration_mps2 for s in states] == pytest.approx(
+        [0, *((b - a) / step_s for a, b in pairwise(speeds))]
+    )
 
 
-def test_the_step_is_the_file_s_own():
-    recording = drive("L_4_0")
-    recording.columns["dt"] = [20]
-    states = record(recording).states
-    assert states[2].time_s - states[0].time_s == pytest.approx(0.02)
-    speeds = recording.columns["velocities.left"]
-    assert states[2].acceleration_mps2 == pytest.approx((speeds[1] - speeds[0]) / 0.02)
+def test_the_pages_are_named_as_in_the_publications():
+    for name in HUMAN_CONDITIONS:
+        assert condition_of(f"docs/plots/{name.split('_', 1)[1]}.html") == name
+    assert condition_of("L_4_-8.html") == "L_4_-8"
+    assert condition_of("initial_action.html") is condition_of("experiment_4_iter_1.csv") is None
 
 
-def test_a_trial_that_never_leaves_the_tunnels_is_refused():
-    recording = drive("L_4_0", yields="both")
-    recording.columns["travelled_distance.left"][1:] = [20.0] * 600
-    with pytest.raises(Unreadable, match="never both beyond the tunnels"):
-        record(recording)
+def swap(traces):
+    traces["left"]["line"].update(dash="dash")
+    traces["right"]["line"].update(dash="solid")
 
 
-def test_a_finished_trial_without_its_end_is_refused():
-    recording = drive("L_4_0")
-    recording.columns = {
-        name: values[:-3] if len(values) > 1 else values
-        for name, values in recording.columns.items()
-    }
-    with pytest.raises(
-        Unreadable, match=r"Finished, but ends with no vehicle beyond 14[0-8]\.\d m"
-    ):
-        record(recording)
+def cut(traces):
+    for each in traces.values():
+        for axis in "xy":
+            del each[axis][120:]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda traces: traces.pop("right"), "it does not show both vehicles"),
+        (lambda traces: traces["left"]["x"].pop(), "it does not show both vehicles"),
+        (lambda traces: traces["left"]["x"].__setitem__(3, 0.3), "at equal steps from 0 s on"),
+        (lambda traces: traces["left"]["x"].__setitem__(0, 0.05), "at equal steps from 0 s on"),
+        (swap, "its lines are dash and solid, but left is ahead at the end"),
+        (lambda traces: traces["left"]["line"].update(dash="dot"), "its lines are dot and dash"),
+        (cut, "with no vehicle beyond"),
+    ],
+)
+def test_a_trial_that_the_page_does_not_show_whole_says_why(change, says):
+    ((_, _, traces),) = trials_of(velocity_page({"1-1": drive("L_4_0")}), "L_4_0")
+    assert trace_of(traces, "L_4_0").velocities_mps["left"] == traces["left"]["y"]
+    change(traces)
+    with pytest.raises(Unreadable, match=says):
+        trace_of(traces, "L_4_0")

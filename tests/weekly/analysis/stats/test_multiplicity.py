@@ -11,10 +11,12 @@ from scipy.special import expit
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
 from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M, human_counts, published
-from merge_runner_analysis.data.study import Group, _published_humans
+from merge_runner_analysis.data.study import Group, Study
 from merge_runner_analysis.stats import verdicts
 from merge_runner_analysis.stats.regressions import gap_design
+from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.verdict_words import DIFFERS
+from tests.support.studies import write_study
 
 COPIES = 200
 CONDITIONS = pd.DataFrame(
@@ -62,26 +64,44 @@ def drawn(rng: np.random.Generator, trials: int, *, pairs: bool, of_velocity: fl
     return Group("copy", "baseline", "copy", found, "copy", models=("copy",), name="copy")
 
 
+@pytest.fixture(scope="module")
+def humans(tmp_path_factory):
+    """The humans as published."""
+    return Study(write_study(tmp_path_factory.mktemp("humans") / "t.duckdb", [])).human
+
+
 @np.errstate(divide="ignore")
-def states(groups: Iterator[Group]) -> list[dict[str, str]]:
-    tests = (verdicts.tests_of(group, _published_humans(), None) for group in groups)
+def states(groups: Iterator[Group], humans: Group) -> list[dict[str, str]]:
+    tests = (verdicts.tests_of(group, humans, None) for group in groups)
     return [verdicts.decided(test)[0] for test in tests]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("pairs", [True, False])
 @pytest.mark.parametrize("trials", [22, 110, 330])
-def test_at_most_6_percent_of_copies_of_the_humans_are_said_to_differ(trials, pairs):
+def test_at_most_6_percent_of_copies_of_the_humans_are_said_to_differ(humans, trials, pairs):
     rng = np.random.default_rng(trials + pairs)
-    found = states(drawn(rng, trials, pairs=pairs) for _ in range(COPIES))
+    found = states((drawn(rng, trials, pairs=pairs) for _ in range(COPIES)), humans)
     different = sum(not DIFFERS.isdisjoint(of.values()) for of in found)
     assert different <= 0.06 * COPIES
 
 
-@pytest.mark.long
-def test_a_planted_weaker_response_to_relative_velocity_is_found():
+def test_a_planted_weaker_response_to_relative_velocity_is_found(humans):
     """-1.0 in place of the humans' -3.3 log-odds per m/s."""
     rng = np.random.default_rng(1)
     weaker = {"pairs": True, "of_velocity": -1.0 + 3.3}
-    found = states(drawn(rng, 110, **weaker) for _ in range(COPIES))
+    found = states((drawn(rng, 110, **weaker) for _ in range(COPIES)), humans)
     assert sum(of["velocity"] in DIFFERS for of in found) >= 0.85 * COPIES
+
+
+def test_no_reference_driver_differs_in_a_measure_whose_corrected_p_is_5_percent(prepare, tmp_path):
+    done = prepare(tmp_path, "sweep", "reference", "--db", "ref.duckdb")
+    assert done.code == 0, done.err
+    (table,) = make_tables(Study(tmp_path / "ref.duckdb"), ["verdicts"])
+    rows = [row.values for row in table.rows if row.values.get("p_holm") is not None]
+    assert rows
+    for values in rows:
+        assert (values["state"] in DIFFERS) == (values["p_holm"] < 0.05), values
+    idm = next(row.values for row in table.rows if row.id == "idm/baseline/gap-velocity")
+    # 2 m apart by the signed product, without spread: beyond the margin, and never "inconclusive".
+    assert idm["estimate"] > 2
+    assert idm["state"] == "unlike"

@@ -9,7 +9,6 @@ from scipy import stats
 from scipy.special import expit
 
 from merge_runner.scenarios.merge.conditions import HUMAN_CONDITIONS
-from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.stats.first_action import (
     exchange_rate,
     fieller,
@@ -22,7 +21,6 @@ SLOPE, SPREAD = -0.34, 0.63
 HEADWAY, VELOCITY = 1.11, -3.30
 # The correlation of two humans' first actions in a trial is about 0.3.
 TOGETHER = 0.3
-STUDIES = 200
 
 
 def drawn(rng, trials=198):
@@ -45,14 +43,6 @@ def drawn(rng, trials=198):
     rows = pd.concat(sides, ignore_index=True)
     odds = HEADWAY * rows["headway_m"] + VELOCITY * rows["velocity_mps"]
     return rows.assign(tactical=np.where(rng.random(len(rows)) < expit(odds), "M", "Y"))
-
-
-def test_the_published_slope_is_that_of_the_published_means():
-    classes = published("human_first_actions")
-    known = published("human_first_action_trials").set_index("measure")["value"]
-    at, means = classes["relative_velocity_mps"], classes["mean_mps2"]
-    fitted = np.polyfit(at, means, 1, w=np.sqrt(classes["n"]))[0]
-    assert fitted == pytest.approx(float(known["slope_mps2_per_mps"]), abs=1e-3)
 
 
 def test_the_published_human_rate_is_that_of_the_published_coefficients():
@@ -79,36 +69,6 @@ def test_fiellers_interval_ends_where_the_test_of_a_ratio_does():
         se = np.sqrt(np.array([rate, 1.0]) @ covariance @ np.array([rate, 1.0]))
         assert abs(-3.3 + rate * 1.1) / se == pytest.approx(stats.t.ppf(0.975, 20))
     assert fieller(0.3, -3.3, covariance, 20) is None
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("estimate", "truth"), [(slope, SLOPE), (mean, 0.0), (exchange_rate, -VELOCITY / HEADWAY)]
-)
-def test_intervals_cover_the_truth_as_often_as_they_say(estimate, truth):
-    rng = np.random.default_rng(4)
-    found = [estimate(drawn(rng)) for _ in range(STUDIES)]  # few have separated words, and no rate
-    inside = np.mean([one.low < truth < one.high for one in found if one])
-    assert 0.9 <= inside <= 0.99  # three standard errors of such a share
-
-
-def test_two_actions_of_a_trial_that_depend_on_each_other_are_not_counted_as_two():
-    """The other driver does the opposite: nothing new is learnt from it."""
-    rows = drawn(np.random.default_rng(5))
-    half = rows.iloc[: len(rows) // 2]
-    mirrored = half.assign(
-        headway_m=-half["headway_m"],
-        velocity_mps=-half["velocity_mps"],
-        first_mps2=-half["first_mps2"],
-        tactical=half["tactical"].map({"M": "Y", "Y": "M"}),
-    )
-    both = pd.concat([half, mirrored], ignore_index=True)
-    alone = both.assign(cluster=np.arange(len(both)))
-    for estimate in (slope, exchange_rate):
-        found, apart = estimate(both), estimate(alone)
-        assert found.value == pytest.approx(apart.value)
-        # An exchange rate has ends, and no error of its own.
-        assert found.high - found.low > 1.3 * (apart.high - apart.low)
 
 
 def test_the_errors_are_those_of_a_cluster_sandwich_with_students_t():

@@ -1,6 +1,6 @@
 """Speeds whose control is known, and how far measures of I5 tell them apart.
 
-``python -m tests.support.controls`` prints the tables of docs/reference/analysis.md.
+``python -m merge_runner_analysis.research.controls`` prints tables of docs/reference/analysis.md.
 """
 
 from __future__ import annotations
@@ -284,4 +284,4 @@ def markdown(headings: list[str], rows: list[list[str]]) -> str:
 
 
 if __name__ == "__main__":
-    print(candidates_table(), controls_table(), clock_table(), sep="\n\n")  # noqa: T201 # it is a command
+    print(candidates_table(), controls_table(), clock_table(), sep="\n\n")

@@ -1,1 +1,0 @@
-from tests.support.human_fixtures import human

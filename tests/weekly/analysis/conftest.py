@@ -1,1 +1,0 @@
-from tests.support.analysis_fixtures import in_process, small, study, tables
