@@ -12,7 +12,6 @@ from collections.abc import (
     Awaitable,
     Callable,
     Collection,
-    Iterable,
     Mapping,
     Sequence,
 )
@@ -202,7 +201,7 @@ class LocalRunner:
         return f"{calls} calls in flight"
 
     async def play(
-        self, specs: Iterable[TrialSpec], ended: Ended, room: Room | None = None
+        self, specs: Sequence[TrialSpec], ended: Ended, room: Room | None = None
     ) -> None:
         """Play trials in order; an error raised by ``ended`` or outside a trial ends the run."""
         waiting = iter(specs)
@@ -221,7 +220,7 @@ class LocalRunner:
 
         try:
             async with asyncio.TaskGroup() as group:
-                playing = [group.create_task(work()) for _ in range(self.in_flight)]
+                playing = [group.create_task(work()) for _ in specs[: self.in_flight]]
                 if self.rounds is not None:
                     watching = group.create_task(self.rounds.watch(self._is_idle))
                     await asyncio.gather(*playing)
