@@ -280,7 +280,7 @@ async def test_another_served_model_is_said_loudly_and_an_alias_is_none(
 
 async def test_programs_drive_without_a_call_alone_and_against_a_model(merge_runner):
     for program, ends in (("constant", "collided"), ("projected-order", "finished")):
-        alone = await merge_runner(*SMALL, "--model", program)
+        alone = await merge_runner(*SMALL, "--model", program, "--in-flight", 10**9)
         assert alone.summary["trials"][ends] == 11
         assert alone.summary["calls"] == {"live": 0, "cached": 0}
     mixed = await merge_runner(*SMALL, "--conditions", "N_0_0", "--model", "emulator+constant")
