@@ -44,10 +44,10 @@ lint: .venv/dev ## formatting, lint, types, import contract
 	@.venv/bin/lint-imports
 
 check: lint ## what a change must pass: formatting, lint, types, import contract, unit and integration tests
-	@$(PYTEST) -m "not long" tests/unit tests/integration $(ARGS)
+	@$(PYTEST) tests/unit tests/integration $(ARGS)
 
 check-all: check ## what an hour may find: the weekly tests too, and the wheel on every Python that is here
-	@MERGE_RUNNER_BROWSER=required $(PYTEST) -m long $(ARGS)
+	@MERGE_RUNNER_BROWSER=required $(PYTEST) tests/weekly $(ARGS)
 	@.ci/installed everywhere
 
 bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/reference/performance.md
