@@ -80,14 +80,19 @@ def built(kind: str, source: Path, to: Path) -> Path:
     return to / done.out.split()[-1]
 
 
-def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the_sdist(tmp_path):
-    # A copy of what a build takes, which leaves its own files there.
-    checkout = tmp_path / "checkout"
+def checkout_in(folder: Path) -> Path:
+    """A copy of what a build takes, which leaves its own files there."""
+    checkout = folder / "checkout"
     checkout.mkdir()
     listed = ("git", "ls-files", "merge_runner*", "analysis", "plugins", "experiments", "cache",
               "pyproject.toml", "README.md", "LICENSE")  # fmt: skip
     tracked = run(PROJECT, *listed).out.split()
     run(PROJECT, "cp", "--parents", "--no-dereference", *tracked, checkout)
+    return checkout
+
+
+def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the_sdist(tmp_path):
+    checkout = checkout_in(tmp_path)
     sdist = built("sdist", checkout, tmp_path)
     shutil.unpack_archive(sdist, tmp_path / "sdist")
     (unpacked,) = (tmp_path / "sdist").iterdir()
