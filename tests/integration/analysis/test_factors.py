@@ -137,11 +137,11 @@ def test_a_level_is_compared_with_the_reference_of_the_study(played, rows, tmp_p
 @pytest.mark.parametrize("lacking", [None, "N_0_0"])
 def test_a_comparison_has_one_corrected_p_wherever_it_is_printed(tmp_path, lacking):
     """Also of a level that lacks a condition, since the test is one within shared conditions."""
-    drives = yielding("o3", reps=4)
+    drives = yielding("o3", reps=2)
     for variant, share in (("A1", 0.5), ("A2", 0.9), ("A3", 1.1)):
         drives += [
             replace(d, variant=variant, left=tuple(share * x for x in d.left))
-            for d in drives[:44]
+            for d in drives[:22]
             if (variant, d.condition) != ("A2", lacking)
         ]
     study = Study(write_study(tmp_path / "t.duckdb", drives))
@@ -176,7 +176,7 @@ def test_factors_are_shown_at_each_level_of_another_one_with_interactions(played
 def test_an_interaction_is_the_difference_of_the_differences_in_shared_cells(tmp_path):
     """o3 has two prompts in two moods; in the second mood the second prompt brakes harder."""
     drives = []
-    for drive in [*yielding("o3", reps=8), *yielding("o3", "A1", 8)]:
+    for drive in [*yielding("o3", reps=4), *yielding("o3", "A1", 4)]:
         hard = drive.variant == "A1" and drive.rep % 2 == 0
         drives.append(replace(drive, right=tuple(x * (0.5 + 0.25 * hard) for x in drive.right)))
     moody = changed(

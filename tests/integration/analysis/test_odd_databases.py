@@ -39,23 +39,14 @@ SAID = {
     "separated": (["o3/baseline: "], ["effect of headway on who merges first"]),
     # Half of its trials do nothing: what does nothing is not late.
     "all_tied": (["o3/baseline: "], ["acts late"]),
-    "golden": (
-        [
-            "projected-order/baseline: 11 of 22 trials of programs repeat an earlier one",
-            "* emulator: scripted stand-in, no language model",
-            "trials of several studies: ",
-            "A difference between trials of different studies has no p",
-        ],
-        ["declare no chance"],
-    ),
 }
 
 
 @pytest.mark.parametrize("kind", SAID)
-def test_the_report_of_an_odd_database_says_what_is_true_of_it(kind, tmp_path, golden):
-    study = Study(golden / "golden.duckdb" if kind == "golden" else made(tmp_path, kind))
-    names = ["ablation-quantitative"] + (["factors"] if kind == "golden" else [])
-    text = re.sub(r"\s+", " ", html.unescape(report_html(study, make_tables(study, names), {})))
+def test_the_report_of_an_odd_database_says_what_is_true_of_it(kind, tmp_path):
+    study = Study(made(tmp_path, kind))
+    page = report_html(study, make_tables(study, ["ablation-quantitative"]), {})
+    text = re.sub(r"\s+", " ", html.unescape(page))
     said, unsaid = SAID[kind]
     assert [words for words in said if words not in text] == []
     assert [words for words in unsaid if words in text] == []

@@ -73,7 +73,7 @@ def file(tmp_path):
 
 
 def test_what_is_planted_is_told_and_strong_effects_need_fewer_trials(file):
-    found = powered(file(PLANTED), simulations=20)
+    found = powered(file(PLANTED), simulations=8)
     assert {each["truth"] for each in found} == {"as planted"}
     speeds = {each["arms"]: each for each in found if each["question"] == "I2"}
     strong, weak = speeds["x_relative_speed=-3.3"], speeds["x_relative_speed=-0.2"]

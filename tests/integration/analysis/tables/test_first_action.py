@@ -153,7 +153,7 @@ def asked(prepare, tmp_path_factory):
     ):
         run = prepare(folder, *ask, "--db", "t.duckdb")
         assert run.code == 0, run.err
-    grid = ("--reps", 4, "--grid", "h=-6:6:2,dv=-1.6:1.6:0.8", "--db", "grid.duckdb")
+    grid = ("--reps", 2, "--grid", "h=-6:6:2,dv=-1.6:1.6:0.8", "--db", "grid.duckdb")
     for model in ("emulator", "projected-order"):
         assert prepare(folder, *baseline, "--first", "--model", model, *grid).code == 0
     return folder
@@ -195,7 +195,7 @@ def test_drivers_and_levels_that_were_only_asked_can_be_chosen(asked):
 def test_the_planted_exchange_rate_of_who_was_only_asked_is_found_beside_the_humans(asked):
     rows = values_of(Study(asked / "grid.duckdb"), "first-action")
     own, program = (rows[f"{name} [asked]/baseline"] for name in ("emulator", "projected-order"))
-    assert own["n"] == 7 * 5 * 2 * 4
+    assert own["n"] == 7 * 5 * 2 * 2
     assert own["exchange_rate_ci"][0] < 3.30 / 1.11 < own["exchange_rate_ci"][1]
     assert program["n"] == 7 * 5 * 2, "each answer counts once"
 
