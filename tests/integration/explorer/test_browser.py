@@ -156,8 +156,8 @@ def test_from_a_filtered_list_to_a_collision_its_words_and_back(page):
     expect(page.get_by_text("The vehicles collided")).to_be_visible()
     page.locator("#decision article").last.get_by_role("link").click()
     panel = page.locator(".decision-panel")
-    found = panel.locator("h3").all_inner_texts()
-    assert [found.index(f"What it {did}") for did in ("said", "planned", "was told")] == [0, 1, 2]
+    for number, did in enumerate(("said", "planned", "was told")):
+        expect(panel.locator("h3").nth(number)).to_have_text(f"What it {did}")
     expect(panel.locator("details.block", has_text="as before").locator("pre").first).to_be_hidden()
     page.keyboard.press("Escape")
     expect(page.locator("a.decision[aria-current]")).to_have_count(0)
