@@ -14,6 +14,7 @@ from merge_runner.records import Slot, make_request
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
+from tests.support.harness import listening
 
 KEY = "sk-dummy-0123456789"
 
@@ -103,11 +104,5 @@ class Says:
 @pytest.fixture
 async def server():
     said = Says()
-    app = web.Application(client_max_size=2**26)
-    app.router.add_route("*", "/{path:.*}", said.handle)
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
-    await runner.setup()
-    await web.TCPSite(runner, "127.0.0.1", 0).start()
-    said.url = f"http://127.0.0.1:{runner.addresses[0][1]}"
-    yield said
-    await runner.cleanup()
+    async with listening(said.handle) as said.url:
+        yield said

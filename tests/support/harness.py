@@ -104,6 +104,20 @@ class Watched:
         return self.asked.total()
 
 
+@asynccontextmanager
+async def listening(handle: Callable[[web.Request], Awaitable[web.StreamResponse]]):
+    """Serve one handler for all methods and paths on loopback; yields the URL."""
+    app = web.Application(client_max_size=2**26)
+    app.router.add_route("*", "/{path:.*}", handle)
+    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
+    await runner.setup()
+    await web.TCPSite(runner, HOST, 0).start()
+    try:
+        yield f"http://{HOST}:{runner.addresses[0][1]}"
+    finally:
+        await runner.cleanup()
+
+
 async def as_a_model(request: web.Request, handler) -> web.StreamResponse:
     """Answer without the field that says that a stand-in does."""
     body = json.loads((await handler(request)).body)

@@ -187,6 +187,14 @@ def write_study(
     return path
 
 
+def damage(db: Path, *statements: str) -> None:
+    """Change a database by statements, each of which must change something."""
+    with duckdb.connect(str(db)) as connection:
+        for statement in statements:
+            rows = connection.execute(statement).fetchall()
+            assert rows[0][0] > 0, f"nothing was damaged: {statement}"
+
+
 def changed(db: Path, *statements: str) -> Study:
     """The study of a database after some changes."""
     with duckdb.connect(str(db)) as connection:

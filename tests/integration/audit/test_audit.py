@@ -26,6 +26,7 @@ from merge_runner.run.stored_replay import audit_database
 from tests.support.harness import FAST, PROJECT, RECORDING, environment, watched
 from tests.support.mock_server import FaultPlan, served
 from tests.support.program import invoke
+from tests.support.studies import damage
 
 FAULTS = FaultPlan(
     seed=4, delay_s=0.01, rates={"rate_limit": 0.1, "refused": 0.1, "malformed": 0.15}
@@ -101,13 +102,6 @@ def made(tmp_path_factory, prepare):
 def db(made, tmp_path):
     """A copy of the database, to be damaged."""
     return shutil.copy(made / "results/merge.duckdb", tmp_path / "copy.duckdb")
-
-
-def damage(db: Path, *statements: str) -> None:
-    with duckdb.connect(str(db)) as connection:
-        for statement in statements:
-            rows = connection.execute(statement).fetchall()
-            assert rows[0][0] > 0, f"nothing was damaged: {statement}"
 
 
 def test_whole_sweeps_pass_and_what_was_checked_is_counted(made):

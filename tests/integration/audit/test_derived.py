@@ -7,7 +7,6 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
-import duckdb
 import pytest
 
 from merge_runner.audit.checks import audit_recording
@@ -19,6 +18,7 @@ from merge_runner.results.store import query
 from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 from tests.support.harness import PROJECT, RECORDING
 from tests.support.mock_server import FaultPlan, served
+from tests.support.studies import damage
 
 FAULTS = FaultPlan(seed=4, delay_s=0.01, rates={"rate_limit": 0.2, "malformed": 0.2})
 STUDY = """
@@ -63,12 +63,6 @@ def db(made, tmp_path):
     return shutil.copy(made / "results/merge.duckdb", tmp_path / "copy.duckdb")
 
 
-def change(db: Path, *statements: str) -> None:
-    with duckdb.connect(str(db)) as connection:
-        for statement in statements:
-            assert connection.execute(statement).fetchone()[0] > 0, f"nothing changed: {statement}"
-
-
 def findings(db: Path, cache: Path | None = None) -> list:
     return [finding for audit in audit_database(db, cache=cache) for finding in audit.findings]
 
@@ -107,7 +101,7 @@ def changed(prepare, tmp_path_factory):
     db = folder / "results/merge.duckdb"
     trials = query(db, "SELECT trial_id FROM trials ORDER BY ALL")[1]
     of = {column: trial for column, (trial,) in zip(OF_A_TRIAL, trials, strict=False)}
-    change(db, *(altered(*column, f"{ROWS[column[0]]} AND trial_id = '{trial}'")
+    damage(db, *(altered(*column, f"{ROWS[column[0]]} AND trial_id = '{trial}'")
                  for column, trial in of.items()))  # fmt: skip
     told = [Counter(str(finding.trial).rstrip("x") for finding in findings(db, cache))
             for cache in (None, folder / "cache/responses")]  # fmt: skip
@@ -130,7 +124,7 @@ def test_one_changed_value_of_a_column_is_a_finding(changed, column):
 
 @pytest.mark.parametrize(("table", "column", "kind"), [c for c in COLUMNS if c not in OF_A_TRIAL])
 def test_one_changed_value_of_what_is_no_trials_is_a_finding(db, table, column, kind):
-    change(db, altered(table, column, kind))
+    damage(db, altered(table, column, kind))
     assert bool(findings(db)) == (f"{table}.{column}" not in NOT_REPLAYED)
 
 
@@ -145,7 +139,7 @@ def test_an_audit_by_a_cache_passes_and_counts_what_it_replayed(made):
 
 
 def test_a_format_that_there_is_not_is_a_finding_and_switches_nothing_off_in_silence(db):
-    change(db, "UPDATE sweeps SET config = replace(config::VARCHAR, 'openai-chat', 'zz')::JSON")
+    damage(db, "UPDATE sweeps SET config = replace(config::VARCHAR, 'openai-chat', 'zz')::JSON")
     (finding,) = findings(db)
     assert finding.kind == "config"
     assert finding.text.endswith("'zz'")
@@ -157,7 +151,7 @@ def test_a_format_that_there_is_not_is_a_finding_and_switches_nothing_off_in_sil
      "json_merge_patch(config, '{\"study\": 1}')", "json_merge_patch(config, '{\"arms\": [1]}')"],
 )  # fmt: skip
 def test_a_configuration_that_cannot_be_read_is_a_finding(db, config):
-    change(db, f"UPDATE sweeps SET config = {config}")
+    damage(db, f"UPDATE sweeps SET config = {config}")
     assert "config" in {finding.kind for finding in findings(db)}
 
 
@@ -181,7 +175,7 @@ def test_what_is_not_replayed_is_listed_in_the_docs_and_by_the_command(made, pre
     ],
 )
 def test_a_column_that_is_changed_throughout_is_one_finding_a_trial(db, statement, says):
-    change(db, statement)
+    damage(db, statement)
     (finding,) = (f for f in findings(db) if f.kind == "replay")
     assert says in finding.text
     assert "more in the trial" in finding.text
@@ -194,14 +188,14 @@ def test_the_answers_of_two_calls_that_are_exchanged_are_found(db, made):
             AND other.decision = if(calls.decision = 2, 5, 2))
         WHERE decision IN (2, 5) AND outcome = 'ok'
     """
-    change(db, swap)
+    damage(db, swap)
     found = findings(db)
     assert {(f.kind, f.decision) for f in found} >= {("exchanged", 2)}
     assert 2 in {f.decision for f in findings(db, made / "cache/responses") if f.kind == "cache"}
 
 
 def test_an_answer_that_is_said_to_have_come_with_an_error_is_found(db):
-    change(db, "UPDATE calls SET http_status = 500 WHERE decision = 3 AND outcome = 'ok'")
+    damage(db, "UPDATE calls SET http_status = 500 WHERE decision = 3 AND outcome = 'ok'")
     texts = [finding.text for finding in findings(db) if finding.kind == "replay"]
     assert any("it cannot be replayed: left: HTTP 500" in text for text in texts)
 
@@ -224,7 +218,7 @@ def test_trials_of_other_prompts_are_a_note(db, monkeypatch):
 
 
 def test_a_difference_below_the_tolerance_is_none(db):
-    change(db, "UPDATE states SET position_m = position_m + 1e-11")
+    damage(db, "UPDATE states SET position_m = position_m + 1e-11")
     assert findings(db) == []
 
 

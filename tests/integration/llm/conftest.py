@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.support.mock_server import serve
+from tests.support.emulator_fixtures import emulator
 
 
 @pytest.fixture(autouse=True)
@@ -15,18 +15,3 @@ def _no_settings_of_the_user(monkeypatch, tmp_path):
     # Nothing here speaks TLS, and to load the certificates takes longer than most of the tests.
     monkeypatch.delenv("SSL_CERT_FILE", raising=False)
     monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path))
-
-
-@pytest.fixture
-async def emulator():
-    """A function that starts an emulator with the given faults and returns its base URL."""
-    runners = []
-
-    async def start(faults=None):
-        runner, url = await serve(0, faults)
-        runners.append(runner)
-        return url
-
-    yield start
-    for runner in runners:
-        await runner.cleanup()

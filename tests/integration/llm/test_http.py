@@ -17,6 +17,7 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.http import Connections, HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure
 from merge_runner.records import Slot, call_key, canonical_json, make_request
+from tests.support.harness import listening
 from tests.support.mock_server import FaultPlan
 from tests.support.raw_server import raw_server
 
@@ -43,14 +44,8 @@ class Recorder:
 @pytest.fixture
 async def recorder():
     kept = Recorder()
-    app = web.Application()
-    app.router.add_route("*", "/{path:.*}", kept.handle)
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
-    await runner.setup()
-    await web.TCPSite(runner, "127.0.0.1", 0).start()
-    kept.url = f"http://127.0.0.1:{runner.addresses[0][1]}"
-    yield kept
-    await runner.cleanup()
+    async with listening(kept.handle) as kept.url:
+        yield kept
 
 
 @pytest.fixture

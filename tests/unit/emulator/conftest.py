@@ -1,1 +1,1 @@
-from tests.support.emulator_fixtures import driving_prompt, emulator
+from tests.support.emulator_fixtures import driving_prompt
