@@ -174,7 +174,9 @@ class Batches:
         else:
             try:
                 attempt = self._emulator.attempt(asked)
-                body = self._emulator.answer(asked, attempt, custom_id=line.custom_id)
+                fault = self._emulator.plan.fault(asked.where, attempt)
+                fault = fault if fault in ("empty", "malformed") else None
+                body = self._emulator.answer(asked, attempt, fault, line.custom_id)
             except UsageError as exc:
                 status, message = 400, str(exc)
         if status != 200:
