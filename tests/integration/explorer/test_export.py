@@ -19,12 +19,17 @@ from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
 from tests.support.exporting import export
 from tests.support.hostile import hostile_trial
+from tests.support.serving import Page
 from tests.support.studies import Drive, as_humans, write_study, yielding
 
-TRIAL = "o3/baseline/N_0_0/rep01"
+TRIAL, OTHER = "o3/baseline/N_0_0/rep01", "o3/baseline/L_4_0/rep01"
+CONDITIONS = {"N_0_0", "L_4_0", "R_0_8"}
+HIDDEN = "o3\u202egpj\u200b"
 FEW = {  # which stand for all
-    "TABLES": {"attempts": TABLES["attempts"]},
-    "FIGURES": {"first-action": FIGURES["first-action"]},
+    "pages.tables.TABLES": {"attempts": TABLES["attempts"]},
+    "pages.tables.FIGURES": {"first-action": FIGURES["first-action"]},
+    "catalogue.PAGE": 3,
+    "pages.trials.PAGE": 3,
 }
 
 
@@ -57,11 +62,13 @@ def broken(page):
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
-    """A driver with words, a collision, a hostile trial and a human one."""
+    """Drivers with words, one of an odd name, a collision, a hostile trial and a human one."""
     path = tmp_path_factory.mktemp("study") / "study.duckdb"
     crash = Drive("o3", "baseline", "N_0_0", 9, (0.0,), (0.0,), {})
+    hidden = Drive(HIDDEN, "baseline", "N_0_0", 1, (0.4,), (-0.4,))
     human = Drive("human", "baseline", "N_0_0", 1, (0.4, 0.4), (-0.4, -0.4))
-    write_study(path, [*yielding("o3", reps=1), crash, human])
+    of_o3 = [drive for drive in yielding("o3", reps=1) if drive.condition in CONDITIONS]
+    write_study(path, [*of_o3, crash, hidden, human])
     Store(path).write("sweep-1", [hostile_trial()], patience_s=5)
     as_humans(path)
     return path
@@ -72,7 +79,7 @@ def test_all_that_an_export_of_a_study_refers_to_lies_in_it_and_asks_no_server(s
     Notes(db, "anna").add(TRIAL, "o3-baseline", "", None, "It hesitates.")
     with pytest.MonkeyPatch.context() as patch:
         for name, few in FEW.items():
-            patch.setattr(f"merge_runner_analysis.explorer.pages.tables.{name}", few)
+            patch.setattr(f"merge_runner_analysis.explorer.{name}", few)
         export(db, tmp_path / "made")
     exported = (tmp_path / "made").rename(tmp_path / "moved")
     names = {path.relative_to(exported).as_posix() for path in exported.rglob("*")}
@@ -84,9 +91,13 @@ def test_all_that_an_export_of_a_study_refers_to_lies_in_it_and_asks_no_server(s
     }
     pages = {page: page.read_text() for page in exported.rglob("*.html")}
     assert {str(page): found for page in pages if (found := broken(page))} == {}
-    assert len(pages) > 30
     assert not [page for page, text in pages.items() if "<form" in text]
     assert not [page for page, text in pages.items() if "<script>document" in text]
+    said = ["".join(Page(text).said) for text in pages.values()]
+    assert not [text for text in said if {"\u202e", "\u200b"} & set(text)]
+    lists = [text for page, text in pages.items() if re.match(r"trials(-page-\d+)?$", page.stem)]
+    assert [text.count(">o3[U+202E]gpj[U+200B]/") for text in lists].count(1) == 1
+    assert len(lists) == 3
     assert "It hesitates." in pages[exported / "files/notes.html"]
     scripts = {name.partition("static/")[2] for name in names if name.endswith(".js")}
     assert scripts.isdisjoint({"vendor/htmx-2.0.11.min.js", "notes.js", "lost.js"})
@@ -111,15 +122,34 @@ def test_a_page_of_its_own_refers_to_nothing_but_itself(study, tmp_path):
     assert f"<dd>{shown}" in text.replace("−", "-").replace("&minus;", "-")
 
 
-def test_an_earlier_export_in_the_folder_goes_and_nothing_else(study, tmp_path):
-    (tmp_path / "mine.html").write_text("<title>mine</title>")
-    for trial in (TRIAL, TRIAL.replace("N_0_0", "L_4_0")):
-        export(study, tmp_path, [trial])
-        trials = {path.name for path in tmp_path.glob("files/trials-*rep01.html")}
-        assert trials == {f"trials-{trial.replace('/', '-')}.html"}
-        export_page(study, tmp_path / "one.html", [TRIAL])
-    there = {path.name for path in tmp_path.iterdir()}
-    assert there == {"index.html", "files", "mine.html", "one.html"}
+def test_an_export_of_some_trials_takes_the_place_of_an_earlier_one_unless_it_holds_a_secret(
+    study, tmp_path, monkeypatch
+):
+    db, folder = shutil.copy(study, tmp_path / "study.duckdb"), tmp_path / "pages"
+    folder.mkdir()
+    (folder / "mine.html").write_text("<title>mine</title>")
+    Notes(db, "anna").add(TRIAL, "o3-baseline", "left", 1, "It hesitates.")
+    Notes(db, "ben").add(OTHER, "o3-baseline", "", None, "not of all trials")
+    monkeypatch.setattr("merge_runner_analysis.explorer.export.MOST", 1)
+    for wanted, shown in (([OTHER], "not of all"), ([TRIAL, "human/*"], "It hesitates.")):
+        export(db, folder, wanted)
+        pages = {page.name: page.read_bytes() for page in folder.rglob("*.html")}
+        trials = {name for name in pages if re.match(r"trials-.*rep01\.html$", name)}
+        assert f"trials-{wanted[0].replace('/', '-')}.html" in trials
+        assert (len(trials), "notes.html" in pages) == (len(wanted), False), "humans do not count"
+        text = b"".join(pages.values()).decode()
+        assert [note in text for note in ("not of all", "It hesitates.")].count(True) == 1
+        assert shown in text
+    Notes(db, "anna").add(TRIAL, "o3-baseline", "", None, "sk-proj-abcdefghijklmnop0123")
+    for refused in (lambda: export(db, folder, [TRIAL]), lambda: alone(db, folder / "one.html")):
+        with pytest.raises(UsageError, match="looks like a key"):
+            refused()
+    assert {page.name: page.read_bytes() for page in folder.rglob("*.html")} == pages
+    assert {path.name for path in folder.iterdir()} == {"index.html", "files", "mine.html"}
+
+
+def alone(db, file):
+    return export_page(db, file, [TRIAL])
 
 
 @pytest.mark.parametrize("name", ["index.html", "files"])
@@ -134,39 +164,10 @@ def test_what_is_no_export_is_not_replaced(study, tmp_path, name):
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_of_too_many_trials_a_line_says_how_else_to_send_them(study, tmp_path, monkeypatch):
+def test_of_too_many_trials_or_none_a_line_says_what_else_to_do(study, tmp_path, monkeypatch):
     monkeypatch.setattr("merge_runner_analysis.explorer.export.MOST", 2)
-    told = "13 trials, .* for 2: .*--trials, or send study.duckdb .*view --db study.duckdb"
+    told = "6 trials, .* for 2: .*--trials, or send study.duckdb .*view --db study.duckdb"
     with pytest.raises(UsageError, match=told):
         export(study, tmp_path / "pages")
-    assert export(study, tmp_path / "pages", ["*/N_0_0/*"]).exists(), "humans do not count"
     with pytest.raises(UsageError, match="holds no trial called o5/"):
         export_page(study, tmp_path / "one.html", ["o5/*"])
-
-
-@pytest.mark.parametrize(
-    ("said", "told"),
-    [
-        ("my-dummy-secret-key", "the value of OPENAI_API_KEY"),
-        ("sk-proj-abcdefghijklmnop0123", "what looks like a key: sk-pro"),
-        ("{cwd}/notes.txt", "names the path"),
-        ("ghp_abcdefghijklmnopqrstuvwxyz0123456789", "what looks like a key: ghp_ab"),
-        ("/home/somebody/notes.txt", "names the path /home/somebody/"),
-    ],
-)
-def test_a_secret_or_a_path_in_a_reply_stops_the_export_and_leaves_an_earlier_one(
-    study, tmp_path, monkeypatch, said, told
-):
-    monkeypatch.setenv("OPENAI_API_KEY", "my-dummy-secret-key")
-    monkeypatch.chdir(tmp_path)
-    db, folder = shutil.copy(study, tmp_path / "study.duckdb"), tmp_path / "pages"
-    export(db, folder, [TRIAL])
-    earlier = {path: path.read_bytes() for path in folder.rglob("*.html")}
-    with duckdb.connect(str(db)) as connection:
-        said = said.format(cwd=tmp_path)
-        connection.execute("UPDATE decisions SET rationale = ? WHERE decision = 2", [said])
-    with pytest.raises(UsageError, match=re.escape(told)):
-        export(db, folder, [TRIAL])
-    assert {path: path.read_bytes() for path in folder.rglob("*.html")} == earlier
-    assert {path.name for path in tmp_path.iterdir()} >= {"pages", "study.duckdb"}
-    assert not [path for path in tmp_path.iterdir() if path.is_dir() and path != folder]
