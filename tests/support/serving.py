@@ -16,6 +16,7 @@ from pathlib import Path
 import uvicorn
 from starlette.testclient import TestClient
 
+from merge_runner.errors import UsageError
 from merge_runner_analysis.explorer.app import explorer, listen
 from merge_runner_analysis.explorer.computing import Computing, Numbers, Worker
 from merge_runner_analysis.explorer.site import Site
@@ -23,19 +24,8 @@ from tests.support.gate import HANGS_S
 
 HOST = "127.0.0.1:8700"
 INLINE = {
-    "a",
-    "abbr",
-    "b",
-    "code",
-    "del",
-    "i",
-    "ins",
-    "kbd",
-    "mark",
-    "q",
-    "small",
-    "span",
-    "strong",
+    *("a", "abbr", "b", "code", "del", "i", "ins"),
+    *("kbd", "mark", "q", "small", "span", "strong"),
 }
 
 
@@ -54,6 +44,13 @@ class InProcess(Worker):
 
     def close(self):
         self.thread.shutdown(wait=False, cancel_futures=True)
+
+
+class Never(InProcess):
+    """A computation that never comes to anything."""
+
+    def answer(self, request):
+        raise UsageError("not now")
 
 
 class Awaited(Computing):

@@ -12,7 +12,6 @@ import pytest
 from merge_runner.errors import UsageError
 from merge_runner_analysis.explorer.app import MOST_NOTED
 from merge_runner_analysis.explorer.notes import LONGEST_NAME, LONGEST_TEXT, Notes, reader_of
-from tests.support.exporting import export
 from tests.support.hostile import HOSTILE
 from tests.support.serving import HOST, Page, client_of
 from tests.support.studies import write_study, yielding
@@ -187,17 +186,3 @@ def test_a_reader_has_a_name():
     for odd in ("", " ", "x" * (LONGEST_NAME + 1)):
         with pytest.raises(UsageError, match="--reader needs a name"):
             reader_of(odd)
-
-
-def test_an_export_takes_the_notes_along_and_refuses_a_secret_in_one(db, tmp_path):
-    noted(asking(db), text="It hesitates. #late", side="left", decision="1")
-    noted(asking(db, "ben"), trial=OTHER, text="not of these trials")
-    files = export(db, tmp_path / "few", [TRIAL])
-    pages = {path.name: path.read_text() for path in files.glob("*.html")}
-    assert "It hesitates." in pages["trials-o3-baseline-N_0_0-rep01.html"]
-    assert "not of these trials" not in "".join(pages.values())
-    assert "notes.html" not in pages
-    noted(asking(db), text="sk-proj-abcdefghijklmnop0123")
-    with pytest.raises(UsageError, match="looks like a key"):
-        export(db, tmp_path / "more", [TRIAL])
-    assert not (tmp_path / "more").exists()

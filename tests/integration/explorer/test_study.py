@@ -13,40 +13,29 @@ from html import unescape
 import duckdb
 import pytest
 
-from merge_runner.errors import UsageError
 from merge_runner_analysis.data.study import Study
-from merge_runner_analysis.explorer.computing import Computing
+from merge_runner_analysis.explorer.computing import Computing, Numbers
+from merge_runner_analysis.explorer.display_text import with_minus
 from merge_runner_analysis.names import TableFormat
-from merge_runner_analysis.tables import make_tables
-from merge_runner_analysis.tables.formats import render
+from merge_runner_analysis.tables import formats, make_tables
+from merge_runner_analysis.tables.model import from_text
 from merge_runner_analysis.verdict_words import MEASURES, by_group, headline, sentence, verdict_word
-from tests.support.serving import InProcess, Page, client_of, listed
+from tests.support.serving import Never, Page, client_of, listed
 from tests.support.studies import Said, write_study, yielding
 
 WORST = "L_0_-8"
 NUMBER = re.compile(r"[−-]?\d+(?:\.\d+)?(?:e-\d+)?")
 
 
-class Never(InProcess):
-    """A computation that never comes to anything."""
-
-    def answer(self, request):
-        raise UsageError("not now")
-
-
-def of(tmp_path, drives, **more):
-    return client_of(write_study(tmp_path / "t.duckdb", drives, **more))
-
-
 @pytest.fixture(scope="module")
 def db(tmp_path_factory):
-    """o3 and a variant of it, which collide in two conditions; one trial is lost.
+    """o3 and a variant of it, which collide in two conditions, and o4; one trial is lost.
 
-    It drove one condition less often, so that the humans beside it weigh otherwise than by
+    o3 drove one condition less often, so that the humans beside it weigh otherwise than by
     themselves.
     """
-    drives = []
-    for drive in [*yielding("o3"), *yielding("o3", "A1", reps=1)]:
+    drives = yielding("o4", reps=1)
+    for drive in [*yielding("o3", reps=2), *yielding("o3", "A1", reps=1)]:
         crash = drive.condition == WORST or (drive.condition == "N_0_0" and drive.rep == 1)
         said = {1: Said(("timeout",), lost=True)} if drive.condition == "R_0_8" else {}
         straight = {"left": (0.0,), "right": (0.0,)} if crash else {}
@@ -65,8 +54,12 @@ def client(db):
 
 @pytest.fixture(scope="module")
 def verdicts(db):
-    (table,) = make_tables(Study(db), ["verdicts"])
-    return by_group(table.rows)
+    return by_group(table_of(db, "verdicts").rows)
+
+
+def table_of(db, *asked):
+    """A table, which is made once for a page and what it is compared with."""
+    return from_text(Numbers(db).answer(("table", *asked))["table"])
 
 
 def printed(html: str) -> list[str]:
@@ -95,7 +88,7 @@ def test_the_study_says_and_shows_what_the_table_of_verdicts_has(client, verdict
     text = unescape(client.get("/").text)
     page = Page(text)
     own = verdicts["o3/baseline"]
-    assert " ".join(headline({"o3": own})) in page.text
+    assert " ".join(headline({"o3": own, "o4": verdicts["o4/baseline"]})) in page.text
     assert sentence(own) in page.text
     assert sentence(verdicts["o3/A1"]) not in page.text
     assert "Not shown: 1 other prompt." in page.text
@@ -133,14 +126,15 @@ def test_a_drivers_page_has_the_numbers_of_the_table_with_the_trials_behind_them
     assert "990 trials" in client.get("/drivers/human").text
 
 
-@pytest.mark.parametrize(("form", "suffix"), [(TableFormat.CSV, "csv"), (TableFormat.LATEX, "tex")])
-def test_a_table_comes_as_a_file(client, db, form, suffix):
-    reply = client.get(f"/tables/attempts.{suffix}")
-    assert reply.text == render(make_tables(Study(db), ["attempts"]), form) + "\n"
-    assert f'filename="attempts.{suffix}"' in reply.headers["content-disposition"]
-    assert Page(client.get("/tables/attempts").text).to(f"/tables/attempts.{suffix}")
+def test_a_table_comes_as_a_file(client, db):
+    page, tables = Page(client.get("/tables/attempts").text), make_tables(Study(db), ["attempts"])
+    for form, suffix in ((TableFormat.CSV, "csv"), (TableFormat.LATEX, "tex")):
+        reply = client.get(f"/tables/attempts.{suffix}")
+        assert reply.text == formats.render(tables, form) + "\n"
+        assert f'filename="attempts.{suffix}"' in reply.headers["content-disposition"]
+        assert page.to(f"/tables/attempts.{suffix}")
+        assert client.get(f"/tables/nothing.{suffix}").status_code == 404
     assert client.get("/tables/attempts.exe").status_code == 404
-    assert client.get(f"/tables/nothing.{suffix}").status_code == 404
 
 
 def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
@@ -148,20 +142,29 @@ def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
     assert variant.to("/drivers/o3?variant=A1")
     assert variant.to("/drivers/o3?variant=baseline") == []
     one = Page(client.get(f"/?condition={WORST}").text)
-    whole = {to for to, n in one.to("/trials?") if n == "3" and "outcome" not in to}
-    assert {listed(client.get(link).text) for link in whole} == {3}
-    (part,) = make_tables(Study(db, condition=WORST), ["verdicts"])
-    rows = by_group(part.rows)
+    whole = {to for to, n in one.to("/trials?") if n == "2" and "outcome" not in to}
+    assert {listed(client.get(link).text) for link in whole} == {2}
+    rows = by_group(table_of(db, "verdicts", "", WORST).rows)
     collisions = rows["o3/baseline"]["collisions"]
-    assert collisions["n"] + (collisions["undecided"] or 0) == 3
+    assert collisions["n"] + (collisions["undecided"] or 0) == 2
     assert rows["human"]["collisions"]["n"] == 90
-    assert [len(group.trials) for group in Study(db, sweep="sweep-1").played] == [31, 11]
+    assert [len(group.trials) for group in Study(db, sweep="sweep-1").played] == [21, 11, 11]
     assert Study(db, sweep="none").played == []
 
 
-@pytest.mark.parametrize("wrong", ["variant=A9", "condition=nowhere", "sweep=none", "model=nobody"])
-def test_a_scope_without_trials_is_not_there(client, wrong):
-    assert client.get(f"/?{wrong}").status_code == 404
+def test_a_scope_without_trials_is_not_there(client):
+    for wrong in ("variant=A9", "condition=nowhere", "sweep=none", "model=nobody"):
+        assert client.get(f"/?{wrong}").status_code == 404
+
+
+def test_the_page_of_prompts_has_the_differences_of_the_table(client, db):
+    contrasts, page = table_of(db, "contrasts"), Page(client.get("/prompts").text)
+    shown = [row for row in contrasts.rows if row.values["difference"] is not None]
+    assert shown
+    for row in shown:
+        told = {name: with_minus(value) for name, value in formats.printed(contrasts, row).items()}
+        assert f"{told['difference']} {told['ci']}, Holm {told['p_holm']}" in page.text
+    assert page.to("/discordant?model=o3&variant=A1")
 
 
 @pytest.mark.parametrize("page", ["", "drivers", "trials", "words", "prompts", "sweeps", "sql"])
@@ -192,34 +195,33 @@ def test_the_explorer_begins_without_the_libraries_of_the_statistics():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_a_driver_stands_beside_another(tmp_path):
-    client = of(tmp_path, [*yielding("o3", reps=2), *yielding("o4", reps=2)])
-    text = client.get("/drivers/o3?with=o4").text
+def test_a_driver_stands_beside_another(client, db):
+    text = client.get("/drivers/o3?variant=baseline&with=o4").text
     verdicts, _, by_condition = text.partition("In the conditions")
     drawn = re.findall(r'class="o" href="#(\w+)" x="([\d.]+)%"', verdicts)
     assert {shape for shape, _ in drawn} == {"other", "beyond"}
     assert ("beyond", "100.0") in drawn  # outside its axis it is an arrow, and no value at the end
     assert ("other", "100.0") not in drawn
     left_first = re.search(r"Left goes first <small>.*?</tr>", by_condition, re.DOTALL)[0]
-    with duckdb.connect(str(client.site.db), read_only=True) as connection:
+    with duckdb.connect(str(db), read_only=True) as connection:
         shares = connection.execute(
             "SELECT round(100 * avg((merged_first = 'left')::INT), 2) FROM trials "
-            "WHERE model_left = 'o3' AND merged_first IS NOT NULL GROUP BY condition"
+            "WHERE spec_hash = 'o3-baseline' AND merged_first IS NOT NULL GROUP BY condition"
         ).fetchall()
     marks = re.findall(r'class="d" href="#plain" x="([\d.]+)%"', left_first)
     assert sorted(map(float, marks)) == sorted(share for (share,) in shares)
-    assert left_first.count('class="band"') == len(marks) == left_first.count('href="#other"')
+    assert len(marks) == 10  # in one it collides
+    assert left_first.count('class="band"') == left_first.count('href="#other"') == 11
     numbers = [words for _, words in Page(client.get("/drivers").text).to("/trials?")]
-    assert sum(words.isdigit() for words in numbers) == 2
-    client.site.close()
+    assert sum(words.isdigit() for words in numbers) == 3
 
 
 def test_a_driver_that_is_not_judged_has_no_verdict_and_missing_decisions_are_counted(tmp_path):
     prose = dict.fromkeys(range(99), Said(failure="no_array"))
     missing = dict.fromkeys(range(2), Said(failure="no_decision"))
     bad = [replace(drive, said=prose, left=(), right=()) for drive in yielding("bad", reps=1)]
-    good = enumerate(yielding("o3", reps=1))
-    client = of(tmp_path, [*bad, *(replace(d, said=missing if n < 3 else {}) for n, d in good)])
+    good = [replace(drive, said=missing) for drive in yielding("o3", reps=1)[:3]]
+    client = client_of(write_study(tmp_path / "t.duckdb", [*bad, *good]))
     page = Page(client.get("/").text)
     why = "Not judged: 46 of the 92 decisions of bad are invalid (50.0 %, more than 20 %)."
     assert why in page.text

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import signal
-import subprocess
-import sys
 import threading
 from contextlib import closing
+from contextvars import copy_context
 from dataclasses import replace
 from html import unescape
 from urllib.parse import parse_qs, urlsplit
@@ -19,36 +17,22 @@ import psutil
 import pytest
 
 from merge_runner.errors import UsageError
+from merge_runner.registry import use
 from merge_runner.results.store import results_digest
+from merge_runner.study.parts import load_study
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
 from merge_runner_analysis.explorer import computing as worker
 from merge_runner_analysis.explorer.computing import Computing, Numbers, Worker
-from merge_runner_analysis.explorer.display_text import with_minus
 from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import MAKERS
-from merge_runner_analysis.tables import make_tables
-from merge_runner_analysis.tables.formats import printed
+from merge_runner_analysis.tables.model import from_text
 from tests.support.gate import HANGS_S
 from tests.support.serving import InProcess, Page, client_of, listed
 from tests.support.studies import Said, write_study, yielding
 
 HOSTILE = '<img src=x onerror="alert(1)">'
-ASK = """
-import sys
-from pathlib import Path
-from merge_runner_analysis.explorer.computing import Worker
-from merge_runner.registry import use
-from merge_runner.study.parts import load_study
-
-use(load_study(sys.argv[2], trust=True)[1])
-Path(sys.argv[2]).with_name("mine.py").write_text("raise RuntimeError('nobody agreed to this')")
-worker = Worker(Path(sys.argv[1]))
-found = worker.submit(("table", "factors")).result(timeout=300)
-worker.close()
-print(found["table"])
-"""
 
 
 @pytest.fixture(scope="module")
@@ -64,17 +48,22 @@ def db(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def ask(db):
-    """Gets a page; returns its text."""
+def client(db):
     client = client_of(db)
+    yield client
+    client.site.close()
+
+
+@pytest.fixture
+def ask(client):
+    """Gets a page; returns its text."""
 
     def get(address, code=200):
         reply = client.get(address)
         assert reply.status_code == code, reply.text
         return reply.text
 
-    yield get
-    client.site.close()
+    return get
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +77,11 @@ def asked_alone(prepare, tmp_path_factory):
     client = client_of(folder / "t.duckdb")
     yield client
     client.site.close()
+
+
+def table_of(db, name):
+    """A table, which is made once for the tests and the pages."""
+    return from_text(Numbers(db).answer(("table", name))["table"])
 
 
 def cells(text):
@@ -111,8 +105,7 @@ def answering(db, *answers):
 
 @pytest.mark.parametrize(("name", "every"), [("ablation-quantitative", 9), ("contrasts", 25)])
 def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, every):
-    study = Study(db)
-    (table,) = make_tables(study, [name])
+    study, table = Study(db), table_of(db, name)
     links = cells(ask(f"/tables/{name}"))
     assert len(links) > 20
     for link in links[::every]:
@@ -143,12 +136,12 @@ def test_numbers_of_first_decisions_lead_to_what_they_rest_on_and_no_cell_leads_
 
 
 def test_a_table_leaves_out_columns_by_its_address_and_no_head_is_empty(ask):
-    heads = [
+    whole, part = (
         re.findall(r'<th scope="col"[^>]*>(.*?)</th>', ask(f"/tables/attempts{without}"))
         for without in ("", "?without=calls")
-    ]
-    assert len(heads[0]) - 1 == len(heads[1])
-    assert all(Page(head).text for head in heads[0])
+    )
+    assert len(whole) - 1 == len(part)
+    assert all(Page(head).text for head in whole)
 
 
 def test_facets_sorting_and_exports_keep_the_cell(ask):
@@ -238,26 +231,14 @@ def test_discordant_trials_are_the_pairs_that_differ(ask, db):
     assert "no trial of this variant" in ask("/discordant?model=o3&variant=A7")
 
 
-def test_the_page_of_prompts_has_the_differences_of_the_table(ask, db):
-    (contrasts,) = make_tables(Study(db), ["contrasts"])
-    page = Page(ask("/prompts"))
-    shown = [row for row in contrasts.rows if row.values["difference"] is not None]
-    assert shown
-    for row in shown:
-        told = {name: with_minus(value) for name, value in printed(contrasts, row).items()}
-        assert f"{told['difference']} {told['ci']}, Holm {told['p_holm']}" in page.text
-    assert page.to("/discordant?model=o3&variant=A1")
+def test_a_name_is_shown_as_text_and_nothing_is_inline(ask):
+    for address in ("/tables/attempts", "/tables"):
+        text = ask(address)
+        assert HOSTILE not in text
+        assert Page(text).inline == []
 
 
-@pytest.mark.parametrize("address", ["/tables/attempts", "/prompts", "/tables"])
-def test_a_name_is_shown_as_text_and_nothing_is_inline(ask, address):
-    text = ask(address)
-    assert HOSTILE not in text
-    assert Page(text).inline == []
-
-
-def test_every_figure_is_offered_and_comes_as_svg_and_png_and_is_cited(db):
-    client = client_of(db)
+def test_every_figure_is_offered_and_comes_as_svg_and_png_and_is_cited(client, db):
     offered = {to for to, _ in Page(client.get("/tables").text).to("/figures/")}
     assert offered == {f"/figures/{name}{end}" for name in MAKERS for end in ("", ".svg")}
     assert list(FIGURES) == list(MAKERS)
@@ -273,7 +254,6 @@ def test_every_figure_is_offered_and_comes_as_svg_and_png_and_is_cited(db):
     assert page.to("/tables/first-action.csv")
     assert results_digest(db)[0] in page.text
     assert "arXiv:2604.09609" in page.text
-    client.site.close()
 
 
 def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
@@ -348,13 +328,15 @@ def test_a_worker_that_is_closed_leaves_no_thread_that_a_program_could_stumble_o
     assert set(threading.enumerate()) <= before
 
 
-def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(played, tmp_path):
-    for name in ("mine.toml", "mine.py"):
-        shutil.copy(played.folder / name, tmp_path)
-    told = subprocess.run(
-        [sys.executable, "-c", ASK, played.db, tmp_path / "mine.toml"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "opponent=sleepy/duration_s" in told.stdout
+def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(golden_copy):
+    db, plugin = golden_copy / "golden.duckdb", golden_copy / "mine.py"
+    with duckdb.connect(str(db)) as connection:
+        connection.execute("DELETE FROM trials WHERE model_left <> 'cheap'")
+
+    def compute():
+        use(load_study(golden_copy / "mine.toml", trust=True)[1])
+        plugin.write_text("raise RuntimeError('nobody agreed to this')")
+        with closing(Worker(db)) as process:
+            return process.submit(("table", "factors")).result(HANGS_S)
+
+    assert "opponent=sleepy/duration_s" in copy_context().run(compute)["table"]

@@ -19,7 +19,6 @@ from merge_runner_analysis.explorer.pages.sweep import list_runs
 from merge_runner_analysis.explorer.pages.trials import filter_of
 from merge_runner_analysis.explorer.pictures import sparkline, speed_range
 from tests.support.crashes import CLOSING_IN, EXAMPLES, drive
-from tests.support.exporting import export
 from tests.support.harness import FAST
 from tests.support.serving import Page, client_of
 from tests.support.studies import Drive, as_humans, played, write_study, yielding
@@ -212,19 +211,6 @@ def test_a_name_that_hides_something_is_neutral(listing, address):
     said = "".join(Page(listing.get(address).text).said)
     assert "[U+202E]" in said
     assert not {"\u202e", "\u200b"} & set(said)
-
-
-def test_a_name_that_hides_something_is_neutral_on_every_page_of_an_export(
-    listing, tmp_path, monkeypatch
-):
-    monkeypatch.setattr("merge_runner_analysis.explorer.catalogue.PAGE", 7)
-    monkeypatch.setattr("merge_runner_analysis.explorer.pages.trials.PAGE", 7)
-    files = export(listing.site.db, tmp_path / "pages", ["*"])
-    assert len([*files.glob("trials-page-*.html")]) == 2
-    said = ["".join(Page(page.read_text()).said) for page in tmp_path.glob("pages/**/*.html")]
-    assert not [text for text in said if {"\u202e", "\u200b"} & set(text)]
-    lists = [tmp_path / "pages/index.html", *files.glob("trials-page-*.html")]
-    assert sum("o3[U+202E]gpj[U+200B]" in page.read_text() for page in lists) == 1
 
 
 @pytest.mark.parametrize(
