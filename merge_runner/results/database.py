@@ -167,7 +167,7 @@ async def in_thread(read: Callable[[], ResultT]) -> ResultT:
     thread = loop.run_in_executor(None, copy_context().run, reads)
     try:
         await asyncio.wait([thread])
-    except asyncio.CancelledError:
+    except (asyncio.CancelledError, KeyboardInterrupt):  # Ctrl-C may come before it waits
         while not thread.done():
             reading.end()  # again, where it was between two queries
             with contextlib.suppress(asyncio.CancelledError):

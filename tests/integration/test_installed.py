@@ -52,7 +52,6 @@ def test_no_command_imports_from_the_folder_it_is_called_in(tmp_path):
     for command in (small, ("tables", "gap")):
         done = run(tmp_path, PROGRAM, *command)
         assert done.code == 0, done.err
-    assert run(tmp_path, PROGRAM, "tables", "--db", "none").code == 2
 
 
 def test_a_file_of_the_users_named_analysis_and_ours_are_two_modules(tmp_path):

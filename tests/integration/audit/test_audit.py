@@ -144,15 +144,15 @@ async def test_the_command_says_what_it_checked_and_fails_with_the_findings(merg
     assert f", {MIXED}, left, decision 2: decisions.prompt_hash is x" in damaged.out
 
 
-@pytest.mark.parametrize("what", WIDER)
-def test_each_wider_damage_is_found_and_nothing_else(db, what):
-    damage(db, *WIDER[what]["sql"])
+@pytest.mark.parametrize("together", WIDER)
+def test_wider_damages_are_found_and_nothing_else(db, together):
+    damage(db, *WIDER[together]["sql"])
     found = audit("--db", db)
     assert found.code == 1
-    assert found.kinds == set(WIDER[what]["finds"])
-    for kind, text in WIDER[what]["finds"].items():
-        texts = [finding["text"] for finding in found.findings if finding["kind"] == kind]
-        assert any(text in told for told in texts), texts
+    assert found.kinds == set(WIDER[together]["finds"])
+    for kind, said in WIDER[together]["finds"].items():
+        texts = "\n".join(told["text"] for told in found.findings if told["kind"] == kind)
+        assert [text for text in said if text not in texts] == []
 
 
 @pytest.fixture(scope="module")
@@ -344,8 +344,6 @@ async def test_a_proxy_that_caches_is_found_in_repetitions_and_in_a_fresh_set_of
     async with watched(caching({})) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         part = ("sweep", "baseline", "--conditions", "L_4_8", "--reps")
-        assert (await merge_runner(*part, 1, **env)).code == 0
-        assert audit("--db", tmp_path / "results/merge.duckdb").code == 0
         for more in ((2,), (1, "--sample-set", 1)):
             run = await merge_runner(*part, *more, **env)
             assert run.code == 1, "the sweep itself finds it at its end"
@@ -360,7 +358,7 @@ async def test_a_proxy_that_caches_is_found_in_repetitions_and_in_a_fresh_set_of
 # Ollama draws an id out of a thousand, some servers give all replies the same one, some give none.
 @pytest.mark.parametrize(
     ("name", "repeats"),
-    [("'chatcmpl-' || rowid % 30", True), ("'chatcmpl-0'", True), ("NULL", False), ("''", False)],
+    [("'chatcmpl-' || rowid % 30", True), ("if(rowid % 2 = 0, NULL, '')", False)],
 )
 def test_ids_that_a_server_gives_to_different_answers_are_a_note(db, name, repeats):
     damage(db, f"UPDATE calls SET reply = json_merge_patch(reply, json_object('id', {name})) "
@@ -385,7 +383,7 @@ async def test_equal_answers_under_repeating_ids_of_a_local_server_are_a_note(
         return web.json_response(body)
 
     async with watched(terse, honest=False) as server:
-        part = ("--model", "local", "--reps", 1)
+        part = ("--model", "local", "--reps", 1, *TWO)
         run = await merge_runner("sweep", "baseline", *part, LOCAL_BASE_URL=f"{server.url}/v1")
     assert run.code == 0, run.err
     assert "gave more than once" in run.out

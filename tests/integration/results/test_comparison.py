@@ -96,18 +96,35 @@ def columns():
         ).fetchall()
 
 
+COLUMNS = columns()
+
+
 def test_what_is_stored_as_it_was_played_differs_in_nothing(stored):
     assert differing(stored) == []
 
 
-@pytest.mark.parametrize(("table", "column", "kind"), columns())
-def test_one_changed_value_of_a_column_is_found_and_no_other(stored, table, column, kind):
-    other = ANOTHER.get(kind, "coalesce({0}, 0) + 1").format(column)
-    stored.execute(f"UPDATE {table} SET {column} = {other} WHERE rowid = "
-                   f"(SELECT min(rowid) FROM {table} WHERE spec_hash = 'h')")  # fmt: skip
-    name = f"rows of {table}" if column in PLACES[table] else f"{table}.{column}"
-    assert differing(stored) == [name]
-    assert differing(stored, ignored=OF_A_RUN) == ([] if column in OF_A_RUN else [name])
+def change(stored, columns) -> None:
+    """Change these columns of the first row that a table has of the trial."""
+    for table, column, kind in columns:
+        other = ANOTHER.get(kind, "coalesce({0}, 0) + 1").format(column)
+        stored.execute(f"UPDATE {table} SET {column} = {other} WHERE rowid = "
+                       f"(SELECT min(rowid) FROM {table} WHERE spec_hash = 'h')")  # fmt: skip
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_every_second_column_that_is_changed_is_found_and_no_other(stored, first):
+    changed = [each for each in COLUMNS if each[1] not in PLACES[each[0]]][first::2]
+    change(stored, changed)
+    names = [f"{table}.{column}" for table, column, _ in changed]
+    assert sorted(differing(stored)) == sorted(names)
+    lasting = [name for name in names if name.partition(".")[2] not in OF_A_RUN]
+    assert sorted(differing(stored, ignored=OF_A_RUN)) == sorted(lasting)
+
+
+@pytest.mark.parametrize("place", [each for each in COLUMNS if each[1] in PLACES[each[0]]])
+def test_a_row_at_another_place_is_another_row(stored, place):
+    change(stored, [place])
+    assert differing(stored) == [f"rows of {place[0]}"]
 
 
 def test_rows_that_lack_or_are_too_many_are_counted(stored):

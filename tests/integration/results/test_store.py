@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import duckdb
@@ -17,7 +18,7 @@ from merge_runner.config import ScenarioConfig
 from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import StoreLocked, UsageError
 from merge_runner.records import TrialRecord
-from merge_runner.results.database import Instance, open_database
+from merge_runner.results.database import Instance, in_thread, open_database
 from merge_runner.results.store import Store, query, results_digest, sweep_facts
 from merge_runner.run.local_runner import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
@@ -120,7 +121,7 @@ def test_two_specs_of_one_trial_stay_apart(store, path):
 
 
 def test_the_digest_sees_every_result_and_no_order(tmp_path):
-    records = [played(c) for c in ("L_4_0", "N_0_0", "R_0_8")]
+    records = [played(c) for c in ("L_4_0", "N_0_0")]
 
     def digest(name, order):
         store = Store(tmp_path / name)
@@ -315,6 +316,22 @@ def test_what_only_reads_does_not_open_the_file_for_writing(store, monkeypatch):
     monkeypatch.setattr("merge_runner.results.store.write_database", refuse)
     assert store.ended_trials(keyed(record)) == set(keyed(record))
     assert store.decisions_by_spec(["another"]) == []
+
+
+async def test_ctrl_c_that_comes_before_a_reading_is_waited_for_ends_it_too(
+    store, path, monkeypatch
+):
+    wait, interrupts = asyncio.wait, iter([KeyboardInterrupt])
+
+    async def interrupted(*arguments, **more):
+        for interrupt in interrupts:
+            raise interrupt
+        return await wait(*arguments, **more)
+
+    monkeypatch.setattr(asyncio, "wait", interrupted)
+    for_ever = f"SELECT count(*) FROM range({10**15}) WHERE hash(range) = 7"
+    with pytest.raises(KeyboardInterrupt):
+        await in_thread(partial(query, path, for_ever))
 
 
 def test_an_instance_that_is_dropped_leaves_the_connections_of_others_open():

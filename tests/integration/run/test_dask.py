@@ -12,14 +12,12 @@ import logging
 import math
 import os
 import shutil
-import signal
 import socket
 from contextlib import closing
 from importlib import import_module
 
 import psutil
 import pytest
-from aiohttp import web
 
 from merge_runner.errors import SweepStopped, UsageError
 from merge_runner.llm.cache import ResponseCache
@@ -51,24 +49,6 @@ async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
     with pytest.raises(SweepStopped, match="the coordinator has said nothing for 300 s"):
         await cluster.Desk().ask(1.0, Asked())
     assert now_s() == 300
-
-
-async def test_three_workers_come_to_the_results_of_one_process(merge_runner):
-    sweep = ("sweep", "baseline", "--reps", 1, "--json")
-    async with watched() as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(*sweep, "--in-flight", 6, "--dask", "local:3", **env)
-        assert run.code == 0, run.err
-        assert "on 3 workers" in run.err
-        assert set(server.asked.values()) == {1}
-        assert run.summary["calls"] == {"live": server.requests, "cached": 0}
-        again = await merge_runner(*sweep, "--db", "again", **env)
-        assert again.summary["calls"]["live"] == 0, "all is recorded"
-    one = await merge_runner(*sweep, "--db", "one", "--cache", "new")
-    assert one.code == 0, one.err
-    digest = (await merge_runner("digest")).out
-    assert digest == (await merge_runner("digest", "--db", "one")).out
-    assert "11 trials" in digest
 
 
 @pytest.mark.parametrize(
@@ -114,24 +94,6 @@ async def test_a_cluster_of_this_machine_leaves_its_host_as_it_is_and_needs_no_c
     assert ([str(each.message) for each in recwarn], safe) == ([], "1")
     assert ({**os.environ}, loggers_levels()) == (before, levels)
     assert [each.message for each in caplog.records] == ["ours"]
-
-
-async def test_what_stops_a_sweep_stops_it_at_all_workers_in_one_line(merge_runner):
-    async def middle(request, handler):
-        if server.requests > 12:
-            body = {"error": {"code": "insufficient_quota", "message": "nothing left"}}
-            return web.json_response(body, status=429)
-        return await handler(request)
-
-    async with watched(middle) as server:
-        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(
-            *SMALL, "--conditions", "L_4_0,N_0_0", "--model", "o3", "--yes", "--dask", "local:2",
-            **env,
-        )  # fmt: skip
-    assert run.code == 3
-    assert "quota is exhausted" in run.err
-    assert "Traceback" not in run.err
 
 
 async def test_workers_of_another_scheduler_play_with_their_own_keys(merge_runner, scheduler):
@@ -223,27 +185,6 @@ def test_the_share_of_a_task_stays_reserved_until_the_task_is_kept(tmp_path):
         assert (spending.spent_usd, spending.reserved_usd, spending.open_attempts) == (1.5, 5.5, 2)
         assert spending.overruns == {"o3": 2.0}
         assert [reason["driver"] for reason in ledger.reasons()] == ["Dask worker tcp://1", "o3"]
-
-
-async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, tmp_path):
-    gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
-    async with watched(gate.middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await started(*ON_TWO, **env)
-        await all_held(gate, trials=4)
-        process.send_signal(signal.SIGINT)
-        for worker in workers_of(process.pid):
-            worker.send_signal(signal.SIGINT)  # as a terminal does
-        await process.said("are saved first")
-        gate.open()
-        code, _, err = await ended(process)
-        assert code == 130, err
-        assert "the replies of 2 tasks are saved first" in err
-        assert "Traceback" not in err
-        run = await merge_runner(*SIX, **env)
-    assert run.code == 0, run.err
-    assert not gate.asked_again
-    assert len(set(gate.asked)) == 114
 
 
 async def test_a_coordinator_that_is_killed_takes_its_workers_along_and_goes_on(

@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,7 +56,6 @@ sys.argv = ["merge-runner", *sys.argv[1:]]
 from merge_runner.cli import main
 main()
 """
-REPLAY = ("replay", "baseline", "--recording", RECORDING, "--json")
 
 
 @pytest.fixture(scope="module")
@@ -104,27 +104,41 @@ async def test_the_recordings_of_a_real_small_model_replay_to_what_their_page_sa
 async def test_without_replies_of_its_own_a_replay_takes_the_recording_that_ships(
     merge_runner, tmp_path
 ):
-    part = ("baseline", "--reps", 1, "--conditions", "N_0_0,L_4_8")
+    part = ("baseline", "--reps", 1, "--conditions", "N_0_0")
     for _ in range(2):  # the first one makes the cache folder, which says nothing of replies
         run = await merge_runner("replay", *part)
         assert run.code == 0, run.err
         shipped = tmp_path.joinpath(run.err.split("ships with merge-runner: ")[1].split("\n")[0])
         assert shipped.samefile(RECORDING)
     (tmp_path / "own.toml").write_text("repetitions = { baseline = 1 }")
-    assert (await merge_runner("replay", "own.toml", "--reps", 1)).code == 4
+    assert (await merge_runner("replay", "own.toml", *part[1:])).code == 4
 
 
-async def test_replies_of_ones_own_are_not_mixed_with_those_that_ship(merge_runner):
-    part = ("baseline", "--reps", 1, "--conditions")
-    assert (await merge_runner("sweep", *part, "N_0_0")).code == 0
+async def test_ones_own_replies_do_not_mix_with_those_that_ship_and_a_damaged_one_fails_its_trial(
+    merge_runner, tmp_path
+):
+    part = ("baseline", "--reps", 1, "--json", "--conditions")
+    assert (await merge_runner("sweep", *part, "N_0_0,L_4_0")).code == 0
     replay = await merge_runner("replay", *part, "N_0_0", "--db", "other")
     assert (replay.code, "ships with" in replay.err) == (0, False)
     assert (await merge_runner("replay", *part, "L_4_8", "--db", "other")).code == 4
+    with sqlite3.connect(tmp_path / "cache/responses/cache.db") as database:
+        database.execute(
+            "UPDATE Cache SET value = substr(value, 1, 100) "
+            'WHERE value LIKE \'%"condition":"N_0_0"%"decision":4%\''
+        )
+    run = await merge_runner("replay", *part, "N_0_0,L_4_0", "--db", "replay.duckdb")
+    assert (run.code, run.summary["trials"]["failed"]) == (1, 1)
+    assert "the recorded reply is damaged" in run.summary["failed"]["emulator/baseline/N_0_0/rep01"]
+    assert "Traceback" not in run.err
 
 
-def test_a_replay_opens_no_network_socket_and_is_what_the_emulator_answers_today(tmp_path, quiet):
+def test_a_replay_opens_no_network_socket_and_is_what_the_emulator_answers_today(
+    small, tmp_path, quiet
+):
     done = subprocess.run(
-        [sys.executable, "-c", SEALED, *map(str, REPLAY), "--reps", "1"],
+        [sys.executable, "-c", SEALED, "replay", "baseline", "--recording", small, "--reps", "1",
+         "--json"],
         cwd=tmp_path, env=environment(), capture_output=True, check=True,
     )  # fmt: skip
     assert json.loads(done.stdout)["calls"]["live"] == 0
@@ -144,18 +158,18 @@ def test_a_replay_imports_no_library_that_it_does_not_use():
 async def test_missing_replies_are_counted_with_what_differs_and_the_rest_finishes(
     merge_runner, small
 ):
-    lacking = ("replay", "baseline", "--recording", small, "--json")
-    run = await merge_runner(*lacking, "--reps", 2)
+    lacking = ("replay", "baseline", "--recording", small, "--json", "--conditions")
+    run = await merge_runner(*lacking, "N_0_0,L_4_8", "--reps", 2)
     assert run.code == 4
-    assert run.summary["trials"]["failed"] == 11
-    assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] == 11
+    assert run.summary["trials"]["failed"] == 2
+    assert run.summary["trials"]["finished"] + run.summary["trials"]["collided"] == 2
     (told,) = run.summary["messages"]
     assert re.fullmatch(
         r"emulator/baseline/\w+-?\d_-?\d/rep02, left, decision 0: the nearest recorded request "
-        r"differs in repetition \(recorded 1, wanted 2\); 22 calls of 11 trials differ like this",
+        r"differs in repetition \(recorded 1, wanted 2\); 4 calls of 2 trials differ like this",
         told,
     )
-    part = ("--reps", 1, "--conditions", "N_0_0")
+    part = ("N_0_0", "--reps", 1)
     ablated = await merge_runner(*lacking, *part, "--variants", "A1")
     assert ablated.code == 4
     assert "body.messages.0.content (recorded 'History of the last 2 s" in ablated.err
@@ -169,7 +183,7 @@ async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, s
     blocks = tmp_path / "edited/merge_runner/prompts/blocks.py"
     blocks.write_text(blocks.read_text().replace("- Your speed:", "- Your spead:"))
     run = await merge_runner.start(
-        "replay", "baseline", "--recording", small, "--reps", 1, "--json",
+        "replay", "baseline", "--recording", small, "--reps", 1, "--conditions", "N_0_0", "--json",
         PYTHONPATH=str(tmp_path / "edited"),
     )  # fmt: skip
     out, _ = await run.communicate()
@@ -178,81 +192,63 @@ async def test_one_changed_letter_of_a_prompt_is_one_explanation(merge_runner, s
     assert "small.parquet holds 206 calls of scripted-driver" in held
     assert "recorded '- Your speed: 1" in told
     assert "wanted '- Your spead: 1" in told
-    assert told.endswith("; 22 calls of 11 trials differ like this")
+    assert told.endswith("; 2 calls of 1 trials differ like this")
 
 
 async def test_a_replay_that_finds_nothing_stores_nothing_and_says_what_is_recorded(
-    merge_runner, tmp_path
+    merge_runner, small, tmp_path
 ):
-    other = ("replay", "ablations", "--model", "o3", "--recording", RECORDING)
-    small = ("--reps", 1, "--conditions", "N_0_0", "--recording", RECORDING)
-    fresh = await merge_runner("replay", "baseline", "--sample-set", 3, *small)
-    run = await merge_runner(*other)
-    assert (fresh.code, run.code) == (4, 4)
+    named = ("--reps", 1, "--conditions", "N_0_0", "--recording", small)
+    for other in (("ablations", "--model", "o3"), ("baseline", "--sample-set", 3)):
+        run = await merge_runner("replay", *other, *named)
+        assert run.code == 4
+        assert (
+            "nothing of this replay is recorded, and nothing is stored: "
+            f"{small} holds 206 calls of scripted-driver"
+        ) in run.err
     assert not (tmp_path / "results").exists()
-    assert (
-        "nothing of this replay is recorded, and nothing is stored: "
-        f"{RECORDING} holds 2054 calls of scripted-driver"
-    ) in run.err
-    cached = await merge_runner("replay", "ablations", "--reps", 1)
+    cached = await merge_runner("replay", "ablations", "--reps", 1, "--conditions", "N_0_0")
     assert cached.code == 4
     assert "the cache holds no call at all" in cached.err
 
 
-async def test_an_exported_sweep_goes_round_through_a_file_and_is_played_as_far_as_it_goes(
-    merge_runner, tmp_path
-):
-    part = ("--reps", 1, "--conditions", "N_0_0,R_-4_8")
-    assert (await merge_runner("sweep", "baseline", *part)).code == 0
-    digest = results_digest(tmp_path / "results/merge.duckdb")
-    assert digest[1] == 2
-    assert (await merge_runner("recording", "export", "part.parquet")).code == 0
-    assert (await merge_runner("recording", "verify", "part.parquet")).code == 0
-    info = json.loads((await merge_runner("recording", "info", "part.parquet")).out)
-    assert info["endpoints"] == {"emulator": info["calls"]}
-    assert json.loads(info["provenance"]["config"])["repetitions"] == {"baseline": 1}
-    elsewhere = ("--cache", "elsewhere")
-    for added in (info["calls"], 0):
-        run = await merge_runner("recording", "import", "part.parquet", *elsewhere)
-        assert f"{added} calls added" in run.err
-    imported = await merge_runner("replay", "baseline", *part, "--db", "imported", *elsewhere)
-    replay = ("replay", "baseline", "--recording", "part.parquet", "--cache", "none", "--json")
-    run = await merge_runner(*replay, "--db", "part.duckdb")
-    assert (imported.code, run.code, run.summary["trials"]["planned"]) == (0, 0, 2), run.err
-    assert "the recording holds 2 of the plan's 110 trials" in run.err
-    assert results_digest(tmp_path / "part.duckdb") == digest
-    assert results_digest(tmp_path / "imported") == digest
-    asked = await merge_runner(*replay, "--reps", 2, "--db", "asked.duckdb")
-    assert asked.code == 4, "what is asked for is what is played"
-    assert asked.summary["trials"]["planned"] == 22
-
-
-async def test_several_sweeps_go_into_one_file_and_several_files_into_one_replay(
+async def test_exported_sweeps_go_round_through_files_and_are_played_as_far_as_they_go(
     merge_runner, tmp_path
 ):
     sweeps = []
-    for name, part in (("a", ("N_0_0",)), ("b", ("R_-4_8",)), ("c", ("N_0_0,R_-4_8", "--reps", 2))):
-        run = await merge_runner("sweep", "baseline", "--reps", 1, "--json", "--conditions", *part)
-        assert run.code == 0, run.err
-        sweeps.append(run.summary["sweep_id"])
+    for name, condition in (("a", "N_0_0"), ("b", "R_-4_8")):
+        part = ("--reps", 1, "--json", "--conditions", condition)
+        sweeps.append((await merge_runner("sweep", "baseline", *part)).summary["sweep_id"])
         assert (await merge_runner("recording", "export", f"{name}.parquet")).code == 0
-    both = ("--sweep", sweeps[0], "--sweep", sweeps[1])
-    export = await merge_runner("recording", "export", "both.parquet", *both)
-    assert export.code == 0, export.err
-    audit = await merge_runner("audit", "--recording", "both.parquet")
-    assert audit.code == 0, audit.out
-    told = summarise(tmp_path / "both.parquet")["provenance"]["sweeps"]
-    assert [row["sweep_id"] for row in json.loads(told)] == sweeps[:2]
-    replay = ("replay", "baseline", "--cache", "none", "--json")
-    digests = []
-    for files in (("both",), ("a", "b"), ("a", "c", "b")):
+    digest = results_digest(tmp_path / "results/merge.duckdb")
+    assert digest[1] == 2
+    both = ("recording", "export", "both.parquet", "--sweep", sweeps[0], "--sweep", sweeps[1])
+    assert (await merge_runner(*both)).code == 0
+    for check in (
+        ("recording", "verify", "both.parquet"),
+        ("audit", "--recording", "both.parquet"),
+    ):
+        assert (await merge_runner(*check)).code == 0
+    told = json.loads(summarise(tmp_path / "both.parquet")["provenance"]["sweeps"])
+    assert [row["sweep_id"] for row in told] == sweeps
+    info = json.loads((await merge_runner("recording", "info", "a.parquet")).out)
+    assert info["endpoints"] == {"emulator": info["calls"]}
+    assert json.loads(info["provenance"]["config"])["repetitions"] == {"baseline": 1}
+    for added in (info["calls"], 0):
+        run = await merge_runner("recording", "import", "a.parquet", "--cache", "new")
+        assert f"{added} calls added" in run.err
+    replay = ("replay", "baseline", "--json", "--cache")
+    for files in (("both",), ("a", "both", "b")):
         named = [word for file in files for word in ("--recording", f"{file}.parquet")]
-        db = f"{'-'.join(files)}.duckdb"
-        run = await merge_runner(*replay, *named, "--db", db)
-        assert run.code == 0, run.err
-        digests.append(results_digest(tmp_path / db))
-    assert digests[0] == digests[1]
-    assert [trials for _, trials in digests] == [2, 2, 4]
+        run = await merge_runner(*replay, "none", *named, "--db", f"{len(files)}.duckdb")
+        assert (run.code, run.summary["trials"]["planned"]) == (0, 2), run.err
+        assert "holds 2 of the plan's 110 trials" in run.err
+        assert results_digest(tmp_path / f"{len(files)}.duckdb") == digest
+    imported = ("new", "--reps", 1, "--conditions", "N_0_0", "--db", "imported.duckdb")
+    assert (await merge_runner(*replay, *imported)).code == 0
+    asked = await merge_runner(*replay, "none", *named, "--reps", 2, "--db", "asked.duckdb")
+    assert asked.code == 4, "what is asked for is what is played"
+    assert asked.summary["trials"]["planned"] == 22
     unknown = await merge_runner("recording", "export", "x.parquet", "--sweep", "nobody")
     assert unknown.code == 2
     assert f"unknown sweep 'nobody'; valid: {', '.join(sweeps)}" in unknown.err
@@ -363,63 +359,47 @@ def told(prepare, tmp_path_factory):
     return folder / "told.parquet"
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["git_commit", "git_dirty", "config", "started_at", "ended_at", "exit_code", "name", "versions",
-     "sweep_id", "provenance_sha256", "added"],
-)  # fmt: skip
-def test_a_recording_that_says_something_else_of_its_origin_is_refused(told, tmp_path, name):
+def test_a_recording_that_says_something_else_of_its_origin_is_refused(told, tmp_path):
     origin = summarise(told)["provenance"]
-    assert name in origin or name == "added"
     changed(told, tmp_path / "same.parquet")
     assert summarise(tmp_path / "same.parquet")["provenance"] == origin
-    changed(told, tmp_path / "bad.parquet", **{name: origin.get(name, "") + " "})
-    with pytest.raises(RecordingError, match="what it says of where it comes from"):
-        summarise(tmp_path / "bad.parquet")
-    cache = ResponseCache(tmp_path / "cache")
-    with pytest.raises(RecordingError):
-        import_recording(tmp_path / "bad.parquet", cache)
-    assert list(cache.entries()) == []
+    for name in ("config", "exit_code", "sweep_id", "provenance_sha256", "added"):
+        assert name in origin or name == "added"
+        changed(told, tmp_path / "bad.parquet", **{name: origin.get(name, "") + " "})
+        with pytest.raises(RecordingError, match="what it says of where it comes from"):
+            summarise(tmp_path / "bad.parquet")
+    with closing(ResponseCache(tmp_path / "cache")) as cache:
+        with pytest.raises(RecordingError):
+            import_recording(tmp_path / "bad.parquet", cache)
+        assert list(cache.entries()) == []
 
 
-@pytest.mark.parametrize("number", [1, 3])
-async def test_a_recording_of_another_format_is_refused(merge_runner, told, tmp_path, number):
-    changed(told, tmp_path / "other.parquet", format=f"merge-runner recording {number}")
-    for command in ("verify", "info", "import"):
-        run = await merge_runner("recording", command, "other.parquet")
-        assert run.code == 1
-        (line,) = run.err.splitlines()
-        assert f"has the format 'merge-runner recording {number}' with keys of" in line
+async def test_a_recording_of_another_format_is_refused(merge_runner, told, tmp_path):
+    for number in (1, 3):
+        changed(told, tmp_path / "other.parquet", format=f"merge-runner recording {number}")
+        for command in ("verify", "info", "import"):
+            run = await merge_runner("recording", command, "other.parquet")
+            assert run.code == 1
+            (line,) = run.err.splitlines()
+            assert f"has the format 'merge-runner recording {number}' with keys of" in line
 
 
-async def test_a_replay_into_stored_trials_names_each_column_that_differs(merge_runner, tmp_path):
-    part = ("--reps", 1, "--conditions", "N_0_0,L_4_0")
-    assert (await merge_runner(*REPLAY, *part)).code == 0
-    assert (await merge_runner(*REPLAY, *part)).code == 0
+async def test_a_replay_into_stored_trials_names_each_column_that_differs(
+    merge_runner, small, tmp_path
+):
+    replay = ("replay", "baseline", "--recording", small, "--reps", 1, "--conditions",
+              "N_0_0,L_4_0")  # fmt: skip
+    for _ in range(2):
+        assert (await merge_runner(*replay)).code == 0
     with duckdb.connect(str(tmp_path / "results/merge.duckdb")) as connection:
         connection.execute(
             "UPDATE states SET acceleration_mps2 = acceleration_mps2 + 0.001 "
             "WHERE trial_id LIKE '%N_0_0%' AND step = 7"
         )
         connection.execute("UPDATE decisions SET rationale = 'no' WHERE trial_id LIKE '%L_4_0%'")
-    again = await merge_runner(*REPLAY, *part)
+    again = await merge_runner(*replay)
     assert again.code == 1
     (line,) = (line for line in again.err.splitlines() if "stored otherwise" in line)
     assert "2 trials are stored otherwise in results/merge.duckdb" in line
     assert "emulator/baseline/N_0_0/rep01 (states.acceleration_mps2)" in line
     assert "emulator/baseline/L_4_0/rep01 (decisions.rationale)" in line
-
-
-async def test_a_damaged_reply_fails_its_trial_alone(merge_runner, tmp_path):
-    part = ("--reps", 1, "--conditions", "N_0_0,L_4_0", "--json")
-    assert (await merge_runner("sweep", "baseline", *part)).code == 0
-    with sqlite3.connect(tmp_path / "cache/responses/cache.db") as database:
-        database.execute(
-            "UPDATE Cache SET value = substr(value, 1, 100) "
-            'WHERE value LIKE \'%"condition":"N_0_0"%"decision":4%\''
-        )
-    run = await merge_runner("replay", "baseline", *part, "--db", "replay.duckdb")
-    assert run.code == 1
-    assert run.summary["trials"]["failed"] == 1
-    assert "the recorded reply is damaged" in run.summary["failed"]["emulator/baseline/N_0_0/rep01"]
-    assert "Traceback" not in run.err

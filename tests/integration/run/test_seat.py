@@ -65,9 +65,8 @@ def test_a_sweep_answers_the_situations_and_they_answer_its_first_decisions(prep
     assert before["calls"] == {"live": 4, "cached": 0}
     after = prepare(folder, "sweep", "baseline", *elsewhere).summary
     assert after["calls"] == {"live": swept["calls"]["live"] - 4, "cached": 4}
-    for places in ((), ("--db", "other.duckdb")):
-        audit = prepare(folder, "audit", *places)
-        assert (audit.code, audit.out.count("all holds")) == (0, 3), audit.out
+    audit = prepare(folder, "audit", "--db", "other.duckdb")
+    assert (audit.code, audit.out.count("all holds")) == (0, 3), audit.out
 
 
 def test_a_situation_is_driven_for_a_second_as_its_trial_begins(both):
@@ -88,57 +87,45 @@ def test_the_trials_that_were_driven_are_shown_as_before(both):
     assert before == after != ""
 
 
-async def test_what_is_forgotten_is_asked_again_without_a_call(merge_runner):
-    ask = (*FIRST, "--reps", 1, *TWO, "--json")
-    await merge_runner(*ask)
-    stored = await merge_runner("digest")
-    assert "2 trials" in stored.out
-    assert (await merge_runner(*ask)).summary["trials"]["stored_before"] == 2
-    assert (await merge_runner("forget", "*", "--yes")).code == 0
-    assert "0 trials" in (await merge_runner("digest")).out
-    assert (await merge_runner(*ask)).summary["calls"] == {"live": 0, "cached": 4}
-    assert (await merge_runner("digest")).out == stored.out
-
-
-async def test_a_sealed_replay_and_an_imported_recording_give_the_same_digest(
+async def test_replayed_imported_and_forgotten_situations_are_the_same_without_a_call(
     merge_runner, tmp_path
 ):
-    ask = (*FIRST, "--grid", "h=-6:6:6,dv=1.2")
-    assert (await merge_runner(*ask, "--reps", 2)).code == 0
+    ask = (*FIRST, "--grid", "h=-6:6:6,dv=1.2", "--reps", 1, "--json")
+    assert (await merge_runner(*ask)).summary["calls"] == {"live": 6, "cached": 0}
+    assert (await merge_runner(*ask)).summary["trials"]["stored_before"] == 3
     assert (await merge_runner("recording", "export", "asked.parquet")).code == 0
     assert (await merge_runner("audit", "--recording", "asked.parquet")).code == 0
-    away = {"EMULATOR_BASE_URL": "http://127.0.0.1:9/v1"}
-    from_file = ("--recording", "asked.parquet", "--db", "file.duckdb", "--cache", "none")
-    run = await merge_runner(*ask, "--reps", 2, "--replay", *from_file, "--json", **away)
-    assert (run.code, run.summary["calls"]) == (0, {"live": 0, "cached": 12}), run.err
     assert (await merge_runner("recording", "import", "asked.parquet", "--cache", "new")).code == 0
-    from_cache = ("--db", "cache.duckdb", "--cache", "new")
-    assert (await merge_runner(*ask, "--reps", 2, "--replay", *from_cache)).code == 0
+    away = {"EMULATOR_BASE_URL": "http://127.0.0.1:9/v1"}
+    for places in (
+        ("--db", "file.duckdb", "--recording", "asked.parquet", "--cache", "none"),
+        ("--db", "cache.duckdb", "--cache", "new"),
+    ):
+        run = await merge_runner(*ask, "--replay", *places, **away)
+        assert (run.code, run.summary["calls"]) == (0, {"live": 0, "cached": 6}), run.err
     digests = {results_digest(tmp_path / name) for name in (DB, "file.duckdb", "cache.duckdb")}
-    assert len(digests) == 1
+    assert (await merge_runner("forget", "*", "--yes")).code == 0
+    assert results_digest(tmp_path / DB)[1] == 0
+    assert (await merge_runner(*ask)).summary["calls"] == {"live": 0, "cached": 6}
+    assert digests == {results_digest(tmp_path / DB)}
+    replay = ("replay", "baseline", "--reps", 1, "--conditions", "N_0_0", "--cache", "none")
+    sweep = await merge_runner(*replay, "--recording", "asked.parquet", "--db", "sweep.duckdb")
+    said = "asked.parquet holds 6 calls of scripted-driver"
+    assert (sweep.code, said in sweep.err) == (4, True), sweep.err
 
 
 async def test_a_replay_without_a_number_plays_the_repetitions_that_a_sweep_recorded(merge_runner):
-    run = await merge_runner(*FIRST, "--replay", "--recording", RECORDING, "--json")
+    part = ("--conditions", "N_0_0", "--recording", RECORDING, "--json")
+    run = await merge_runner(*FIRST, "--replay", *part)
     assert run.code == 0, run.err
-    assert run.summary["calls"] == {"live": 0, "cached": 220}
-
-
-async def test_a_recording_of_situations_is_no_recording_of_the_sweep(merge_runner):
-    await merge_runner(*FIRST, "--reps", 1, *TWO)
-    await merge_runner("recording", "export", "asked.parquet")
-    replay = ("replay", "baseline", "--reps", 1, *TWO, "--recording", "asked.parquet")
-    swept = await merge_runner(*replay, "--db", "new.duckdb", "--cache", "new")
-    assert swept.code == 4
-    other = ("--db", "other.duckdb", "--cache", "none")
-    missed = await merge_runner("replay", "baseline", "--sample-set", 5, *replay[4:], *other)
-    said = "asked.parquet holds 4 calls of scripted-driver"
-    assert (missed.code, said in missed.err) == (4, True), missed.err
+    assert run.summary["calls"] == {"live": 0, "cached": 20}
 
 
 async def test_no_more_is_spent_than_the_cap_and_more_money_goes_on(merge_runner, tmp_path):
     (tmp_path / "models.toml").write_text(PRICED)
-    (tmp_path / "mine.toml").write_text('repetitions = 2\nconditions = ["N_0_0", "L_4_8"]\n')
+    (tmp_path / "mine.toml").write_text(
+        'repetitions = 2\nconditions = ["N_0_0"]\n[factors]\nprompt = ["baseline", "A1"]\n'
+    )
     ask = ("sweep", "mine.toml", "--first", "--model", "paid", "--json", *FAST)
     async with watched() as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
@@ -149,25 +136,13 @@ async def test_no_more_is_spent_than_the_cap_and_more_money_goes_on(merge_runner
         capped = await merge_runner(*ask, *cap, 2.1, **env)
         assert capped.code == 3, capped.err
         assert 0 < capped.summary["sweep_cost_usd"] <= 2.1
-        assert capped.summary["trials"]["suspended"] > 0
+        waiting = "(1 of paid/baseline, 2 of paid/A1: what has ended is not balanced)"
+        assert f"3 trials wait for money {waiting}: " in capped.summary["messages"][0]
         run = await merge_runner(*ask, *cap, 20, **env)
         assert run.code == 0, run.err
         assert set(server.asked.values()) == {1}
         assert server.requests == 8
     assert "mine/paid/set0/first" in (await merge_runner("ledger")).out
-
-
-async def test_a_cap_that_leaves_more_of_one_prompt_than_of_another_says_so(merge_runner, tmp_path):
-    (tmp_path / "models.toml").write_text(PRICED)
-    (tmp_path / "mine.toml").write_text(
-        'repetitions = 2\nconditions = ["N_0_0"]\n[factors]\nprompt = ["baseline", "A1"]\n'
-    )
-    ask = ("sweep", "mine.toml", "--first", "--model", "paid", "--yes", "--in-flight", 1, *FAST)
-    async with watched() as server:
-        run = await merge_runner(*ask, "--max-cost", 2.1, EMULATOR_BASE_URL=f"{server.url}/v1")
-    assert run.code == 3, run.err
-    waiting = "(1 of paid/baseline, 2 of paid/A1: what has ended is not balanced)"
-    assert f"3 trials wait for money {waiting}: " in run.err
 
 
 async def test_an_estimate_counts_one_call_a_situation(merge_runner):
@@ -204,10 +179,9 @@ async def test_factors_and_prompts_of_a_study_are_asked(merge_runner, tmp_path):
     assert run.summary["calls"]["live"] == 2 * 4
     query = "select distinct end_time_s from trials order by all"
     assert (await merge_runner("sql", query, "--format", "csv")).out.split()[1:] == ["1.0", "2.0"]
-    part = await merge_runner(
-        "sweep", "mine.toml", "--first", "--only", "prompt=A4", "--json", "--db", "part.duckdb"
-    )
-    assert part.summary["trials"]["planned"] == 2
+    only = ("--only", "prompt=A4", "--dry-run", "--db", "part.duckdb", "--cache", "none")
+    part = await merge_runner("sweep", "mine.toml", "--first", "--json", *only)
+    assert part.summary["trials"] == 2
 
 
 async def test_the_usual_grid_is_the_one_that_help_tells(merge_runner):
@@ -248,7 +222,7 @@ async def test_no_question_depends_on_an_answer_and_replies_without_a_plan_are_c
     for middle, name in ((None, "usual"), (wordless, "wordless")):
         async with watched(middle) as server:
             places = ("--cache", name, "--db", f"{name}.duckdb")
-            ask = (*FIRST, "--reps", 1, "--keep-going", *TWO, "--json", *places)
+            ask = (*FIRST, "--reps", 1, "--keep-going", "--conditions", "N_0_0", "--json", *places)
             run = await merge_runner(*ask, EMULATOR_BASE_URL=f"{server.url}/v1")
             assert run.code == 0, run.err
             asked.append(server.asked)

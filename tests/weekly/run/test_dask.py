@@ -6,9 +6,11 @@ import asyncio
 import json
 import math
 import shutil
+import signal
 import time
 
 import pytest
+from aiohttp import web
 
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, workers_of
 from tests.support.gate import HANGS_S, Gate
@@ -128,3 +130,60 @@ async def test_who_answers_a_worker_is_known_and_where_nobody_does(merge_runner,
     assert (dead.code, dead.summary["trials"]["failed"]) == (1, 0)
     run = await merge_runner(*o3, OPENAI_API_KEY="x", OPENAI_BASE_URL=emulator_url)
     assert (run.code, run.summary["scripted"]) == (0, True), run.err
+
+
+async def test_three_workers_come_to_the_results_of_one_process(merge_runner):
+    sweep = ("sweep", "baseline", "--reps", 1, "--json")
+    async with watched() as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(*sweep, "--in-flight", 6, "--dask", "local:3", **env)
+        assert run.code == 0, run.err
+        assert "on 3 workers" in run.err
+        assert set(server.asked.values()) == {1}
+        assert run.summary["calls"] == {"live": server.requests, "cached": 0}
+        again = await merge_runner(*sweep, "--db", "again", **env)
+        assert again.summary["calls"]["live"] == 0, "all is recorded"
+    one = await merge_runner(*sweep, "--db", "one", "--cache", "new")
+    assert one.code == 0, one.err
+    digest = (await merge_runner("digest")).out
+    assert digest == (await merge_runner("digest", "--db", "one")).out
+    assert "11 trials" in digest
+
+
+async def test_what_stops_a_sweep_stops_it_at_all_workers_in_one_line(merge_runner):
+    async def middle(request, handler):
+        if server.requests > 12:
+            body = {"error": {"code": "insufficient_quota", "message": "nothing left"}}
+            return web.json_response(body, status=429)
+        return await handler(request)
+
+    async with watched(middle) as server:
+        env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
+        run = await merge_runner(
+            *SMALL, "--conditions", "L_4_0,N_0_0", "--model", "o3", "--yes", "--dask", "local:2",
+            **env,
+        )  # fmt: skip
+    assert run.code == 3
+    assert "quota is exhausted" in run.err
+    assert "Traceback" not in run.err
+
+
+async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, tmp_path):
+    gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
+    async with watched(gate.middle) as server:
+        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
+        process = await started(*SIX, "--in-flight", 4, "--dask", "local:2", **env)
+        await all_held(gate, trials=4)
+        process.send_signal(signal.SIGINT)
+        for worker in workers_of(process.pid):
+            worker.send_signal(signal.SIGINT)  # as a terminal does
+        await process.said("are saved first")
+        gate.open()
+        code, _, err = await ended(process)
+        assert code == 130, err
+        assert "the replies of 2 tasks are saved first" in err
+        assert "Traceback" not in err
+        run = await merge_runner(*SIX, **env)
+    assert run.code == 0, run.err
+    assert not gate.asked_again
+    assert len(set(gate.asked)) == 114
