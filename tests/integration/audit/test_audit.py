@@ -28,9 +28,7 @@ from tests.support.mock_server import FaultPlan, served
 from tests.support.program import invoke
 from tests.support.studies import damage
 
-FAULTS = FaultPlan(
-    seed=4, delay_s=0.01, rates={"rate_limit": 0.1, "refused": 0.1, "malformed": 0.15}
-)
+FAULTS = FaultPlan(seed=4, delay_s=0.01, rates={"rate_limit": 0.05, "malformed": 0.15})
 TWO = ("--conditions", "N_0_0,L_4_8")
 MODELS = ("--model", "emulator+constant", "--model", "projected-order")
 RESTARTS = """

@@ -64,7 +64,7 @@ def test_what_can_be_no_driver_is_refused(made, said):
         made()
 
 
-@pytest.mark.parametrize("first", ["registry", "idm", "base"])
+@pytest.mark.parametrize("first", ["idm", "base"])
 def test_programs_are_listed_in_one_order_whichever_is_imported_first(first):
     listed = "from merge_runner.drivers.registry import PROGRAMS; print(*PROGRAMS)"
     listed = f"import merge_runner.drivers.{first}; {listed}"

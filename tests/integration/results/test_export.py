@@ -11,6 +11,7 @@ from merge_runner.results.export import FACTORS, tables
 from merge_runner.results.recording import COLUMNS
 from merge_runner.results.store import query
 from tests.support.harness import PROJECT
+from tests.support.studies import write_study, yielding
 
 
 def rows(path):
@@ -23,8 +24,9 @@ def rows(path):
 def exported(prepare, golden, tmp_path_factory):
     """The folder of an export that has replaced an earlier one."""
     folder = tmp_path_factory.mktemp("exported")
-    for _ in range(2):
-        run = prepare(folder, "export", "out", "--db", golden / "golden.duckdb")
+    earlier = write_study(folder / "earlier.duckdb", yielding("m", reps=1))
+    for db in (earlier, golden / "golden.duckdb"):
+        run = prepare(folder, "export", "out", "--db", db)
         said = "wrote every table into out: begin with out/dictionary.csv\n"
         assert (run.code, run.out, run.err) == (0, said, "")
     return folder / "out"
@@ -39,8 +41,10 @@ def test_every_table_and_view_is_written_as_parquet_and_csv(exported, golden):
         assert len(rows(exported / f"{table.name}.csv")) == there
         told = [row["column"] for row in dictionary if row["table"] == table.name]
         assert told == ["", *parquet.columns]
-    (gap,) = (r for r in dictionary if (r["table"], r["column"]) == ("trial_metrics", "gap_m"))
-    assert (gap["type"], gap["meaning"][:9]) == ("DOUBLE", "net gap, ")
+    meanings = {(r["table"], r["column"]): (r["type"], r["meaning"]) for r in dictionary}
+    kind, meaning = meanings["trial_metrics", "gap_m"]
+    assert (kind, meaning[:9]) == ("DOUBLE", "net gap, ")
+    assert meanings["perceptions", "distance_m"][1] == "how far ahead the other was"
 
 
 def test_the_wide_trials_have_metrics_and_typed_factors_and_humans_stand_beside_them(

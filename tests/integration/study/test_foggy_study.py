@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import html
 import re
 from statistics import median
@@ -132,13 +131,3 @@ def test_the_panel_of_a_decision_shows_both_beside_each_other(db):
     assert "what it perceived" not in panel("perfect")
     assert "state.table" in panel("foggy")
     assert "situation as a table" in panel("foggy")
-
-
-async def test_what_was_told_is_exported_with_its_meaning(merge_runner, db, tmp_path):
-    done = await merge_runner("export", "out", "--db", db)
-    assert done.code == 0, done.err
-    with (tmp_path / "out/dictionary.csv").open(newline="", encoding="utf-8") as file:
-        meanings = {(row["table"], row["column"]): row["meaning"] for row in csv.DictReader(file)}
-    assert meanings["perceptions", "distance_m"] == "how far ahead the other was"
-    with (tmp_path / "out/perceptions.csv").open(newline="", encoding="utf-8") as file:
-        assert len(list(csv.DictReader(file))) > 100
