@@ -68,20 +68,22 @@ async def test_trials_have_a_typed_column_for_each_factor_and_their_measures(fol
     assert "left first" in repr(outcome)
 
 
-async def test_a_factor_of_numbers_and_other_levels_is_of_texts(folder):
+async def test_an_outcome_holds_the_trials_of_its_own_sweep_which_a_replay_gives_again(folder):
+    """A factor of numbers and other levels is of texts."""
     (folder / "study.toml").write_text(STUDY.replace("[0.2, 1.0]", '["default", 1]'))
-    wanted = {"opponent": "constant", "memory_s": 1.0}
-    outcome = await Study("study.toml", conditions=["N_0_0"], only=wanted).arun()
-    assert set(outcome.trials()["temperature"]) == {"default", "1"}
-
-
-async def test_an_outcome_holds_the_trials_of_its_own_sweep(folder):
-    wanted = {"opponent": "constant", "temperature": 0.2, "memory_s": 2.0}
-    first = await Study("study.toml", only=wanted).arun()
-    second = await Study("baseline", models="constant", repetitions=1).arun()
-    assert (len(first.trials()), len(second.trials())) == (2, 11)
-    again = await Study("study.toml", only=wanted).arun()
-    assert (again.facts["trials"]["stored_before"], len(again.trials())) == (2, 2)
+    wanted = {"only": {"opponent": "constant", "memory_s": 1.0}, "conditions": ["N_0_0"]}
+    study = Study("study.toml", **wanted)
+    first = await study.arun()
+    assert set(first.trials()["temperature"]) == {"default", "1"}
+    replayed = await Study("study.toml", **wanted, db="again.duckdb").areplay()
+    assert replayed.ok
+    assert replayed.facts["calls"]["live"] == 0
+    assert results_digest(replayed.db) == results_digest(study.db)
+    other = Study("baseline", models="constant", repetitions=1, conditions=["L_4_0"])
+    second = await other.arun()
+    again = await study.arun()
+    assert [len(outcome.trials()) for outcome in (first, second, again)] == [2, 1, 2]
+    assert again.facts["trials"]["stored_before"] == 2
 
 
 async def test_first_situations_are_asked_alone_in_the_conditions_or_on_a_grid(folder):
@@ -95,18 +97,9 @@ async def test_first_situations_are_asked_alone_in_the_conditions_or_on_a_grid(f
         await Study("study.toml", conditions=["N_0_0"]).arun(first=True, grid="usual")
 
 
-async def test_a_replay_gives_the_same_results_without_a_call(folder):
-    wanted = {"opponent": "constant", "memory_s": 1.0}
-    study = Study("study.toml", only=wanted)
-    await study.arun()
-    replayed = await Study("study.toml", only=wanted, db="again.duckdb").areplay()
-    assert replayed.ok
-    assert replayed.facts["calls"]["live"] == 0
-    assert results_digest(replayed.db) == results_digest(study.db)
-
-
 def test_a_script_runs_it_without_await(folder):
-    assert Study("baseline", models="constant", repetitions=1).run().ok
+    few = {"repetitions": 1, "conditions": ["N_0_0"]}
+    assert Study("baseline", models="constant", **few).run().ok
 
 
 async def test_a_running_loop_is_told_what_to_await(folder):
@@ -116,17 +109,19 @@ async def test_a_running_loop_is_told_what_to_await(folder):
 
 
 async def test_money_is_spent_only_with_leave(folder):
-    study = Study("study.toml", models="dear", only={"opponent": "self", "memory_s": 2.0})
-    with pytest.raises(UsageError, match=r"spends money; yes=True goes ahead: .*trials  4 "):
+    only = {"opponent": "self", "memory_s": 2.0, "temperature": 0.2}
+    study = Study("study.toml", models="dear", only=only)
+    with pytest.raises(UsageError, match=r"spends money; yes=True goes ahead: .*trials  2 "):
         await study.arun()
     expected = await study.adry_run()
-    assert expected.trials == 4
+    assert expected.trials == 2
     assert (await study.arun(yes=True)).facts["cost_usd"] > 0
 
 
 async def test_a_study_is_asked_in_batches_for_half_the_price(folder, monkeypatch):
-    wanted = {"models": "dear", "only": {"opponent": "self", "memory_s": 2.0}}
-    async with watched(faults=FaultPlan(batch=BatchPlan(delay_s=0.1))) as server:
+    only = {"opponent": "self", "memory_s": 2.0, "temperature": 0.2}
+    wanted = {"models": "dear", "only": only, "conditions": ["N_0_0"]}
+    async with watched(faults=FaultPlan(batch=BatchPlan(delay_s=0.01))) as server:
         monkeypatch.setenv("EMULATOR_BASE_URL", f"{server.url}/v1")
         whole = await Study("study.toml", **wanted).arun(yes=True)
         elsewhere = {"db": "batched.duckdb", "cache": "batched"}
@@ -136,7 +131,8 @@ async def test_a_study_is_asked_in_batches_for_half_the_price(folder, monkeypatc
 
 
 async def test_trials_that_failed_are_in_the_outcome(folder):
-    outcome = await Study("study.toml", cache="none").areplay()
+    only = {"memory_s": 1.0, "opponent": "constant"}
+    outcome = await Study("study.toml", cache="none", only=only).areplay()
     assert (outcome.ok, outcome.exit_code) == (False, 4)
     assert f"error: {outcome.messages[0]}" in repr(outcome)
 

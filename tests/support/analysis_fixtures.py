@@ -14,6 +14,7 @@ from merge_runner_analysis.human.load import import_trials, sort_files
 from merge_runner_analysis.tables import make_tables
 from tests.support.recordings import drive, write_folder
 from tests.support.studies import ANSWERS, Said, write_study, yielding
+from tests.support.tables import QUICK
 
 CONFIG = {"models": {"o3": {"id": "o3", "aliases": ["o3-alias"]}}}
 # What went wrong at one decision of the first trials of A1; who drove it did not change.
@@ -65,8 +66,9 @@ def small(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tables(study):
-    """All tables of the study by name."""
-    return {table.name: table for table in make_tables(study)}
+    """All tables of the study by name; the verdicts are of one driver, which takes seconds."""
+    verdicts = make_tables(Study(study.db, ["other"]), ["verdicts"])
+    return {table.name: table for table in [*verdicts, *make_tables(study, QUICK)]}
 
 
 @pytest.fixture(scope="session")

@@ -35,8 +35,10 @@ prompt = ["baseline", "A1"]
 
 
 def killed(db: Path) -> None:
-    """A sweep that was killed: two trials, and no end."""
-    write_study(db, yielding("o3", reps=1)[5:7], asked=OWN)
+    """A sweep that was killed: two trials of vehicles of 8 m, at a temperature, and no end."""
+    body = {"model": "o3", "messages": [], "temperature": 0.2, "max_tokens": 4000}
+    asked = {"endpoint": "openai", "body": body}
+    write_study(db, yielding("o3", reps=1)[5:7], ScenarioConfig(vehicle_length_m=8.0), asked=asked)
     changed(db, "UPDATE sweeps SET ended_at = NULL, exit_code = NULL")
 
 
@@ -44,17 +46,6 @@ def stand_in_behind_o3(db: Path) -> None:
     """The emulator at OPENAI_BASE_URL, asked for o3."""
     write_study(db, yielding("o3", reps=1)[:2], asked=OWN)
     changed(db, "UPDATE trials SET scripted = true")
-
-
-def other_vehicle_length(db: Path) -> None:
-    """Vehicles of 8 m."""
-    write_study(db, yielding("o3", reps=1)[:2], ScenarioConfig(vehicle_length_m=8.0), asked=OWN)
-
-
-def temperature(db: Path) -> None:
-    """A model that was sent a temperature of 0.2."""
-    body = {"model": "gpt", "messages": [], "temperature": 0.2, "max_tokens": 4000}
-    write_study(db, yielding("gpt", reps=1)[:2], asked={"endpoint": "openai", "body": body})
 
 
 def only_failed(db: Path) -> None:
@@ -116,8 +107,8 @@ def complete_import(db: Path) -> None:
 KINDS: dict[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
-        killed, stand_in_behind_o3, other_vehicle_length, temperature, only_failed, separated,
-        all_tied, two_studies, crossed_programs, mirrored_chance, complete_import,
+        killed, stand_in_behind_o3, only_failed, separated, all_tied, two_studies,
+        crossed_programs, mirrored_chance, complete_import,
     )
 }  # fmt: skip
 

@@ -18,8 +18,10 @@ SAID = {
         [
             "o3: 2 finished trials, too few to say whether it drives like humans.",
             "ollisions: inconclusive.",
+            "vehicle_length_m = 8.0",
+            "temperature = 0.2",
         ],
-        ["o3 does not drive", "o3 collides"],
+        ["o3 does not drive", "o3 collides", "no temperature", "default sampling temperature"],
     ),
     "stand_in_behind_o3": (
         [
@@ -30,15 +32,10 @@ SAID = {
         ],
         ["o3 does not drive"],
     ),
-    "other_vehicle_length": (["vehicle_length_m = 8.0"], []),
-    "temperature": (["temperature = 0.2"], ["no temperature", "default sampling temperature"]),
     "only_failed": (
         ["No language model can be compared with humans yet.", "Trials failed"],
         ["o3 does not drive"],
     ),
-    "separated": (["o3/baseline: "], ["effect of headway on who merges first"]),
-    # Half of its trials do nothing: what does nothing is not late.
-    "all_tied": (["o3/baseline: "], ["acts late"]),
 }
 
 

@@ -29,7 +29,6 @@ files = {[f"{kind}.py" for kind in KINDS]}
 WITH = ("--study", "study.toml", "--trust")
 WARNING = "Mind the speed of the other car: at "
 NAME, HEADING = "mean_abs_acceleration_mps2", "mean |a| (m/s²)"
-FORMATS = {"text": HEADING, "csv": NAME, "md": r"mean \|a\|", "latex": "$|$a$|$"}
 MEAN = """
 SELECT avg(a) FROM (SELECT avg(abs(acceleration_mps2)) AS a FROM states
 JOIN trials USING (trial_id, spec_hash) WHERE time_s > 0 AND status = 'finished'
@@ -123,10 +122,9 @@ def test_who_keeps_the_speed_of_a_condition_deviates_from_it_by_nothing(rows):
     ) == [(0.0,)]
 
 
-def test_a_metric_is_in_the_tables_in_every_format_and_leads_to_its_trials(run, rows):
-    for name, heading in FORMATS.items():
-        out = run("tables", "indicators", "contrasts", "--format", name, *WITH).out
-        assert out.count(heading) >= 2, name
+def test_a_metric_is_in_the_tables_and_leads_to_its_trials(run, rows):
+    latex = run("tables", "indicators", "contrasts", "--format", "latex", *WITH).out
+    assert latex.count("$|$a$|$") >= 2
     told = json.loads(run("tables", "ablation-quantitative", "--format", "json", *WITH).out)
     table = {row["row"]: row for row in told["tables"][0]["rows"]}
     row = table["emulator+impulsive/A8"]

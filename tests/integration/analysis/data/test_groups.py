@@ -22,11 +22,17 @@ from tests.support.tables import QUICK, by_id, made, notes_with
 SCRIPTED = "UPDATE trials SET scripted = true WHERE "
 
 
-@pytest.fixture
-def db(tmp_path):
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
     """Three repetitions of two drivers."""
     drives = [*yielding("o3", reps=3), *yielding("other", reps=3)]
-    return write_study(tmp_path / "t.duckdb", drives)
+    return write_study(tmp_path_factory.mktemp("groups") / "t.duckdb", drives)
+
+
+@pytest.fixture
+def db(written, tmp_path):
+    (tmp_path / "t.duckdb").write_bytes(written.read_bytes())
+    return tmp_path / "t.duckdb"
 
 
 def alarms_of(study):
@@ -40,20 +46,18 @@ def listed(study, table, cell):
     return len(source.trials)
 
 
-@pytest.mark.parametrize(
-    ("url", "name"),
-    [
-        ("openai", "o3"),
-        ("http://localhost:8080/v1", "o3 at localhost:8080"),
-        ("https://gateway.example", "o3 at gateway.example"),
-    ],
-)
-def test_a_driver_is_named_by_its_endpoint_unless_that_is_the_providers_own(db, url, name):
-    asked = {"endpoint": url, "body": {"model": "o3"}}
-    spec = json.dumps({"left": asked, "right": asked})
-    study = changed(db, f"UPDATE specs SET spec = '{spec}' WHERE spec_hash = 'o3-baseline'")
-    assert [group.driver for group in study.models] == [name, "other"]
-    assert [group.id for group in Study(db, [name]).models] == [f"{name}/baseline"]
+def test_a_driver_is_named_by_its_endpoint_unless_that_is_the_providers_own(tmp_path):
+    urls = {"o3": "openai", "a": "http://localhost:8080/v1", "b": "https://gateway.example"}
+    drives = [yielding(name, reps=1)[0] for name in urls]
+    db = write_study(tmp_path / "t.duckdb", drives)
+    for name, url in urls.items():
+        asked = {"endpoint": url, "body": {"model": name}}
+        spec = json.dumps({"left": asked, "right": asked})
+        changed(db, f"UPDATE specs SET spec = '{spec}' WHERE spec_hash = '{name}-baseline'")
+    names = {group.driver for group in Study(db).models}
+    assert names == {"o3", "a at localhost:8080", "b at gateway.example"}
+    (chosen,) = Study(db, ["a at localhost:8080"]).models
+    assert chosen.id == "a at localhost:8080/baseline"
 
 
 def test_who_was_asked_is_read_from_the_columns_and_not_from_a_trials_name(db):
@@ -85,13 +89,13 @@ def test_stand_ins_stand_last_and_every_row_of_theirs_says_so(db):
             assert table.notes.count("* o3: scripted stand-in, not o3") == 1, table.name
 
 
-@pytest.mark.parametrize("name", ["emulator", "random"])
-def test_a_mock_model_is_a_stand_in_for_no_model(tmp_path, name):
-    db = write_study(tmp_path / "t.duckdb", yielding(name, reps=1)[:3])
-    study = changed(db, SCRIPTED + "true")
-    assert [group.label for group in study.models] == [
-        f"{name} (scripted stand-in, no language model)"
-    ]
+def test_a_mock_model_is_a_stand_in_for_no_model(tmp_path):
+    drives = [yielding(name, reps=1)[0] for name in ("emulator", "random")]
+    study = changed(write_study(tmp_path / "t.duckdb", drives), SCRIPTED + "true")
+    assert {group.label for group in study.models} == {
+        "emulator (scripted stand-in, no language model)",
+        "random (scripted stand-in, no language model)",
+    }
     assert alarms_of(study) == {}, "nobody takes it for a model"
 
 

@@ -154,37 +154,29 @@ def test_mirrored_trials_stand_in_the_condition_that_their_ego_saw(both):
     assert numbers.tolist() == [-4.0, 0.8]
 
 
-@pytest.mark.parametrize(
-    ("name", "conditions", "seen"),
-    [
-        ("alone", [OWN.format("fast", 4)], {"fast", "fast mirrored"}),
-        ("pair", [OWN.format("fast", 4), OWN.format("tsaf", -4)], {"fast", "tsaf"}),
-    ],
-)
-def test_a_condition_that_has_no_mirror_image_is_named_after_itself(play, name, conditions, seen):
-    study = play(f"{MIRROR}\nconditions = [{', '.join(conditions)}]", name)
-    assert set(load_trials(study.db)["condition"]) == seen
+def test_a_condition_that_has_no_mirror_image_is_named_after_itself(play):
+    conditions = [OWN.format(*at) for at in (("alone", 2), ("fast", 4), ("tsaf", -4))]
+    study = play(f"{MIRROR}\nconditions = [{', '.join(conditions)}]", "own")
+    seen = {*load_trials(study.db)["condition"]}
+    assert seen == {"alone", "alone mirrored", "fast", "tsaf"}
 
 
-@pytest.mark.parametrize("ego", ["left", "right"])
-def test_a_planted_cue_has_its_sign_on_whichever_side_the_ego_sits(tmp_path, ego):
+def test_a_planted_cue_has_its_sign_on_whichever_side_the_ego_sits(tmp_path):
     """The left vehicle of ``yielding`` goes first where it is ahead; it is a model's either way."""
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=5))
     expected = who_first_logit(load_trials(db)).terms
     body, program = {"endpoint": "openai", "body": {"model": "o3"}}, {"program": "p"}
-    left, right = ("o3", "aaa") if ego == "left" else ("aaa", "o3")
-    sides = {"left": body, "right": program} if ego == "left" else {"left": program, "right": body}
-    study = changed(
-        db,
-        f"UPDATE trials SET model_left = '{left}', model_right = '{right}'",
-        f"UPDATE specs SET spec = '{json.dumps(sides)}'",
-    )
-    (group,) = study.models
-    assert (group.driver, group.models) == ("o3+aaa", ("o3", "aaa"))
-    found = fits(group).logit.terms
-    assert found["projected_headway"].b == pytest.approx(expected["projected_headway"].b)
-    sign = 1 if ego == "left" else -1
-    assert found["intercept"].b == pytest.approx(sign * expected["intercept"].b)
+    for ego, other, sign in (("left", "right", 1), ("right", "left", -1)):
+        study = changed(
+            db,
+            f"UPDATE trials SET model_{ego} = 'o3', model_{other} = 'aaa'",
+            f"UPDATE specs SET spec = '{json.dumps({ego: body, other: program})}'",
+        )
+        (group,) = study.models
+        assert (group.driver, group.models) == ("o3+aaa", ("o3", "aaa"))
+        found = fits(group).logit.terms
+        assert found["projected_headway"].b == pytest.approx(expected["projected_headway"].b)
+        assert found["intercept"].b == pytest.approx(sign * expected["intercept"].b)
 
 
 EGOS = [

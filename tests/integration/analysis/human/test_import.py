@@ -65,26 +65,26 @@ def test_importing_twice_or_beside_a_sweep_leaves_the_database_as_it_was(path):
     assert results_digest(path) == before
 
 
-@pytest.mark.parametrize(
-    ("name", "row", "value"),
-    [
-        ("velocities.left", 120, 9.0),
-        ("travelled_distance.right", 120, 60.0),
-        ("end_state", 0, "Collided"),
-        ("dt", 0, 51),
-    ],
-)
-def test_a_trial_that_is_stored_with_other_values_is_named_and_kept(path, name, row, value):
-    first = {"a/experiment_4_iter_1.csv": LEFT.csv(), "b/experiment_4_iter_1.csv": LEFT.csv()}
+OTHER = [
+    ("velocities.left", 120, 9.0),
+    ("travelled_distance.right", 120, 60.0),
+    ("end_state", 0, "Collided"),
+    ("dt", 0, 51),
+]
+
+
+def test_a_trial_that_is_stored_with_other_values_is_named_and_kept(path):
+    names = [f"experiment_4_iter_{number}.csv" for number in range(len(OTHER))]
+    first = {f"{folder}/{name}": LEFT.csv() for name in names for folder in "ab"}
     report = imported(path, first)
-    assert (report.added, report.there) == (1, 1)
-    kept = "from states where trial_id like '%iter001' order by step, side"
-    before = rows(path, "from trials"), rows(path, kept)
-    other = changed(LEFT, name, row, value)
-    report = imported(path, {"experiment_4_iter_1.csv": other, "experiment_4_iter_2.csv": other})
+    assert (report.added, report.there) == (4, 4)
+    kept = "from states where trial_id not like '%iter009' order by trial_id, step, side"
+    before = rows(path, "from trials order by rep"), rows(path, kept)
+    other = {name: changed(LEFT, *change) for name, change in zip(names, OTHER, strict=True)}
+    report = imported(path, other | {"experiment_4_iter_9.csv": LEFT.csv()})
     assert (report.added, report.there) == (1, 0)
-    assert report.differing == ["human/pair1/L_4_0/iter001"]
-    assert (rows(path, "from trials where rep = 1"), rows(path, kept)) == before
+    assert sorted(report.differing) == [f"human/pair1/L_4_0/iter00{number}" for number in range(4)]
+    assert (rows(path, "from trials where rep < 9 order by rep"), rows(path, kept)) == before
 
 
 def test_what_cannot_be_read_says_why_and_the_rest_is_imported(path):

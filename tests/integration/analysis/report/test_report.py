@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import re
+import struct
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 
 from merge_runner.errors import UsageError
-from merge_runner_analysis.data.derived_cache import keep_finished
 from merge_runner_analysis.data.provenance import provenance, tally
 from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.figures import FIGURES
-from merge_runner_analysis.report.page import alarms, finished_figures, report_html, write_report
+from merge_runner_analysis.figures.figure_2 import PAGE_IN
+from merge_runner_analysis.figures.gallery import rendered, write_figures
+from merge_runner_analysis.report.page import alarms, report_html, write_report
 from merge_runner_analysis.tables import TABLES, make_tables
 from tests.support.studies import Said, changed, write_study, yielding
 
@@ -38,17 +40,9 @@ class Page(HTMLParser):
         self.words.append(data)
 
 
-def without_drawing(study):
-    """The study, with figures kept already: drawing takes most of a report's time."""
-    kept = {f"{name}.svg": "PHN2Zy8+" for name in FIGURES}
-    keep_finished(study.db, study.state, study.options, kept)
-    return study
-
-
 @pytest.fixture(scope="module")
 def page(study, tables):
-    figures = finished_figures(without_drawing(study))
-    return Page(report_html(study, list(tables.values()), figures))
+    return Page(report_html(study, list(tables.values()), dict.fromkeys(FIGURES, "PHN2Zy8+")))
 
 
 def test_the_page_needs_no_network_runs_nothing_and_every_link_leads_somewhere(page):
@@ -76,6 +70,7 @@ def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_fac
         "THEN 'You are late.' ELSE 'There is time.' END",
     )
     text = report_html(study, make_tables(study, ["factors", "gap"]), {})
+    assert "Read this first" not in text
     assert "<body>\n<h1>Who is &lt;first&gt;?</h1>" in text
     conditions = ", ".join(sorted(study.conditions))
     parts = ['id="design"', conditions, "There is time.", "-There is time.\n+You",
@@ -83,8 +78,6 @@ def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_fac
     places = [text.index(part) for part in parts]
     assert places == sorted(places)
     assert text.count('id="factors"') == 1
-    again = Study(study.db)
-    assert report_html(again, make_tables(again, ["factors", "gap"]), {}) == text
 
 
 def asking(folder, said, *, variant="baseline"):
@@ -110,9 +103,7 @@ def test_what_went_wrong_stands_at_the_top_before_any_number(page):
 
 
 def test_a_study_in_which_nothing_went_wrong_has_no_warning(tmp_path):
-    study = asking(tmp_path, Said(), variant="A1")
-    assert alarms_of(study) == {}
-    assert "Read this first" not in report_html(study, [], {})
+    assert alarms_of(asking(tmp_path, Said(), variant="A1")) == {}
 
 
 def test_another_served_model_is_loud_and_its_name_is_shown_as_text(tmp_path):
@@ -171,13 +162,24 @@ def test_a_call_that_several_trials_used_was_made_and_paid_once(tmp_path):
     assert (row.calls, row.retries, row.cost_usd) == (1, 1, 0.02)
 
 
-def test_the_report_writes_all_its_parts_as_files(small, tmp_path):
-    db = Path(tmp_path / "t.duckdb")
-    db.write_bytes(small.db.read_bytes())
-    paths = list(write_report(Study(db), tmp_path / "r/report.html", tmp_path / "r/files"))
-    assert (tmp_path / "r/report.html") in paths
-    for name in TABLES:
-        for suffix in ("txt", "csv", "json", "md", "tex"):
-            assert (tmp_path / "r/files" / f"{name}.{suffix}").stat().st_size > 50
+def test_the_report_writes_all_its_parts_as_files(tmp_path):
+    study = Study(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)[:4]))
+    out, files = tmp_path / "r/report.html", tmp_path / "r/files"
+    written = {*write_report(study, out, files)}
+    parts = {f"{name}.{form}" for name in FIGURES for form in ("pdf", "png")}
+    parts |= {f"{name}.{form}" for name in TABLES for form in ("txt", "csv", "json", "md", "tex")}
+    assert written == {out, *(files / part for part in parts)}
+    assert all(path.stat().st_size > 50 for path in written)
+    pdf = (files / "figure2.pdf").read_bytes()
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", pdf)
+    assert float(box[1]) == pytest.approx(72 * PAGE_IN, abs=0.5)
+    assert b"/Type /Font" in pdf, "text stays text"
+    width, _ = struct.unpack(">II", (files / "figure2.png").read_bytes()[16:24])
+    assert width == round(300 * PAGE_IN)
+    for form in ("pdf", "png"):  # equal results give equal files
+        again = rendered(Study(study.db), "first-action", form)
+        assert again == (files / f"first-action.{form}").read_bytes()
+    with pytest.raises(UsageError, match="cannot be made"):
+        list(write_figures(study, out))
     with pytest.raises(UsageError, match="cannot be written"):
-        list(write_report(without_drawing(Study(db)), tmp_path, None))
+        list(write_report(study, tmp_path, None))

@@ -1,0 +1,12 @@
+"""The numbers of more databases stay what they are."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.integration.test_frozen_numbers import MORE_DATABASES, check
+
+
+@pytest.mark.parametrize("name", MORE_DATABASES)
+def test_every_number_of_every_table_is_what_it_was(name, tmp_path):
+    check(name, tmp_path)
