@@ -15,13 +15,14 @@ from merge_runner.config import PERFECT, Perception, ScenarioConfig
 from merge_runner.drivers.base import Seat, take_seat
 from merge_runner.drivers.pace import program_pace
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.records import FAR_BEHIND_M, SIDES, TrialSpec
+from merge_runner.records import FAR_BEHIND_M, SIDES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
-from merge_runner.trial import Eyes, error_process, play_trial
+from merge_runner.trial import Eyes, error_process
+from tests.support import driven_trials
+from tests.support.driven_trials import OTHER, both
 
-OTHER = {"left": "right", "right": "left"}
 FOGGY = {
     "position_sd_m": 0.5,
     "speed_sd_mps": 0.3,
@@ -250,15 +251,9 @@ def test_no_speed_appears_negative():
     assert max(seen.other_speed_mps for seen in told) > 1.0
 
 
-def spec_of(condition="L_4_-8", repetition=1, model="projected-order"):
-    told = ("trial", "hash", "driver", model, model, "baseline", condition, repetition, 0, 0)
-    return TrialSpec(*told, kinematics=CONDITIONS[condition])
-
-
-async def play(name="projected-order", spec=None, **scenario):
-    task, spec = ScenarioConfig(**scenario), spec or spec_of()
-    drivers = {side: PROGRAMS[name].make(task, spec, side) for side in SIDES}
-    return await play_trial(spec, task, drivers)
+async def play(name="projected-order", condition="L_4_-8", repetition=1, **scenario):
+    task = ScenarioConfig(**scenario)
+    return await driven_trials.play(both(PROGRAMS[name]), condition, repetition, scenario=task)
 
 
 def outcome(trial):
@@ -292,18 +287,18 @@ async def test_both_sides_have_errors_of_their_own_and_a_slot_keeps_its_errors()
             if row.side == side
         ][:4]
 
-    trial = await play("constant", spec_of("N_0_0"), **noisy)
+    trial = await play("constant", "N_0_0", **noisy)
     assert errors(trial, "left") != errors(trial, "right")
-    other = await play("projected-order", spec_of("N_0_0"), **noisy)
+    other = await play("projected-order", "N_0_0", **noisy)
     for side in SIDES:
         assert errors(trial, side) == pytest.approx(errors(other, side))
-    again = await play("constant", spec_of("N_0_0", repetition=2), **noisy)
+    again = await play("constant", "N_0_0", 2, **noisy)
     assert errors(again, "left") != errors(trial, "left")
 
 
 async def test_the_first_decision_of_a_program_at_20_hz_is_seen_as_the_first_of_a_slow_one():
     """The seed is the seat's, not the driver's."""
-    spec, noisy = spec_of("N_0_0"), {"position_sd_m": 1.0}
+    spec, noisy = driven_trials.spec("N_0_0"), {"position_sd_m": 1.0}
     seen = []
     for rate_hz in (1.0, 5.0):
         task = ScenarioConfig(perception_left=noisy)

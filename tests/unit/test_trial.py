@@ -14,6 +14,8 @@ from merge_runner.errors import CallFailed, SweepStopped, TrialSuspended, UsageE
 from merge_runner.records import SIDES, Attempt, ChatRequest, Decision, Slot
 from merge_runner.results.database import SCHEMA
 from merge_runner.trial import play_trial
+from tests.support import driven_trials
+from tests.support.driven_trials import both
 from tests.support.specs import spec_of
 
 EXECUTED = 5
@@ -32,9 +34,8 @@ async def play(left, right, condition="N_0_0", *, in_turn=False, **scenario):
 
 
 async def play_constant(condition="N_0_0", **scenario):
-    task, spec = ScenarioConfig(**scenario), spec_of(condition)
-    drivers = {side: PROGRAMS["constant"].make(task, spec, side) for side in SIDES}
-    return await play_trial(spec, task, drivers)
+    programs = both(PROGRAMS["constant"])
+    return await driven_trials.play(programs, condition, scenario=ScenarioConfig(**scenario))
 
 
 class Holding:
@@ -231,9 +232,12 @@ async def test_an_error_that_is_no_failed_call_is_not_hidden():
         await play(Holding(0.0), Failing(0.0, at=1, error=ZeroDivisionError()))
 
 
-async def test_under_own_exit_the_driver_in_the_tunnel_is_not_asked():
+async def test_under_own_exit_alone_the_driver_in_the_tunnel_is_not_asked():
     """In L_4_-8 the right car leaves its tunnel 0.785 s after the left one."""
     left, right = Holding(-0.5), Holding(-1.0)
+    at_once = Holding(-1.0)
+    await play(Holding(-0.5), at_once, "L_4_-8")
+    assert list(at_once.seen)[:2] == [0, 1]
     trial = await play(left, right, "L_4_-8", control_start="own_exit")
     assert list(left.seen)[:3] == [0, 1, 2]
     assert list(right.seen)[:2] == [1, 2]
@@ -248,13 +252,6 @@ async def test_under_own_exit_the_driver_in_the_tunnel_is_not_asked():
     # Who waits for number 0 would never begin: the reference says what is counted.
     (said,) = re.findall(r"decisions\.decision IS (.*?);", SCHEMA.read_text(), re.DOTALL)
     assert "begins above 0 where it leaves its tunnel later" in said
-
-
-async def test_under_both_exits_both_are_asked_from_the_beginning():
-    left, right = Holding(-0.5), Holding(-1.0)
-    await play(left, right, "L_4_-8")
-    assert list(left.seen) == list(right.seen)
-    assert 0 in right.seen
 
 
 class Fast(Holding):

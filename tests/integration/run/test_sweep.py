@@ -280,7 +280,7 @@ async def test_a_dry_run_tells_and_touches_nothing(merge_runner, tmp_path):
 
 async def test_a_dry_run_counts_the_trials_of_programs_that_are_not_stored(merge_runner):
     part = ("sweep", "baseline", "--model", "idm", "--model", "idm+constant", "--reps", 2)
-    for trials in (44, 40):
-        told = await merge_runner(*part, "--dry-run", "--json")
+    await merge_runner(*part, "--conditions", "N_0_0")
+    for trials, db in ((44, ("--db", "none")), (40, ())):
+        told = await merge_runner(*part, "--dry-run", "--json", *db)
         assert (told.summary["trials"], told.summary["calls"]) == (trials, 0)
-        await merge_runner(*part, "--conditions", "N_0_0")

@@ -39,6 +39,8 @@ def test_models_factors_and_prompts_are_crossed_and_named_by_what_varies(plan_of
         "seed": "7",
     }
     assert bodies(plan) == {0.2, 1.0}
+    assert len({spec.spec_hash for spec in specs}) == len(plan.arms)
+    assert set(plan.registered.values()) == {"emulator", "local"}
 
 
 def test_more_trials_than_can_be_played_are_refused_before_they_are_built(plan_of):
@@ -55,32 +57,35 @@ def test_more_trials_than_can_be_played_are_refused_before_they_are_built(plan_o
         make_plan("baseline", repetitions=100_000)
 
 
-def test_a_level_is_another_request_and_another_spec(plan_of):
-    plan = plan_of("[factors]\ntemperature = [0.2, 1.0]\n")
-    first, second = plan.trial_specs()[0], plan.trial_specs()[1]
-    assert first.spec_hash != second.spec_hash
-    assert set(plan.entries) == {"emulator temperature=0.2", "emulator temperature=1.0"}
-    assert set(plan.registered.values()) == {"emulator"}
-
-
 def test_what_is_the_default_already_is_not_sent(plan_of):
     plan = plan_of("[factors]\ntemperature = [1.0]\n", ["o3"])
     assert plan.entries == make_plan("baseline", "o3").entries
 
 
-def test_default_leaves_a_parameter_as_the_registry_has_it(plan_of):
-    plan = plan_of('[factors]\nreasoning_effort = ["default", "low"]\n', ["o3"])
-    efforts = [entry.parameters["reasoning_effort"] for entry in plan.entries.values()]
-    assert efforts == ["medium", "low"]
-
-
-def test_common_names_stand_where_the_format_wants_them(plan_of):
-    plan = plan_of('[factors]\nreasoning_effort = ["low"]\n', ["gpt-6-sol"])
-    (entry,) = plan.entries.values()
-    assert entry.parameters["reasoning"] == {"effort": "low"}
-    plan = plan_of("[factors]\nthinking_budget = [128]\n", ["gemini-2.5-pro"])
-    (entry,) = plan.entries.values()
-    assert entry.parameters["thinkingConfig"] == {"thinkingBudget": 128}
+@pytest.mark.parametrize(
+    ("model", "factor", "sent"),
+    [
+        ("o3", 'reasoning_effort = ["default", "low"]', ["medium", "low"]),
+        ("gpt-6-sol", 'reasoning_effort = ["low"]', [{"effort": "low"}]),
+        ("gemini-2.5-pro", "thinking_budget = [128]", [{"thinkingBudget": 128}]),
+        # It has no parameter of this name.
+        (
+            "gemini-2.5-pro",
+            'reasoning_effort = ["low", "high"]',
+            [{"thinkingBudget": 1024}, {"thinkingBudget": 24576}],
+        ),
+        # What is no table gives way to one.
+        ("mine", 'reasoning_effort = ["low"]', [{"effort": "low"}]),
+    ],
+)
+def test_common_names_stand_where_the_format_wants_them(plan_of, tmp_path, model, factor, sent):
+    entry = 'provider = "local"\nformat = "openai-responses"\nid = "m"\nmax_output_tokens = 9\n'
+    mine = f'[mine]\n{entry}parameters = {{ reasoning = "low" }}\n'
+    (tmp_path / "models.toml").write_text(mine)
+    entries = plan_of(f"[factors]\n{factor}\n", [model]).entries.values()
+    named = ("reasoning_effort", "reasoning", "thinkingConfig")
+    assert [entry.parameters[each] for entry in entries for each in named
+            if each in entry.parameters] == sent  # fmt: skip
 
 
 def test_an_opponent_drives_on_the_right_and_keeps_its_own_parameters(plan_of):
@@ -136,20 +141,6 @@ def test_levels_that_are_no_names_have_ids_of_their_own(plan_of):
     assert all(trial_id.isascii() and len(trial_id) < 120 for trial_id in ids)
 
 
-def test_effort_is_translated_for_a_model_that_has_no_parameter_of_this_name(plan_of):
-    plan = plan_of('[factors]\nreasoning_effort = ["low", "high"]\n', ["gemini-2.5-pro", "o3"])
-    sent = {
-        name: entry.parameters.get("thinkingConfig", entry.parameters.get("reasoning_effort"))
-        for name, entry in plan.entries.items()
-    }
-    assert sent == {
-        "gemini-2.5-pro reasoning_effort=low": {"thinkingBudget": 1024},
-        "gemini-2.5-pro reasoning_effort=high": {"thinkingBudget": 24576},
-        "o3 reasoning_effort=low": "low",
-        "o3 reasoning_effort=high": "high",
-    }
-
-
 def test_plain_sweeps_have_one_arm_for_each_prompt():
     plan = make_plan("ablations", "emulator")
     assert [arm.label for arm in plan.arms] == ["baseline", *(f"A{i}" for i in range(1, 8))]
@@ -179,14 +170,6 @@ def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
     }
     edited = plan_of(f'[factors]\nperception = ["foggy"]\n{FOGGY}dropout = 0.1\n')
     assert edited.trial_specs()[0].spec_hash not in {s.spec_hash for s in plan.trial_specs()}
-
-
-def test_a_parameter_within_what_is_no_table_takes_its_place(plan_of, tmp_path):
-    entry = 'provider = "local"\nformat = "openai-responses"\nid = "m"\nmax_output_tokens = 9\n'
-    (tmp_path / "models.toml").write_text(f'[mine]\n{entry}parameters = {{ reasoning = "low" }}\n')
-    plan = plan_of('[factors]\nreasoning_effort = ["low"]\n', ["mine"])
-    (entry,) = plan.arms[0].entries.values()
-    assert entry.parameters == {"reasoning": {"effort": "low"}}
 
 
 @pytest.mark.parametrize("scenario", ["", "[scenario]\nstep_s = 0.05\nplan_step_s = 0.2\n"])

@@ -52,13 +52,9 @@ def hashes(plan):
 MINE = '[drivers.mine]\nprogram = "braking"\n'
 
 
-async def test_a_driver_of_a_study_drives_by_its_parameters(plan_of):
-    trial = await played(plan_of(MINE + "strength = 0.5\n", "mine"))
-    assert {row.decision.applied for row in trial.decisions} == {(-0.5,)}
-
-
-def test_its_parameters_are_in_its_spec_and_another_value_is_another_spec(plan_of):
+async def test_a_driver_of_a_study_drives_by_its_parameters_and_has_them_in_its_spec(plan_of):
     plan = plan_of(MINE + "strength = 0.5\n", "mine")
+    assert {row.decision.applied for row in (await played(plan)).decisions} == {(-0.5,)}
     (spec,) = specs(plan)
     assert spec["left"]["parameters"] == {"set": "mild", "strength": 0.5, "unused": 1.0}
     assert (spec["left"]["program"], spec["left"]["based_on"]) == ("mine", "braking")

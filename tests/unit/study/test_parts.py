@@ -102,7 +102,7 @@ def test_an_edited_prompt_is_another_spec_at_once(plan_of):
         assert [each in prompt(plan, "taxi") for each in texts] == [each == text for each in texts]
 
 
-def test_blocks_are_removed_replaced_and_moved(plan_of):
+def test_blocks_are_removed_replaced_and_moved_and_their_place_is_in_the_hash(plan_of):
     plan = plan_of(
         '[factors]\nprompt = ["other"]\n[prompts.other]\nbased_on = "A2"\n'
         'remove = ["C3.safety", "C4"]\nreplace = { "C3.human" = "Drive like a robot." }\n'
@@ -111,13 +111,8 @@ def test_blocks_are_removed_replaced_and_moved(plan_of):
     rest = [name for name in blocks_of("A2") if name not in ("C0", "C3.safety", "C4")]
     assert list(plan.parts.prompts["other"].blocks) == ["C0", "C4", *rest]
     assert "Drive like a robot." in prompt(plan, "other")
-
-
-def test_the_place_of_a_block_is_in_the_hash_of_its_prompt(plan_of):
-    plan = plan_of(
-        '[factors]\nprompt = ["other"]\n[prompts.other]\nremove = ["C4"]\n'
-        'add = [{ after = "C0", block = "C4" }]\n'
-    )
+    moved = 'remove = ["C4"]\nadd = [{ after = "C0", block = "C4" }]\n'
+    plan = plan_of(f'[factors]\nprompt = ["other"]\n[prompts.other]\n{moved}')
     assert plan.parts.prompts["other"].digests != prompt_of("baseline").digests
 
 
