@@ -2,17 +2,15 @@
 
 from dataclasses import replace
 
-from merge_runner.records import SIDES, TrialSpec
-from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner.records import SIDES
 from merge_runner.trial import play_trial
+from tests.support.specs import spec_of
 
 OTHER = {"left": "right", "right": "left"}
 
 
 def spec(condition, repetition=1):
-    trial_id = f"test/baseline/{condition}/rep{repetition:02d}"
-    who = (trial_id, "test", "driver", "a", "b", "baseline", condition, repetition, 0, 0)
-    return TrialSpec(*who, kinematics=CONDITIONS[condition])
+    return spec_of(condition, repetition=repetition)
 
 
 def both(program):
