@@ -66,7 +66,7 @@ def test_tables_show_it_without_a_value_and_the_rest_as_if_it_were_not_there(mix
 
 
 def test_report_and_audit_say_that_it_is_not_judged_and_conclude_nothing(mixed):
-    table = made(Study(mixed), "verdicts")
+    table = made(Study(mixed, where={"prompt": ["baseline", "A1"]}), "verdicts")
     assert "bad" not in table.notes[0]
     ((title, text),) = alarms(Study(mixed), provenance(mixed)).items()
     assert title == "Too few valid decisions"

@@ -157,7 +157,6 @@ BLOCKS.register("C6", Block("x", "Text.", None, before="C9"))
 VARIANTS.register("A8", Variant(adds=frozenset({"C6"})))
 VARIANTS.register("A9", Variant(adds=frozenset({"C6"})))
 """
-CONDITION = how_to("add-a-condition") + "CONDITIONS.register({!r}, Condition({}, 0.0))"
 REFUSED = {
     "a world that is too coarse": (
         {"study": STUDY.replace("0.05", "0.2").replace("emulator+", "constant+")},
@@ -167,14 +166,11 @@ REFUSED = {
     ),
     "a condition beyond": (
         {
-            "condition": CONDITION.format("beyond", 60.0),
+            "condition": how_to("add-a-condition")
+            + "CONDITIONS.register('beyond', Condition(60.0, 0.0))",
             "study": STUDY.replace('"far"', '"beyond"'),
         },
         "at the merge point",
-    ),
-    "a name of two words": (
-        {"condition": CONDITION.format("too far", 8.0)},
-        "needs a name of letters",
     ),
     "a block without a place": (
         {"prompt-block": MISPLACED},

@@ -100,7 +100,7 @@ def test_a_mock_model_is_a_stand_in_for_no_model(tmp_path):
 
 
 def test_the_sides_of_a_stand_in_are_those_of_the_scripted_calls(tmp_path):
-    drives = [replace(drive, said={}) for drive in yielding("o3", reps=1)[:3]]
+    drives = [replace(yielding("o3", reps=1)[0], said={})]
     scripted = "UPDATE calls SET scripted = true WHERE side = 'left'"
     study = changed(write_study(tmp_path / "t.duckdb", drives), scripted, SCRIPTED + "true")
     assert study.models[0].label == "o3 (scripted stand-in on the left, not o3)"

@@ -133,10 +133,9 @@ def test_what_is_stored_before_an_interruption_stays(path, monkeypatch):
     assert (report.added, report.there) == (3, 2)
 
 
-@pytest.mark.parametrize("form", [list, packed])
-def test_a_page_gives_the_trials_that_the_recordings_give(tmp_path, form):
+def test_a_page_gives_the_trials_that_the_recordings_give(tmp_path):
     one, other = tmp_path / "pages.duckdb", tmp_path / "recordings.duckdb"
-    pages = {"plots/4_0.html": velocity_page(DRIVEN, form)}
+    pages = {"plots/4_0.html": velocity_page(DRIVEN, packed)}
     recordings = {
         f"experiment_{number}_iter_{label[2:]}.csv": DRIVEN[label].csv()
         for label, number in (("1-1", 4), ("3-12", 6))

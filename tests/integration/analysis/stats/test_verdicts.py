@@ -43,8 +43,8 @@ def rows(table):
     return {name: row.values for name, row in by_id(table).items()}
 
 
-@pytest.mark.parametrize(("collided", "n"), [(2, 9), (0, 9)])
-def test_few_collisions_are_tested_exactly_as_by_fisher(tmp_path, collided, n):
+def test_few_collisions_are_tested_exactly_as_by_fisher(tmp_path):
+    collided, n = 2, 9
     apart, together = ((0.4,) * 9, (-0.4,) * 9), ((0.1,) * 9, (0.1,) * 9)
     drives = [
         Drive("o3", "baseline", "N_0_0", rep, *(together if rep <= collided else apart))
