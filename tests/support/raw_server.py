@@ -35,7 +35,7 @@ CHAT = json.dumps(
 ).encode()
 
 
-def a_request(number: int = 0, prompt: str | None = None) -> ChatRequest:
+def a_request(number: int = 0, prompt: str | None = None, slot: Slot | None = None) -> ChatRequest:
     """What a client sends to any such server."""
     return make_request(
         provider="openai",
@@ -44,7 +44,7 @@ def a_request(number: int = 0, prompt: str | None = None) -> ChatRequest:
         path="/chat/completions",
         headers={},
         body={"prompt": prompt or f"number {number}"},
-        slot=Slot("N_0_0", 1, "left", number, 0),
+        slot=slot or Slot("N_0_0", 1, "left", number, 0),
     )
 
 
