@@ -83,19 +83,14 @@ def test_each_setting_alone_holds_where_a_statement_slips_through(unchanged, mon
 
 
 def test_the_settings_that_hold_where_duckdb_has_more_ways_out_than_are_listed_here(here):
-    settings = {
-        "enable_external_access": "false",
-        "lock_configuration": "true",
-        "temp_directory": "",
-    }
     found = dict(query(DB, "SELECT name, value FROM duckdb_settings()")[1])
-    assert settings.items() <= found.items()
+    names = ("enable_external_access", "lock_configuration", "temp_directory")
+    assert [found[name] for name in names] == ["false", "true", ""]
 
 
 def test_the_environment_and_the_program_s_variables_are_out_of_reach(here):
-    for variable in ("path", "sql", "connection", "os"):
-        refusal(f"FROM {variable}")
-    refusal("SELECT current_setting('x')")
+    for sql in ("FROM path", "FROM connection", "SELECT current_setting('x')"):
+        refusal(sql)
     for sql in ("FROM duckdb_settings()", "FROM duckdb_secrets()", "FROM duckdb_variables()"):
         assert os.environ["MERGE_RUNNER_TEST_SECRET"] not in str(query(DB, sql))
 
@@ -103,30 +98,19 @@ def test_the_environment_and_the_program_s_variables_are_out_of_reach(here):
 @pytest.mark.parametrize(
     ("sql", "rows"),
     [
-        ("SELECT count(*) FROM trials", [(0,)]),
-        ("select 1;", [(1,)]),
         ("/* one */ SELECT 1 -- ; two", [(1,)]),
-        ("FROM range(2)", [(0,), (1,)]),
+        ("FROM range(2);", [(0,), (1,)]),
         ("VALUES (1)", [(1,)]),
         ("WITH x AS (SELECT 1) FROM x", [(1,)]),
         ("SELECT ';INSERT INTO meta VALUES (9);'", [(";INSERT INTO meta VALUES (9);",)]),
         ("SELECT now()::TIMESTAMP < '2000-01-01'", [(False,)]),
+        ("SELECT * FROM trial_metrics JOIN trials USING (trial_id, spec_hash)", []),
+        *((sql, ANY) for sql in ("DESCRIBE trials", "SHOW TABLES", "SUMMARIZE meta")),
+        *((sql, ANY) for sql in ("EXPLAIN SELECT 1", "PIVOT meta ON schema_version")),
     ],
 )
-def test_a_query_is_answered(here, sql, rows):
+def test_a_query_of_any_form_is_answered(here, sql, rows):
     assert query(DB, sql)[1] == rows
-
-
-@pytest.mark.parametrize(
-    "sql",
-    [
-        *("DESCRIBE trials", "SHOW TABLES", "SUMMARIZE meta", "EXPLAIN SELECT 1", "TABLE meta"),
-        "PIVOT meta ON schema_version USING count(*)",
-        "SELECT * FROM trial_metrics JOIN trials USING (trial_id, spec_hash)",
-    ],
-)
-def test_every_form_of_a_query_works(here, sql):
-    assert query(DB, sql)[0]
 
 
 @pytest.mark.parametrize(
@@ -144,9 +128,6 @@ def test_a_refusal_says_what_is_wrong(here, sql, says):
 
 
 async def test_the_program_refuses_with_a_line_and_no_traceback(here, merge_runner):
-    for sql, lines in (("DROP TABLE meta", 1), ("FROM read_text('private.csv')", 4), ("", 1)):
-        run = await merge_runner("sql", sql, cwd=here)
-        assert (run.code, run.out) == (2, "")
-        assert run.err.startswith("error: ")
-        assert len(run.err.splitlines()) <= lines
-        assert "Traceback" not in run.err
+    run = await merge_runner("sql", "DROP TABLE meta", cwd=here)
+    assert (run.code, run.out, len(run.err.splitlines())) == (2, "", 1)
+    assert run.err.startswith("error: ")
