@@ -26,9 +26,14 @@ max_output_tokens = 4000
 price = {{ input = 2.0, output = 8.0, source = "made up" }}
 batch = {{ price_factor = 0.5, source = "made up" }}
 """
-# One decision of two drivers in 11 conditions: one batch.
-STUDY = "[repetitions]\nbaseline = 1\n[scenario]\ntimeout_s = 1\n"
-LINES = 22
+# One decision of two drivers in 3 conditions: one batch.
+STUDY = """
+repetitions = 1
+conditions = ["L_4_0", "N_0_0", "R_-4_8"]
+[scenario]
+timeout_s = 1
+"""
+LINES = 6
 KINDS = {
     "upload": re.compile("POST .*/files"),
     "create": re.compile("POST (/v1/batches|/v1/messages/batches|.*:batchGenerateContent)"),
@@ -158,41 +163,40 @@ CANCELLED = {"status": "cancelled"}
 FAILED = {"status": "failed", "errors": {"data": [{"code": "server_error", "message": "no"}]}}
 # The provider, what stands between, what the emulator does, and how many answers are asked again.
 CASES = {
-    **{f"odd lines and a state that goes back, {provider}":
-        (provider, lambda: (lines(odd), goes_back()), {}, 0) for provider in FORMATS},
-    "a second answer": ("openai", lambda: (lines(with_another_answer),), {}, 0),
-    "a broken line": ("openai", lambda: (lines(lambda these: [b"{\n", *these[1:]]),), {}, 1),
-    "a missing line": ("anthropic", lambda: (lines(lambda these: these[1:]),), {}, 1),
-    "failed lines, results late": ("openai", tuple, {"failed": 0.4, "late_results": 2}, 0),
-    "expired lines, 500 at results": (
-        "gemini", lambda: (first("results", status(500)),), {"expired": 0.4}, 0
+    "500 before an upload and after a creation, a web page at a state, cut results": (
+        "openai",
+        lambda: (first("upload", status(500)), first("create", failed_after),
+                 first("state", no_json), first("results", cut_after), lines(odd), goes_back()),
+        {"failed": 0.4, "late_results": 2}, 0,
     ),
-    "all expired": ("anthropic", tuple, {"expired": 1.0}, 0),
+    "500 after an upload, before a creation and at results, expired lines, few tokens": (
+        "gemini",
+        lambda: (first("upload", failed_after), first("create", status(500)),
+                 first("results", status(500)), lines(odd), goes_back()),
+        {"expired": 0.4, "enqueued_tokens": 14_000}, 0,
+    ),
+    "429 at a creation, 503 at a state, short results that are cut": (
+        "anthropic",
+        lambda: (first("create", status(429, **{"retry-after": "0"})),
+                 first("state", status(503), 2), first("results", cut_after, 2),
+                 lines(odd), goes_back()),
+        {"short_results": 1}, 0,
+    ),
+    "a second answer, a broken line": (
+        "openai",
+        lambda: (lines(with_another_answer), lines(lambda these: [b"{\n", *these[1:]])), {}, 1,
+    ),
+    "a missing line": ("anthropic", lambda: (lines(lambda these: these[1:]),), {}, 1),
     "a failed batch": ("openai", lambda: (changed("state", FAILED),), {}, LINES),
     "a cancelled batch": (
         "openai", lambda: (changed("state", CANCELLED),), {"expired": 0.4}, LINES
     ),
-    "500 before an upload and after a creation, a web page at a state, cut results": (
-        "openai",
-        lambda: (first("upload", status(500)), first("create", failed_after),
-                 first("state", no_json), first("results", cut_after)), {}, 0,
-    ),
-    "500 after an upload and before a creation": (
-        "gemini", lambda: (first("upload", failed_after), first("create", status(500))), {}, 0
-    ),
     "500 where no mark is": ("anthropic", lambda: (first("create", failed_after),), {}, LINES),
-    "429 at a creation, 503 at a state, short results that are cut": (
-        "anthropic",
-        lambda: (first("create", status(429, **{"retry-after": "1"})),
-                 first("state", status(503), 2), first("results", cut_after, 2)),
-        {"short_results": 1}, 0,
-    ),
     "a cut upload, no id": (
         "gemini", lambda: (first("upload", cut_before), changed("create", {"name": 7})), {}, 0
     ),
     "a cut creation": ("openai", lambda: (first("create", cut_after),), {}, 0),
     "no answer to creations": ("gemini", tuple, {"lost": 1.0}, 0),
-    "few tokens": ("gemini", tuple, {"enqueued_tokens": 14_000}, 0),
 }  # fmt: skip
 PLAIN = {}
 

@@ -59,15 +59,16 @@ async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tm
     sweep = configured(tmp_path, deadline_s=1.2)
     async with watched(middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(*sweep, "--reps", 1, **env)
+        sweep = (*sweep, "--reps", 1, "--conditions", "L_4_8,N_0_0,L_4_0")
+        run = await merge_runner(*sweep, **env)
         assert run.code == 1
-        assert run.summary["trials"]["finished"] == 10
+        assert run.summary["trials"]["finished"] == 2
         ((trial, error),) = run.summary["failed"].items()
         assert trial == "patient/baseline/L_4_8/rep01"
         assert "no answer within 1 s (HTTP 503: The engine is down.), 2 attempts" in error
         before = server.requests
         mended = True
-        again = await merge_runner(*sweep, "--reps", 1, **env)
+        again = await merge_runner(*sweep, **env)
         assert again.code == 0, again.err
     # The attempts in vain are not forgotten, and what had been answered was not asked again.
     told = await merge_runner(
@@ -77,12 +78,12 @@ async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tm
     )  # fmt: skip
     assert json.loads(told.out) == [{"fate": "retried", "n": 2}]
     assert server.requests - before < 20
-    assert again.summary["trials"]["stored_before"] == 10
+    assert again.summary["trials"]["stored_before"] == 2
 
 
 async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_path):
     service = Service(working=False)
-    sweep = (*configured(tmp_path, deadline_s=0.6), "--reps", 3)
+    sweep = (*configured(tmp_path, deadline_s=0.6), "--reps", 2)
     async with watched(service.middle) as server:
         env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         run = await merge_runner(*sweep, "--in-flight", 4, **env)
@@ -92,13 +93,13 @@ async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_pat
         )
         assert "run the same command to go on" in run.err
         assert run.summary["trials"]["failed"] <= 14
-        # Two sides of at most 14 of 33 trials, with two or three attempts each.
+        # Two sides of at most 14 of 22 trials, with two or three attempts each.
         assert server.requests <= 2 * 14 * 3
         service.working = True
         configured(tmp_path, deadline_s=60)
         again = await merge_runner(*sweep, "--in-flight", 20, **env)
     assert again.code == 0, again.err
-    assert again.summary["trials"]["finished"] + again.summary["trials"]["collided"] == 33
+    assert again.summary["trials"]["finished"] + again.summary["trials"]["collided"] == 22
 
 
 STREAM = ('data: {"choices": [{"delta": {"content": "M"}}]}\n\ndata: [DONE]\n', "text/event-stream")
@@ -140,13 +141,12 @@ async def test_a_quota_that_is_used_up_in_the_midst_fails_no_trial(merge_runner,
             return as_reply({"error": {"message": USED_UP, "type": "invalid_request_error"}}, 400)
         return await handler(request)
 
-    sweep = configured(tmp_path, deadline_s=600)
     async with watched(middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(*sweep, "--reps", 1, **env)
-    assert run.code == 3, run.err
+        run = await merge_runner(
+            *configured(tmp_path, deadline_s=600), EMULATOR_BASE_URL=f"{server.url}/v1"
+        )
+    assert (run.code, run.summary["trials"]["failed"]) == (3, 0), run.err
     assert USED_UP in run.err
-    assert run.summary["trials"]["failed"] == 0
 
 
 async def test_errors_within_a_200_and_odd_bodies_in_the_midst_of_a_run_cost_no_trial(
@@ -184,12 +184,14 @@ async def test_nobody_listens(merge_runner, tmp_path):
     assert run.summary["trials"]["failed"] == 0
 
 
-async def test_waits_are_told(merge_runner, tmp_path):
+async def test_waits_are_told(merge_runner, tmp_path, monkeypatch):
+    monkeypatch.setattr("merge_runner.llm.client.LONG_WAIT_S", 0.5)
+
     async def middle(request, handler):
         if server.requests > 1:
             return await handler(request)
         return web.json_response(
-            {"error": {"message": "Slow down."}}, status=429, headers={"retry-after": "7"}
+            {"error": {"message": "Slow down."}}, status=429, headers={"retry-after": "2"}
         )
 
     sweep = configured(tmp_path, deadline_s=60)
