@@ -173,7 +173,7 @@ CASES = {
         "gemini",
         lambda: (first("upload", failed_after), first("create", status(500)),
                  first("results", status(500)), lines(odd), goes_back()),
-        {"expired": 0.4, "enqueued_tokens": 14_000}, 0,
+        {"expired": 0.4, "enqueued_tokens": 4_000}, 0,
     ),
     "429 at a creation, 503 at a state, short results that are cut": (
         "anthropic",
@@ -204,8 +204,9 @@ PLAIN = {}
 @pytest.fixture
 def play(tmp_path, monkeypatch):
     """Plays a sweep of a provider; returns its digest and the server's counts."""
-    monkeypatch.setattr("merge_runner.llm.batch.rounds.ENDING_S", 2.0)
-    monkeypatch.setattr("merge_runner.llm.batch.rounds.ARRIVAL_S", (1.0, 1.0))
+    brief = {"ENDING_S": 1.0, "ARRIVAL_S": (0.5, 0.5), "SHORTEST_POLL_S": 0.05}
+    for name, value in {**brief, "backoff_s": lambda *_: 0.05}.items():
+        monkeypatch.setattr(f"merge_runner.llm.batch.rounds.{name}", value)
 
     async def run(provider, middles=(), plan=None, **options):
         registry = REGISTRY.format(provider=provider, format=FORMATS[provider])
