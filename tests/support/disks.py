@@ -1,4 +1,4 @@
-"""Folders that cannot be written or are full, and a cache as any program may open it."""
+"""Folders that cannot be written or are full."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 
-import diskcache
 import pytest
 
 
@@ -54,15 +53,3 @@ def small_disk(tmp_path):
             yield folder
 
     return make
-
-
-@pytest.fixture
-def stock():
-    """Opens a cache folder as diskcache does without us."""
-
-    @contextlib.contextmanager
-    def opened(folder):
-        with diskcache.Cache(str(folder)) as cache:
-            yield cache
-
-    return opened

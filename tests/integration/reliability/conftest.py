@@ -1,1 +1,1 @@
-from tests.support.disks import read_only, small_disk, stock
+from tests.support.disks import read_only, small_disk

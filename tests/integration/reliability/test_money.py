@@ -12,8 +12,8 @@ from aiohttp import web
 from tests.support.harness import FAST, PROJECT, as_a_model, watched
 
 SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
-# o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.08 USD, and each of its
-# up to 24 calls could cost 0.14 USD (16,000 tokens of output).
+# o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.08 USD, and each of
+# its up to 24 calls could cost 0.14 USD (16,000 tokens of output).
 SHORT = "[repetitions]\nbaseline = 4\n[scenario]\ntimeout_s = 12\n"
 ROOM_FOR_SOME = 0.9
 
