@@ -76,36 +76,30 @@ async def rows(merge_runner, query, db="results/merge.duckdb"):
     return json.loads((await merge_runner("sql", query, "--db", db, "--format", "json")).out)
 
 
-async def test_a_sweep_in_batches_has_the_digest_of_a_plain_one(merge_runner, tmp_path):
+async def test_a_sweep_in_batches_is_paid_and_replayed_as_any_other(merge_runner, priced, tmp_path):
     terms = 'batch = { price_factor = 0.5, source = "as at its provider" }'
-    registry = (PROJECT / "experiments/models.toml").read_text()
-    (tmp_path / "models.toml").write_text(registry.replace("[o3]", f"[o3]\n{terms}"))
-    shutil.copy(PROJECT / "experiments/baseline.toml", tmp_path)
-    sweep = ("sweep", "baseline.toml", *TWO, "--model", "o3", "--yes")
+    (tmp_path / "models.toml").write_text(PRICED + terms)
+    sweep = ("short.toml", *TWO, "--model", "priced", "--json")
     async with watched(faults=FaultPlan(batch=BatchPlan(delay_s=0.1))) as server:
-        env = account(server)
-        plain = await merge_runner(*sweep, *FAST, "--db", "plain", "--cache", "a", **env)
-        run = await merge_runner(
-            *sweep, "--batch", "--json", "--db", "batch", "--cache", "b", **env
-        )
-    assert (plain.code, run.code) == (0, 0), plain.err + run.err
-    assert results_digest(tmp_path / "plain") == results_digest(tmp_path / "batch")
-    sums = "select sum(cost_usd) as usd, count(distinct batch_id) as batches from calls"
-    (once,), (half,) = [await rows(merge_runner, sums, db) for db in ("plain", "batch")]
-    assert half["usd"] == pytest.approx(once["usd"] / 2)
-    (decisions,) = await rows(merge_runner, "select max(decision) + 1 as n from calls", "batch")
-    assert (once["batches"], half["batches"]) == (0, decisions["n"])
-    assert run.summary["sweep_cost_usd"] == pytest.approx(half["usd"], abs=1e-6)
-    replay = await merge_runner("replay", "baseline.toml", *TWO, "--model", "o3", "--db", "replay",
-                                "--cache", "b")  # fmt: skip
+        run = await merge_runner("sweep", *sweep, "--batch", "--yes", *FAST, **account(server))
+    assert run.code == 0, run.err
+    sums = (
+        "select sum(cost_usd) as usd, sum(input_tokens * 1e-6 + output_tokens * 4e-6) as half, "
+        "count(distinct batch_id) as batches, max(decision) + 1 as decisions from calls"
+    )
+    (told,) = await rows(merge_runner, sums)
+    assert told["usd"] == pytest.approx(told["half"])
+    assert told["batches"] == told["decisions"]
+    assert run.summary["sweep_cost_usd"] == pytest.approx(told["usd"], abs=1e-6)
+    replay = await merge_runner("replay", *sweep, "--db", "replay")
     assert replay.code == 0, replay.err
-    assert results_digest(tmp_path / "replay") == results_digest(tmp_path / "plain")
-    assert await rows(merge_runner, sums, "replay") == [half]
+    assert results_digest(tmp_path / "replay") == results_digest(tmp_path / "results/merge.duckdb")
+    assert await rows(merge_runner, sums, "replay") == [told]
 
 
 async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
     sweep = ("sweep", "short.toml", *TWO, "--model", "priced", "--batch", "--yes")
-    async with watched(faults=FaultPlan(batch=BatchPlan(polls=8))) as server:
+    async with watched(faults=FaultPlan(batch=BatchPlan(polls=5))) as server:
         env = account(server)
         left = json.loads(await interrupted(merge_runner, server, *sweep, "--json", **env))
         last = await merge_runner(*sweep, "--json", **env)
@@ -118,26 +112,19 @@ async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
     assert not alone
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (("--batch", "--replay"), "leave it, --replay or --dask out"),
-        (("--batch", "--dask", "local:1"), "leave it, --replay or --dask out"),
-        (("--batch", "--model", "constant"), "leave it, --replay or --dask out"),
-        (("--batch", "--model", "emulator"), "leave it, --replay or --dask out"),
-        (
-            ("--batch", "--model", "local"),
-            "local has no batch mode that is known; valid with --batch: o3, ",
-        ),
-    ],
-)
-async def test_what_cannot_go_in_batches_is_refused_in_one_line(merge_runner, options, says):
-    run = await merge_runner("sweep", "baseline", *options, LOCAL_MODEL="m", EMULATOR_BASE_URL="")
-    assert run.code == 2
-    assert says in run.err.splitlines()[-1]
-    assert (run.out, run.err.count("error: ")) == ("", 1)
-    valid = run.err.partition("valid with --batch: ")[2].partition(". ")[0].split(", ")
-    assert not {"emulator", "random"} & {*valid}
+async def test_what_cannot_go_in_batches_is_refused_in_one_line(merge_runner):
+    for options in ("--replay", "--dask local:1", "--model constant", "--model emulator"):
+        run = await merge_runner(
+            "sweep", "baseline", "--batch", *options.split(), EMULATOR_BASE_URL=""
+        )
+        assert (run.code, run.out, run.err.count("error: ")) == (2, "", 1)
+        assert "leave it, --replay or --dask out" in run.err.splitlines()[-1]
+    local = {"LOCAL_MODEL": "m", "EMULATOR_BASE_URL": ""}
+    run = await merge_runner("sweep", "baseline", "--batch", "--model", "local", **local)
+    said, _, valid = run.err.splitlines()[-1].partition("; valid with --batch: ")
+    assert "local has no batch mode that is known" in said
+    assert "o3" in valid
+    assert not {"emulator", "random"} & {*valid.partition(". ")[0].split(", ")}
 
 
 async def test_a_dry_run_says_what_batches_cost_beside_single_calls(merge_runner):

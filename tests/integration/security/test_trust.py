@@ -75,7 +75,6 @@ def models_file(folder, name, **keys):
     ("name", "keys", "variable"),
     [
         ("nice", {"provider": "local", "key_env": "AWS_SECRET"}, "AWS_SECRET"),
-        ("nice", {"provider": "openai"}, "OPENAI_API_KEY"),
         ("o3", {"provider": "openai"}, "OPENAI_API_KEY"),
     ],
 )
