@@ -10,18 +10,14 @@ import sys
 import pytest
 
 
-def mounted(*arguments):
+@contextlib.contextmanager
+def mount(folder, *arguments):
     """Mount something; skips where the system does not let us."""
     if sys.platform != "linux" or shutil.which("mount") is None:
         pytest.skip("mounting needs Linux")
-    done = subprocess.run(["mount", *map(str, arguments)], capture_output=True, check=False)
+    done = subprocess.run(["mount", *map(str, arguments), folder], capture_output=True, check=False)
     if done.returncode:
         pytest.skip(f"mounting needs more rights: {done.stderr.decode().strip()}")
-
-
-@contextlib.contextmanager
-def mount(folder, *arguments):
-    mounted(*arguments, folder)
     try:
         yield
     finally:

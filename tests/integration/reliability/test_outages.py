@@ -228,27 +228,6 @@ async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
     assert loose.summary["model_mismatches"]
 
 
-async def test_one_dead_model_of_a_pair_stops_the_sweep(merge_runner, tmp_path):
-    dead_service = Service(working=False)
-
-    async def middle(request, handler):
-        dead = (await request.json())["model"] == "dead"
-        return await (dead_service.middle(request, handler) if dead else handler(request))
-
-    configured(tmp_path, deadline_s=0.6)
-    dead = MODELS.format(deadline_s=0.6).replace("[patient]", "[bad]")
-    registry = tmp_path / "experiments/models.toml"
-    registry.write_text(registry.read_text() + dead.replace("scripted-driver", "dead"))
-    async with watched(middle) as server:
-        run = await merge_runner(
-            "sweep", "baseline", "--model", "patient+bad", "--in-flight", 4, "--json",
-            EMULATOR_BASE_URL=f"{server.url}/v1",
-        )  # fmt: skip
-    assert run.code == 1
-    assert "the last 10 trials with bad failed" in run.err
-    assert run.summary["trials"]["failed"] <= 14
-
-
 async def test_recorded_trials_do_not_hide_an_outage(merge_runner, tmp_path):
     service = Service(working=True)
     sweep = configured(tmp_path, deadline_s=0.6)

@@ -111,30 +111,12 @@ def test_pickles_are_never_read_under_any_name(imported, tmp_path):
 
 def test_names_cannot_speak_to_the_terminal(imported, tmp_path):
     name = f"two\nlines\x1b[2J\u202e/{TRIAL}.csv"
-    for path in (
-        write_zip(tmp_path / "d.zip", {name: b"x"}),
-        write_folder(tmp_path / "folder", {name: b"x"}),
-    ):
-        run = imported(path)
-        assert run.code == 1
-        error, *notes = run.err.splitlines()
-        assert error.startswith(f"error: two?lines?[2J?/{TRIAL}.csv: it lacks ")
-        assert error.isprintable()
-        assert notes
-        assert all(note.startswith("note: ") for note in notes)
-
-
-def test_a_zip_within_the_zip_is_not_opened_and_text_that_looks_like_sql_is_text(
-    imported, tmp_path
-):
-    recording = drive("L_4_0")
-    recording.columns["end_state"] = ["'); DROP TABLE trials; --"]
-    inner = write_zip(tmp_path / "inner.zip", {f"{TRIAL}.csv": GOOD_CSV}).read_bytes()
-    hostile = {f"{TRIAL}.csv": recording.csv(), "inner.zip": inner}
-    run = imported(write_zip(tmp_path / "d.zip", {**GOOD, **hostile}))
+    run = imported(write_zip(tmp_path / "d.zip", {name: b"x"}))
     assert run.code == 1
-    assert "DROP TABLE trials; --" in run.err
-    assert trials(tmp_path) == 1
+    error, *notes = run.err.splitlines()
+    assert error.startswith(f"error: two?lines?[2J?/{TRIAL}.csv: it lacks ")
+    assert error.isprintable()
+    assert {note[:6] for note in notes} == {"note: "}
 
 
 def test_every_archive_that_is_damaged_is_refused_or_its_files_are(tmp_path):
@@ -142,7 +124,7 @@ def test_every_archive_that_is_damaged_is_refused_or_its_files_are(tmp_path):
     whole = write_zip(tmp_path / "d.zip", {**GOOD, f"{TRIAL}.csv": GOOD_CSV[:2000]}).read_bytes()
     # Near the ends are the headers.
     places = [*range(100), *range(len(whole) - 300, len(whole))]
-    for _ in range(500):
+    for _ in range(200):
         damaged = bytearray(whole)
         for _ in range(chance.choice((1, 3))):
             damaged[chance.choice(places)] = chance.randrange(256)

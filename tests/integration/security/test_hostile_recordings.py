@@ -182,7 +182,7 @@ def test_nothing_is_kept_of_a_file_whose_last_row_is_wrong(file, cache, monkeypa
 SQL = "x'); DROP TABLE calls; COPY (SELECT 1) TO 'planted.csv'; --"
 
 
-def test_sql_in_strings_is_a_string(file, tmp_path, monkeypatch):
+def test_sql_in_strings_is_a_string(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     hostile = entry(7, prompt=SQL)
     source = ResponseCache(tmp_path / "source")
@@ -190,9 +190,7 @@ def test_sql_in_strings_is_a_string(file, tmp_path, monkeypatch):
     made = tmp_path / "hostile.parquet"
     export_recording(made, source, [hostile.request.key], {"note": SQL, SQL: "note"})
     assert summarise(made)["provenance"]["note"] == SQL
-    target = ResponseCache(tmp_path / "target")
-    assert import_recording(made, target) == (1, 0)
-    assert target.get(hostile.request.key) == hostile
+    assert list(read_recording(made)) == [hostile]
     assert not (tmp_path / "planted.csv").exists()
 
 

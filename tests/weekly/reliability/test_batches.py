@@ -1,4 +1,4 @@
-"""Sweeps in batches that are killed, change their mode, or ask first situations alone."""
+"""Sweeps in batches that are killed, or change their mode."""
 
 from __future__ import annotations
 
@@ -96,17 +96,3 @@ async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path):
     assert not batched.keys() & alone.keys()
     digest = results_digest(tmp_path / "results/merge.duckdb")
     assert digest == results_digest(tmp_path / "plain")
-
-
-async def test_first_situations_take_one_batch(merge_runner, tmp_path):
-    first = ("sweep", "baseline", "--first", "--reps", 1)
-    async with watched(faults=FaultPlan(batch=BatchPlan(polls=8))) as server:
-        env = account(server)
-        left = await interrupted(merge_runner, server, *first, "--batch", **env)
-        run = await merge_runner(*first, "--batch", **env)
-        plain = await merge_runner(*first, "--db", "plain", "--cache", "new", **env)
-    assert [run.code, plain.code] == [0, 0], run.err
-    assert left.count("open batch: 22 calls of emulator wait in batch ") == 1
-    (batches,) = await rows(merge_runner, "select count(distinct batch_id) as n from calls")
-    assert batches["n"] == 1
-    assert results_digest(tmp_path / "results/merge.duckdb") == results_digest(tmp_path / "plain")

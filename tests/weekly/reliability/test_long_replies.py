@@ -65,16 +65,11 @@ def test_a_thousand_long_replies_are_audited_and_looked_up_in_the_cache(long):
     assert told["audits"][0]["counts"]["calls"] > 1_000
 
 
-def test_a_thousand_long_replies_are_queried_in_every_format(long):
+def test_a_thousand_long_replies_are_queried(long):
     query = "SELECT call_key, reply, reply->>'$.model' AS model FROM calls ORDER BY call_key"
     rows = list(csv.DictReader(io.StringIO(command(long, "sql", query, "--format", "csv"))))
     assert len(rows) > 1_000
     assert min(len(row["reply"]) for row in rows) > 0.9 * SIZE
-    few = f"{query} LIMIT 20"
-    assert rows[:20] == json.loads(command(long, "sql", few, "--format", "json"))
-    table = command(long, "sql", few).splitlines()
-    assert table[0].split() == ["call_key", "reply", "model"]
-    assert [line.split()[0] for line in table[1:]] == [row["call_key"] for row in rows[:20]]
 
 
 def test_a_query_that_needs_too_much_memory_says_what_to_do(long):
