@@ -79,11 +79,11 @@ def first(kind, answer, times=1):
     return middle
 
 
-def status(code, body=None, **headers):
+def status(code, **headers):
     """Refuse a request before anything is done."""
 
     async def answer(request, handler):
-        return web.json_response(body or {"error": {"message": "no"}}, status=code, headers=headers)
+        return web.json_response({"error": {"message": "no"}}, status=code, headers=headers)
 
     return answer
 
@@ -137,14 +137,14 @@ def goes_back():
     return middle
 
 
-def changed(kind, members, times=1):
+def changed(kind, members):
     """A middleware that changes members of what is said."""
 
     async def answer(request, handler):
         body = json.loads((await handler(request)).body)
         return web.json_response({**body, **members})
 
-    return first(kind, answer, times)
+    return first(kind, answer)
 
 
 def odd(these):
