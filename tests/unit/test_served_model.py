@@ -6,7 +6,7 @@ import json
 
 import duckdb
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.audit.checks import audit_sweep
@@ -86,6 +86,7 @@ def memory():
         yield connection
 
 
+@settings(max_examples=40)
 @given(st.lists(st.tuples(names, names)), st.lists(st.tuples(names, names)))
 def test_the_condition_in_sql_is_the_rule(memory, pairs, aliases):
     others = others_among(pairs, aliases)
