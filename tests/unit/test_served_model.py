@@ -78,6 +78,7 @@ def test_the_table_and_the_trials_behind_its_cell_agree(db):
 
 
 names = st.text(max_size=3)
+pairs_of_names = st.lists(st.tuples(names, names), max_size=5)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +88,7 @@ def memory():
 
 
 @settings(max_examples=40)
-@given(st.lists(st.tuples(names, names)), st.lists(st.tuples(names, names)))
+@given(pairs_of_names, pairs_of_names)
 def test_the_condition_in_sql_is_the_rule(memory, pairs, aliases):
     others = others_among(pairs, aliases)
     for pair in pairs:
