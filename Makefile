@@ -54,16 +54,16 @@ bench: .venv/runtime .venv-peer/installed ## the benchmarks: docs/reference/perf
 	@.venv/bin/python -m benchmarks $(ARGS)
 
 lock: ## renew the lock files (needs uv)
-	uv pip compile $(LOCK) --group dev -o requirements-dev.lock pyproject.toml
-	uv pip compile $(LOCK) --group build -c requirements-dev.lock -o requirements.lock pyproject.toml
-	uv pip compile $(LOCK) --extra dask -c requirements-dev.lock $(OTHERS) -o requirements-dask.lock pyproject.toml
-	uv pip compile $(LOCK) --group test --resolution lowest-direct -o requirements-lowest.lock pyproject.toml
-	uv pip compile $(LOCK) --group pyproject.toml:peer -o requirements-peer.lock
+	uv pip compile $(LOCK) --group dev -o requirements/dev.lock pyproject.toml
+	uv pip compile $(LOCK) --group build -c requirements/dev.lock -o requirements/runtime.lock pyproject.toml
+	uv pip compile $(LOCK) --extra dask -c requirements/dev.lock $(OTHERS) -o requirements/dask.lock pyproject.toml
+	uv pip compile $(LOCK) --group test --resolution lowest-direct -o requirements/lowest.lock pyproject.toml
+	uv pip compile $(LOCK) --group pyproject.toml:peer -o requirements/peer.lock
 
 LOCK := --quiet --universal --no-strip-extras --python-version 3.11 --generate-hashes --no-annotate \
 	--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock"
-# What requirements.lock has already.
-OTHERS = $(shell sed -n 's/^\([a-z0-9-]*\)==.*/--no-emit-package \1/p' requirements.lock)
+# What requirements/runtime.lock has already.
+OTHERS = $(shell sed -n 's/^\([a-z0-9-]*\)==.*/--no-emit-package \1/p' requirements/runtime.lock)
 PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 
 .venv/python:
@@ -71,23 +71,23 @@ PIP := .venv/bin/python -m pip --disable-pip-version-check --quiet
 	@$(PYTHON) -m venv .venv
 	@touch $@
 
-.venv/runtime: .venv/python requirements.lock pyproject.toml
+.venv/runtime: .venv/python requirements/runtime.lock pyproject.toml
 	@echo "installing the pinned packages into .venv (once, a minute or two)" >&2
-	@$(PIP) install --require-hashes -r requirements.lock
-	@$(PIP) install --no-deps --no-build-isolation --config-settings editable_mode=compat --editable .
+	@$(PIP) install --require-hashes -r requirements/runtime.lock
+	@$(PIP) install --no-deps --no-build-isolation --editable .
 	@touch $@
 
-.venv/dev: .venv/runtime requirements-dev.lock
+.venv/dev: .venv/runtime requirements/dev.lock
 	@echo "installing the pinned development packages into .venv" >&2
-	@$(PIP) install --require-hashes -r requirements-dev.lock
+	@$(PIP) install --require-hashes -r requirements/dev.lock
 	@touch $@
 
-.venv/dask: .venv/runtime requirements-dask.lock
+.venv/dask: .venv/runtime requirements/dask.lock
 	@echo "installing the pinned packages of the extra dask into .venv" >&2
-	@$(PIP) install --require-hashes --no-deps -r requirements-dask.lock
+	@$(PIP) install --require-hashes --no-deps -r requirements/dask.lock
 	@touch $@
 
-.venv-peer/installed: requirements-peer.lock
+.venv-peer/installed: requirements/peer.lock
 	@echo "installing inspect-ai, to compare with, into .venv-peer" >&2
 	@$(PYTHON) -m venv .venv-peer
 	@.venv-peer/bin/python -m pip --disable-pip-version-check --quiet install --require-hashes -r $<

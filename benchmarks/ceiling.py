@@ -1,4 +1,4 @@
-"""Compute the human ceiling, ``analysis/data/human_ceiling.csv``: about ten minutes.
+"""Compute the human ceiling, ``human_ceiling.csv`` of the analysis: about ten minutes.
 
 ``python -m benchmarks.ceiling`` writes it anew, with equal seeds an equal file.
 """

@@ -8,9 +8,15 @@ from merge_runner.errors import UsageError
 
 PACKAGE = Path(__file__).resolve().parent
 PROJECT = PACKAGE.parent
-# In a checkout these are links to the top-level folders, in a wheel copies of them.
-SHIPPED_EXPERIMENTS = PACKAGE / "experiments"
-SHIPPED_RECORDINGS = PACKAGE / "recordings"
+
+
+def shipped(in_wheel: Path, in_checkout: str) -> Path:
+    """Where a file or folder is that ships with the program: in a checkout it is not copied."""
+    return in_wheel if in_wheel.exists() else PROJECT / in_checkout
+
+
+SHIPPED_EXPERIMENTS = shipped(PACKAGE / "experiments", "experiments")
+SHIPPED_RECORDINGS = shipped(PACKAGE / "recordings", "cache/recordings")
 DEFAULT_DB = Path("results/merge.duckdb")
 DEFAULT_CACHE = Path("cache/responses")
 

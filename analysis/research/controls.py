@@ -1,6 +1,6 @@
 """Speeds whose control is known, and how far measures of I5 tell them apart.
 
-``python -m merge_runner_analysis.research.controls`` prints tables of docs/reference/analysis.md.
+``python -m analysis.research.controls`` prints tables of docs/reference/analysis.md.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from merge_runner_analysis.commands import app
 from tests.support.harness import PROGRAM, PROJECT, Run, environment
 
 MODULE = (sys.executable, "-m", "merge_runner")
-BUILD = "import sys; from setuptools import build_meta; print(build_meta.build_{}(sys.argv[1]))"
+BUILD = "import sys; from hatchling import build; print(build.build_{}(sys.argv[1]))"
 DESCRIBED = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
 
 
@@ -83,10 +83,9 @@ def checkout_in(folder: Path) -> Path:
     """A copy of what a build takes, which leaves its own files there."""
     checkout = folder / "checkout"
     checkout.mkdir()
-    listed = ("git", "ls-files", "merge_runner*", "analysis", "plugins", "experiments", "cache",
-              "pyproject.toml", "README.md", "LICENSE")  # fmt: skip
-    tracked = run(PROJECT, *listed).out.split()
-    run(PROJECT, "cp", "--parents", "--no-dereference", *tracked, checkout)
+    listed = "merge_runner analysis plugins experiments cache docs pyproject.toml README.md LICENSE"
+    tracked = run(PROJECT, "git", "ls-files", *listed.split()).out.split()
+    run(PROJECT, "cp", "--parents", *tracked, checkout)
     return checkout
 
 
@@ -102,19 +101,27 @@ def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the
     (from_checkout, from_sdist) = ({n for n in names if "RECORD" not in n} for names in contents)
     assert from_checkout == from_sdist
     shipped = {
-        f"merge_runner/{link}/{file.name}"
-        for link, folder in (("experiments", "experiments"), ("recordings", "cache/recordings"))
+        f"merge_runner/{inside}/{file.name}"
+        for inside, folder in (("experiments", "experiments"), ("recordings", "cache/recordings"))
         for file in (PROJECT / folder).iterdir()
     }
     shipped |= {
-        f"merge_runner{name}" for name in ("/py.typed", "_analysis/py.typed", "_cei/driver.py")
+        f"merge_runner{name}"
+        for name in (
+            "/py.typed",
+            "_analysis/py.typed",
+            "_analysis/explorer/glossary.md",
+            "_cei/driver.py",
+        )
     }
     assert shipped <= from_checkout
-    assert not {name for name in from_checkout if name.startswith(("tests", "benchmarks"))}
+    assert not {
+        name for name in from_checkout if name.startswith(("tests", "benchmarks", "analysis"))
+    }
 
 
 def test_the_oldest_packages_that_are_tested_are_those_that_pyproject_names():
-    lock = (PROJECT / "requirements-lowest.lock").read_text()
+    lock = (PROJECT / "requirements/lowest.lock").read_text()
     tested = dict(re.findall(r"^([a-z0-9-]+)==([0-9.]+)", lock, re.MULTILINE))
     for requirement in DESCRIBED["dependencies"]:
         name, oldest = re.split(">=|,", requirement)[:2]

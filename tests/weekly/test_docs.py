@@ -30,8 +30,7 @@ INSTALLED = (
     '-o .venv-peer/installed ${RUN:+RUN="$RUN"} "$@"; }\n'
 )
 SERVES = re.compile(r" emulate |make view$| view$| view --port")
-LINKED = (".venv", "Makefile", "pyproject.toml", "benchmarks", "tests")
-LOCKS = [path.name for path in PROJECT.glob("requirements*.lock")]
+LINKED = (".venv", "Makefile", "pyproject.toml", "requirements", "benchmarks", "tests")
 
 
 def lines_of(block: str) -> list[str]:
@@ -49,7 +48,7 @@ def commands(page: Path) -> list[str]:
 @pytest.fixture
 def checkout(tmp_path):
     """The project as it is checked out, with its environment and without results."""
-    for name in (*LINKED, *LOCKS):
+    for name in LINKED:
         (tmp_path / name).symlink_to(PROJECT / name)
     shutil.copytree(PROJECT / "experiments", tmp_path / "experiments")
     shutil.copytree(PROJECT / "cache/recordings", tmp_path / "cache/recordings")

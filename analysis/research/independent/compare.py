@@ -1,6 +1,6 @@
 """The program's tables beside those of the recomputation, for any database.
 
-``python -m merge_runner_analysis.research.independent.compare DB [STUDY]`` prints where.
+``python -m analysis.research.independent.compare DB [STUDY]`` prints where.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from merge_runner_analysis.research.independent import recompute
+from analysis.research.independent import recompute
 
 TABLES = (
     "who-first", "gap", "indicators", "ablation-qualitative", "ablation-quantitative", "contrasts",

@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from merge_runner_analysis.research.independent import recompute_statistics as statistics
-from merge_runner_analysis.research.independent import recompute_trials as measured
-from merge_runner_analysis.research.independent import recompute_verdicts
+from analysis.research.independent import recompute_statistics as statistics
+from analysis.research.independent import recompute_trials as measured
+from analysis.research.independent import recompute_verdicts
 
 WHO_FIRST = ("intercept", "projected_headway", "relative_velocity")
 GAP = ("intercept", "abs_projected_headway", "abs_relative_velocity", "headway_x_velocity")

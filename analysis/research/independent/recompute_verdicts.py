@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from merge_runner_analysis.research.independent import recompute_statistics as statistics
-from merge_runner_analysis.research.independent import recompute_trials as measured
+from analysis.research.independent import recompute_statistics as statistics
+from analysis.research.independent import recompute_trials as measured
 
 # arXiv 2604.09609, human rows of Table IV (n = 962) and of Table VII.
 GAP_B, GAP_SE = np.array([3.54, 0.17, -0.20, 0.06]), (0.146, 0.034, 0.166, 0.029)

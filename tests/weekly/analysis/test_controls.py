@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from analysis.research import controls
+from analysis.research.controls import CELLS, HELD, MOVING, separation
 from merge_runner_analysis.data.intermittency import gains
-from merge_runner_analysis.research import controls
-from merge_runner_analysis.research.controls import CELLS, HELD, MOVING, separation
 from tests.support.harness import PROJECT
 
 

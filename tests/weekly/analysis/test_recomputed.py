@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from merge_runner_analysis.research.independent.compare import compare
+from analysis.research.independent.compare import compare
 from tests.support.odd_databases import made
 
 KINDS = (

@@ -33,12 +33,13 @@ class Watch:
         if (child := os.fork()) == 0:
             os.setpgrp()
             os.chdir(COPY)
-            sys.path[0] = os.environ["PYTHONPATH"] = str(COPY)
+            sys.path[:1] = [str(COPY), f"{COPY}/analysis", f"{COPY}/plugins"]
+            os.environ["PYTHONPATH"] = ":".join(sys.path[:3])
             os.dup2(os.open(f"{COPY}.out", os.O_CREAT | os.O_WRONLY | os.O_TRUNC), 1)
             if "-x" not in arguments:
                 threading.settrace(self.called)
                 sys.settrace(self.called)
-            options = [*OPTIONS.split(), "-m", "not long", f"--basetemp={COPY}.tmp", *arguments]
+            options = [*OPTIONS.split(), f"--basetemp={COPY}.tmp", *arguments]
             os._exit(pytest.main(options, plugins=[self]))
         self.status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         os.system(f"kill -9 -{child} 2> {os.devnull}")
@@ -107,7 +108,7 @@ def score(mutant, tests):
         is_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         if is_function and node.lineno <= text.count("\n", 0, start) + 1 <= node.end_lineno:
             starts.append(min(each.lineno for each in [node, *node.decorator_list]))
-    path = re.sub("^analysis/", "merge_runner_analysis/", mutant["file"]).removeprefix("plugins/")
+    path = mutant["file"]
     for near in (f"{path}:{max(starts)}:", f"{path}:", f"{os.path.dirname(path)}/"):
         found = [test for test in tests if any(call.startswith(near) for call in test["calls"])]
         if found:

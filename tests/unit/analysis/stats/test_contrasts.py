@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from merge_runner_analysis.research.independent.recompute_statistics import exact_p, means_within
+from analysis.research.independent.recompute_statistics import exact_p, means_within
 from merge_runner_analysis.stats import intervals
 from merge_runner_analysis.stats.contrasts import (
     contrast_cells,

@@ -10,13 +10,13 @@ import pandas as pd
 import pytest
 from firthmodels import FirthLogisticRegression, detect_separation
 
-from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.data.reference_data import human_outcomes
-from merge_runner_analysis.research.independent.recompute_statistics import (
+from analysis.research.independent.recompute_statistics import (
     equivalence_p,
     joint_p,
     least_squares,
 )
+from merge_runner.scenarios.merge.conditions import CONDITIONS
+from merge_runner_analysis.data.reference_data import human_outcomes
 from merge_runner_analysis.stats.regressions import (
     Counts,
     gap_ols,

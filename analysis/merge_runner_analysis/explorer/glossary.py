@@ -8,8 +8,9 @@ from pathlib import Path
 
 from markupsafe import Markup, escape
 
-# A link to docs/glossary.md, which becomes a file of the package when it is built.
-FILE = Path(__file__).with_name("glossary.md")
+from merge_runner.paths import shipped
+
+FILE = shipped(Path(__file__).with_name("glossary.md"), "docs/glossary.md")
 _ROW = re.compile(r"\| (.+?) \| (.+) \|")
 _MARKED = (
     (re.compile(r"\*\*(.+?)\*\*"), r"<strong>\1</strong>"),
