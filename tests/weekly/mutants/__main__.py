@@ -68,13 +68,8 @@ class Watch:
             self.codes |= self.of_fixture.get(fixture, {})
         found = {f"{code.co_filename}:{code.co_firstlineno}:" for code in [*self.codes.values()]}
         calls = [name.removeprefix(f"{COPY}/") for name in sorted(found) if "merge_runner" in name]
-        note(
-            self.notes,
-            test=item.nodeid,
-            passed=failed == item.session.testsfailed,
-            s=s,
-            calls=calls,
-        )
+        passed = failed == item.session.testsfailed
+        note(self.notes, test=item.nodeid, passed=passed, s=s, calls=calls)
         return done
 
 
