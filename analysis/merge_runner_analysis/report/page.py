@@ -30,9 +30,9 @@ from merge_runner_analysis.figures.gallery import rendered, write_figures
 from merge_runner_analysis.names import BASELINE, DESCRIPTIONS, TableFormat
 from merge_runner_analysis.tables import finished_tables
 from merge_runner_analysis.tables.against import FILES, against
-from merge_runner_analysis.tables.differences import verdicts
 from merge_runner_analysis.tables.formats import render, table_view
 from merge_runner_analysis.tables.model import Column, Row, Table
+from merge_runner_analysis.tables.verdicts import verdicts
 from merge_runner_analysis.verdict_words import TABLE, sentences
 
 # What each variant asks first: of all of them in the same condition, as far as that was played.

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -26,9 +25,8 @@ if TYPE_CHECKING:
 
 
 class Listed(NamedTuple):
-    """A table as lists show it: the module of its maker, its title, its number in the paper."""
+    """A table as lists show it: its title, and its number in the paper."""
 
-    module: str
     title: str
     number: str = ""
 
@@ -38,41 +36,28 @@ class Listed(NamedTuple):
         return f"{self.number}: {self.title}" if self.number else self.title
 
 
-# A module is imported only when its table is computed, so that a table that is kept can be shown
-# without waiting for pandas.
 TABLES = {
-    "verdicts": Listed("differences", "What drivers show beside the humans"),
-    "who-first": Listed(
-        "regressions", "Logistic regression of which driver merged first (1: left)", "Table III"
-    ),
+    "verdicts": Listed("What drivers show beside the humans"),
+    "who-first": Listed("Logistic regression of which driver merged first (1: left)", "Table III"),
     "gap": Listed(
-        "regressions",
         "Linear regression of the gap at the merge point (m, net of the vehicle length)",
         "Table IV",
     ),
     "indicators": Listed(
-        "indicators",
         "Qualitative and quantitative indicators of behaviour during merging conflicts",
         "Table V",
     ),
     "ablation-qualitative": Listed(
-        "indicators",
         "Alignment with qualitative indicators of human behaviour across prompt ablations",
         "Table VI",
     ),
-    "ablation-quantitative": Listed(
-        "indicators", "Quantitative measures across prompt ablations", "Table VII"
-    ),
-    "contrasts": Listed("differences", "Differences between prompts"),
-    "factors": Listed(
-        "differences", "Each factor's levels: every metric, and the difference from the reference"
-    ),
-    "criticality": Listed(
-        "indicators", "When conflicts are resolved, and how close the vehicles come"
-    ),
-    "attempts": Listed("attempts", "What became of the calls"),
+    "ablation-quantitative": Listed("Quantitative measures across prompt ablations", "Table VII"),
+    "contrasts": Listed("Differences between prompts"),
+    "factors": Listed("Each factor's levels: every metric, and the difference from the reference"),
+    "criticality": Listed("When conflicts are resolved, and how close the vehicles come"),
+    "attempts": Listed("What became of the calls"),
     "first-action": Listed(
-        "regressions", "Net acceleration (m/s²) at the first decision, by own relative velocity"
+        "Net acceleration (m/s²) at the first decision, by own relative velocity"
     ),
 }
 # The table that also has drivers that were only asked.
@@ -86,11 +71,11 @@ def make_tables(study: Study, names: Sequence[str] = ()) -> list[Table]:
 
 def _made(name: str, study: Study) -> Table:
     """A table with its notes, and a row, of a note alone, for each group that is not judged."""
+    # Imported only here, so that a table that is kept is shown without waiting for pandas.
+    from merge_runner_analysis.tables.makers import MAKERS
     from merge_runner_analysis.tables.notes import footnoted
 
-    module = import_module(f"merge_runner_analysis.tables.{TABLES[name].module}")
-    maker: Callable[[Study], Table] = getattr(module, name.replace("-", "_"))
-    table = maker(study)
+    table = MAKERS[name](study)
     shown = {name for row in table.rows for name in row.groups}
     first = table.columns[0].name
     of_drivers = any(column.name == "driver" for column in table.columns)

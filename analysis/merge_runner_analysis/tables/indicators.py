@@ -1,18 +1,10 @@
-"""Tables V to VII: indicators of human behaviour beside the human ceiling, and metrics."""
+"""Table V: indicators of human behaviour beside the human ceiling, and metrics."""
 
 from __future__ import annotations
 
-from merge_runner.scenarios.merge.measures import NO_CONFLICT_MPS
 from merge_runner_analysis.data.reference_data import HUMAN_GAP_SD_M
 from merge_runner_analysis.data.study import Group, Study
-from merge_runner_analysis.metrics import (
-    INTERVALS,
-    RULES_NOTE,
-    Bounded,
-    HumanReference,
-    Metric,
-    shown_in,
-)
+from merge_runner_analysis.metrics import RULES_NOTE, Metric, shown_in
 from merge_runner_analysis.stats.indicators import (
     INDICATORS,
     Score,
@@ -23,19 +15,12 @@ from merge_runner_analysis.stats.indicators import (
     total,
 )
 from merge_runner_analysis.stats.intervals import Estimate
-from merge_runner_analysis.stats.measures import (
-    estimate_or_reference,
-    no_human_value,
-    outcomes_note,
-    undecided_note,
-)
+from merge_runner_analysis.stats.measures import outcomes_note
 from merge_runner_analysis.stats.regressions import GAP_MARGIN_M
+from merge_runner_analysis.tables.ablation_quantitative import measured
 from merge_runner_analysis.tables.model import (
-    ENDED,
     FINISHED,
-    GROUP_COLUMNS,
     Column,
-    Kind,
     Optional,
     Row,
     Table,
@@ -78,7 +63,7 @@ def indicators(study: Study) -> Table:
             Optional("differ", "", meaning="where the two rules disagree"),
             Optional("value", "value", "number", 2, "mean gain (I5) or measure"),
             interval("interval", "Wilson for rates, t for means"),
-            *_ceiling_columns("humans pass (%)", "humans, robust (%)"),
+            *ceiling_columns("humans pass (%)", "humans, robust (%)"),
             Optional("n", "n", "count", 0, "trials"),
         ),
         [
@@ -93,41 +78,12 @@ def indicators(study: Study) -> Table:
     )
 
 
-def ablation_qualitative(study: Study) -> Table:
-    """Table VI: I1 to I5 of every driver and prompt."""
-    columns = [*GROUP_COLUMNS, Column("n", "n", "count", 0, "trials that ended")]
-    for name, text in INDICATORS.items():
-        prefix = name.lower()
-        columns += [
-            Optional(f"{prefix}_paper", name, "verdict", meaning=text),
-            Optional(f"{prefix}_robust", f"{name} rob.", "verdict", meaning="by robust tests"),
-            Optional(f"{prefix}_differ", "", meaning="where the two rules disagree"),
-        ]
-    hold = "indicators that hold, of those that can be judged, by"
-    columns += [
-        Optional("score_paper", "S", meaning=f"{hold} the paper's rule"),
-        Optional("score_robust", "S rob.", meaning=f"{hold} the robust rule"),
-        *_ceiling_columns("humans I1-I4 (%)", "humans, rob. (%)"),
-    ]
-    rows = [_group_row(study, group) for group in study.groups]
-    return Table("ablation-qualitative", columns, rows, NOTES)
-
-
-def _ceiling_columns(paper: str, robust: str) -> list[Column]:
+def ceiling_columns(paper: str, robust: str) -> list[Column]:
+    """The columns of how often human data sets pass, by both rules."""
     return [
         Optional("ceiling_paper", paper, "percent", 0, f"{RESAMPLED} by the paper's rule"),
         Optional("ceiling_robust", robust, "percent", 0, f"{RESAMPLED} by the robust rule"),
     ]
-
-
-def _group_row(study: Study, group: Group) -> Row:
-    found = score(study, group)
-    values: dict[str, Value] = {"n": len(group.ended_outcomes)}
-    for name in INDICATORS:
-        values |= _verdicts(found, name, f"{name.lower()}_")
-    values |= _verdicts(found, SCORE, "score_") | _ceilings(group, found, SCORE)
-    remarks = _why(found, *INDICATORS), _no_ceiling(group), outcomes_note(group)
-    return row_of(group, values, *remarks, counts=ENDED)
 
 
 def _verdict_row(study: Study, group: Group, name: str) -> Row:
@@ -135,14 +91,14 @@ def _verdict_row(study: Study, group: Group, name: str) -> Row:
     trials = group.outcomes if name in OF_OUTCOMES else group.trials
     values: dict[str, Value] = {
         "indicator": name,
-        **_verdicts(found, name),
-        **_ceilings(group, found, name),
+        **verdict_values(found, name),
+        **ceiling_values(group, found, name),
         "n": int((trials["status"] == "finished").sum()),
     }
-    remarks = [_why(found, name)]
+    remarks = [reasons(found, name)]
     # I5 compares with human traces directly and has no ceiling.
     if name != "I5":
-        remarks.append(_no_ceiling(group))
+        remarks.append(no_ceiling(group))
     elif group.measured:
         gain, still = mean_gain(study, group), int(gains(study, group)["steady"].sum())
         values |= {"value": gain.value, "interval": gain.bounds()}
@@ -164,7 +120,7 @@ def _metric_row(group: Group, metric: Metric) -> Row:
     return row_of(group, values, *remarks, item=metric.name, counts=counts)
 
 
-def _verdicts(found: Score, name: str, prefix: str = "") -> dict[str, Value]:
+def verdict_values(found: Score, name: str, prefix: str = "") -> dict[str, Value]:
     """An indicator by both rules, and whether they disagree; or the score by both."""
     if name == SCORE:
         return {f"{prefix}paper": total(found.paper), f"{prefix}robust": total(found.robust)}
@@ -176,7 +132,7 @@ def _verdicts(found: Score, name: str, prefix: str = "") -> dict[str, Value]:
     }
 
 
-def _ceilings(group: Group, found: Score, name: str) -> dict[str, Value]:
+def ceiling_values(group: Group, found: Score, name: str) -> dict[str, Value]:
     """Which percentages of human data sets pass an indicator, or I1 to I4 together, by rule."""
     # A ceiling is for as many trials as there are outcomes. It does not fit indicators of the gap
     # or the speeds where only some of these trials have traces.
@@ -187,90 +143,16 @@ def _ceilings(group: Group, found: Score, name: str) -> dict[str, Value]:
     return {f"ceiling_{rule}": 100 * share[key] for rule, share in shares if key in share}
 
 
-def _why(found: Score, *names: str) -> str:
+def reasons(found: Score, *names: str) -> str:
     """Why a verdict is missing, or what it rests on if not on a test."""
-    reasons: dict[str, list[str]] = {}
+    which: dict[str, list[str]] = {}
     for rule, judged in found.rules.items():
         for name in names:
             if name in judged and judged[name].why:
-                reasons.setdefault(f"{rule}: {judged[name].why}", []).append(name)
-    return "; ".join(f"{', '.join(which)} {why}" for why, which in reasons.items())
+                which.setdefault(f"{rule}: {judged[name].why}", []).append(name)
+    return "; ".join(f"{', '.join(names)} {why}" for why, names in which.items())
 
 
-def _no_ceiling(group: Group) -> str:
+def no_ceiling(group: Group) -> str:
+    """Why a group has no ceiling; empty where it has one."""
     return "" if min(group.sizes) else NO_CEILING
-
-
-def ablation_quantitative(study: Study) -> Table:
-    """Table VII: collisions, gap, RMSE and joint rate of every driver and prompt."""
-    ended = ", ".join(one.heading for one in shown_in("tables") if one.trials == "ended")
-    trials = f"{ended}: of all trials that ended; the rest: of the finished ones"
-    return _table("ablation-quantitative", study.groups, "tables", trials, RULES_NOTE)
-
-
-def criticality(study: Study) -> Table:
-    """Surrogate measures of safety of every group whose traces are known."""
-    note = (
-        "a conflict is resolved when no vehicle, at its present speed, would meet the other at the "
-        "first possible contact, the merge point or the end of the track; vehicles that after the "
-        f"merge never close in faster than {NO_CONFLICT_MPS} m/s are in no conflict, and have no "
-        "time to collision"
-    )
-    ended = ", ".join(one.heading for one in shown_in("criticality") if one.trials == "ended")
-    medians = (
-        "medians are of finished trials that have the measure; their number stands before each"
-    )
-    if ended:
-        medians += f". {ended}: of all trials that ended"
-    return _table("criticality", study.measured, "criticality", medians, note)
-
-
-def _table(name: str, groups: list[Group], place: str, *notes: str) -> Table:
-    metrics = shown_in(place)
-    columns = [*GROUP_COLUMNS, Column("n", "n", "count", 0, "trials that ended")]
-    for one in metrics:
-        kind: Kind = "percent" if one.rate else "number"
-        counts = one.column if one.rate else ""
-        meaning, trials = one.meaning, ""
-        if one.estimator == "median":
-            of, trials = f"{one.trials} trials that have the measure", one.counts
-            meaning = f"median over the {of}: {meaning}"
-            columns.append(Optional(f"{one.name}_n", "n", "count", 0, of, trials=trials))
-        columns += [
-            Column(one.name, one.heading, kind, one.decimals, meaning, counts, trials=trials),
-            interval(f"{one.name}_ci", f"of {one.label}", one.decimals, trials),
-        ]
-    rows = []
-    for group in groups:
-        found, remarks = measured(group, metrics)
-        values = {name: one.value for name, one in found.items()}
-        intervals = {f"{name}_ci": one.bounds() for name, one in found.items()}
-        sizes = {
-            f"{one.name}_n": estimate.n or None
-            for one in metrics
-            if one.estimator == "median" and isinstance(estimate := found.get(one.name), Estimate)
-        }
-        cells = {"n": len(group.ended_outcomes), **sizes, **values, **intervals}
-        rows.append(row_of(group, cells, *remarks, counts=ENDED))
-    return Table(name, columns, rows, (f"intervals: {INTERVALS}", *notes))
-
-
-def measured(group: Group, metrics: list[Metric]) -> tuple[dict[str, Bounded], list[str]]:
-    """What a group comes to by each metric, and remarks on those that are published or missing."""
-    found: dict[str, Bounded] = {}
-    remarks = [outcomes_note(group)]
-    reasons: dict[str, list[str]] = {}
-    for metric in metrics:
-        one = estimate_or_reference(group, metric)
-        if one is None:
-            remarks.append(no_human_value(metric))
-            continue
-        found[metric.name] = one
-        if isinstance(one, HumanReference):
-            why = f"published, no human traces are imported ({one.source})"
-            reasons.setdefault(why, []).append(metric.heading)
-        elif one.value is None and one.bounds() is None:
-            reasons.setdefault("no trial has it", []).append(metric.heading)
-        else:
-            remarks.append(undecided_note(group, metric))
-    return found, [*remarks, *(f"{', '.join(names)}: {why}" for why, names in reasons.items())]

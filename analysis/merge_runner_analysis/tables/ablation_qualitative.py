@@ -1,0 +1,56 @@
+"""Table VI: the indicators of every driver and prompt."""
+
+from __future__ import annotations
+
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats.indicators import INDICATORS, score
+from merge_runner_analysis.stats.measures import outcomes_note
+from merge_runner_analysis.tables.indicators import (
+    NOTES,
+    SCORE,
+    ceiling_columns,
+    ceiling_values,
+    no_ceiling,
+    reasons,
+    verdict_values,
+)
+from merge_runner_analysis.tables.model import (
+    ENDED,
+    GROUP_COLUMNS,
+    Column,
+    Optional,
+    Row,
+    Table,
+    Value,
+    row_of,
+)
+
+
+def ablation_qualitative(study: Study) -> Table:
+    """Table VI: I1 to I5 of every driver and prompt."""
+    columns = [*GROUP_COLUMNS, Column("n", "n", "count", 0, "trials that ended")]
+    for name, text in INDICATORS.items():
+        prefix = name.lower()
+        columns += [
+            Optional(f"{prefix}_paper", name, "verdict", meaning=text),
+            Optional(f"{prefix}_robust", f"{name} rob.", "verdict", meaning="by robust tests"),
+            Optional(f"{prefix}_differ", "", meaning="where the two rules disagree"),
+        ]
+    hold = "indicators that hold, of those that can be judged, by"
+    columns += [
+        Optional("score_paper", "S", meaning=f"{hold} the paper's rule"),
+        Optional("score_robust", "S rob.", meaning=f"{hold} the robust rule"),
+        *ceiling_columns("humans I1-I4 (%)", "humans, rob. (%)"),
+    ]
+    rows = [_group_row(study, group) for group in study.groups]
+    return Table("ablation-qualitative", columns, rows, NOTES)
+
+
+def _group_row(study: Study, group: Group) -> Row:
+    found = score(study, group)
+    values: dict[str, Value] = {"n": len(group.ended_outcomes)}
+    for name in INDICATORS:
+        values |= verdict_values(found, name, f"{name.lower()}_")
+    values |= verdict_values(found, SCORE, "score_") | ceiling_values(group, found, SCORE)
+    remarks = reasons(found, *INDICATORS), no_ceiling(group), outcomes_note(group)
+    return row_of(group, values, *remarks, counts=ENDED)

@@ -1,0 +1,70 @@
+"""What the tables of regressions have in common: a row for each term, driver and fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import astuple
+
+from merge_runner_analysis.data.reference_data import published
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats.regressions import Regression
+from merge_runner_analysis.tables.model import GROUP_COLUMNS, Column, Row, Value, row_of
+
+TERM_NAMES = {
+    "intercept": "Intercept",
+    "projected_headway": "Projected headway",
+    "relative_velocity": "Relative velocity",
+    "abs_projected_headway": "Abs. projected headway",
+    "abs_relative_velocity": "Abs. relative velocity",
+    "headway_x_velocity": "Headway : relative velocity",
+}
+WITH_GAP = "gap_m IS NOT NULL"
+TESTED_ELSEWHERE = (
+    "whether two drivers differ cannot be read off their p-values: for drivers and humans the "
+    "table verdicts tests it"
+)
+KEYS = (
+    Column("term", "term"),
+    *GROUP_COLUMNS,
+    Column("n", "n", "count", 0, "trials in the regression"),
+    Column("b", "b", "number", 2, "coefficient"),
+    Column("se", "SE", "number", 3, "standard error"),
+)
+P = Column("p", "p", "p", 3, "Wald test")
+# Of the same trials: how its rows differ in name and label from the first ones, and the fit and a
+# robust one by the prefix of their values' names.
+Fit = tuple[str, str, dict[str, Regression]]
+BY_PAIR = ", errors by pair"
+
+
+def row_of_term(group: Group, term: str, fit: Fit, counts: str, note: str = "") -> Row:
+    """The row of a term by one of a group's fits, of the trials that ``counts`` says in SQL."""
+    item, label, found = fit
+    values: dict[str, Value] = {
+        "term": TERM_NAMES[term],
+        "driver": group.label + label,
+        "n": found[""].n,
+    }
+    for prefix, regression in found.items():
+        if term in regression.terms:
+            b, se, statistic, p = astuple(regression.terms[term])
+            # A table shows one of z and t.
+            named = {"b": b, "se": se, "z": statistic, "t": statistic, "p": p}
+            values |= {prefix + name: value for name, value in named.items()}
+    # I4 claims that these effects are absent. A large p is no evidence of that, so equivalence is
+    # tested (Schuirmann 1987).
+    if "hc3_" in found and term == "abs_relative_velocity":
+        values["equivalence_p"] = found["hc3_"].equivalence_p
+        values["velocity_p"] = found["hc3_"].velocity_p
+    remarks = dict.fromkeys(text for one in found.values() for text in (one.problem, one.remark))
+    return row_of(group, values, *remarks, note, item=item + term, counts=counts)
+
+
+def mixed_note(study: Study, table: str, model: str) -> Iterator[str]:
+    """A note with the published mixed model, for comparison with the human rows."""
+    if study.human in study.groups:
+        values = "; ".join(
+            f"{TERM_NAMES[row.term]} {row.estimate:g} (SE {row.std_error:g})"
+            for row in published("human_mixed_models").query("table == @table").itertuples()
+        )
+        yield f"published human mixed model ({model}): {values}"

@@ -1,0 +1,146 @@
+"""First actions by own relative velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+
+from merge_runner_analysis.data.reference_data import citation, published
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.stats.first_action import (
+    HOLD_MPS2,
+    exchange_rate,
+    first_actions,
+    human_exchange_rate,
+    repeats_itself,
+    seats,
+    slope,
+)
+from merge_runner_analysis.stats.intervals import Estimate
+from merge_runner_analysis.tables.model import (
+    ENDED,
+    GROUP_COLUMNS,
+    Optional,
+    Row,
+    Table,
+    Value,
+    interval,
+    row_of,
+)
+
+FIRST_FILE = "human_first_actions"
+NO_ACTION = (
+    "no trial that ended has a first action of both: none did, or with control_start = "
+    '"own_exit" one driver acts while the other is in its tunnel yet'
+)
+REPEATS = (
+    "{name} declares no chance, and does the same first in all repetitions of a situation: each "
+    "situation counts once"
+)
+UNBOUNDED = "exchange rate: no finite interval, as the slope on headway may be 0 (Fieller 1954)"
+ONLY_ASKED = (
+    "asked without the loop (`merge-runner sweep --first`), in {trials} trials that end before a "
+    "second decision"
+)
+# By the sign of the own relative velocity.
+VELOCITIES = {-1: "slower", 0: "equal", 1: "faster"}
+FIRST_ACTIONS = (
+    Optional("n", "n", "count", 0, "first actions: two a trial, one of a mixed pair"),
+    *(
+        Optional(f"mean_{name}", name, "number", 3, f"mean (m/s²) where the own velocity is {name}")
+        for name in VELOCITIES.values()
+    ),
+    Optional("brake_percent", "brake (%)", "percent", 1, f"below -{HOLD_MPS2} m/s²"),
+    Optional("hold_percent", "hold (%)", "percent", 1, f"within {HOLD_MPS2} m/s² of 0"),
+    Optional("go_percent", "go (%)", "percent", 1, f"above {HOLD_MPS2} m/s²"),
+    Optional("slope", "slope", "number", 3, "on own relative velocity, m/s² per m/s"),
+    Optional("slope_se", "SE", "number", 3, "of the slope, clustered by trial"),
+    interval("slope_ci", "of the slope", 3),
+    Optional("exchange_rate", "exchange rate", "number", 2, "m of headway that are worth 1 m/s"),
+    interval("exchange_rate_ci", "of the rate, by Fieller"),
+)
+
+
+def first_action(study: Study) -> Table:
+    """Make the table: a row per driver and prompt, two for a mixed pair."""
+    groups = (*study.groups, *study.asked)
+    return Table(
+        "first-action",
+        (*GROUP_COLUMNS, *FIRST_ACTIONS),
+        [row for group in groups for row in _first_rows(study, group)],
+        (
+            "the first action is the net acceleration of the first step under control, drag "
+            "included; own relative velocity is own minus other. A first decision without a valid "
+            "plan holds, and counts",
+            "slope: least squares with errors clustered by trial. Exchange rate: minus the ratio "
+            "of the slopes on own relative velocity and own projected headway in a logit of M as "
+            "the first word, of humans in one of who merged first; empty where a driver has no "
+            "word, or the logit no finite estimate",
+            *_first_notes(study),
+        ),
+    )
+
+
+def _first_rows(study: Study, group: Group) -> Iterator[Row]:
+    if group is study.human and not study.complete:
+        yield _published_row(group)
+        return
+    for seat in seats(group):
+        rows = first_actions(study, seat)
+        rate = human_exchange_rate() if group is study.human else exchange_rate(rows)
+        values: dict[str, Value] = {"driver": seat.name, "n": len(rows)}
+        if len(rows):
+            action, sign = rows["first_mps2"], np.sign(rows["velocity_mps"].round(6))
+            means, fitted = action.groupby(sign).mean(), slope(rows)
+            values |= {f"mean_{VELOCITIES[at]}": float(mean) for at, mean in means.items()}
+            values |= {
+                "brake_percent": float(100 * (action < -HOLD_MPS2).mean()),
+                "hold_percent": float(100 * (action.abs() <= HOLD_MPS2).mean()),
+                "go_percent": float(100 * (action > HOLD_MPS2).mean()),
+                "slope_se": fitted.se if fitted else None,
+                **_estimate("slope", fitted),
+                **_estimate("exchange_rate", rate),
+            }
+        remarks = (
+            "" if len(rows) else NO_ACTION,
+            REPEATS.format(name=seat.name) if repeats_itself(study, seat) else "",
+            UNBOUNDED if len(rows) and rate and rate.low is None else "",
+            ONLY_ASKED.format(trials=len(group.ended)) if group in study.asked else "",
+        )
+        yield row_of(group, values, *remarks, item=seat.side, counts=ENDED)
+
+
+def _published_row(group: Group) -> Row:
+    rows, known = published(FIRST_FILE), _published_slope()
+    weights = rows["n"] / rows["n"].sum()
+    names = np.sign(rows["relative_velocity_mps"]).map(VELOCITIES)
+    shares = {"brake": "slow", "hold": "hold", "go": "go"}
+    values: dict[str, Value] = {
+        "n": int(rows["n"].sum()),
+        **{f"mean_{name}": mean for name, mean in zip(names, rows["mean_mps2"], strict=True)},
+        **{
+            f"{name}_percent": float((weights * rows[f"{of}_percent"]).sum())
+            for name, of in shares.items()
+        },
+        "slope": float(known["value"]),
+        "slope_ci": (float(known["low"]), float(known["high"])),
+        **_estimate("exchange_rate", human_exchange_rate()),
+    }
+    return row_of(group, values, f"published ({citation(FIRST_FILE)})", counts="")
+
+
+def _estimate(name: str, estimate: Estimate | None) -> dict[str, Value]:
+    return {name: estimate.value, f"{name}_ci": estimate.bounds()} if estimate else {}
+
+
+def _published_slope() -> pd.Series:
+    return published("human_first_action_trials").set_index("measure").loc["slope_mps2_per_mps"]
+
+
+def _first_notes(study: Study) -> Iterator[str]:
+    if study.human not in study.groups:
+        return
+    yield f"human: slope as published: {_published_slope()['caution']}"
+    yield f"human: exchange rate: {citation('human_outcomes')}"

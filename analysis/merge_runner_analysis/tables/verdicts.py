@@ -1,0 +1,136 @@
+"""Every driver beside the humans, by every measure.
+
+Headlines, sentences, the report and the pages read this table and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from merge_runner.records import SIDES
+from merge_runner_analysis.data.driver_words import language_models
+from merge_runner_analysis.data.reference_data import HUMAN_TRIALS
+from merge_runner_analysis.data.study import Group, Study
+from merge_runner_analysis.names import HUMAN
+from merge_runner_analysis.stats.verdicts import Comparison, Known, compared, of_humans
+from merge_runner_analysis.tables.model import Column, Optional, Row, Table, Value, interval
+from merge_runner_analysis.verdict_words import (
+    HUMANS,
+    LANGUAGE_MODEL,
+    MEASURES,
+    MOCK,
+    PROGRAM,
+    TABLE,
+    sentences,
+)
+
+VERDICT_COLUMNS = (
+    Column("driver", "driver"),
+    Column("setting", "prompt"),
+    Column("kind", "kind", meaning="language model, program or mock model"),
+    Optional("measure", "measure"),
+    Optional("n", "n", "count", 0, "trials that the estimate rests on"),
+    Optional("k", "k", "count", 0, "trials that collided", "collided_boxes"),
+    Optional("undecided", "undecided", "count", 0, "ended by another rule"),
+    Column("estimate", "estimate", "number", 2, "in the unit of the measure"),
+    Optional("ci", "CI", "interval", 2, "95 %; with a margin (I4, I5) at the level of the row"),
+    Optional("human", "humans", "number", 2, "in the same conditions"),
+    interval("human_ci", "of the humans"),
+    Optional("difference", "difference", "number", 2, "driver minus humans"),
+    Optional("difference_ci", "CI", "interval", 2, "of the difference, at the level of the row"),
+    Optional("level", "level", "number", 1, "of the interval that the verdict rests on, in %"),
+    Optional("p", "p", "p", 3, "of no difference; with a margin (I4, I5) of being within it"),
+    Optional("p_holm", "Holm", "p", 3, "corrected over the measures of the driver"),
+    Optional("detectable", "detectable", "number", 2, "smallest difference found with power .8"),
+    Optional("state", "verdict", meaning="what is shown"),
+    Optional("rule", "rule", meaning="how the verdict is set", noted=True),
+)
+
+
+def verdicts(study: Study) -> Table:
+    """Every driver and prompt that is judged, and the humans first, by every measure."""
+    rows = [] if study.human not in study.groups else [*_human_rows(study)]
+    for group in study.models:
+        if not group.caution:
+            rows += [_compared(group, _kind(study, group), one) for one in compared(study, group)]
+    rows += [
+        Row(group.id, (group.id,), _driver(group, _kind(study, group)), group.unjudged)
+        for group in study.unjudged
+    ]
+    return Table(
+        TABLE,
+        VERDICT_COLUMNS,
+        rows,
+        (
+            *sentences(rows),
+            *(
+                f"{one.name}: {one.trait}, {one.unit}; verdict: {one.rule}"
+                for one in MEASURES.values()
+            ),
+            "shown: as in humans; weaker, stronger: shown, and the p that is corrected over the "
+            "driver's measures (Holm) is below .05; unlike: not shown, and it is below .05; "
+            "inconclusive: neither. The interval of the difference has the level at which Holm "
+            "tests it, so that it leaves 0 out where the verdict says so",
+            "collisions: by the rule of the human experiment, outlines that overlap, looked for at "
+            "20 Hz; Fisher's exact test within conditions, and the melded interval that agrees "
+            "with it; without p where trials are undecided. The humans' share weighs conditions as "
+            "the driver's trials do, and so does their mean gap as its trials with a gap do",
+            f"intervals take trials as independent. The {HUMAN_TRIALS} human trials are of nine "
+            "pairs who differ, which only the mean gap and imported gaps allow for",
+            *(
+                f"{group.id}: {group.caution}: it is not judged, nor compared with the humans"
+                for group in study.baselines
+                if group.caution
+            ),
+        ),
+    )
+
+
+def _kind(study: Study, group: Group) -> str:
+    if group.scripted:
+        return MOCK
+    models = dict(zip(SIDES, (*group.models, *group.models), strict=False))
+    asked = language_models(models, study.specs.get(group.spec_hash or "", {}))
+    return LANGUAGE_MODEL if asked else PROGRAM
+
+
+def _driver(group: Group, kind: str) -> dict[str, Value]:
+    return {"driver": group.label, "setting": group.setting, "kind": kind}
+
+
+def _compared(group: Group, kind: str, found: Comparison) -> Row:
+    measure = found.measure
+    values: dict[str, Value] = _driver(group, kind) | {
+        "measure": measure.name,
+        **_known(found.own),
+        "human": found.human.estimate.value,
+        "human_ci": found.human.estimate.bounds(),
+        "difference": found.difference,
+        "difference_ci": found.interval,
+        "level": None if found.level is None else 100 * found.level,
+        "p": found.p,
+        "p_holm": found.p_holm,
+        "detectable": found.detectable,
+        "state": found.state or None,
+        "rule": measure.rule,
+    }
+    return Row(f"{group.id}/{measure.name}", (group.id,), values, found.note, measure.counts)
+
+
+def _human_rows(study: Study) -> Iterator[Row]:
+    for name, found in of_humans(study).items():
+        values = _driver(study.human, HUMANS) | {"measure": name, **_known(found)}
+        note = "; ".join(filter(None, (found.problem, found.remark)))
+        # What is published rests on no trials here.
+        counts = "" if found.remark or not study.human.measured else MEASURES[name].counts
+        yield Row(f"{HUMAN}/{name}", (HUMAN,), values, note, counts)
+
+
+def _known(found: Known) -> dict[str, Value]:
+    return {
+        "n": found.estimate.n,
+        "k": found.k,
+        "undecided": found.undecided or None,
+        "estimate": found.estimate.value,
+        "ci": found.estimate.bounds(),
+    }
