@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -74,47 +75,36 @@ def test_notes_are_shown_on_the_trial_in_the_list_and_on_a_page_of_their_own(db)
     assert '<option value="late">late (1)</option>' in client.get("/trials").text
 
 
-@pytest.mark.parametrize(
-    "headers",
-    [
+def test_only_a_page_of_ours_writes(db):
+    client = asking(db)
+    client.headers.pop("origin")
+    for headers in (
         {},
         {"origin": "http://evil.example"},
         {"origin": "null"},
-        {"origin": f"http://{HOST}", "sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"},
-        {"origin": f"http://{HOST}", "sec-fetch-site": "same-site"},
+        {**OURS, "sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"},
+        {**OURS, "sec-fetch-site": "same-site"},
         {"origin": "http://evil.example:8700", "host": "evil.example:8700"},
         {"referer": f"http://{HOST}/"},
-    ],
-)
-def test_only_a_page_of_ours_writes(db, headers):
-    client = asking(db)
-    client.headers.pop("origin")
-    reply = client.post("/notes", data={"trial": TRIAL, "text": "x"}, headers=headers)
-    assert reply.status_code == (400 if "host" in headers else 403)
+    ):
+        reply = client.post("/notes", data={"trial": TRIAL, "text": "x"}, headers=headers)
+        assert reply.status_code == (400 if "host" in headers else 403), headers
     assert lines(db) == []
 
 
-@pytest.mark.parametrize(
-    ("given", "told"),
-    [
-        ({"text": "  "}, "up to 4,000 characters"),
-        ({"text": "x" * (LONGEST_TEXT + 1)}, "up to 4,000 characters"),
-        ({"text": "x", "side": "left"}, "a decision"),
-        ({"text": "x", "side": "up", "decision": "1"}, "a decision"),
-        ({f"field{number}": "x" for number in range(11)}, "fields"),
-    ],
-)
-def test_what_is_no_note_is_told_and_not_kept(db, given, told):
-    reply = noted(asking(db), **given)
-    assert reply.status_code == 400
-    assert told in reply.text
-    assert lines(db) == []
-
-
-def test_a_form_is_bounded_and_a_trial_must_be_there(db):
+def test_what_is_no_note_is_told_and_not_kept(db):
     client = asking(db)
-    assert noted(client, text="x" * MOST_NOTED).status_code == 413
-    assert client.post("/notes", data={"trial": "no/such", "text": "x"}).status_code == 404
+    for given, code, told in (
+        ({"text": "  "}, 400, "up to 4,000 characters"),
+        ({"text": "x" * (LONGEST_TEXT + 1)}, 400, "up to 4,000 characters"),
+        ({"text": "x", "side": "left"}, 400, "a decision"),
+        ({"text": "x", "side": "up", "decision": "1"}, 400, "a decision"),
+        ({f"field{number}": "x" for number in range(11)}, 400, "fields"),
+        ({"text": "x" * MOST_NOTED}, 413, "too large"),
+        ({"text": "x", "trial": "no/such"}, 404, "no/such"),
+    ):
+        reply = noted(client, **given)
+        assert (reply.status_code, told in reply.text) == (code, True), told
     assert lines(db) == []
 
 
@@ -127,18 +117,19 @@ def test_what_a_reader_wrote_is_text_everywhere(db):
         assert "\u202e" not in "".join(Page(text).said)
 
 
-@pytest.mark.parametrize("damage", [b'{"at": "1', b"\xff\xfe", b'{"reader": 3}', b"null", b""])
-def test_a_damaged_line_is_told_and_skipped_and_kept(db, damage):
+def test_a_damaged_line_is_told_and_skipped_and_kept(db):
     client = asking(db)
-    noted(client, text="before")
-    with Notes(db).path.open("ab") as file:
-        file.write(damage)  # as by a process that died amid a line
+    damages = (b'{"at": "1', b"\xff\xfe", b'{"reader": 3}', b"null", b"")
+    for number, damage in enumerate(damages):
+        noted(client, text=f"before {number}")
+        with Notes(db).path.open("ab") as file:
+            file.write(damage)  # as by a process that died amid a line
     noted(client, text="after")
     text = client.get("/notes").text
-    assert "before" in text
-    assert "after" in text
-    assert ("line 2 of study.notes.jsonl is damaged" in text) == bool(damage)
-    assert damage in Notes(db).path.read_bytes()
+    assert all(said in text for said in ("after", *(f"before {n}" for n in range(5))))
+    told = re.findall(r"line (\d) of study.notes.jsonl is damaged", text)
+    assert told == ["2", "4", "6", "8"]
+    assert all(damage in Notes(db).path.read_bytes() for damage in damages)
 
 
 def test_where_nothing_can_be_written_a_line_says_so(db):
