@@ -39,7 +39,7 @@ async def test_an_edited_program_is_played_anew(merge_runner, tmp_path):
         run = await merge_runner(*part, "--json")
         assert run.summary["trials"]["stored_before"] == stored
     edited = tmp_path / "edited"
-    for folder in ("merge_runner", "merge_runner_analysis", "experiments"):
+    for folder in ("merge_runner", "experiments"):
         shutil.copytree(PROJECT / folder, edited / folder)
     driver = edited / "merge_runner/drivers/constant.py"
     driver.write_text(driver.read_text().replace("held(0.0)", "held(0.1)"))
