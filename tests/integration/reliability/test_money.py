@@ -251,7 +251,7 @@ async def test_a_gateways_error_may_be_charged_whatever_its_form(merge_runner, e
     assert run.code == 1
     attempts = run.summary["attempts"]
     assert attempts["server_error"] > 0 < attempts["overloaded"]
-    unknown = attempts["server_error"] + attempts["overloaded"]
+    unknown = sum(attempts.values())  # also one that the deadline cuts off
     assert run.summary["attempts_of_unknown_cost"] == unknown
     assert run.summary["set_aside_usd"] == pytest.approx(0.137 * unknown, rel=0.1)
 
