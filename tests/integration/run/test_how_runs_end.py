@@ -70,7 +70,7 @@ async def test_a_writer_that_breaks_ends_the_run_before_more_is_asked(options, m
     assert summary["exit_code"] == 1
     (told,) = summary["messages"]
     assert told.startswith("1 trials are not stored: the writer of results has failed (")
-    assert "Error" in told
+    assert "Error('no memory')" in told
     assert "run the same command again: it writes them from the recorded replies" in told
     assert summary["calls"]["cached"] == 0 < summary["calls"]["live"]
     assert ends(options) == [(True, 1)]
