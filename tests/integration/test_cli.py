@@ -1,7 +1,5 @@
 """The command line: its outputs in every form, at a terminal and elsewhere."""
 
-from __future__ import annotations
-
 import csv
 import fcntl
 import io
@@ -85,11 +83,7 @@ async def test_a_quiet_sweep_shows_no_progress(merge_runner):
 
 @pytest.mark.parametrize(
     ("typed", "completed"),
-    [
-        ("sw", "sweep"),
-        ("sweep baseline --ord", "--order-seed"),
-        ("tables indi", "indicators"),
-    ],
+    [("sw", "sweep"), ("sweep baseline --ord", "--order-seed"), ("tables indi", "indicators")],
 )
 def test_the_shell_completes_commands_options_and_names(run, typed, completed):
     words = f"merge-runner {typed}"

@@ -1,7 +1,5 @@
 """What the docs say of prices, and what no file of the project says."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 

@@ -4,8 +4,6 @@
 keeps its digits.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import sys

@@ -1,7 +1,5 @@
 """The program runs wherever it is installed, and imports nothing of the folder it is called in."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -126,17 +124,6 @@ def test_the_oldest_packages_that_are_tested_are_those_that_pyproject_names():
     for requirement in DESCRIBED["dependencies"]:
         name, oldest = re.split(">=|,", requirement)[:2]
         assert re.fullmatch(rf"{re.escape(oldest)}(\.0)*", tested[name]), name
-
-
-def test_the_citation_is_of_this_version_and_names_the_paper():
-    text = (PROJECT / "CITATION.cff").read_text()
-    told = dict(re.findall(r"^([a-z-]+): (.+)$", text, re.MULTILINE))
-    assert told["cff-version"] == "1.2.0"
-    assert told["version"] == DESCRIBED["version"]
-    assert told["license"] == DESCRIBED["license"]
-    authors = (PROJECT / "LICENSE").read_text().split("(c) 2026 ")[1].split("\n")[0]
-    assert f"authors:\n  - name: {authors}\n" in text
-    assert "arXiv:2604.09609" in text
 
 
 def test_make_says_the_exit_code_of_the_program(tmp_path):

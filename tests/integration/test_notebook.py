@@ -1,7 +1,5 @@
 """A study run from Python: its results as data frames, and what is refused."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -95,11 +93,6 @@ async def test_first_situations_are_asked_alone_in_the_conditions_or_on_a_grid(f
     assert set(gridded.trials()["relative_velocity_mps"]) == {0.0, 0.4, 0.8}
     with pytest.raises(UsageError, match="a grid takes the place of the conditions"):
         await Study("study.toml", conditions=["N_0_0"]).arun(first=True, grid="usual")
-
-
-def test_a_script_runs_it_without_await(folder):
-    few = {"repetitions": 1, "conditions": ["N_0_0"]}
-    assert Study("baseline", models="constant", **few).run().ok
 
 
 async def test_a_running_loop_is_told_what_to_await(folder):

@@ -1,7 +1,5 @@
 """What an installed package registers is as good as built in, or told in one line."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

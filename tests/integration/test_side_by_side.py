@@ -1,14 +1,10 @@
 """Studies that run side by side in one process: each with its own words, conditions and drivers."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import duckdb
 import pytest
@@ -21,8 +17,6 @@ from merge_runner.prompts.blocks import VARIANTS, Variant
 from merge_runner.registry import NO_STUDY, in_use
 from merge_runner.run.stored_replay import audit_database
 from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition
-from merge_runner_analysis import table
-from merge_runner_analysis.metrics import METRICS, Metric
 from tests.support.harness import CONFIGURING
 
 WORDS = {"a": "You are late.", "b": "You have time."}
@@ -125,20 +119,6 @@ async def test_a_cell_that_runs_again_changes_nothing_of_its_study_that_runs(fol
     assert set(outcome.trials()["projected_headway_m"]) <= {2.0}
 
 
-def test_a_driver_finds_the_modules_of_its_plug_in_while_its_study_is_planned_again(
-    folder, monkeypatch
-):
-    plugin = folder / "a/plugin.py"
-    plugin.write_text(f"import probe\nprobe.meanwhile()\n{plugin.read_text()}")
-    probe = SimpleNamespace(meanwhile=lambda: None)
-    monkeypatch.setitem(sys.modules, "probe", probe)
-    mine, found = study("a"), []
-    braking = mine.plan().parts.programs["mine"].driver(SimpleNamespace(held=lambda action: action))
-    probe.meanwhile = lambda: found.append(asyncio.run(braking.decide(None, 0)))
-    mine.plan()
-    assert found == [BRAKING["a"]]
-
-
 async def test_two_studies_run_in_one_event_loop(folder):
     outcomes = await asyncio.gather(*(study(name).arun() for name in WORDS))
     for name, outcome in zip(WORDS, outcomes, strict=True):
@@ -164,28 +144,6 @@ def test_what_is_registered_for_a_study_is_unknown_to_others_and_to_the_process(
         Study("baseline", prompts=["own"], repetitions=1).plan()
     with pytest.raises(UsageError, match="there is a variant 'A1' already"):
         mine.register(VARIANTS, "A1", Variant())
-
-
-def test_nothing_is_registered_outside_of_a_study(folder):
-    for registry, thing in ((VARIANTS, Variant()), (METRICS, None), (CONDITIONS, None)):
-        before = [*registry]
-        with pytest.raises(UsageError, match=r"'late' comes too late: .* by Study\.register, or"):
-            registry.register("late", thing)
-        assert [*registry] == before
-
-
-async def test_a_table_has_the_metrics_and_titles_of_the_study_of_its_database(folder):
-    mine = Study("baseline", models="constant", repetitions=1, db="mine.duckdb")
-    stops = Metric(name="stops", label="stops", unit="", meaning="m", value="end_time_s")
-    mine.register(METRICS, stops.name, stops)
-    outcome = await mine.arun()
-    assert "stops" in table(outcome.db, "ablation-quantitative")
-    ends = Metric(name="ends", label="ends", unit="", meaning="m", value="end_time_s")
-    mine.register(METRICS, ends.name, ends)
-    assert {"stops", "ends"} <= {*table(outcome.db, "ablation-quantitative")}
-    assert "stops" not in METRICS
-    other = await Study("baseline", models="constant", repetitions=1, db="b.duckdb").arun()
-    assert "stops" not in table(other.db, "ablation-quantitative")
 
 
 async def test_two_studies_run_in_two_threads_while_both_are_planned(folder, monkeypatch):

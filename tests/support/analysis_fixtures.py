@@ -1,7 +1,5 @@
 """Studies that several tests read."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Trials of a few seconds, each an example of one account."""
 
-from __future__ import annotations
-
 from merge_runner.config import ScenarioConfig
 from merge_runner.records import SIDES
 from merge_runner.scenarios.merge.geometry import TRACK

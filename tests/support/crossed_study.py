@@ -1,7 +1,5 @@
 """A study of several models, with an opponent, a condition and a metric of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

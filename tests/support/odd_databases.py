@@ -1,17 +1,14 @@
 """Odd databases of every kind."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from merge_runner.config import ScenarioConfig
 from merge_runner_analysis.data.reference_data import PAIRS, published
 from tests.support import program
 from tests.support.harness import PROJECT, environment
-from tests.support.studies import Drive, Said, as_humans, changed, write_study, yielding
+from tests.support.studies import Drive, as_humans, write_study, yielding
 
 # A study of its own drivers and factors, of a model that another sweep drives too.
 STUDY = """
@@ -32,26 +29,6 @@ repetitions = 4
 [factors]
 prompt = ["baseline", "A1"]
 """
-
-
-def killed(db: Path) -> None:
-    """A sweep that was killed: two trials of vehicles of 8 m, at a temperature, and no end."""
-    body = {"model": "o3", "messages": [], "temperature": 0.2, "max_tokens": 4000}
-    asked = {"endpoint": "openai", "body": body}
-    write_study(db, yielding("o3", reps=1)[5:7], ScenarioConfig(vehicle_length_m=8.0), asked=asked)
-    changed(db, "UPDATE sweeps SET ended_at = NULL, exit_code = NULL")
-
-
-def stand_in_behind_o3(db: Path) -> None:
-    """The emulator at OPENAI_BASE_URL, asked for o3."""
-    write_study(db, yielding("o3", reps=1)[:2], asked=OWN)
-    changed(db, "UPDATE trials SET scripted = true")
-
-
-def only_failed(db: Path) -> None:
-    """Every trial failed for want of an answer."""
-    lost = {1: Said(("timeout",), lost=True)}
-    write_study(db, [replace(d, said=lost) for d in yielding("o3", reps=1)], asked=OWN)
 
 
 def separated(db: Path) -> None:
@@ -107,8 +84,7 @@ def complete_import(db: Path) -> None:
 KINDS: dict[str, Callable[[Path], None]] = {
     make.__name__: make
     for make in (
-        killed, stand_in_behind_o3, only_failed, separated, all_tied, two_studies,
-        crossed_programs, mirrored_chance, complete_import,
+        separated, all_tied, two_studies, crossed_programs, mirrored_chance, complete_import,
     )
 }  # fmt: skip
 

@@ -1,7 +1,5 @@
 """Pages as Plotly writes them, of trials of our own."""
 
-from __future__ import annotations
-
 import base64
 import json
 

@@ -1,7 +1,5 @@
 """The analysis's tables, as tests read them."""
 
-from __future__ import annotations
-
 from merge_runner_analysis.tables import TABLES, make_tables
 
 # The comparison with humans takes seconds for each driver.

@@ -1,7 +1,5 @@
 """A unit test stays within its process: it starts no other, and asks and serves nobody."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 

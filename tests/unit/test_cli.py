@@ -1,7 +1,5 @@
 """The command line: its menu, its help, and what becomes of its options."""
 
-from __future__ import annotations
-
 import sys
 from importlib.metadata import entry_points
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The docs and the program name the same things, and links lead somewhere."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is registered is found by name."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest

@@ -1,18 +1,13 @@
 """All that tell of another model's answers tell the same, by the aliases of all sweeps."""
 
-from __future__ import annotations
-
 import json
 
 import duckdb
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from merge_runner.audit.checks import audit_sweep
-from merge_runner.results.database import in_memory
 from merge_runner.results.store import sweep_facts
-from merge_runner.served_model import others_among, sql_of
+from merge_runner.served_model import others_among
 from merge_runner_analysis.data.provenance import provenance, tally
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
@@ -75,27 +70,6 @@ def test_the_table_and_the_trials_behind_its_cell_agree(db):
     assert tally(study, group)["other_model"] == len(OTHERS)
     (source,) = explain(study, attempts(study), f"{group.id}:other_model").sources
     assert len(source.numerator) == len(OTHERS)
-
-
-names = st.text(max_size=3)
-pairs_of_names = st.lists(st.tuples(names, names), max_size=5)
-
-
-@pytest.fixture(scope="module")
-def memory():
-    with in_memory({}) as connection:
-        yield connection
-
-
-@settings(max_examples=40)
-@given(pairs_of_names, pairs_of_names)
-def test_the_condition_in_sql_is_the_rule(memory, pairs, aliases):
-    others = others_among(pairs, aliases)
-    for pair in pairs:
-        (other,) = memory.execute(
-            f"SELECT {sql_of(others)} FROM (SELECT ? AS model_requested, ? AS model_served)", pair
-        ).fetchone()
-        assert other is (pair in others)
 
 
 def test_neither_the_id_nor_an_alias_is_another_model():

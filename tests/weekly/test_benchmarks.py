@@ -1,7 +1,5 @@
 """The benchmarks still run; how fast anything is, no test asserts."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import pytest

@@ -1,7 +1,5 @@
 """Every command of the README and the docs, run as it stands there, by hand and by make."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import pty

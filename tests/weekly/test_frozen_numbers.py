@@ -1,7 +1,5 @@
 """The numbers of more databases stay what they are."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.integration.test_frozen_numbers import MORE_DATABASES, check

@@ -1,7 +1,5 @@
 """The notebooks of the docs, executed as notebooks."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import sys
@@ -21,12 +19,6 @@ PICTURE = "a picture"
 
 def code(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
-
-
-def shown(cell) -> str:
-    """What stands below a cell, as text."""
-    texts = [out.text if "text" in out else out["data"]["text/plain"] for out in cell.outputs]
-    return "\n".join(texts)
 
 
 async def execute(notebook, folder):
@@ -52,10 +44,6 @@ def executed(tmp_path_factory, emulator_url):
         yield run
 
 
-def named(name):
-    return nbformat.read(PROJECT / f"docs/notebooks/{name}.ipynb", as_version=4)
-
-
 def results(cells):
     """The value of each cell as text, and its pictures; the summary of a run names times."""
     kinds = ("execute_result", "display_data")
@@ -66,26 +54,6 @@ def results(cells):
         if out.output_type in kinds and "decisions: " not in out.data["text/plain"]
     ]
     return [value for value in values if "trials: " not in value]
-
-
-async def test_a_study_is_run_in_a_notebook_and_looked_at_by_factor(executed):
-    cells = await executed(named("run-a-study"))
-    estimate, run, types, means, *_, replayed, tables = map(shown, cells)
-    assert estimate == "(48, 0.0)"
-    assert "trials: 48/48 ended" in run
-    assert "\x1b" not in run
-    assert "\r" not in run
-    assert "temperature    float64" in types
-    assert "projected-order 0.2" in means
-    assert replayed.splitlines()[-1] == "(0, True)"
-    assert "gap_m" in tables
-
-
-async def test_an_edited_file_is_another_driver_and_a_metric_is_in_the_tables(executed):
-    _, _, played, again, _, table = map(shown, await executed(named("own-driver-and-metric")))
-    assert played.splitlines()[-1] == "22"
-    assert again.splitlines()[-1] == "(0, set())"
-    assert "hardest_braking_mps2" in table
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: Path(path).stem)

@@ -1,7 +1,5 @@
 """What changes in tables and figures once human recordings are imported."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

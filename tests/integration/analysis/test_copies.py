@@ -1,7 +1,5 @@
 """Programs read no prompt: their trials with each are copies, which count once in every table."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

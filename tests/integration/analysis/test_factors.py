@@ -1,7 +1,5 @@
 """A study by its factors: its groups, its tables, its audit, and what its plug-in adds."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -228,12 +226,3 @@ def test_stand_ins_are_never_pooled_with_models(copy):
     for level in levels:
         assert {name.startswith("dear") for name in level.groups} == {not level.pooled.scripted}
         assert level.id.endswith(" [scripted]") == level.pooled.scripted
-
-
-def test_an_audit_replays_a_studys_prompts_and_conditions_without_its_file_but_runs_no_plug_in(
-    played,
-):
-    alone = json.loads(played.run("audit", "--json").out)
-    assert alone["ok"]
-    assert alone["audits"][0]["counts"]["replayed"] == 24
-    assert "unknown driver 'sleepy'" in " ".join(alone["audits"][0]["notes"])

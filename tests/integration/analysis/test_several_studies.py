@@ -3,8 +3,6 @@
 The driver is a program whose trials depend on the slot alone, so that no prompt changes anything.
 """
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """A driver of which too many decisions are invalid: shown with the reason, and in nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

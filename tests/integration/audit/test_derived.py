@@ -1,18 +1,12 @@
 """One changed value of any stored column is found, or the audit says that no replay gives it."""
 
-from __future__ import annotations
-
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from merge_runner.audit.checks import audit_recording
-from merge_runner.llm.cache import ResponseCache
 from merge_runner.prompts.blocks import Prompt
 from merge_runner.results.database import in_memory, schema_sql
-from merge_runner.results.recording import export_recording
 from merge_runner.results.store import query
 from merge_runner.run.stored_replay import NOT_REPLAYED, audit_database
 from tests.support.harness import PROJECT, RECORDING
@@ -25,7 +19,6 @@ repetitions = 1
 conditions = ["L_4_0"]
 factors = { opponent = ["constant"] }
 """
-PART = ("--reps", 1, "--conditions", "L_4_0")
 ANOTHER = {
     "VARCHAR": "coalesce({0}, '') || 'x'", "BOOLEAN": "NOT coalesce({0}, false)",
     "DOUBLE[]": "list_transform(coalesce({0}, [0.0]), lambda a : a + 0.01)",
@@ -205,33 +198,3 @@ def test_trials_of_another_program_or_other_prompts_are_a_note(db, monkeypatch):
 def test_a_difference_below_the_tolerance_is_none(db):
     damage(db, "UPDATE states SET position_m = position_m + 1e-11")
     assert findings(db) == []
-
-
-async def test_answers_that_were_exchanged_before_they_were_kept_are_found(
-    merge_runner, tmp_path, made
-):
-    """All agrees with them then: only that the emulator says what it answers tells of it."""
-    folder = shutil.copytree(made / "cache/responses", tmp_path / "swapped")
-    cache = ResponseCache(folder)
-    entries = {entry.request.slot.decision: entry for entry in cache.entries()}
-    cache.close()
-    first, second = entries[2], entries[5]
-    swapped = [
-        *(entry for number, entry in entries.items() if number not in (2, 5)),
-        replace(first, attempts=second.attempts),
-        replace(second, attempts=first.attempts),
-    ]
-    shutil.rmtree(folder)
-    cache = ResponseCache(folder)
-    cache.put_now(swapped)
-    keys = [entry.request.key for entry in swapped]
-    export_recording(tmp_path / "swapped.parquet", cache, keys, {})
-    cache.close()
-    (finding, *_) = audit_recording(tmp_path / "swapped.parquet").findings
-    assert (finding.kind, finding.decision) == ("exchanged", 2)
-    # The trial goes another way after the first of them, so that it ends for want of a reply.
-    await merge_runner(
-        "replay", "baseline", "--model", "emulator+constant", *PART, "--cache", "swapped"
-    )
-    texts = {f.decision: f.text for f in findings(tmp_path / "results/merge.duckdb")}
-    assert "the answer to another request" in texts[2]

@@ -1,7 +1,5 @@
 """The code of the pages on adding a driver, a condition, a block and a metric, in one study."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """A wire format that a study adds, and a provider with it, as docs/how-to says."""
 
-from __future__ import annotations
-
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 

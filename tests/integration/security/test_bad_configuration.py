@@ -1,7 +1,5 @@
 """Whatever is wrong with a command or its files: exit code 2, and one line that says why."""
 
-from __future__ import annotations
-
 import shlex
 
 import pytest

@@ -1,7 +1,5 @@
 """Caches and databases from others: only replies are read, each verified, and no name leads out."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil
@@ -14,7 +12,7 @@ import pytest
 
 from merge_runner.errors import RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache, import_folder
-from merge_runner.records import Attempt, make_request
+from merge_runner.records import Attempt
 from tests.support.raw_server import a_request
 
 SECRET = "what nobody else may read"
@@ -68,8 +66,7 @@ def everything_in(folder):
 
 # diskcache's modes: a value in the row, bytes, a text, or a pickle in the file.
 @pytest.mark.parametrize(
-    ("mode", "leads"),
-    [*((mode, "absolutely") for mode in range(5)), (4, "up"), (2, "inside")],
+    ("mode", "leads"), [*((mode, "absolutely") for mode in range(5)), (4, "up"), (2, "inside")]
 )
 def test_a_file_that_a_row_names_is_neither_read_nor_deleted(folder, mode, leads):
     victim = folder.with_name("diary.txt")
@@ -188,16 +185,6 @@ def test_an_attempt_that_no_run_makes_is_refused(folder, cache, own, changes):
         import_folder(folder, own)
     with pytest.raises(RecordingError):
         cache.get(FIRST.request.key)
-
-
-def test_a_request_that_nobody_sends_is_refused(folder, cache, own):
-    """Its key is right, but its body is no JSON object."""
-    request = FIRST.request
-    parts = {"path": request.path, "headers": {}, "body": ["x"], "slot": request.slot}
-    made = make_request(provider="openai", endpoint="openai", model="m", **parts)
-    cache.put_now([CachedCall(made, FIRST.attempts)])
-    with pytest.raises(RecordingError, match="not a canonical JSON object"):
-        import_folder(folder, own)
 
 
 async def test_the_command_takes_a_folder_and_says_what_it_left(merge_runner, tmp_path):

@@ -1,7 +1,5 @@
 """What a model or a server writes is stored as it is, and speaks to no terminal."""
 
-from __future__ import annotations
-
 import io
 import json
 

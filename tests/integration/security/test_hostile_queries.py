@@ -1,7 +1,5 @@
 """``merge-runner sql`` reads the database, and reaches nothing else."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A study's folder runs no code, and sends no key where its user did not send it, unasked."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

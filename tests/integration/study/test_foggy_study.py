@@ -1,7 +1,5 @@
 """A study of imperfect perception and of state lines, from its file to what is read of it."""
 
-from __future__ import annotations
-
 import html
 import re
 from statistics import median
@@ -101,14 +99,6 @@ def test_the_prompt_says_what_was_told_and_not_what_was_so(db):
         distance, speed = told or ("not seen", "not seen")
         assert f"| Speed of the other car | {speed} | m/s |" in prompt
         assert f"behind) | {distance} | m |" in prompt
-
-
-def test_programs_are_told_no_more_than_models(db):
-    """A program in a short range keeps its speed until it sees the other."""
-    _, rows = query(db, "SELECT plan[1] FROM decisions WHERE call_key IS NULL AND NOT other_seen")
-    assert {plan for (plan,) in rows} == {0.0}
-    _, rows = query(db, "SELECT count(*) FROM decisions WHERE call_key IS NULL AND plan[1] <> 0")
-    assert rows[0][0] > 0
 
 
 def test_the_panel_of_a_decision_shows_both_beside_each_other(db):

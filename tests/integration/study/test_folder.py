@@ -1,9 +1,6 @@
 """The folder that `merge-runner init` writes: what it has runs there, and is refused elsewhere."""
 
-from __future__ import annotations
-
 import ast
-import asyncio
 import json
 import re
 import tomllib
@@ -16,8 +13,6 @@ from merge_runner.config import ModelEntry
 from merge_runner.paths import DEFAULT_DB, home_of
 from merge_runner.results.store import query, results_digest
 from merge_runner.study.file import TEMPLATE, write_folder
-from tests.support.harness import watched
-from tests.support.mock_server import FaultPlan
 
 
 @pytest.fixture
@@ -28,37 +23,34 @@ def study(tmp_path):
     return folder
 
 
-async def test_a_new_study_is_killed_resumed_replayed_and_shown(merge_runner, study):
-    async with watched(faults=FaultPlan(latency_s=0.05)) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        part = ("study.toml", "--only", "temperature=0.2")
-        sweep = ("sweep", *part, "--in-flight", 2, "--json")
-        process = await merge_runner.start(*sweep, cwd=study, **env)
-        while server.requests < 20:
-            await asyncio.sleep(0.02)
-        process.kill()
-        assert await process.wait() != 0
-        before = server.requests
-        resumed = await merge_runner(*sweep, cwd=study, **env)
-        assert (resumed.code, resumed.summary["trials"]["planned"]) == (0, 12), resumed.err
-        assert resumed.summary["calls"]["live"] == server.requests - before
-        done = server.requests
-        again = await merge_runner("replay", *part, "--db", "again.duckdb", cwd=study, **env)
-        assert again.code == 0, again.err
-        assert server.requests == done
-    digest = results_digest(study / "results/merge.duckdb")
-    assert results_digest(study / "again.duckdb") == digest
-    tables = await merge_runner("tables", "ablation-quantitative", cwd=study)
+PART = ("--only", "temperature=0.2", "--conditions", "L_4_0")
+
+
+@pytest.fixture(scope="module")
+def played(prepare, tmp_path_factory):
+    """A new study of which a part was played, from outside of its folder."""
+    above = tmp_path_factory.mktemp("above")
+    write_folder(above / "mine")
+    run = prepare(above, "sweep", "mine/study.toml", *PART)
+    assert run.code == 0, run.err
+    assert [path.name for path in above.iterdir()] == ["mine"]
+    return above / "mine"
+
+
+async def test_a_new_study_is_replayed_and_shown(merge_runner, played):
+    again = await merge_runner("replay", "study.toml", *PART, "--db", "again.duckdb", cwd=played)
+    assert again.code == 0, again.err
+    digest = results_digest(played / "results/merge.duckdb")
+    assert results_digest(played / "again.duckdb") == digest
+    tables = await merge_runner("tables", "attempts", cwd=played)
     assert "emulator+hesitant [temperature=0.2]/hurry" in tables.out
 
 
 async def test_an_export_names_the_plug_ins_that_it_carries_and_has_no_command_line(
-    merge_runner, study, tmp_path
+    merge_runner, played, tmp_path
 ):
-    part = ("--only", "temperature=0.2", "--only", "prompt=baseline")
-    played = await merge_runner("sweep", study / "study.toml", *part)
-    assert played.code == 0, played.err
-    places = ("--db", study / "results/merge.duckdb", "--cache", study / "cache/responses")
+    db = played / "results/merge.duckdb"
+    places = ("--db", db, "--cache", played / "cache/responses")
     export = await merge_runner("recording", "export", "mine.parquet", *places)
     assert "the whole source of the study's plug-ins: plugin.py" in export.err
     told = await merge_runner("recording", "info", "mine.parquet")
@@ -67,23 +59,19 @@ async def test_an_export_names_the_plug_ins_that_it_carries_and_has_no_command_l
     assert str(tmp_path) not in told.out
     assert str(tmp_path).encode() not in (tmp_path / "mine.parquet").read_bytes()
     config = json.loads(info["provenance"]["config"])
-    [(stored,)] = query(study / "results/merge.duckdb", "SELECT config FROM sweeps")[1]
+    [(stored,)] = query(db, "SELECT config FROM sweeps")[1]
     assert json.loads(stored).keys() - config.keys() == {"typed"}
 
 
-async def test_results_lie_beside_the_study_wherever_it_is_started(merge_runner, study, tmp_path):
-    outside = ("mine/study.toml", "--only", "temperature=0.2", "--only", "prompt=baseline")
-    begun = await merge_runner("sweep", *outside, "--json")
-    assert begun.code == 0, begun.err
-    assert not (tmp_path / "results").exists()
-    assert not (tmp_path / "cache").exists()
-    inside = await merge_runner("sweep", "study.toml", *outside[1:], "--json", cwd=study)
-    assert inside.summary["trials"]["stored_before"] == begun.summary["trials"]["planned"]
-    made = Study(study / "study.toml")
-    assert (made.db, made.cache) == (study / "results/merge.duckdb", study / "cache/responses")
-    tables = await merge_runner("tables", "attempts", "--study", "mine/study.toml")
+async def test_results_lie_beside_the_study_wherever_it_is_started(merge_runner, played, tmp_path):
+    file = played / "study.toml"
+    inside = await merge_runner("sweep", file.name, *PART, "--json", cwd=played)
+    assert inside.summary["trials"]["stored_before"] == inside.summary["trials"]["planned"] > 0
+    made = Study(file)
+    assert (made.db, made.cache) == (played / "results/merge.duckdb", played / "cache/responses")
+    tables = await merge_runner("tables", "attempts", "--study", file)
     assert "hesitant" in tables.out
-    named = await merge_runner("tables", "--study", "mine/study.toml", "--db", DEFAULT_DB)
+    named = await merge_runner("tables", "--study", file, "--db", DEFAULT_DB)
     assert "there is no database results/merge.duckdb" in named.err
 
 

@@ -1,7 +1,5 @@
 """The list of metrics, to which packages add."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

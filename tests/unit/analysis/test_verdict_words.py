@@ -1,7 +1,5 @@
 """The sentences that verdicts are told in, of rows made by hand."""
 
-from __future__ import annotations
-
 import pytest
 
 from merge_runner_analysis.verdict_words import headline, sentence, told

@@ -1,7 +1,5 @@
 """The page about a study's file: every key is there, and every example can be played."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import fields, is_dataclass

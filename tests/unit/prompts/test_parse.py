@@ -18,8 +18,6 @@ WORDS = {
     "@TIMES": str([round(0.2 * k, 1) for k in range(N)]),
     "@ZEROS": ", ".join(["0.0"] * (N - 1)),
 }
-REFUSALS = {*table("replies", "entries").values(), "no_array", "several_arrays"}
-MANY = 250_000
 
 
 def fenced(code, tag="python"):
@@ -100,12 +98,6 @@ def test_an_entry_that_is_no_number_or_out_of_range_is_refused_by_name(entry, fa
     assert (parsed.plan, parsed.failure) == (None, failure)
 
 
-def test_an_expression_is_never_evaluated(tmp_path):
-    trace = tmp_path / "trace"
-    parse_reply(with_first(f"__import__('pathlib').Path({str(trace)!r}).touch()"), N)
-    assert not trace.exists()
-
-
 @pytest.mark.parametrize(("head", "decided"), table("replies", "decided").items())
 def test_the_decision_at_the_head_is_read_in_its_usual_dressings_and_words(head, decided):
     parsed = parse_reply(f"{head}\n```python\n{LIST}\n```", N)
@@ -158,53 +150,8 @@ def test_token_and_rationale_survive_an_invalid_plan():
     assert (parsed.tactical, parsed.rationale) == ("M", "I go first because I am ahead.")
 
 
-@given(st.text() | st.text("[]`#,.-+0123456789eEinfMY \r\n\"'*:"))
-def test_any_text_gives_a_plan_or_a_named_refusal(text):
-    parsed = parse_reply(text, 1)
-    assert parsed.failure in {None, *REFUSALS}
-    assert parsed.failure or (len(parsed.plan) == 1 and -1 <= parsed.plan[0] <= 1)
-    assert (parsed.plan is None) == (parsed.failure is not None)
-
-
 @given(st.lists(st.floats(-1, 1), min_size=N, max_size=N))
 def test_a_plan_that_is_written_out_in_full_survives_exactly(plan):
     parsed = parse_reply(fenced(repr(plan)), N)
     # By their spelling, since 0.0 == -0.0.
     assert list(map(repr, parsed.plan)) == list(map(repr, plan))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "[" * MANY,
-        "]" * MANY,
-        "[array no.]" * (MANY // 11),
-        "[[" * (MANY // 4) + "]]" * (MANY // 4),
-        "[0," * (MANY // 3),
-        "[" + "0.00000000," * (MANY // 11) + "]",
-        "```" * (MANY // 3),
-        "```\n[" * (MANY // 5),
-        "#" * MANY,
-        "\r\n" * (MANY // 2),
-        " " * MANY,
-        "*" * MANY,
-        "M" * MANY,
-        "M " * (MANY // 2),
-        "decision: " * (MANY // 10),
-        "decision:\n" * (MANY // 10),
-        ("decision: " * 7 + "\n") * (MANY // 71),
-        ("-" * 79 + "\n") * (MANY // 80),
-        '{"decision": ' * (MANY // 13),
-        "[" + " " * MANY + "x]",
-        "[-" + " " * MANY + "]",
-        "[" + "-" * MANY + "]",
-        "[0." + "1" * MANY + "]",
-        "[0." + "1" * MANY + "x]",
-        "[1e" + "1" * MANY + "]",
-        "[" + "1" * MANY + "]",
-        "[" + "1" * MANY + "x]",
-    ],
-    ids=lambda text: f"{text[:12]!r}...{text[-3:]!r}",
-)
-def test_much_hostile_text_is_refused_at_once(text):
-    assert parse_reply(text, N).failure in REFUSALS

@@ -1,7 +1,5 @@
 """Whatever is wrong with a file: one line that says what is valid."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 
@@ -15,12 +13,7 @@ from merge_runner.study.file import StudyFile
 from tests.support.harness import PROJECT
 
 CASES = tomllib.loads((PROJECT / "tests/cases/bad_configuration.toml").read_text())
-MODEL = {
-    "provider": '"local"',
-    "format": '"openai-chat"',
-    "id": '"x"',
-    "max_output_tokens": "10",
-}
+MODEL = {"provider": '"local"', "format": '"openai-chat"', "id": '"x"', "max_output_tokens": "10"}
 BASELINE = "repetitions = { baseline = 1 }"
 NO_TEXT = {
     bytes(range(256)): "cannot be read: 'utf-8' codec can't decode",

@@ -1,7 +1,5 @@
 """Whatever a model answers: a plan or a named refusal, no code, no exception, linear time."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time
@@ -24,31 +22,22 @@ EXECUTED: list[str] = []
 TRAP = f"__import__('sys').modules[{__name__!r}].EXECUTED.append('reply')"
 
 
-class Watch:
-    """What the interpreter reports: compiling, executing, importing, opening, starting, ..."""
-
-    def __init__(self):
-        self.events = []
-        self.open = False
-        sys.addaudithook(self.note)  # for good: a hook cannot be taken away
-
-    def note(self, event, _):
-        if self.open:
-            self.events.append(event)
-
-    @contextmanager
-    def __call__(self):
-        self.events.clear()
-        self.open = True
-        try:
-            yield self.events
-        finally:
-            self.open = False
-
-
 @pytest.fixture(scope="module")
 def every_audit_event():
-    return Watch()
+    """What the interpreter reports: compiling, executing, importing, opening, starting, ..."""
+    events, watching = [], []
+    sys.addaudithook(lambda event, _: watching and events.append(event))  # for good
+
+    @contextmanager
+    def watch():
+        events.clear()
+        watching.append(True)
+        try:
+            yield events
+        finally:
+            watching.clear()
+
+    return watch
 
 
 MODEL_LIKE = [

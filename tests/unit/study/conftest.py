@@ -1,7 +1,5 @@
 """Fixtures for studies."""
 
-from __future__ import annotations
-
 import pytest
 
 from merge_runner.run.plan import make_plan

@@ -1,7 +1,5 @@
 """What the factors of a study cross to, and what of it is refused before anything is asked."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -99,12 +97,6 @@ def test_an_opponent_drives_on_the_right_and_keeps_its_own_parameters(plan_of):
     assert {spec.model_right for spec in plan.trial_specs()} == {"emulator", "constant", "local"}
 
 
-def test_a_switch_of_the_scenario_is_a_factor(plan_of):
-    plan = plan_of('[factors]\ncollision_rule = ["euclid2d", "rectangle"]\n')
-    assert [arm.scenario.collision_rule for arm in plan.arms] == ["euclid2d", "rectangle"]
-    assert len({spec.spec_hash for spec in plan.trial_specs()}) == 2
-
-
 def test_skip_leaves_crossings_out_and_may_list_levels(plan_of):
     text = (
         'models = ["o3", "gemini-2.5-pro"]\nskip = [{ model = "o3", temperature = [0.2, 0.5] }]\n'
@@ -168,8 +160,6 @@ def test_a_perfect_perception_leaves_a_spec_as_it_is_without(plan_of):
     assert {spec.spec_hash for spec in plan_of("").trial_specs()} < {
         spec.spec_hash for spec in plan.trial_specs()
     }
-    edited = plan_of(f'[factors]\nperception = ["foggy"]\n{FOGGY}dropout = 0.1\n')
-    assert edited.trial_specs()[0].spec_hash not in {s.spec_hash for s in plan.trial_specs()}
 
 
 @pytest.mark.parametrize("scenario", ["", "[scenario]\nstep_s = 0.05\nplan_step_s = 0.2\n"])

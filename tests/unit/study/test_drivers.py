@@ -1,34 +1,26 @@
 """Drivers that a study makes of programs, and the world that they are driven in."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 
 import pytest
 
-from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.records import SIDES, ChatReply, ChatRequest
+from merge_runner.records import SIDES
 from merge_runner.registry import using
-from merge_runner.run.plan import make_plan
 from merge_runner.study.file import StudyFile
 from merge_runner.study.parts import declared_catalogue
 from merge_runner.trial import play_trial
-from tests.support.braking import BRAKING, HEAD
+from tests.support.braking import BRAKING
+
+HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 
 
 @pytest.fixture
-def plan_of(tmp_path):
+def plan_of(plan_of):
     """Makes the plan of a study's text beside a plug-in with a program of 20 Hz."""
-    (tmp_path / "mine.py").write_text(BRAKING)
-
-    def plan(text, models=(), scenario=""):
-        file = tmp_path / "mine.toml"
-        file.write_text(f'{HEAD}{text}\n{scenario}\n[plugins]\nfiles = ["mine.py"]\n')
-        return make_plan(str(file), models, trust=True)
-
-    return plan
+    added = '\n[plugins]\nfiles = ["mine.py"]\n'
+    return lambda text, models=(): plan_of(text + added, models, BRAKING)
 
 
 async def played(plan):
@@ -106,33 +98,3 @@ def test_a_world_is_as_fine_as_its_drivers_need_and_otherwise_as_it_was(plan_of)
         "slow": (0.2, None),
         "odd": (0.1, 0.2),
     }
-
-
-def test_what_a_sweep_stores_of_its_world_is_what_its_trials_are_played_in(plan_of):
-    plan = plan_of("", "braking")
-    assert plan.model_dump(mode="json")["arms"][0]["scenario"] == specs(plan)[0]["scenario"]
-
-
-async def test_a_model_is_told_the_same_in_the_finer_world(plan_of):
-    """Beside a program that keeps its speed, at 20 Hz and at the prompt rate."""
-    keeping = '[drivers.keeping]\nprogram = "braking"\nstrength = 0\n'
-    told = []
-    for pair in ("emulator+keeping", "emulator+constant"):
-        plan = plan_of(keeping, pair)
-        (spec, *_), (arm, *_), prompts = plan.trial_specs(), plan.arms, []
-
-        async def ask(prompt, slot, _, prompts=prompts):
-            prompts.append((prompt, slot))
-            request = ChatRequest("", "", "", "", "", {}, "", slot)
-            return ChatReply(f"Y\n```python\n{[-0.513, -0.107] * 10}\n```", "ok", request, (), 0)
-
-        makers = {
-            "left": LanguageModel(ask, plan.parts.prompts),
-            "right": plan.parts.programs[arm.sides["right"]],
-        }
-        drivers = {side: makers[side].make(arm.scenario, spec, side) for side in SIDES}
-        await play_trial(spec, arm.scenario, drivers)
-        told.append(prompts)
-    assert len(told[0]) > 5
-    assert told[0][:-1] == told[1][: len(told[0]) - 1]
-    assert abs(len(told[0]) - len(told[1])) <= 1  # the finer world may see the end a step earlier

@@ -1,7 +1,5 @@
 """Two different drivers of a study sit both ways round, so that driver and side are told apart."""
 
-from __future__ import annotations
-
 import pytest
 
 from merge_runner.errors import UsageError

@@ -1,23 +1,18 @@
 """The prompts, conditions and plug-ins that a study adds."""
 
-from __future__ import annotations
-
-import json
 import sys
 from importlib import import_module
 
 import pytest
 
 from merge_runner.config import ScenarioConfig
-from merge_runner.errors import UsageError
 from merge_runner.prompts.blocks import blocks_of, prompt_of, render_prompt
-from merge_runner.registry import Catalogue, collecting, using
+from merge_runner.registry import Catalogue, Registry, collecting, using
 from merge_runner.run.plan import make_plan
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.source import STUDY_PLUGINS, source_digest
-from tests.support.harness import how_to
 
 HEAD = 'repetitions = 1\nconditions = ["N_0_0"]\n'
 DRIVER = """
@@ -43,24 +38,6 @@ def prompt(plan, variant):
 def persona(text="You are a taxi driver."):
     added = f'add = [{{ after = "C3.human", text = "{text}" }}]'
     return f'[factors]\nprompt = ["taxi"]\n[prompts.taxi]\n{added}\n'
-
-
-MODELS = """
-[talker-1]
-provider = "talker"
-format = "say"
-id = "talker-1"
-max_output_tokens = 2000
-price = "free"
-"""
-
-
-def test_models_beside_a_study_may_speak_a_wire_format_of_its_plug_ins(plan_of, tmp_path):
-    (tmp_path / "models.toml").write_text(MODELS)
-    named = 'models = ["talker-1"]\n[plugins]\nfiles = ["mine.py"]\n'
-    plan = plan_of(named, plugin=how_to("add-a-wire-format"))
-    assert plan.entries["talker-1"].format == "say"
-    assert {json.loads(text)["left"]["path"] for text in plan.specs().values()} == {"/say"}
 
 
 def test_a_paragraph_is_added_where_it_belongs(plan_of):
@@ -116,31 +93,23 @@ def test_blocks_are_removed_replaced_and_moved_and_their_place_is_in_the_hash(pl
     assert plan.parts.prompts["other"].digests != prompt_of("baseline").digests
 
 
-OWN = """
-[[conditions]]
-name = "X"
-projected_headway_m = 1
-relative_velocity_mps = 0.5
-mean_speed_mps = {speed}
+OWN = """conditions = ["all",
+    {{ name = "X", projected_headway_m = 1, relative_velocity_mps = 0.5, mean_speed_mps = {speed} }}
+]
 """
 
 
 def test_an_own_condition_is_played_and_another_mean_speed_is_another_spec(plan_of):
     specs = []
     for speed in (10.0, 12.0):
-        specs += plan_of(OWN.format(speed=speed), head="repetitions = 1\n").trial_specs()
-        assert specs[-1].kinematics.speeds_mps[0] == speed + 0.25
+        plan = plan_of(OWN.format(speed=speed), head="repetitions = 1\n")
+        assert len(plan.conditions) == 11 + 1
+        (spec,) = (spec for spec in plan.trial_specs() if spec.condition == "X")
+        assert spec.kinematics.speeds_mps[0] == speed + 0.25
+        specs.append(spec)
     assert len({spec.spec_hash for spec in specs}) == 2
     plain = make_plan("baseline", "emulator").trial_specs()[0].spec_hash
     assert specs[0].spec_hash == plain  # its headway and velocity stand in the trial's row
-
-
-def test_all_stands_for_the_conditions_of_the_scenario(plan_of):
-    text = (
-        'conditions = ["all", { name = "Y", projected_headway_m = 1, relative_velocity_mps = 0 }]\n'
-    )
-    plan = plan_of(text, head="repetitions = 1\n")
-    assert len(plan.conditions) == 12
 
 
 def test_a_plug_in_beside_the_study_drives_and_an_edit_of_it_is_another_driver(plan_of):
@@ -155,44 +124,20 @@ def test_a_plug_in_beside_the_study_drives_and_an_edit_of_it_is_another_driver(p
     }
 
 
-def test_an_edit_of_what_a_plug_in_imports_is_another_driver(tmp_path):
-    study = tmp_path / "mine.toml"
-    study.write_text(HEAD + '[plugins]\nfiles = ["gains.py", "mine.py"]\n')
-    driver = "from .gains import GAIN\n" + DRIVER.format(action="GAIN")
-    (tmp_path / "mine.py").write_text(driver)
-    hashes = []
-    for gain in (-0.1, -0.9):
-        (tmp_path / "gains.py").write_text(f"GAIN = {gain}\n")
-        hashes.append(make_plan(str(study), ["braking"], trust=True).trial_specs()[0].spec_hash)
-    assert hashes[0] != hashes[1]
-
-
-def test_what_an_earlier_study_added_is_gone(plan_of):
-    plan_of('[plugins]\nfiles = ["mine.py"]\n', ["braking"], plugin=DRIVER.format(action=0))
-    with pytest.raises(UsageError, match="unknown model 'braking'"):
-        plan_of("", ["braking"])
-    plan_of(persona())
-    with pytest.raises(UsageError, match="unknown variant 'taxi'"):
-        plan_of('[factors]\nprompt = ["taxi"]\n')
-
-
 def test_what_a_plug_in_imports_is_no_part_of_its_study(plan_of, tmp_path, monkeypatch):
     """Also where one needs a path of its own: an import that fails hides no other one."""
-    register = 'CONDITIONS.register("elsewhere", Condition(1.0, 0.0))\n'
-    imports = "from merge_runner.scenarios.merge.conditions import CONDITIONS, Condition\n"
-    (tmp_path / "imported_by_a_plug_in.py").write_text(imports + register)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(CONDITIONS, "_things", dict(CONDITIONS._things))
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    beside = tmp_path / "beside"
-    beside.mkdir()
-    (beside / "found_by_its_path.py").write_text("")
-    own = f"import sys\nsys.path.insert(0, {str(beside)!r})\nimport found_by_its_path\n"
-    own += f"import imported_by_a_plug_in\n{imports}{register.replace('elsewhere', 'own')}"
+    colours, register = Registry("colour"), "import sys\nsys.colours.register({!r}, 1)\n"
+    monkeypatch.setattr(sys, "colours", colours, raising=False)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    (tmp_path / "imported_by_a_plug_in.py").write_text(register.format("elsewhere"))
+    (tmp_path / "beside").mkdir()
+    (tmp_path / "beside/found_by_its_path.py").touch()
+    own = f"sys.path.insert(0, {str(tmp_path / 'beside')!r})\nimport found_by_its_path\n"
+    own = register.format("own") + own + "import imported_by_a_plug_in\n"
     plan = plan_of('[plugins]\nfiles = ["mine.py"]\n', plugin=own)
     with using(plan.parts.catalogue):
-        assert {"elsewhere", "own"} < {*CONDITIONS}
-    assert ("elsewhere" in CONDITIONS, "own" in CONDITIONS) == (True, False)
+        assert {*colours} == {"elsewhere", "own"}
+    assert [*colours] == ["elsewhere"]
 
 
 def test_the_hash_of_a_plug_in_is_that_of_a_package_of_its_name(plan_of, tmp_path, monkeypatch):

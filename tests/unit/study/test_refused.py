@@ -1,7 +1,5 @@
 """What cannot be a study is refused before anything is asked, in one line with what is valid."""
 
-from __future__ import annotations
-
 import tomllib
 
 import pytest

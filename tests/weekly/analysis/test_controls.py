@@ -1,7 +1,5 @@
 """I5 tells controls that hold from those that move, as well as the docs say."""
 
-from __future__ import annotations
-
 import pytest
 
 from analysis.research import controls

@@ -1,7 +1,5 @@
 """The program's tables are those that independent code makes of the same database."""
 
-from __future__ import annotations
-
 import pytest
 
 from analysis.research.independent.compare import compare

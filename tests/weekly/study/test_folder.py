@@ -1,7 +1,5 @@
 """The commands that a new study names."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import subprocess

@@ -1,7 +1,5 @@
 """What is kept beside the database: equal to what is computed anew, and renewed when it must be."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

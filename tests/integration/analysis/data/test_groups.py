@@ -1,7 +1,5 @@
 """Who stands in which group: endpoints, stand-ins, and deterministic drivers."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -11,8 +9,6 @@ from merge_runner_analysis.data.load import load
 from merge_runner_analysis.data.provenance import provenance
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
-from merge_runner_analysis.explorer.pages.sweep import list_runs
-from merge_runner_analysis.explorer.site import Site
 from merge_runner_analysis.report.page import alarms
 from merge_runner_analysis.tables import make_tables
 from merge_runner_analysis.tables.formats import value_rows
@@ -181,31 +177,3 @@ def test_equal_trials_of_a_language_model_are_told_and_count(db):
     assert title == "Trials repeat earlier ones"
     says = "o3/baseline: 2 of 33 trials are as an earlier one to the last state; each counts"
     assert says in text
-
-
-def test_trials_that_a_program_draws_otherwise_count_beside_its_copies(prepare, tmp_path):
-    for pair in ("human-odds+constant", "projected-order+constant"):
-        sweep = ("sweep", "baseline", "--model", pair, "--mirror", "--reps", 3)
-        done = prepare(tmp_path, *sweep, "--conditions", "L_4_0,R_-4_0", "--db", "t.duckdb")
-        assert done.code == 0
-    models = Study(tmp_path / "t.duckdb").models
-    assert {group.driver: (len(group.trials), group.repeated) for group in models} == {
-        "constant+human-odds": (7, 5),  # one way where it goes first, and any other gap
-        "constant+projected-order": (2, 10),
-    }
-
-
-def test_a_driver_of_a_study_is_a_program_also_where_the_study_is_not_at_hand(prepare, tmp_path):
-    (tmp_path / "mine.toml").write_text(
-        'models = ["emulator+slow"]\nrepetitions = 1\nconditions = ["N_0_0"]\n'
-        '[drivers.slow]\nprogram = "idm"\nclock = 1.0\n[factors]\nx_noise = [0.5]\n'
-    )
-    db = tmp_path / "results/merge.duckdb"
-    assert prepare(tmp_path, "sweep", "mine.toml").code == 0
-    site = Site(db)
-    site.catalogue.refresh()
-    (group,) = Study(db).models
-    (trial,) = site.catalogue.every({})
-    (run,) = list_runs(site.catalogue)
-    said = "scripted stand-in, no language model"
-    assert (group.posing, trial["stand_in"], run["stand_in"]) == (said, said, said)

@@ -1,7 +1,5 @@
 """What imported human trials are, beside the published counts, and how their rows are named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pandas as pd

@@ -1,7 +1,5 @@
 """Results as data frames, and what is remembered of a study."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

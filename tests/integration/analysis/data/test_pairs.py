@@ -4,8 +4,6 @@ The trials are real ones of programs: ``brakes`` and ``goes`` keep to one action
 trial and the one with the sides changed are mirror images to the last bit.
 """
 
-from __future__ import annotations
-
 import json
 
 import duckdb
@@ -17,6 +15,7 @@ from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.stats.indicators import fits
 from merge_runner_analysis.stats.regressions import who_first_logit
 from merge_runner_analysis.tables import make_tables
+from tests.support.cases import table
 from tests.support.studies import changed, write_study, yielding
 from tests.support.tables import made, notes_with
 
@@ -29,17 +28,8 @@ class Held:
     async def decide(self, observation, number):
         return self.seat.held(self.action)
 
-class Brakes(Held):
-    action = -0.2
-
-class Goes(Held):
-    action = 0.2
-
-class Follows(Held):
-    action = -0.1
-
-for name, driver in (("brakes", Brakes), ("goes", Goes), ("follows", Follows)):
-    PROGRAMS.register(name, Program(driver, name))
+for name, action in (("brakes", -0.2), ("goes", 0.2), ("follows", -0.1)):
+    PROGRAMS.register(name, Program(type(name, (Held,), {"action": action}), name))
 """
 STUDY = """
 models = ["goes"]
@@ -179,25 +169,10 @@ def test_a_planted_cue_has_its_sign_on_whichever_side_the_ego_sits(tmp_path):
         assert found["intercept"].b == pytest.approx(sign * expected["intercept"].b)
 
 
-EGOS = [
-    ("o3", "o3", ["o3"], "self", "left"),
-    ("constant", "constant", [], None, "left"),
-    ("o3", "constant", ["o3"], None, "left"),
-    ("constant", "o3", ["o3"], None, "right"),
-    ("constant", "o3", ["o3"], "o3", "left"),
-    ("o3", "constant", ["o3"], "constant", "left"),
-    ("o3", "gpt", ["o3", "gpt"], None, "right"),
-    ("gpt", "o3", ["o3", "gpt"], None, "left"),
-    ("gpt", "o3", ["o3", "gpt"], "gpt", "right"),
-    ("cei", "idm", [], None, "left"),
-    ("cei", "idm", [], "cei", "right"),
-]
-
-
 def test_the_program_and_the_database_agree_on_the_ego(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)[:1])
-    for left, right, asking, opponent, ego in EGOS:
-        assert ego_side({"left": left, "right": right}, asking, opponent or "self") == ego
+    for left, right, asking, opponent, ego in table("egos", "egos"):
+        assert ego_side({"left": left, "right": right}, asking, opponent) == ego
         spec = {
             side: {"endpoint": "openai", "body": {}} if name in asking else {"program": name}
             for side, name in (("left", left), ("right", right))
@@ -208,7 +183,7 @@ def test_the_program_and_the_database_agree_on_the_ego(tmp_path):
             connection.execute("DELETE FROM trial_factors")
             connection.execute(
                 "INSERT INTO trial_factors SELECT trial_id, spec_hash, 'opponent', level "
-                "FROM trials, (SELECT ?::VARCHAR AS level) WHERE level IS NOT NULL",
+                "FROM trials, (SELECT ?::VARCHAR AS level)",
                 [opponent],
             )
             found = connection.execute("SELECT ego, driver FROM trial_drivers").fetchall()

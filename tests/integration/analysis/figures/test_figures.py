@@ -1,7 +1,5 @@
 """The figures: their data, their sizes, and that equal results give equal files."""
 
-from __future__ import annotations
-
 import re
 from itertools import combinations
 
@@ -181,8 +179,7 @@ def test_each_group_has_a_row_of_its_own_by_the_same_scales(study):
 
 
 @pytest.mark.parametrize(
-    "drives",
-    [[], [yielding("o3", "A1", reps=1)[0], Drive("crash", "A1", "N_0_0", 1, (0,), (0,))]],
+    "drives", [[], [yielding("o3", "A1", reps=1)[0], Drive("crash", "A1", "N_0_0", 1, (0,), (0,))]]
 )
 def test_figures_of_next_to_nothing_are_drawn_all_the_same(drives, tmp_path, recwarn):
     study = Study(write_study(tmp_path / "t.duckdb", drives))

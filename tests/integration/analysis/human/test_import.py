@@ -1,7 +1,5 @@
 """Importing: which files are read, what is stored, and what happens the second time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a study can find before it is played."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -122,8 +120,8 @@ def test_power_sends_and_makes_nothing_and_says_where_a_price_is_unknown(prepare
         '[dear]\nprovider = "openai"\nformat = "openai-chat"\nid = "no-such-model"\n'
         "max_output_tokens = 4000\n"
     )
-    few = ("--model", "dear", "--reps", 4, "--sims", 20)
+    few = ("--model", "dear", "--reps", 1, "--conditions", "N_0_0,L_4_0", "--sims", 20)
     run = prepare(tmp_path, "power", "baseline", *few)
     assert run.code == 0, run.err
-    assert "44 trials, an unknown price; 20 simulated studies" in run.out
+    assert "2 trials, an unknown price; 20 simulated studies" in run.out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["experiments"]

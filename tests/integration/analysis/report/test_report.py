@@ -1,14 +1,13 @@
 """The report: one file that needs nothing else, and says what can and cannot be concluded."""
 
-from __future__ import annotations
-
+import html
 import re
 import struct
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import pytest
 
+from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
 from merge_runner_analysis.data.provenance import provenance, tally
 from merge_runner_analysis.data.reference_data import published
@@ -21,23 +20,15 @@ from merge_runner_analysis.tables import TABLES, make_tables
 from tests.support.studies import Said, changed, write_study, yielding
 
 
-class Page(HTMLParser):
+class Page:
     """What a page refers to and what it shows."""
 
     def __init__(self, text):
-        super().__init__()
-        self.tags, self.ids, self.links, self.sources, self.words = [], [], [], [], []
-        self.feed(text)
-        self.text = " ".join(" ".join(self.words).split())
-
-    def handle_starttag(self, tag, attrs):
-        found = dict(attrs)
-        self.tags.append(tag)
-        for name, values in (("id", self.ids), ("href", self.links), ("src", self.sources)):
-            values.extend([found[name]] if name in found else [])
-
-    def handle_data(self, data):
-        self.words.append(data)
+        self.tags = {*re.findall(r"<(\w+)", text)}
+        self.ids, self.links, self.sources = (
+            re.findall(rf'<[^>]* {name}="([^"]*)"', text) for name in ("id", "href", "src")
+        )
+        self.text = " ".join(html.unescape(re.sub(r"<[^>]*>", " ", text)).split())
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +55,10 @@ def test_every_table_and_reading_is_on_the_page_with_the_trials_behind_its_numbe
 
 def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_factors(tmp_path):
     drives = [*yielding("o3", reps=1)[:3], *yielding("o3", "A1", reps=1)[:3]]
+    asked = {"endpoint": "openai", "body": {"model": "o3", "messages": [], "temperature": 0.2}}
+    of, long = {"description": "Who is <first>?"}, ScenarioConfig(vehicle_length_m=8.0)
     study = changed(
-        write_study(tmp_path / "t.duckdb", drives, config={"description": "Who is <first>?"}),
+        write_study(tmp_path / "t.duckdb", drives, long, config=of, asked=asked),
         "UPDATE decisions SET prompt = 'Drive.\n' || CASE WHEN trial_id LIKE '%/A1/%' "
         "THEN 'You are late.' ELSE 'There is time.' END",
     )
@@ -78,6 +71,8 @@ def test_a_report_begins_with_the_description_the_design_the_prompts_and_the_fac
     places = [text.index(part) for part in parts]
     assert places == sorted(places)
     assert text.count('id="factors"') == 1
+    assert "temperature = 0.2" in text
+    assert "vehicle_length_m = 8.0" in text
 
 
 def asking(folder, said, *, variant="baseline"):
@@ -104,14 +99,6 @@ def test_what_went_wrong_stands_at_the_top_before_any_number(page):
 
 def test_a_study_in_which_nothing_went_wrong_has_no_warning(tmp_path):
     assert alarms_of(asking(tmp_path, Said(), variant="A1")) == {}
-
-
-def test_another_served_model_is_loud_and_its_name_is_shown_as_text(tmp_path):
-    study = asking(tmp_path, Said(served="<script>alert(1)</script>"), variant="A1")
-    page = Page(report_html(study, [], {}))
-    assert "script" not in page.tags
-    assert "Another model answered" in page.text
-    assert "o3 was asked for, <script>alert(1)</script> answered: 6 answers" in page.text
 
 
 def test_the_fallbacks_of_a_group_are_unusual_above_one_in_twenty(tmp_path):

@@ -1,10 +1,7 @@
 """Collisions of models by the paper's rule and by that of the humans, side by side."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
-import duckdb
 import numpy as np
 import pandas as pd
 import pytest
@@ -15,7 +12,6 @@ from merge_runner_analysis.data.load import load_trials
 from merge_runner_analysis.data.reference_data import human_counts
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.data.trials import judged
-from merge_runner_analysis.explain import explain
 from merge_runner_analysis.metrics import BOXES, COLLISIONS
 from merge_runner_analysis.stats.intervals import wilson
 from merge_runner_analysis.stats.measures import counts
@@ -92,17 +88,6 @@ def test_a_driver_is_compared_with_humans_by_the_rule_of_the_humans(study, tmp_p
     # In the conditions that it drove, as often as it drove them.
     rates = [human_counts()[name] for name in played.models[0].trials["condition"]]
     assert found["human"] == pytest.approx(100 * sum(of.collided / sum(of) for of in rates) / 5)
-
-
-@pytest.mark.parametrize("measure", [COLLISIONS, BOXES])
-def test_explain_lists_the_trials_that_are_decided(study, measure):
-    (table,) = make_tables(study, ["indicators"])
-    found = explain(study, table, f"o3/baseline/{measure.name}:n")
-    (source,) = found.sources
-    assert str(len(source.trials)) == found.value
-    with duckdb.connect(str(study.db), read_only=True) as connection:
-        rows = connection.execute(source.query).fetchall()
-    assert tuple(trial_id for trial_id, *_ in rows) == source.trials
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """I5 of stored trials: whether accelerations are held; of programs known to hold and to move."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

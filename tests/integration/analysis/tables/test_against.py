@@ -1,7 +1,5 @@
 """Which of the paper's rows a row stands beside, and what is not compared with itself."""
 
-from __future__ import annotations
-
 import pytest
 
 from merge_runner_analysis.data.reference_data import published
@@ -16,10 +14,16 @@ TABLE_VII = "ablation-quantitative"
 def met(tmp_path_factory):
     """Models, a program, and the emulator under its own name and in gemini's."""
     path = tmp_path_factory.mktemp("met") / "t.duckdb"
-    names = (("o3",), ("o3", "A2"), ("gemini-2.5-pro",), ("emulator",), ("constant",))
+    names = [("o3", variant) for variant in ("baseline", "A1", "A2", "A3")]
+    names += [(model, "baseline") for model in ("gemini-2.5-pro", "emulator", "constant")]
     write_study(path, [drive for name in names for drive in yielding(*name, reps=1)])
     scripted = "model_left IN ('gemini-2.5-pro', 'emulator')"
-    return changed(path, f"UPDATE trials SET scripted = true WHERE {scripted}")
+    return changed(
+        path,
+        f"UPDATE trials SET scripted = true WHERE {scripted}",
+        "UPDATE trials SET sample_set = 1 WHERE variant = 'A3'",
+        f"""UPDATE specs SET spec = '{{"left": {AT}, "right": {AT}}}' WHERE spec_hash = 'o3-A1'""",
+    )
 
 
 AT = '{"endpoint": "http://localhost:8080/v1"}'
@@ -51,25 +55,15 @@ def test_humans_of_a_partial_import_stand_beside_the_paper_without_differences(i
     assert cell(indicators, "human/collided_boxes_percent", "value_in_paper") == 2.83
 
 
-@pytest.mark.parametrize(
-    ("change", "row", "stands"),
-    [
-        ("SELECT 1", "o3/baseline", True),
-        # A model at another endpoint is another one, and other samples are of the same.
-        (
-            f"""UPDATE specs SET spec = '{{"left": {AT}, "right": {AT}}}'""",
-            "o3 at localhost:8080/baseline",
-            False,
-        ),
-        ("UPDATE trials SET sample_set = 1", "o3/set1/baseline", True),
-        ("UPDATE trials SET scripted = true", "o3/baseline", False),
-    ],
-)
-def test_only_the_papers_models_stand_beside_its_values(tmp_path, change, row, stands):
-    study = changed(write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)), change)
+def test_only_the_papers_models_stand_beside_its_values(met):
+    """A model at another endpoint is another one, and other samples are of the same."""
     rows = published("paper_ablation_quantitative").set_index(["driver", "setting"])["gap_m"]
-    found = cell(beside(study), row, "gap_m_in_paper")
-    assert found == (rows["o3", "baseline"] if stands else None)
+    papers = {"o3/baseline": "baseline", "o3/A2": "A2", "o3/set1/A3": "A3"}
+    papers = {row: rows["o3", setting] for row, setting in papers.items()}
+    others = ("o3 at localhost:8080/A1", "gemini-2.5-pro/baseline", "emulator/baseline")
+    table = beside(met)
+    found = {row: cell(table, row, "gap_m_in_paper") for row in (*papers, *others)}
+    assert found == papers | dict.fromkeys(others)
 
 
 def test_values_stand_against_the_paper_alone(met, prepare, tmp_path):

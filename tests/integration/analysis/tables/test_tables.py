@@ -1,7 +1,5 @@
 """The tables: their numbers, their forms, and what they say where there is nothing to say."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -278,15 +276,7 @@ def test_explain_names_the_valid_rows_and_columns(study, tables):
     assert [source.group for source in found.sources] == ["o3/baseline", "o3/A2"]
 
 
-@pytest.mark.parametrize(
-    ("command", "shown"),
-    [
-        (("sql", "SELECT '× – é' AS sign"), "? ? ?"),
-        (("--help",), "merge-runner"),
-    ],
-)
-def test_what_an_encoding_cannot_say_is_replaced(small, prepare, tmp_path, command, shown):
-    db = () if command == ("--help",) else ("--db", small.db)
-    done = prepare(tmp_path, *command, *db, PYTHONIOENCODING="ascii")
-    assert done.code == 0, done.err
-    assert shown in done.out
+def test_what_an_encoding_cannot_say_is_replaced(small, prepare, tmp_path):
+    asked = ("sql", "SELECT '× – é' AS sign", "--db", small.db)
+    done = prepare(tmp_path, *asked, PYTHONIOENCODING="ascii")
+    assert (done.code, "? ? ?" in done.out) == (0, True), done.err

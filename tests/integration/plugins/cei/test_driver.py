@@ -91,23 +91,6 @@ def test_a_driver_starts_below_the_speed_it_desires_by_the_error_of_the_cruise_c
         assert set_speeds(task, np.array([9.92063])) == pytest.approx(desired_mps, abs=2e-4)
 
 
-async def test_drivers_without_a_conflict_keep_their_speed():
-    task = model(scenario(resistance="none"), noise=False)
-    own, other = (Vehicles(np.array([at_m]), np.array([10.0])) for at_m in (110.0, 60.0))
-    ticks, noise = np.array([100.0]), np.zeros((1, 2))
-    agents = start(task, [Base(0.1, 0.5)], own, other, own.speeds_mps, ticks, noise)
-    for _ in range(100):
-        agents.perceive(task, other, np.zeros(1), np.zeros(1))
-        agents.decide(task, own, other, np.zeros(1), np.ones(1, bool))
-        assert agents.inputs == pytest.approx(0.0, abs=1e-12)
-
-
-async def test_at_the_clock_of_a_language_model_an_input_is_held_for_a_second():
-    record = await played("N_0_0", 1, scenario(), cei(set="K0", clock=1.0))
-    times = [row.time_s for row in record.decisions if row.side == "left"]
-    assert times == [float(n) for n in range(len(times))]
-
-
 def test_a_threshold_can_be_set_over_those_of_a_set():
     wanted = asdict(SETS["F1"]) | {"upper_mean": 0.5}
     assert cei(set="F1", upper_mean=0.5).values.items() >= wanted.items()

@@ -9,7 +9,6 @@ import duckdb
 import pytest
 from starlette.testclient import TestClient
 
-from merge_runner.drivers.registry import PROGRAMS
 from merge_runner.errors import UsageError
 from merge_runner.records import SIDES
 from merge_runner.results.store import Store, query
@@ -88,12 +87,6 @@ async def test_two_replayed_sides_of_a_trial_are_the_trial(db, plan_of, text):
     assert found.keys() == wanted.keys()
     assert all(found[at] == pytest.approx(wanted[at], abs=1e-6) for at in wanted)
     assert (trial.status, trial.merged_first) == ("finished", "left")
-
-
-async def test_a_replayed_human_declares_no_chance_and_is_the_same_with_any_seed(plan_of):
-    one, other = [await played(plan_of(HUMAN_REPLAY, sample_set=n)) for n in (0, 1)]
-    assert one.states == other.states
-    assert not PROGRAMS[HUMAN_REPLAY].chance
 
 
 @pytest.mark.parametrize("side", SIDES)

@@ -1,7 +1,5 @@
 """A trial's account in words, and the moments that are marked."""
 
-from __future__ import annotations
-
 import pytest
 
 from merge_runner_analysis.accounts import Mark, account

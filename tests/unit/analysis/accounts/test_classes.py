@@ -1,7 +1,5 @@
 """How a collision came about, and the last moment at which it could have been avoided."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is said of trials in which a scripted stand-in answered."""
 
-from __future__ import annotations
-
 import pytest
 
 from merge_runner.config import both_sides

@@ -1,7 +1,5 @@
 """Folders and zips: read in memory, and refused where they are damaged or made to harm."""
 
-from __future__ import annotations
-
 import struct
 import zipfile
 

@@ -1,7 +1,5 @@
 """What a recording becomes: its condition, its outcome, its times and its ids."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

@@ -1,7 +1,5 @@
 """Trial files: what is read of them, and what makes one unreadable."""
 
-from __future__ import annotations
-
 import pytest
 
 from merge_runner_analysis.human.archive import Unreadable

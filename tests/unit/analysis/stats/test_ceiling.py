@@ -1,27 +1,13 @@
 """The human ceiling is a shipped curve with the power that theory gives."""
 
-from __future__ import annotations
-
 import pytest
 
-from benchmarks.ceiling import SIZES
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner_analysis.data.reference_data import published
 from merge_runner_analysis.stats.indicators import ceiling
-
-NAMES = ["I1", "I2", "I3", "I4", "I1-I4"]
 
 
 def even(n):
     return (n,) * len(CONDITIONS)
-
-
-def test_the_file_has_each_size_indicator_and_rule_once():
-    curve = published("human_ceiling")
-    assert list(curve["n"].unique()) == list(SIZES)
-    assert not curve.duplicated(["n", "indicator", "rule"]).any()
-    assert len(curve) == len(SIZES) * 2 * len(NAMES)
-    assert curve["share"].between(0, 1).all()
 
 
 def test_a_ceiling_is_that_of_the_curve_and_between_its_sizes_linear():

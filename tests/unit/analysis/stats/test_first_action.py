@@ -1,7 +1,5 @@
 """First actions: planted slopes and exchange rates are found, with intervals that hold."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -1,7 +1,5 @@
 """The verdicts on hand-made regressions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 
@@ -139,16 +137,6 @@ def test_gaps_without_spread_are_compared_with_the_margin_themselves(slope, pass
     fit = gap_ols(trials_of(by_product(slope)), robust=True)
     assert robust_verdicts(who_first(), fit)["I4"] == Verdict(passed)
     assert [equivalence_p(b, 0.0, 9) for b in (0.0, 0.999, -0.999, 1.0, -1.0)] == [0, 0, 0, 1, 1]
-
-
-@pytest.mark.filterwarnings("error", "ignore::ResourceWarning")
-def test_terms_whose_errors_hang_together_have_no_joint_test():
-    """Gaps vary in N_0_0 alone: one number says the errors of all coefficients."""
-    rest = {name: 5 + 0.2 * abs(c.projected_headway_m) for name, c in CONDITIONS.items()}
-    level = [trials_of({"N_0_0": gap_m}) for gap_m in (4.0, 6.0)]
-    fit = gap_ols(pd.concat([trials_of(rest), *level]), robust=True)
-    assert fit.velocity_p is None
-    assert robust_verdicts(who_first(), fit)["I4"].passed is not None
 
 
 def test_differences_are_of_played_conditions_with_one_projected_headway():

@@ -1,7 +1,5 @@
 """The regressions against printed figures and against computations that share no code with them."""
 
-from __future__ import annotations
-
 from itertools import product
 from pathlib import Path
 
@@ -10,11 +8,7 @@ import pandas as pd
 import pytest
 from firthmodels import FirthLogisticRegression, detect_separation
 
-from analysis.research.independent.recompute_statistics import (
-    equivalence_p,
-    joint_p,
-    least_squares,
-)
+from analysis.research.independent.recompute_statistics import equivalence_p, joint_p, least_squares
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner_analysis.data.reference_data import human_outcomes
 from merge_runner_analysis.stats.regressions import (
@@ -112,21 +106,6 @@ def test_the_human_counts_give_the_papers_logit_to_the_printed_digits():
 
 
 @BOTH_FITS
-def test_with_the_sides_swapped_only_the_intercept_changes_its_sign(fit):
-    trials = drawn(2, 5, 0.7, 0.6, -1.0)
-    swapped = trials.assign(
-        projected_headway_m=-trials["projected_headway_m"],
-        relative_velocity_mps=-trials["relative_velocity_mps"],
-        merged_first=trials["merged_first"].map({"left": "right", "right": "left"}),
-    )
-    b, se, p = numbers(fit(trials), WHO_FIRST)
-    mirrored = numbers(fit(swapped), WHO_FIRST)
-    assert b[0] > 0.2
-    assert mirrored[0] == pytest.approx([-b[0], b[1], b[2]], rel=1e-3)
-    assert mirrored[1:] == (pytest.approx(se, rel=1e-3), pytest.approx(p, rel=1e-3))
-
-
-@BOTH_FITS
 def test_only_finished_trials_with_a_first_merger_count(fit):
     others = [
         (4.0, 0.8, "collided", None, None),
@@ -156,12 +135,7 @@ COUNTS = [5, 1, 5, 1, 5, 4, 2, 1, 5, 2, 2]
     "trials",
     [
         pytest.param(HUMANS, id="humans"),
-        pytest.param(OVERLAPPING, id="unseparated"),
         pytest.param(SEPARATED, id="separated"),
-        pytest.param(
-            ruled(4, lambda h, dv, rep: "left" if h + dv + rep % 2 > 0.5 else "right"),
-            id="quasi-separated",
-        ),
         pytest.param(
             frame([(h, dv, "finished", "left" if h + 3 * dv > 0.1 else "right", 4.0)
                    for (h, dv), n in zip(CELLS, COUNTS, strict=True) for _ in range(n)]),
@@ -245,18 +219,6 @@ def test_the_gap_is_regressed_by_least_squares_with_plain_or_hc3_errors(robust):
         assert fit.equivalence_p == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(
-    ("gap_of", "expected"),
-    [
-        (lambda h, dv, e: 6 + h * dv + e / 100, [6, 0, 0, 1]),
-        (lambda h, dv, e: 6 + abs(h) / 2 - abs(dv) + e / 100, [6, 0.5, -1, 0]),
-    ],
-)
-def test_the_product_is_signed_and_the_main_effects_are_not(gap_of, expected):
-    fit = gap_ols(of_gaps(3, gap_of))
-    assert [term.b for term in fit.terms.values()] == pytest.approx(expected, abs=0.02)
-
-
 @ROBUST
 def test_only_finished_trials_with_a_gap_count(robust):
     others = [
@@ -319,24 +281,5 @@ def test_too_little_data_are_said(fit):
     no_fit(fit(frame([(4.0, 0.8, "finished", "left", 3.0)])), "1 finished trial with a ")
     one_cell = [(4.0, 0.8, "finished", ("left", "right")[k % 2], 4.0 + k) for k in range(20)]
     no_fit(fit(frame(one_cell)), "too few or in too few conditions to tell the terms apart")
-
-
-@BOTH_FITS
-def test_as_many_trials_as_coefficients_are_too_few(fit):
-    rows = [
-        (4.0, 0.8, "finished", "left", 3.0),
-        (0.0, 0.0, "finished", "right", 3.0),
-        (0.0, -0.8, "finished", "left", 3.0),
-    ]
-    no_fit(fit(frame(rows)), "3 finished trials with a first merger")
-
-
-@EVERY_FIT
-def test_small_samples_give_finite_terms_or_a_reason(fit):
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        n = int(rng.integers(2, 23))
-        found = fit(drawn(seed, 2, *rng.normal(0, 2, 3)).sample(n, random_state=1))
-        assert bool(found.terms) != bool(found.problem)
-        values = [(term.b, term.se, term.p) for term in found.terms.values()]
-        assert all(np.isfinite(each).all() and each[1] > 0 for each in values)
+    if fit in (who_first_logit, who_first_firth):  # as many trials as coefficients
+        no_fit(fit(OVERLAPPING[:3]), "3 finished trials with a first merger")

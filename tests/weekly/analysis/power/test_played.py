@@ -1,7 +1,5 @@
 """Simulated studies find what studies that are played find, at the stated rate."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 

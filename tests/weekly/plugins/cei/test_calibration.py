@@ -5,7 +5,6 @@ import subprocess
 import sys
 from dataclasses import asdict, replace
 
-import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
@@ -17,12 +16,12 @@ from merge_runner_analysis.data.reference_data import PAIRS
 from merge_runner_analysis.human.record import SPEC, SPEC_HASH, Trace, trial_record
 from merge_runner_cei.batch import simulate
 from merge_runner_cei.calibration import __main__ as calibration
-from merge_runner_cei.calibration.authors_fit import GRID, REACTIONS, estimated, grid_speeds
+from merge_runner_cei.calibration.authors_fit import REACTIONS, estimated
 from merge_runner_cei.calibration.design import design, experiment, model_of
 from merge_runner_cei.calibration.search import MISSING, cost, search, targets
 from merge_runner_cei.calibration.searches import SEARCHES
 from merge_runner_cei.driver import check
-from merge_runner_cei.parameters import OFFSETS, SETS, TICK_S, Base
+from merge_runner_cei.parameters import OFFSETS, SETS, TICK_S
 from tests.support.cei_trials import scenario, simulated
 from tests.support.harness import PROJECT, environment
 
@@ -87,16 +86,6 @@ def test_the_order_of_the_drivers_is_found_again(humans):
         }
         found = estimates.groupby("driver")[threshold].mean()
         assert spearmanr(found, [planted[name] for name in found.index])[0] > 0.8
-
-
-def test_an_agent_of_the_grid_is_given_its_own_thresholds_or_equal_ones():
-    speeds = grid_speeds()
-    assert {len(found) for found in speeds.values()} == {len(GRID)} == {625}
-    # Mirrored conditions are one for the two sides.
-    np.testing.assert_array_equal(speeds["L_4_8", "left"], speeds["R_-4_-8", "right"])
-    agent = GRID.index(min(GRID, key=lambda one: abs(one.lower - 0.2) + abs(one.upper - 0.4)))
-    assert speeds["N_0_0", "left"][agent] < 9.5
-    assert isinstance(GRID[agent], Base)
 
 
 def test_the_design_has_each_pair_ten_times_in_each_condition_with_the_seeds_of_the_slots():
