@@ -118,14 +118,6 @@ def test_the_wheel_holds_sweeps_registry_and_recordings_also_when_built_from_the
     }
 
 
-def test_the_oldest_packages_that_are_tested_are_those_that_pyproject_names():
-    lock = (PROJECT / "requirements/lowest.lock").read_text()
-    tested = dict(re.findall(r"^([a-z0-9-]+)==([0-9.]+)", lock, re.MULTILINE))
-    for requirement in DESCRIBED["dependencies"]:
-        name, oldest = re.split(">=|,", requirement)[:2]
-        assert re.fullmatch(rf"{re.escape(oldest)}(\.0)*", tested[name]), name
-
-
 def test_make_says_the_exit_code_of_the_program(tmp_path):
     missed = run(
         PROJECT, "make", "replay", "MODEL=o3", "RECORDING=",

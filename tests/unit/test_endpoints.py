@@ -107,16 +107,7 @@ def test_the_models_of_the_paper_are_those_it_names_and_have_successors():
     assert {*successors.values()} <= models.keys()
 
 
-@pytest.mark.parametrize(
-    ("today", "note"),
-    [
-        ("2026-11-10", "note: m closes in 31 days, on 2026-12-11; its successor is n"),
-        ("2026-11-11", "WARNING: m closes in 30 days, on 2026-12-11: record it now (docs/"),
-        ("2026-12-10", "WARNING: m closes in 1 day, on 2026-12-11: record it now (docs/"),
-        ("2026-12-11", "WARNING: m closed on 2026-12-11: only a recording answers for it"),
-        ("2027-01-01", "WARNING: m closed on 2026-12-11: only a recording answers for it"),
-    ],
-)
+@pytest.mark.parametrize(("today", "note"), CASES["closing"].items())
 def test_a_warning_comes_thirty_days_before_a_model_closes_and_from_then_on(today, note):
     closing = {"m": entry(shutdown="2026-12-11", successor="n"), "other": entry()}
     (said,) = shutdown_notes(closing, date.fromisoformat(today))

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_runner.prompts.parse import parse_reply
+from tests.support.cases import table
 
 N = 20
 REFUSALS = {
@@ -52,14 +53,8 @@ MODEL_LIKE = [
     "",
 ]
 HOSTILE = [
-    *("1e999999", "-1e999999", "1e-999999", "9" * 400, "0." + "1" * 400, "nan", "-inf", "1_0"),
-    *("0x1p3", "1j", "\u0661", "\u2212", "\u221e", "True", "None", "[]", "{}", "[[", "]]", "()"),
-    *("__import__('os')", "__import__('os').system('true')", TRAP, f"[{TRAP}]", f"[{TRAP}]*20"),
-    *("eval('1')", "exec('1')", "open('/etc/passwd')", "(lambda: 0)()", "np.array([0.1]*20)"),
-    *("np.zeros(20).tolist()", "np.linspace(-1,1,20)", "float('1e5')", "float('nan')"),
-    *("{{7*7}}", "${x}", "%s%n", "'; DROP TABLE trials;--", "<script>", "\x00", "\x1b[2J"),
-    *("```", "````", "``", "```python", "```\n```", "#", "# [", "\\", "\r", "\r\n", "\u2028"),
-    *("\ud800", "\udfff", "\ufeff", "\u202e", "\U0010ffff", "e\u0301" * 9, "M", "Y", "M/Y", "-- "),
+    *table("hostile_replies", "pieces"),
+    *("9" * 400, "0." + "1" * 400, TRAP, f"[{TRAP}]", f"[{TRAP}]*20", "\ud800", "\udfff"),
 ]
 
 
@@ -103,14 +98,7 @@ def test_the_watch_sees_code_that_runs(every_audit_event):
 
 # What stands before and after the unit that is repeated.
 FRAMES = (("", ""), ("M ", "x"), ("[", "x]"), ("```\n[", "\n```"))
-UNITS = (
-    *("[", "]", "[]", "[[", "[1,", "[1],", "1,", "1", "0.", "1.1,", "1e", "e+", "-", "- ", "+ "),
-    *(".,", "```", "``", "`", "```\n[", "```\n[1]\n```\n", "#", "# ", "#\n", "# [", "*", "_", "* "),
-    *("M ", "M", "Y\n", "(M)", "tactical ", "tactical decision: ", "decision", "plan_", "merge "),
-    *(" ", "\n", "\r\n", "\t ", "\r", "\u2212", "\u2013 ", "\x00"),
-    *("a", "a ", "\u00e9", "\U0001f697"),
-    *("nan,", "np.", "float('", "infinity", "[0.1]*", "'", '"', ":", ")", "\u2014", "yield "),
-)
+UNITS = table("hostile_replies", "units")
 
 
 def seconds(frame, unit, size):

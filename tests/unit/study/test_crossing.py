@@ -133,12 +133,6 @@ def test_levels_that_are_no_names_have_ids_of_their_own(plan_of):
     assert all(trial_id.isascii() and len(trial_id) < 120 for trial_id in ids)
 
 
-def test_plain_sweeps_have_one_arm_for_each_prompt():
-    plan = make_plan("ablations", "emulator")
-    assert [arm.label for arm in plan.arms] == ["baseline", *(f"A{i}" for i in range(1, 8))]
-    assert all(not spec.factors for spec in plan.trial_specs())
-
-
 FOGGY = "[perception.foggy]\nspeed_sd_mps = 0.3\ndelay_s = 0.4\n"
 
 

@@ -171,7 +171,7 @@ def test_a_planted_cue_has_its_sign_on_whichever_side_the_ego_sits(tmp_path):
 
 def test_the_program_and_the_database_agree_on_the_ego(tmp_path):
     db = write_study(tmp_path / "t.duckdb", yielding("o3", reps=1)[:1])
-    for left, right, asking, opponent, ego in table("egos", "egos"):
+    for left, right, asking, opponent, ego in table("pairs", "egos"):
         assert ego_side({"left": left, "right": right}, asking, opponent) == ego
         spec = {
             side: {"endpoint": "openai", "body": {}} if name in asking else {"program": name}

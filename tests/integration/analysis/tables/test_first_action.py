@@ -207,13 +207,9 @@ def test_the_explorer_and_the_figure_tell_who_was_only_asked(asked):
     assert any("[asked]" in name for name in names)
 
 
-def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(prepare, tmp_path):
-    (tmp_path / "mine.toml").write_text(
-        'repetitions = 1\nconditions = ["L_4_8", "R_-4_-8"]\n'
-        '[scenario]\ncontrol_start = "own_exit"\n'
-    )
-    assert prepare(tmp_path, "sweep", "mine.toml").code == 0
-    rows = by_id(made(Study(tmp_path / "results/merge.duckdb"), "first-action"))
-    (row,) = (row for name, row in rows.items() if name.startswith("emulator"))
+def test_drivers_that_take_control_one_after_the_other_are_left_out_with_a_note(tmp_path):
+    apart = ScenarioConfig(control_start="own_exit")
+    db = write_study(tmp_path / "t.duckdb", following("alike", -0.34)[:8], apart)
+    row = by_id(made(Study(db), "first-action"))["alike/baseline"]
     assert row.values["n"] == 0
     assert '"own_exit" one driver acts while' in row.note

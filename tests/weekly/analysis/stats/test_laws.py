@@ -6,22 +6,11 @@ from scipy import stats
 
 from benchmarks.ceiling import shares
 from merge_runner_analysis.data.reference_data import published
-from merge_runner_analysis.stats.contrasts import contrast_means
 from merge_runner_analysis.stats.first_action import exchange_rate, mean, slope
 from merge_runner_analysis.stats.intervals import melded
 from merge_runner_analysis.stats.regressions import who_first_firth
-from tests.unit.analysis.stats.test_contrasts import group
 from tests.unit.analysis.stats.test_first_action import HEADWAY, SLOPE, VELOCITY, drawn
 from tests.unit.analysis.stats.test_regressions import OVERLAPPING, firthmodels, who_first_arrays
-
-
-def test_a_small_group_that_scatters_differs_by_chance_in_one_of_twenty():
-    rng, found = np.random.default_rng(5), 0
-    for _ in range(400):
-        first = group(N_0_0=rng.normal(2, 4, 3), L_4_8=rng.normal(8, 4, 3))
-        second = group(N_0_0=rng.normal(2, 1, 30), L_4_8=rng.normal(8, 1, 30))
-        found += contrast_means(first, second, "gap_m").p < 0.05
-    assert 0.02 * 400 < found < 0.08 * 400
 
 
 @pytest.mark.parametrize("rates", [(0.02, 0.03), (0.3, 0.03), (0.5, 0.5), (0.0, 0.03)])
