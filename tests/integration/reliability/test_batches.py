@@ -60,14 +60,29 @@ async def answered(server):
     return batched, alone
 
 
-async def interrupted(merge_runner, server, *command, **env):
+class Looks:
+    """Holds the second look at a batch, and all after it, until they may be ``answered``."""
+
+    def __init__(self):
+        self.seen = 0
+        self.second, self.answered = asyncio.Event(), asyncio.Event()
+
+    async def middle(self, request, handler):
+        if re.search("/batches/.", request.path):
+            self.seen += 1
+            if self.seen >= 2:
+                self.second.set()
+                await self.answered.wait()
+        return await handler(request)
+
+
+async def interrupted(merge_runner, looks, *command, **env):
     """What a run prints that gets Ctrl-C at the second look at a batch."""
-    before = len(server.paths)
     process = await merge_runner.start(*command, **env)
-    while sum(bool(re.search("/batches/.", path)) for path in server.paths[before:]) < 2:
-        await asyncio.sleep(0.02)
+    await looks.second.wait()
     process.send_signal(signal.SIGINT)
     out, err = await process.communicate()
+    looks.answered.set()
     assert process.returncode == 130, err
     return out.decode()
 
@@ -99,9 +114,10 @@ async def test_a_sweep_in_batches_is_paid_and_replayed_as_any_other(merge_runner
 
 async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
     sweep = ("sweep", "short.toml", *TWO, "--model", "priced", "--batch", "--yes")
-    async with watched(faults=FaultPlan(batch=BatchPlan(polls=5))) as server:
+    looks = Looks()
+    async with watched(looks.middle, FaultPlan(batch=BatchPlan(polls=5))) as server:
         env = account(server)
-        left = json.loads(await interrupted(merge_runner, server, *sweep, "--json", **env))
+        left = json.loads(await interrupted(merge_runner, looks, *sweep, "--json", **env))
         last = await merge_runner(*sweep, "--json", **env)
         batched, alone = await answered(server)
     assert last.code == 0, last.err

@@ -11,6 +11,7 @@ import pytest
 
 from merge_runner.results.store import results_digest
 from tests.integration.reliability.test_batches import (
+    Looks,
     account,
     answered,
     interrupted,
@@ -77,15 +78,15 @@ async def test_a_sweep_that_is_killed_at_20_instants_pays_nothing_twice(merge_ru
 
 async def test_a_sweep_may_change_its_mode_at_any_time(merge_runner, tmp_path):
     sweep = ("sweep", "short.toml", "--model", "priced", "--yes")
-    plan = FaultPlan(latency_s=0.02, batch=BatchPlan(delay_s=0.5))
-    async with watched(faults=plan) as server:
+    plan, looks = FaultPlan(latency_s=0.02, batch=BatchPlan(delay_s=0.5)), Looks()
+    async with watched(looks.middle, plan) as server:
         env = account(server)
         process = await merge_runner.start(*sweep, "--in-flight", 2, **env)
         while server.requests < 20:  # another process asks
             await asyncio.sleep(0.02)
         process.send_signal(signal.SIGINT)
         assert await process.wait() == 130
-        await interrupted(merge_runner, server, *sweep, "--batch", **env)
+        await interrupted(merge_runner, looks, *sweep, "--batch", **env)
         last = await merge_runner(*sweep, **env)
         batched, alone = await answered(server)
         plain = await merge_runner(*sweep, "--db", "plain", "--cache", "new", **env)
