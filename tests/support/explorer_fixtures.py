@@ -4,13 +4,25 @@ from __future__ import annotations
 
 import os
 import shutil
+from importlib.resources import files
 
 import pytest
 
-from tests.support.axe import serious
-
 HERE = ("http://127.0.0.1:", "file:", "data:", "blob:")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+# All rules are run; only of what violates one are the places described, which takes longest.
+RUN = "axe.run({preload: false, resultTypes: ['violations']})"
+AXE = files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8")
+
+
+def serious(page):
+    """The findings that are serious or critical: rule, and the beginning of three elements."""
+    page.evaluate(AXE)
+    return [
+        (finding["id"], [node["html"][:200] for node in finding["nodes"][:3]])
+        for finding in page.evaluate(RUN)["violations"]
+        if finding["impact"] in {"serious", "critical"}
+    ]
 
 
 @pytest.fixture(scope="module")

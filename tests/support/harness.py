@@ -103,6 +103,11 @@ class Watched:
     def requests(self) -> int:
         return self.asked.total()
 
+    @property
+    def env(self) -> dict[str, str]:
+        """With which the program asks it for the emulator."""
+        return {"EMULATOR_BASE_URL": f"{self.url}/v1"}
+
 
 @asynccontextmanager
 async def listening(handle: Callable[[web.Request], Awaitable[web.StreamResponse]]):

@@ -19,6 +19,7 @@ from starlette.testclient import TestClient
 from merge_runner.errors import UsageError
 from merge_runner_analysis.explorer.app import explorer, listen
 from merge_runner_analysis.explorer.computing import Computing, Numbers, Worker
+from merge_runner_analysis.explorer.export import export_folder
 from merge_runner_analysis.explorer.site import Site
 from tests.support.gate import HANGS_S
 
@@ -151,3 +152,15 @@ def held(db: Path):
         yield
     finally:
         holder.communicate()
+
+
+def in_a_thread(function, *arguments):
+    """Where a browser is there, the tests' own thread has an event loop."""
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(function, *arguments).result()
+
+
+def export(db, folder, wanted=()):
+    """Export a study or some trials; gives the folder of all pages but the first."""
+    assert in_a_thread(export_folder, db, folder, wanted) == folder / "index.html"
+    return folder / "files"

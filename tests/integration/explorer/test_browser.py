@@ -3,8 +3,6 @@
 All are on a copy of the golden study, which one server shows.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -17,16 +15,12 @@ import pytest
 from anyio.from_thread import start_blocking_portal
 from playwright.sync_api import expect
 
-from merge_runner_analysis.data.study import Study
+from merge_runner_analysis.explorer import computing
 from merge_runner_analysis.explorer.export import export_page
-from merge_runner_analysis.report.page import report_html
-from merge_runner_analysis.tables import make_tables
-from tests.support.axe import serious
-from tests.support.exporting import export, in_a_thread
+from tests.support.explorer_fixtures import serious
 from tests.support.gate import HANGS_S, Gate
 from tests.support.harness import PROGRAM, environment, watched
-from tests.support.serving import served
-from tests.support.studies import write_study, yielding
+from tests.support.serving import export, in_a_thread, served
 
 EMULATOR = "emulator/baseline/N_0_0/rep01"
 TRIAL = f"/trials/{EMULATOR}"
@@ -34,34 +28,17 @@ NEXT = "emulator/baseline/N_0_0/rep02"
 COLLIDED = "smollm2/baseline/N_0_0/rep01"
 HUMAN = "/trials/human/experiment_1/N_0_0/iter010"
 HOSTILE = "/trials/%3Cb%3Eo3%3C%2Fb%3E/baseline/L_4_0/rep01?side=left&decision=1"
-# Where the cross of a collision is on the screen: 2 units before the end of its line.
-ON_THE_CROSS = """path => {
-    const at = path.getPointAtLength(path.getTotalLength() - 2);
-    const { x, y } = at.matrixTransform(path.getScreenCTM());
-    return [x, y];
-}"""
-# A number, a share, a p-value, an interval or a date, of which no part may stand in a line below.
-BROKEN = r"""() => [...document.querySelectorAll("td")].filter((cell) => {
-  if (!/^[-+<\[\]\d., :]*\d[-\d., :\]%]*$/.test(cell.textContent.trim())) return false;
-  const range = document.createRange();
-  range.selectNodeContents(cell);
-  const lines = [...range.getClientRects()].filter((box) => box.width > 0);
-  return new Set(lines.map((box) => Math.round(box.bottom))).size > 1;
-}).map((cell) => cell.textContent)"""
-WIDE = """() => [...document.querySelectorAll("table")]
-  .filter((table) => table.getBoundingClientRect().right > document.documentElement.clientWidth)
-  .map((table) => table.querySelector("th").textContent)"""
 OVER = "document.documentElement.scrollWidth - innerWidth"
-PAPER_PX = round(190 * 96 / 25.4)  # A4 within its margins
 
 
 @pytest.fixture(scope="module")
 def db(golden, tmp_path_factory):
-    """Without its crossed study, whose groups would be computed without being looked at."""
+    """With two drivers and the odd trials: every other group would be computed as well."""
     path = tmp_path_factory.mktemp("browser") / "golden.duckdb"
     shutil.copy(golden / "golden.duckdb", path)
     with duckdb.connect(str(path)) as connection:
         connection.execute("DELETE FROM trials WHERE model_left IN ('cheap', 'dear')")
+        connection.execute("DELETE FROM trials WHERE source = 'driver'")
     return path
 
 
@@ -75,28 +52,37 @@ def clock(page) -> float:
     return float(page.locator("#clock").inner_text().split()[0])
 
 
-def place(page, side):
-    return page.locator(f"#track .own.{side}").get_attribute("transform")
+def place(page, side, whose="own"):
+    return page.locator(f"#track .{whose}.{side}").get_attribute("transform")
 
 
 def headings(page):
     return page.locator("#decision .decision-panel h2")
 
 
-def answered(page):
-    """Wait for the verdicts, which take longest."""
+def judged_by(page, shape):
+    """What is drawn is what the scenario of the trial judges, in m."""
+    expect(page.locator("#track .judged")).to_have_count(2)
+    width = "it => Number(it.getAttribute('width') ?? 2 * it.getAttribute('r'))"
+    assert page.locator(f"#track .own.left {shape}.judged").evaluate(width) == 4.5
+
+
+def test_from_the_study_to_a_verdict_and_to_why_the_worst_condition_collides_and_a_note(page, db):
+    page.goto("/")
     words = "too few to say whether they drive like humans"
     expect(page.locator(".answer")).to_contain_text(words, timeout=2000 * HANGS_S)
-
-
-def test_from_the_study_to_why_the_worst_condition_collides_and_a_note_on_it(page, db):
+    page.locator("#answers").get_by_role("rowheader", name="smollm2").get_by_role("link").click()
+    trials = page.locator("#headway").get_by_role("link").last.inner_text()
+    page.get_by_label("Compare with").select_option("emulator")
+    page.get_by_role("button", name="Apply").click()
+    expect(page.get_by_role("columnheader", name="emulator", exact=True)).to_be_visible()
+    page.locator("#headway").get_by_role("link").last.click()
+    expect(page.locator(".totals")).to_contain_text(f"{trials} trials")
     page.goto("/")
-    answered(page)
     page.set_viewport_size({"width": 1024, "height": 800})
     assert page.evaluate(OVER) <= 0
-    page.locator("#collisions").get_by_role("row", name="smollm2").get_by_role("link").nth(
-        3
-    ).click()
+    row = page.locator("#collisions").get_by_role("row", name="smollm2")
+    row.get_by_role("link").nth(3).click()
     page.get_by_role("link", name="smollm2/baseline/", exact=False).first.click()
     account = page.locator("details", has_text="Why it collided")
     expect(account).to_contain_text("could still have avoided it")
@@ -104,36 +90,21 @@ def test_from_the_study_to_why_the_worst_condition_collides_and_a_note_on_it(pag
     expect(page.locator("#panel blockquote, #panel pre").first).to_be_visible()
     page.get_by_role("button", name="nearest human").click()
     expect(page.locator("#ghost-key")).to_contain_text("human experiment_")
-    page.keyboard.press("n")
-    expect(page.locator("#note-text")).to_be_focused()
-    page.keyboard.type("The whole trial #level")
-    page.keyboard.press("Enter")
-    expect(page.locator("#noted")).to_contain_text("The whole trial")
-    page.keyboard.press("[")
-    page.keyboard.press("n")
-    about = page.locator("#note-about").inner_text()
-    page.keyboard.type("and this")
-    page.keyboard.press("Enter")
-    expect(page.locator("#noted")).to_contain_text("and this")
+    abouts = []
+    for key, text in (("Shift", "Whole #level"), ("[", "and this")):
+        page.keyboard.press(key)
+        page.keyboard.press("n")
+        expect(page.locator("#note-text")).to_be_focused()
+        abouts.append(page.locator("#note-about").inner_text())
+        page.keyboard.type(text)
+        page.keyboard.press("Enter")
+        expect(page.locator("#noted")).to_contain_text(text)
     whole, part = map(json.loads, db.with_name("golden.notes.jsonl").read_text().splitlines())
-    assert (whole["text"], whole["decision"]) == ("The whole trial #level", None)
-    assert about == f"on the {part['side']} decision {part['decision']}"
+    assert (whole["text"], whole["decision"]) == ("Whole #level", None)
+    assert abouts == ["on the trial", f"on the {part['side']} decision {part['decision']}"]
     page.goto("/notes")
     page.locator(".all-notes tbody a").first.click()
     expect(page.locator("#noted")).to_contain_text("and this")
-
-
-def test_from_the_study_to_a_verdict_its_trials_and_another_driver_beside_it(page):
-    page.goto("/")
-    answered(page)
-    page.get_by_role("rowheader", name="quantal").get_by_role("link").click()
-    verdict = page.locator("#headway")
-    trials = verdict.get_by_role("link").last.inner_text()
-    page.get_by_label("Compare with").select_option("idm")
-    page.get_by_role("button", name="Apply").click()
-    expect(page.get_by_role("columnheader", name="idm", exact=True)).to_be_visible()
-    page.locator("#headway").get_by_role("link").last.click()
-    expect(page.locator(".totals")).to_contain_text(f"{trials} trials")
 
 
 def test_from_a_filtered_list_to_a_collision_its_words_and_back(page):
@@ -153,12 +124,11 @@ def test_from_a_filtered_list_to_a_collision_its_words_and_back(page):
     page.reload()
     expect(page.locator("tbody tr")).to_have_count(2)
     page.locator("tbody a").first.click()
-    expect(page.get_by_text("The vehicles collided")).to_be_visible()
     page.locator("#decision article").last.get_by_role("link").click()
-    panel = page.locator(".decision-panel")
-    for number, did in enumerate(("said", "planned", "was told")):
-        expect(panel.locator("h3").nth(number)).to_have_text(f"What it {did}")
-    expect(panel.locator("details.block", has_text="as before").locator("pre").first).to_be_hidden()
+    told = ["What it said", "What it planned", "What it was told", "Attempts"]
+    expect(page.locator(".decision-panel h3")).to_have_text(told)
+    block = page.locator("details.block", has_text="as before")
+    expect(block.locator("pre").first).to_be_hidden()
     page.keyboard.press("Escape")
     expect(page.locator("a.decision[aria-current]")).to_have_count(0)
     page.keyboard.press("Escape")
@@ -166,21 +136,24 @@ def test_from_a_filtered_list_to_a_collision_its_words_and_back(page):
 
 
 def test_through_a_list_by_keys_and_links_and_from_its_words(page):
+    name = page.locator("h1")
     page.goto("/trials?q=emulator&sort=-end")
     names = page.locator("tbody th a").all_inner_texts()
     page.locator("tbody th a").nth(1).click()
-    for move, name in (
+    for move, there in (
         (lambda: None, names[1]),
         (lambda: page.keyboard.press("j"), names[2]),
         (page.locator("#previous-trial").click, names[1]),
         (lambda: page.keyboard.press("k"), names[0]),
     ):
         move()
-        expect(page.locator("h1")).to_have_text(name)
-        expect(page.locator("#next-trial")).to_be_visible()
+        expect(name).to_have_text(there)
+        expect(page.locator("#next-trial")).to_be_visible()  # keys are heard from here on
     expect(page.locator("#previous-trial")).to_be_hidden()
     page.keyboard.press("Escape")
     page.wait_for_url("**/trials?q=emulator&sort=-end")
+    page.goto("/sql?q=select+count(*)+from+trials")
+    expect(page.locator("#result tbody")).to_contain_text("79")
     page.goto("/words")
     page.keyboard.press("/")
     page.keyboard.type("MERGE")
@@ -189,17 +162,15 @@ def test_through_a_list_by_keys_and_links_and_from_its_words(page):
     every = [row.split()[0] for row in page.locator(".hits tbody th").all_inner_texts()]
     first, second, *_ = dict.fromkeys(every)
     page.locator(".hits tbody th a").first.click()
-    expect(page.locator("h1")).to_have_text(first)
-    expect(headings(page)).to_have_count(1)
+    expect(name).to_have_text(first)
+    expect(page.locator(".decision-panel h2")).to_have_count(1)
     page.keyboard.press("j")
-    expect(page.locator("h1")).to_have_text(second)
-    page.goto(TRIAL)  # to which no list led
-    expect(page.locator("#track")).to_be_visible()
-    expect(page.locator("#next-trial")).to_be_hidden()
+    expect(name).to_have_text(second)
 
 
 def test_time_moves_by_play_scrub_keys_and_charts_and_ends_at_a_collision(page):
     page.goto(TRIAL)
+    judged_by(page, "circle")
     start = place(page, "left")
     for key, speed in zip("12345", ("0.25", "0.5", "1", "2", "4"), strict=True):
         page.keyboard.press(key)
@@ -210,11 +181,9 @@ def test_time_moves_by_play_scrub_keys_and_charts_and_ends_at_a_collision(page):
     assert place(page, "left") != start
     page.locator("#scrub").fill("2.5")
     head = page.locator("#playhead").bounding_box()["x"]
-    times = [clock(page)]
-    for key in ("ArrowLeft", "ArrowRight", "Shift+ArrowRight"):
+    for key, time_s in (("ArrowLeft", 2.4), ("ArrowRight", 2.5), ("Shift+ArrowRight", 3.5)):
         page.keyboard.press(key)
-        times.append(clock(page))
-    assert times == [2.5, 2.4, 2.5, 3.5]
+        assert clock(page) == time_s
     assert page.locator("#playhead").bounding_box()["x"] > head
     expect(page).to_have_url(re.compile(r"t=3\.5"))
     chart = page.locator("#chart-h")
@@ -223,12 +192,15 @@ def test_time_moves_by_play_scrub_keys_and_charts_and_ends_at_a_collision(page):
     page.get_by_role("button", name="left merges").click()
     told = page.locator("#now").inner_text()
     assert float(re.search(r"left \S+ m/s at (\S+) m", told)[1]) == pytest.approx(100, abs=0.1)
+    expect(page.locator("#next-trial")).to_be_hidden()  # no list led here
     page.goto(f"/trials/{COLLIDED}?t=2")
     expect(page.locator("#lines .collision")).to_have_count(1)
     expect(page.locator("#track .crash")).to_be_hidden()
     page.locator("#play").click()
     expect(page.locator("#track .crash")).to_be_visible()
     expect(page.locator("#play")).to_have_text("Play")
+    page.goto(f"{HUMAN}?t=3")
+    judged_by(page, "rect")
 
 
 def test_the_panel_follows_the_replay_until_a_decision_is_chosen_or_somebody_reads(page):
@@ -307,18 +279,18 @@ def test_another_trial_is_found_by_the_keyboard_and_goes_on_where_this_one_ended
     page.wait_for_function("() => new Promise((done) => setTimeout(() => done(true)))")
     expect(page.locator("#others option")).to_have_count(1)
     page.keyboard.press("Enter")
-    expect(page.locator("#ghost-key")).to_contain_text("L_4_8, rep 2")
+    key = page.locator("#ghost-key")
+    expect(key).to_contain_text("L_4_8, rep 2")
     page.locator("#scrub").fill("3.8")
-    ghost = page.locator("#track .ghost.left")
-    before = ghost.get_attribute("transform")
+    before = place(page, "left", "ghost")
     page.keyboard.press("Shift+ArrowRight")
-    assert ghost.get_attribute("transform") != before
+    assert place(page, "left", "ghost") != before
     page.keyboard.press(" ")
     expect(page.locator("#play")).to_have_text("Pause")
     page.get_by_role("button", name="next repetition").click()
-    expect(page.locator("#ghost-key")).to_contain_text("rep 2. The vehicles collided")
+    expect(key).to_contain_text("rep 2. The vehicles collided")
     page.go_back()
-    expect(page.locator("#ghost-key")).to_contain_text("L_4_8, rep 2")
+    expect(key).to_contain_text("L_4_8, rep 2")
     page.locator("#alone").click()
     expect(page.locator("#clock")).to_have_text("2.8 s of 2.8 s")
 
@@ -326,35 +298,24 @@ def test_another_trial_is_found_by_the_keyboard_and_goes_on_where_this_one_ended
 def test_what_a_model_wrote_is_text_and_its_failures_are_named(page):
     page.goto(HOSTILE)
     panel = page.locator(".decision-panel")
-    expect(panel).to_contain_text("<script>document.title='owned'</script>")
-    expect(panel).to_contain_text("{{ 7*7 }}")
-    expect(panel).to_contain_text("[U+202E]")
-    assert "owned" not in page.title()
-    assert panel.locator("script, img").count() == 0
-    expect(panel).to_contain_text("no valid plan: no_array: it drove on with an older plan")
+    for said in (
+        "<script>document.title='owned'</script>",
+        "{{ 7*7 }}",
+        "[U+202E]",
+        "no valid plan: no_array: it drove on with an older plan",
+    ):
+        expect(panel).to_contain_text(said)
+    assert ("owned" in page.title(), panel.locator("script, img").count()) == (False, 0)
     expect(panel.locator("details", has_text="The whole reply")).to_have_attribute("open", "")
     raw = page.request.get(panel.get_by_role("link", name="the whole text").get_attribute("href"))
     assert raw.headers["content-type"].startswith("text/csv")
     assert "attachment" in raw.headers["content-disposition"]
-    assert len(raw.text()) > 1_000_000
-    assert len(panel.inner_text()) < 50_000
+    assert len(raw.text()) > 1_000_000 > 20 * len(panel.inner_text())
     page.goto("/trials/o4/baseline/L_4_0/rep01")
-    page.get_by_role(
-        "link", name=re.compile("left, decision 2 at .* no answer, never driven")
-    ).click()
+    lost = re.compile("left, decision 2 at .* no answer, never driven")
+    page.get_by_role("link", name=lost).click()
     expect(panel).to_contain_text("The call got no answer")
     expect(panel.locator("tbody")).to_contain_text("timeout")
-
-
-@pytest.mark.parametrize(
-    ("trial", "shape", "size"), [(TRIAL, "circle", 4.5), (HUMAN, "rect", 4.5)], ids=["llm", "human"]
-)
-def test_a_picture_draws_what_the_scenario_of_a_trial_judges(page, trial, shape, size):
-    page.goto(f"{trial}?t=3")
-    expect(page.locator("#track .judged")).to_have_count(2)
-    drawn = page.locator(f"#track .own.left {shape}.judged")
-    width = "it => Number(it.getAttribute('width') ?? 2 * it.getAttribute('r'))"
-    assert drawn.evaluate(width) == size
 
 
 def test_a_phone_shows_a_decision_that_is_tapped_and_leads_back_by_day_and_by_night(page):
@@ -378,30 +339,6 @@ def test_a_phone_shows_a_decision_that_is_tapped_and_leads_back_by_day_and_by_ni
     expect(page.locator("#track")).to_be_in_viewport(ratio=0.9)
     expect(page.locator("a.decision[aria-current]")).to_have_count(1)
     assert page.evaluate(OVER) <= 0
-
-
-def test_a_trace_of_a_condition_leads_to_its_trial_and_back(page):
-    page.goto("/conditions/N_0_0")
-    page.locator("summary", has_text="all of").click()
-    page.get_by_label("smollm2").check()
-    page.get_by_role("button", name="Apply").click()
-    expect(page.locator(".overlay a")).to_have_count(2)
-    crash = page.locator("path.collided").last
-    crash.scroll_into_view_if_needed()
-    page.mouse.click(*crash.evaluate(ON_THE_CROSS))
-    expect(page.locator("h1")).to_contain_text("smollm2/baseline/N_0_0/rep0")
-    page.get_by_role("link", name="the traces of N_0_0").click()
-    expect(page.locator("h1")).to_contain_text("N_0_0: the drivers' trials beside the humans'")
-
-
-def test_a_link_of_another_page_runs_no_query_and_a_typed_address_does(page, site, tmp_path):
-    query = f"{site}/sql?q=select+count(*)+from+trials"
-    (tmp_path / "other.html").write_text(f'<title>a</title><a href="{query}">here</a>')
-    page.goto((tmp_path / "other.html").as_uri())
-    refused = page.request.get(query, headers={"sec-fetch-site": "cross-site"})
-    assert (refused.status, refused.text()) == (403, "another site's page may not ask here\n")
-    page.goto(query)
-    expect(page.locator("#result tbody")).to_contain_text("145")
 
 
 def test_a_page_says_that_nobody_answers_it_until_somebody_does(browser, db):
@@ -432,22 +369,18 @@ def held_server(tmp_path):
         start_blocking_portal() as elsewhere,
         elsewhere.wrap_async_context_manager(watched(gate.middle)) as server,
     ):
-        yield server.url, lambda: elsewhere.call(gate.open)
+        yield f"{server.url}/v1", lambda: elsewhere.call(gate.open)
 
 
-def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_server):
+def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_server, monkeypatch):
+    monkeypatch.setattr(computing, "STANDS_S", 0.0)
     url, let_go = held_server
-    db = tmp_path / "merge.duckdb"
+    db, ended = tmp_path / "merge.duckdb", "Finished: all 2 trials ended"
     sweep = subprocess.Popen(
-        [
-            *(PROGRAM, "sweep", "baseline", "--reps", "1", "--conditions", "L_4_0,N_0_0"),
-            *("--db", db, "--cache", tmp_path / "cache"),
-        ],
-        cwd=tmp_path,
-        env=environment(EMULATOR_BASE_URL=f"{url}/v1"),
-        stderr=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-    )
+        [PROGRAM, "sweep", "baseline", "--reps", "1", "--conditions", "L_4_0,N_0_0", "--db", db],
+        cwd=tmp_path, env=environment(EMULATOR_BASE_URL=url),
+        stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
     while not (tmp_path / "merge.duckdb.progress").is_dir():
         assert sweep.poll() is None
         time.sleep(0.05)
@@ -466,12 +399,12 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_se
         assert serious(page) == []
         page.evaluate("window.stayed = true")
         let_go()
-        expect(verdict).to_contain_text("Finished: all 2 trials ended")
+        expect(verdict).to_contain_text(ended)
         assert page.evaluate("window.stayed")
         expect(page.locator(".heard")).to_have_text(verdict.locator("strong").inner_text())
         expect(listing.locator(".state")).to_have_text("finished")
         expect(listing.locator("tbody tr")).to_contain_text("2 of 2")
-        expect(study.locator("#strip")).to_contain_text("Finished: all 2 trials ended")
+        expect(study.locator("#strip")).to_contain_text(ended)
         expect(study.locator("#answers .n a").first).to_have_text("2")
         trials.get_by_role("link", name="Show them").click()
         expect(trials.locator("tbody tr")).to_have_count(1)
@@ -483,8 +416,8 @@ def test_a_sweep_is_followed_to_its_end_without_a_reload(page, tmp_path, held_se
     assert sweep.wait() == 0
 
 
-def test_an_exported_folder_opens_from_the_disk_with_replay_decisions_and_notes(page, db, tmp_path):
-    export(db, tmp_path / "made", [EMULATOR, "smollm2/baseline/*"])
+def test_an_exported_folder_and_a_page_of_few_trials_open_from_the_disk(page, db, tmp_path):
+    export(db, tmp_path / "made", [EMULATOR, "smollm2/baseline/N_0_0/*"])
     page.context.set_offline(True)
     page.goto((tmp_path / "made").rename(tmp_path / "moved").joinpath("index.html").as_uri())
     expect(page.locator("footer")).to_contain_text("Search, filters, SQL and new notes need")
@@ -493,11 +426,11 @@ def test_an_exported_folder_opens_from_the_disk_with_replay_decisions_and_notes(
     start = place(page, "left")
     for _ in range(3):
         page.keyboard.press("]")
-    expect(headings(page)).to_have_text(re.compile("decision 1 at "))
+    for again in (lambda: None, page.reload):
+        again()
+        expect(headings(page)).to_have_text(re.compile("decision 1 at "))
+        expect(page).to_have_url(re.compile("decision=1"))
     assert place(page, "left") != start
-    expect(page).to_have_url(re.compile("decision=1"))
-    page.reload()
-    expect(headings(page)).to_have_text(re.compile("decision 1 at "))
     expect(page.locator("#charts .chart")).to_have_count(3)
     expect(page.locator(".plan-values dd").first).to_be_visible()
     expect(page.locator("#note")).to_have_count(0)
@@ -509,39 +442,13 @@ def test_an_exported_folder_opens_from_the_disk_with_replay_decisions_and_notes(
     expect(page.locator("#next-trial")).to_be_visible()
     page.keyboard.press("j")
     expect(page.locator("h1")).to_contain_text("smollm2/")
-
-
-def test_a_page_of_few_trials_lists_them_and_leads_nowhere_else(page, db, tmp_path):
     file = in_a_thread(export_page, db, tmp_path / "one two.html", ["emulator/baseline/N_0_0/*"])
-    page.context.set_offline(True)
     page.goto(file.as_uri())
     listed = page.get_by_label("Trials of this page").get_by_role("link")
     expect(listed).to_have_count(2)
     expect(page.locator("h1")).to_have_text(EMULATOR)
-    expect(listed.first).to_have_attribute("aria-current", "page")
     listed.last.click()
     expect(page.locator("h1")).to_have_text(NEXT)
     page.locator("a.decision").nth(1).click()
     expect(page.locator(".decision-panel .block").first).to_contain_text("You drive a car")
-    page.keyboard.press("Escape")
-    page.keyboard.press("Escape")
-    expect(page.locator("#track")).to_be_visible()
     expect(page.locator("header nav a")).to_have_count(0)
-
-
-def test_a_report_breaks_no_number_and_cuts_no_table_on_a_screen_and_on_paper(page, tmp_path):
-    drives = [*yielding("o3"), *yielding("o3", "A1", 1), *yielding("instruct at localhost:8123", 1)]
-    study = in_a_thread(Study, write_study(tmp_path / "t.duckdb", drives))
-    html = in_a_thread(lambda: report_html(study, make_tables(study), {}))
-    (tmp_path / "report.html").write_text(html)
-    page.goto((tmp_path / "report.html").as_uri())
-    heads = page.locator("#verdicts + .wide th")
-    assert heads.last.text_content() == "verdict"
-    for media, width in (("screen", 1440), ("print", PAPER_PX)):
-        page.emulate_media(media=media)
-        page.set_viewport_size({"width": width, "height": 1000})
-        assert page.evaluate(BROKEN) == []
-        last = heads.last.bounding_box()
-        assert last["x"] + last["width"] <= width
-    assert page.evaluate(WIDE) == []
-    page.goto("/glossary")

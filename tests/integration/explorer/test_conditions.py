@@ -1,7 +1,5 @@
 """All trials of a condition in one picture: what is drawn of whom, and where it leads."""
 
-from __future__ import annotations
-
 import re
 
 import duckdb
@@ -30,8 +28,15 @@ def client(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def query(client):
+    """Asks the database; gives rows as dicts."""
     with duckdb.connect(str(client.site.db), read_only=True) as connection:
-        yield lambda *sql: connection.execute(*sql).fetchall()
+
+        def rows(sql, keys=()):
+            found = connection.execute(sql, [list(part) for part in zip(*keys, strict=True)])
+            names = [column[0] for column in found.description]
+            return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
+
+        yield rows
 
 
 def traces(text):
@@ -40,22 +45,17 @@ def traces(text):
     return dict(re.findall(found, text))
 
 
-def read(client, sql, keys):
-    """What the page reads of trials by (name, spec)."""
-    with duckdb.connect(str(client.site.db), read_only=True) as connection:
-        found = connection.execute(sql, [list(part) for part in zip(*keys, strict=True)])
-        names = [column[0] for column in found.description]
-        return [dict(zip(names, row, strict=True)) for row in found.fetchall()]
-
-
-def test_the_picture_has_a_line_for_each_trial_of_a_driver_that_leads_to_it(client, query):
+def test_the_picture_has_a_line_for_each_trial_of_a_driver_that_leads_to_it(
+    client, query, monkeypatch
+):
     text = client.get("/conditions/N_0_0").text
-    there = dict(
-        query(
-            "SELECT trial_id, coalesce(merged_first || '-first', status) FROM trials "
+    there = {
+        row["trial_id"]: row["shown"]
+        for row in query(
+            "SELECT trial_id, coalesce(merged_first || '-first', status) AS shown FROM trials "
             "WHERE condition = 'N_0_0' AND source <> 'human'"
         )
-    )
+    }
     assert traces(text) == there
     assert there["o3/baseline/N_0_0/rep09"] == "collided"
     assert text.count(conditions.CROSS) == len(PANELS)
@@ -68,29 +68,39 @@ def test_the_picture_has_a_line_for_each_trial_of_a_driver_that_leads_to_it(clie
     assert "beside the humans" not in without
     for address in ("nothing", "N_0_0?variant=A9"):
         assert client.get(f"/conditions/{address}").status_code == 404
+    monkeypatch.setattr(conditions, "MOST", 3)
+    text = client.get("/conditions/N_0_0").text
+    assert len(traces(text)) == 3
+    assert "3 trials of drivers are drawn, taken evenly from the list of 7" in Page(text).text
 
 
-@pytest.mark.parametrize(
-    ("asked", "names"),
-    [
-        ("model=o4", {"o4/baseline"}),
-        ("model=o3&model=o4&variant=baseline", {"o3/baseline", "o4/baseline"}),
-        ("model=o3&variant=A1", {"o3/A1"}),
-        ("variant=A1", {"o3/A1"}),
-        ("sweep=sweep-1", {"o3/baseline", "o3/A1", "o4/baseline"}),
-    ],
-)
-def test_picture_and_table_are_of_the_scope(client, asked, names):
-    text = client.get(f"/conditions/N_0_0?{asked}").text
-    assert {name.rpartition("/N_0_0")[0] for name in traces(text)} == names
-    rows = re.findall(r'<tr><th scope="row">([^<]*)</th><td>([^<]*)</td>', text)
-    assert {"/".join(row) for row in rows} == names
+def test_picture_and_table_are_of_the_scope_and_the_first_page_leads_there_and_back(client, query):
+    for asked, names in {
+        "model=o4": {"o4/baseline"},
+        "model=o3&model=o4&variant=baseline": {"o3/baseline", "o4/baseline"},
+        "sweep=sweep-1&variant=A1": {"o3/A1"},
+    }.items():
+        text = client.get(f"/conditions/N_0_0?{asked}").text
+        assert {name.rpartition("/N_0_0")[0] for name in traces(text)} == names
+        rows = re.findall(r'<tr><th scope="row">([^<]*)</th><td>([^<]*)</td>', text)
+        assert {"/".join(row) for row in rows} == names
+    home = Page(client.get("/").text)
+    for row in query("SELECT DISTINCT condition FROM trials"):
+        address = f"/conditions/{row['condition']}"
+        assert home.to(address)
+        assert Page(client.get(address).text).to("/#collisions")
+    for address, to in (
+        ("/?variant=baseline&condition=N_0_0", "/conditions/N_0_0?variant=baseline"),
+        ("/trials/o3/baseline/N_0_0/rep09", "/conditions/N_0_0"),
+    ):
+        assert Page(client.get(address).text).to(to)
+    words = "the right vehicle would be 2 m ahead at the merge point, and the left one is 0.8 m/s"
+    assert f"{words} faster R_-2_8" in home.text
 
 
-def test_the_humans_are_a_median_and_a_band_from_the_10th_to_the_90th_percentile(client):
+def test_the_humans_are_a_median_and_a_band_from_the_10th_to_the_90th_percentile(query):
     keys = [(f"human/baseline/N_0_0/rep0{i}", "human-baseline") for i in (1, 2, 3)]
-    band = read(client, BAND, keys)
-    own = {row["trial_id"]: row for row in read(client, TRACES, keys)}
+    band, own = query(BAND, keys), {row["trial_id"]: row for row in query(TRACES, keys)}
     one, middle, other = (own[name] for name, _ in keys)
     at = {round(t, 3): v for t, v in zip(middle["time_s"], middle["first_mps"], strict=True)}
     assert len(at) > 10
@@ -106,62 +116,37 @@ def test_the_humans_are_a_median_and_a_band_from_the_10th_to_the_90th_percentile
     assert high == pytest.approx(last - (last - median) / 5)
 
 
-def test_the_first_vehicle_is_the_one_that_merged_first_or_was_ahead_at_the_end(client, query):
+def test_the_first_vehicle_is_the_one_that_merged_first_or_was_ahead_at_the_end(query):
     rows = query(
         "SELECT trial_id, spec_hash, coalesce(any_value(merged_first), if("
         "arg_max(position_m, time_s) FILTER (side = 'left') >= "
-        "arg_max(position_m, time_s) FILTER (side = 'right'), 'left', 'right')), "
-        "arg_max(velocity_mps, time_s) FILTER (side = 'left'), "
-        "arg_max(velocity_mps, time_s) FILTER (side = 'right') "
+        "arg_max(position_m, time_s) FILTER (side = 'right'), 'left', 'right')) AS first, "
+        "arg_max(velocity_mps, time_s) FILTER (side = 'left') AS left, "
+        "arg_max(velocity_mps, time_s) FILTER (side = 'right') AS right "
         "FROM trials JOIN states USING (trial_id, spec_hash) GROUP BY ALL"
     )
-    assert {first for _, _, first, *_ in rows} == {"left", "right"}
-    found = read(client, TRACES, [(trial, spec) for trial, spec, *_ in rows])
+    assert {row["first"] for row in rows} == {"left", "right"}
+    found = query(TRACES, [(row["trial_id"], row["spec_hash"]) for row in rows])
     assert {row["time_s"][0] for row in found} == {0}
     assert min(row["headway_m"][-1] for row in found) >= 0
-    assert {
-        (row["trial_id"], row["spec_hash"], row["first_mps"][-1], row["second_mps"][-1])
+    last = {
+        (row["trial_id"], row["spec_hash"]): (row["first_mps"][-1], row["second_mps"][-1])
         for row in found
-    } == {
-        (trial, spec, *((left, right) if first == "left" else (right, left)))
-        for trial, spec, first, left, right in rows
     }
-
-
-def test_all_lines_lie_in_their_panels_over_one_axis_of_time(client):
-    keys = [("o3/baseline/N_0_0/rep09", "o3-baseline"), ("o3/A1/N_0_0/rep01", "o3-A1")]
-    drawn = [{"outcome": "collided", **row} for row in read(client, TRACES, keys)]
-    picture = conditions.picture(drawn, [])
+    for row in rows:
+        speeds = (row["left"], row["right"])
+        ordered = speeds if row["first"] == "left" else speeds[::-1]
+        assert last[row["trial_id"], row["spec_hash"]] == ordered
+    picture = conditions.picture([{"outcome": "collided", **row} for row in found[:2]], [])
     assert [panel["heading"] for panel in picture["panels"]] == [*PANELS.values()]
-    bottom = picture["panels"][-1]["top"] + picture["panel"]
-    assert bottom < picture["height"]
-    for panel in picture["panels"]:
-        places = [place for place, _ in panel["ticks"]]
-        assert (min(places), max(places)) == (panel["top"], panel["top"] + picture["panel"])
     assert picture["seconds"][0] == (picture["left"], 0)
     assert picture["seconds"][-1][0] == picture["right"]
+    ends = [(panel["top"], panel["top"] + picture["panel"]) for panel in picture["panels"]]
+    assert ends[-1][1] < picture["height"]
+    for panel, (top, bottom) in zip(picture["panels"], ends, strict=True):
+        places = [place for place, _ in panel["ticks"]]
+        assert (min(places), max(places)) == (top, bottom)
     for _, path in picture["lines"]:
         starts = re.findall(r"M(\d+) (\d+)l", path)
-        assert [x for x, _ in starts] == [str(picture["left"])] * len(PANELS)
-        for panel, (_, y) in zip(picture["panels"], starts, strict=True):
-            assert panel["top"] <= int(y) <= panel["top"] + picture["panel"]
-
-
-def test_of_too_many_trials_a_part_is_drawn_and_the_page_says_so(client, monkeypatch):
-    monkeypatch.setattr(conditions, "MOST", 3)
-    text = client.get("/conditions/N_0_0").text
-    assert len(traces(text)) == 3
-    assert "3 trials of drivers are drawn, taken evenly from the list of 7" in Page(text).text
-
-
-def test_the_first_page_leads_to_every_condition_in_words_and_each_leads_back(client, query):
-    home = Page(client.get("/").text)
-    for (name,) in query("SELECT DISTINCT condition FROM trials"):
-        assert home.to(f"/conditions/{name}")
-        assert Page(client.get(f"/conditions/{name}").text).to("/#collisions")
-    assert Page(client.get("/?variant=baseline&condition=N_0_0").text).to(
-        "/conditions/N_0_0?variant=baseline"
-    )
-    assert Page(client.get("/trials/o3/baseline/N_0_0/rep09").text).to("/conditions/N_0_0")
-    words = "the right vehicle would be 2 m ahead at the merge point, and the left one is 0.8 m/s"
-    assert f"{words} faster R_-2_8" in home.text
+        for (top, bottom), (x, y) in zip(ends, starts, strict=True):
+            assert (int(x), top <= int(y) <= bottom) == (picture["left"], True)

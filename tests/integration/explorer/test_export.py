@@ -1,30 +1,24 @@
 """An exported study refers to nothing but itself; no secret leaves with it."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from html.parser import HTMLParser
 from urllib.parse import unquote, urlsplit
 
-import duckdb
 import pytest
 
 from merge_runner.config import ScenarioConfig
 from merge_runner.errors import UsageError
-from merge_runner.results.store import Store
+from merge_runner.results.store import Store, query
 from merge_runner_analysis.explorer.export import export_page
 from merge_runner_analysis.explorer.notes import Notes
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.tables import TABLES
-from tests.support.exporting import export
 from tests.support.hostile import hostile_trial
-from tests.support.serving import Page
+from tests.support.serving import Page, export
 from tests.support.studies import Drive, as_humans, write_study, yielding
 
 TRIAL, OTHER = "o3/baseline/N_0_0/rep01", "o3/baseline/L_4_0/rep01"
-CONDITIONS = {"N_0_0", "L_4_0", "R_0_8"}
-HIDDEN = "o3\u202egpj\u200b"
 FEW = {  # which stand for all
     "pages.tables.TABLES": {"attempts": TABLES["attempts"]},
     "pages.tables.FIGURES": {"first-action": FIGURES["first-action"]},
@@ -48,16 +42,15 @@ class References(HTMLParser):
 
 def broken(page):
     """What a page refers to that is no file beside it; a picture in the page itself is there."""
-    return [
-        address
-        for address in References(page.read_text()).found
-        if not address.startswith("data:image/")
-        and (
-            (parts := urlsplit(address)).scheme
-            or parts.netloc
-            or not (page.parent / unquote(parts.path) if parts.path else page).is_file()
-        )
-    ]
+    found = []
+    for address in References(page.read_text()).found:
+        parts = urlsplit(address)
+        file = page.parent / unquote(parts.path) if parts.path else page
+        if not address.startswith("data:image/") and (
+            parts.scheme or parts.netloc or not file.is_file()
+        ):
+            found.append(address)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +58,10 @@ def study(tmp_path_factory):
     """Drivers with words, one of an odd name, a collision, a hostile trial and a human one."""
     path = tmp_path_factory.mktemp("study") / "study.duckdb"
     crash = Drive("o3", "baseline", "N_0_0", 9, (0.0,), (0.0,), {})
-    hidden = Drive(HIDDEN, "baseline", "N_0_0", 1, (0.4,), (-0.4,))
+    hidden = Drive("o3\u202egpj\u200b", "baseline", "N_0_0", 1, (0.4,), (-0.4,))
     human = Drive("human", "baseline", "N_0_0", 1, (0.4, 0.4), (-0.4, -0.4))
-    of_o3 = [drive for drive in yielding("o3", reps=1) if drive.condition in CONDITIONS]
+    three = {"N_0_0", "L_4_0", "R_0_8"}
+    of_o3 = [drive for drive in yielding("o3", reps=1) if drive.condition in three]
     write_study(path, [*of_o3, crash, hidden, human])
     Store(path).write("sweep-1", [hostile_trial()], patience_s=5)
     as_humans(path)
@@ -110,13 +104,11 @@ def test_a_page_of_its_own_refers_to_nothing_but_itself(study, tmp_path):
         assert broken(page) == []
         text = page.read_text()
         assert {urlsplit(address).path for address in References(text).found} == {""}
-        assert "trials like" not in text
-        assert "the traces of" not in text
-    with duckdb.connect(str(study), read_only=True) as connection:
-        (plan,) = connection.execute(
-            f"SELECT plan FROM decisions WHERE trial_id = '{TRIAL}' AND side = 'left' "
-            "AND decision = 0"
-        ).fetchone()
+        assert not re.search("trials like|the traces of", text)
+    sql = (
+        f"SELECT plan FROM decisions WHERE trial_id = '{TRIAL}' AND side = 'left' AND decision = 0"
+    )
+    ((plan,),) = query(study, sql)[1]
     hardest = ScenarioConfig().max_acceleration_mps2
     shown = " ".join(f"{value * hardest:+.2f}" for value in plan)
     assert f"<dd>{shown}" in text.replace("−", "-").replace("&minus;", "-")
@@ -141,15 +133,14 @@ def test_an_export_of_some_trials_takes_the_place_of_an_earlier_one_unless_it_ho
         assert [note in text for note in ("not of all", "It hesitates.")].count(True) == 1
         assert shown in text
     Notes(db, "anna").add(TRIAL, "o3-baseline", "", None, "sk-proj-abcdefghijklmnop0123")
-    for refused in (lambda: export(db, folder, [TRIAL]), lambda: alone(db, folder / "one.html")):
+    for refused in (
+        lambda: export(db, folder, [TRIAL]),
+        lambda: export_page(db, folder / "one.html", [TRIAL]),
+    ):
         with pytest.raises(UsageError, match="looks like a key"):
             refused()
     assert {page.name: page.read_bytes() for page in folder.rglob("*.html")} == pages
     assert {path.name for path in folder.iterdir()} == {"index.html", "files", "mine.html"}
-
-
-def alone(db, file):
-    return export_page(db, file, [TRIAL])
 
 
 @pytest.mark.parametrize("name", ["index.html", "files"])

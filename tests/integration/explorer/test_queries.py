@@ -1,7 +1,5 @@
 """Queries of a browser run on a copy of the database, and within limits."""
 
-from __future__ import annotations
-
 import gc
 import os
 import shutil
@@ -18,25 +16,19 @@ from merge_runner.results.database import open_database
 from merge_runner_analysis.explorer import queries as module
 from merge_runner_analysis.explorer.database_copy import Copies
 from merge_runner_analysis.explorer.queries import Queries
+from tests.support.cases import cases, table
 from tests.support.gate import HANGS_S
 from tests.support.studies import write_study, yielding
 
 ENDLESS = "WITH RECURSIVE r AS (SELECT 1 AS n UNION ALL SELECT n + 1 FROM r) SELECT max(n) FROM r"
-REFUSED = {
-    "INSERT INTO meta VALUES (9)": "one that only reads",
-    "WITH x AS (INSERT INTO meta VALUES (9) RETURNING *) FROM x": "read-only",
-    "COPY trials TO 'out.csv'": "one that only reads",
-    "ATTACH 'new.duckdb'": "one that only reads",
-    "INSTALL httpfs": "one that only reads",
-    "LOAD httpfs": "one that only reads",
-    "SET memory_limit = '1TB'": "one that only reads",
-    "PRAGMA threads = 9": "one that only reads",
-    "SELECT 1; DROP TABLE meta": "one query at a time",
-    "EXPLAIN ANALYZE COPY (SELECT 1) TO 'out.csv'": "disabled",
-    "FROM read_csv('/etc/passwd', sep = ':')": "disabled",
-    "FROM glob('/*')": "disabled",
-    "SELECT getenv('OPENAI_API_KEY')": "getenv does not exist",
-}
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def texts(rows):
+    return [[cell and cell[0] for cell in row] for row in rows]
 
 
 @pytest.fixture(scope="module")
@@ -56,10 +48,6 @@ def own(study, tmp_path):
     return shutil.copy(study, tmp_path / "own.duckdb")
 
 
-def contents(folder):
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def refusal(queries, sql):
     with pytest.raises(UsageError) as refused:
         queries.result(sql)
@@ -67,36 +55,31 @@ def refusal(queries, sql):
     return str(refused.value)
 
 
-def texts(rows):
-    return [[cell and cell[0] for cell in row] for row in rows]
-
-
-@pytest.mark.parametrize(("sql", "words"), REFUSED.items(), ids=str)
+@pytest.mark.parametrize("case", cases("explorer", "refused-queries"))
 def test_what_is_more_than_a_query_of_the_database_is_refused_and_changes_nothing(
-    study, queries, sql, words
+    study, queries, case
 ):
     before = contents(study.parent)
-    assert words in refusal(queries, sql)
+    assert case["told"] in refusal(queries, case["sql"])
     assert contents(study.parent) == before
 
 
+def test_what_is_too_long_cannot_be_copied_or_is_no_database_is_said_in_a_line(
+    study, tmp_path, monkeypatch
+):
+    (tmp_path / "text.duckdb").write_text("no database")
+    told = refusal(Queries(Copies(tmp_path / "text.duckdb")), "SELECT 1")
+    assert "cannot be opened as a database" in told
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    told = refusal(Queries(Copies(study)), "SELECT 1")
+    assert ("cannot be copied" in told, str(tmp_path) in told) == (True, False)
+    assert "up to 10,000 characters" in refusal(Queries(Copies(study)), "x" * 10_001)
+
+
 def test_values_of_all_kinds_become_texts(queries):
-    values = {
-        "NULL": None,
-        "true": "true",
-        "170141183460469231731687303715884105727::HUGEINT": str(2**127 - 1),
-        "0.1": "0.1",
-        "'nan'::DOUBLE": "nan",
-        "'-inf'::FLOAT": "-inf",
-        "DATE '290000-01-01'": "290000-01-01",
-        "TIMESTAMP '2026-01-02 03:04:05.5'": "2026-01-02 03:04:05.500000",
-        "[1.5::DOUBLE, NULL, 'nan']": "[1.5, null, NaN]",
-        "{'x': [DATE '2026-01-02'], 'y': '<é\"'}": '{"x": ["2026-01-02"], "y": "<é\\""}',
-        "MAP([[1]], [2])": '{"key": [[1]], "value": [2]}',
-        "'a' || chr(0) || chr(8238)": "a\0\u202e",
-    }
-    found = queries.result(f"SELECT {', '.join(values)}")
-    assert texts(found.rows) == [list(values.values())]
+    expressions, shown = zip(*table("explorer", "values").values(), strict=True)
+    found = queries.result(f"SELECT NULL, {', '.join(expressions)}")
+    assert texts(found.rows) == [[None, *shown]]
     assert found.columns[1][1] == "BOOLEAN"
 
 
@@ -123,36 +106,22 @@ def test_a_download_is_whole_or_refused(queries, monkeypatch):
         queries.csv("FROM range(99)")
 
 
-def test_a_copy_that_cannot_be_made_is_said_in_a_line(study, tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
-    assert "cannot be copied" in refusal(Queries(Copies(study)), "SELECT 1")
-    assert str(tmp_path) not in refusal(Queries(Copies(study)), "SELECT 1")
-
-
 def test_what_needs_too_much_memory_is_stopped(queries):
     sql = "SELECT list(range || repeat('x', 1000)) FROM range(10000000)"
     assert refusal(queries, sql) == "the query needed more than 512 MB"
 
 
-def test_an_endless_query_is_stopped_in_time(study):
-    assert refusal(Queries(Copies(study), longest_s=0.3), ENDLESS) == "stopped after 0.3 s"
-
-
-def test_a_sweep_writes_while_a_query_runs(own):
+def test_a_sweep_writes_while_a_query_runs_which_is_stopped_in_time(own):
     copies = Copies(own)
     copy, said = copies.current(), []
-    queries = Queries(copies, longest_s=1)
+    queries = Queries(copies, longest_s=0.5)
     asking = threading.Thread(target=lambda: said.append(refusal(queries, ENDLESS)))
     asking.start()
     with open_database(own, read_only=False, patience_s=0) as connection:
         connection.execute("DELETE FROM sweeps")
     asking.join(HANGS_S)
-    assert said == ["stopped after 1 s"]
+    assert said == ["stopped after 0.5 s"]
     assert copies.current() is not copy
-
-
-def test_a_value_that_python_has_not_is_told(queries):
-    assert "must have magnitude" in refusal(queries, "SELECT INTERVAL '3000000 years'")
 
 
 def test_what_lies_in_the_log_beside_the_database_is_read(own, tmp_path):
@@ -163,10 +132,8 @@ def test_what_lies_in_the_log_beside_the_database_is_read(own, tmp_path):
             shutil.copy(f"{own}{end}", f"{crashed}{end}")
     assert Path(f"{crashed}.wal").stat().st_size > 0
     # Read by a copy of its own: the database is not read first, for what lies there is damaged.
-    result = Queries(Copies(crashed), longest_s=HANGS_S).result(
-        "SELECT min(schema_version) FROM meta"
-    )
-    assert texts(result.rows) == [["-1"]]
+    queries = Queries(Copies(crashed), longest_s=HANGS_S)
+    assert texts(queries.result("SELECT min(schema_version) FROM meta").rows) == [["-1"]]
 
 
 def test_a_copy_lasts_while_the_file_stays_and_leaves_nothing(own, tmp_path, monkeypatch):
@@ -204,11 +171,3 @@ def test_who_is_one_too_many_is_told_at_once(study):
         assert "too many queries are waiting" in str(first.exception())
         going.set()
     assert [each.exception() for each in asked if each is not first] == [None] * many
-
-
-def test_what_is_no_database_is_said(tmp_path):
-    (tmp_path / "text.duckdb").write_text("no database")
-    assert "cannot be opened as a database" in refusal(
-        Queries(Copies(tmp_path / "text.duckdb")), "SELECT 1"
-    )
-    assert "up to 10,000 characters" in refusal(Queries(Copies(tmp_path)), "x" * 10_001)

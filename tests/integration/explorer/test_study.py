@@ -1,7 +1,5 @@
 """The study on one screen and its drivers: the numbers of the table, and where they lead."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -10,9 +8,9 @@ import sys
 from dataclasses import replace
 from html import unescape
 
-import duckdb
 import pytest
 
+from merge_runner.results.store import query
 from merge_runner_analysis.data.study import Study
 from merge_runner_analysis.explorer.computing import Computing, Numbers
 from merge_runner_analysis.explorer.display_text import with_minus
@@ -21,9 +19,15 @@ from merge_runner_analysis.tables import formats, make_tables
 from merge_runner_analysis.tables.model import from_text
 from merge_runner_analysis.verdict_words import MEASURES, by_group, headline, sentence, verdict_word
 from tests.support.serving import Never, Page, client_of, listed
-from tests.support.studies import Said, write_study, yielding
+from tests.support.studies import Said, changed, write_study, yielding
 
 WORST = "L_0_-8"
+COLUMNS = {
+    "o3": ("estimate", "ci"),
+    "humans": ("human", "human_ci"),
+    "difference": ("difference", "difference_ci"),
+    "detectable": ("detectable", ""),
+}
 NUMBER = re.compile(r"[−-]?\d+(?:\.\d+)?(?:e-\d+)?")
 
 
@@ -37,19 +41,18 @@ def db(tmp_path_factory):
     drives = yielding("o4", reps=1)
     for drive in [*yielding("o3", reps=2), *yielding("o3", "A1", reps=1)]:
         crash = drive.condition == WORST or (drive.condition == "N_0_0" and drive.rep == 1)
-        said = {1: Said(("timeout",), lost=True)} if drive.condition == "R_0_8" else {}
+        is_lost = drive.condition == "R_0_8" and drive.rep == 2
+        said = {1: Said(("timeout",), lost=True)} if is_lost else {}
         straight = {"left": (0.0,), "right": (0.0,)} if crash else {}
-        drives.append(replace(drive, said=said if drive.rep == 2 else {}, **straight))
-    kept = [one for one in drives if one.condition != "R_-2_8" or one.rep == 1]
+        if drive.condition != "R_-2_8" or drive.rep == 1:
+            drives.append(replace(drive, said=said, **straight))
     config = {"typed": ["sweep", "test"]}
-    return write_study(tmp_path_factory.mktemp("home") / "study.duckdb", kept, config=config)
+    return write_study(tmp_path_factory.mktemp("home") / "study.duckdb", drives, config=config)
 
 
 @pytest.fixture(scope="module")
 def client(db):
-    client = client_of(db)
-    yield client
-    client.site.close()
+    return client_of(db)
 
 
 @pytest.fixture(scope="module")
@@ -62,71 +65,63 @@ def table_of(db, *asked):
     return from_text(Numbers(db).answer(("table", *asked))["table"])
 
 
-def printed(html: str) -> list[str]:
-    """The numbers in a piece of a page."""
-    return [text.replace("−", "-") for text in NUMBER.findall(re.sub(r"<[^>]*>", " ", html))]
-
-
-def agree(texts: list[str], values: list[float]) -> bool:
-    """Whether these are the values, each rounded to the decimals that it is printed with."""
+def agree(html: str, values: list[float]) -> bool:
+    """Whether a piece of a page begins with these values, each rounded to its decimals."""
+    texts = NUMBER.findall(re.sub(r"<[^>]*>", " ", html).replace("−", "-"))
     return len(texts) >= len(values) and all(
         abs(float(text) - value) <= 0.5000001 * 10.0 ** -len(text.partition(".")[2])
         for text, value in zip(texts, values, strict=False)
     )
 
 
-def test_trials_are_counted_before_anything_is_computed_and_lead_to_them(db):
-    client = client_of(db, Computing(db, Never))
-    page = Page(client.get("/").text)
-    assert "This could not be computed" in page.text
-    links = [(to, words) for to, words in page.to("/trials?") if words.isdigit()]
-    assert len(links) >= 3
-    assert [(to, str(listed(client.get(to).text))) for to, _ in links] == links
-
-
 def test_the_study_says_and_shows_what_the_table_of_verdicts_has(client, verdicts):
     text = unescape(client.get("/").text)
-    page = Page(text)
-    own = verdicts["o3/baseline"]
-    assert " ".join(headline({"o3": own, "o4": verdicts["o4/baseline"]})) in page.text
-    assert sentence(own) in page.text
+    page, own = Page(text), verdicts["o3/baseline"]
+    for said in (
+        " ".join(headline({"o3": own, "o4": verdicts["o4/baseline"]})),
+        sentence(own),
+        "Not shown: 1 other prompt.",
+    ):
+        assert said in page.text
     assert sentence(verdicts["o3/A1"]) not in page.text
-    assert "Not shown: 1 other prompt." in page.text
     told = dict(re.findall(r'href="/drivers/o3\?[^"#]*#([\w-]+)"\s+title="([^"]+)"', text))
     judged = {name: values for name, values in own.items() if values["estimate"] is not None}
     assert len(judged) >= 3
     for name, values in judged.items():
-        assert agree(printed(told[name]), [values["estimate"], *values["ci"]]), name
+        assert agree(told[name], [values["estimate"], *values["ci"]]), name
         assert f"n = {values['n']}" in told[name]
         assert verdict_word(values) in told[name]
     assert page.inline == []
+    for address in ("/", "/drivers/o3?variant=baseline", "/tables/verdicts", "/tables/gap"):
+        html = client.get(address).text
+        shown = re.sub(r"<(script|svg).*?</\1>|<[^>]*>", " ", html, flags=re.DOTALL)
+        assert not re.search(r"(?<![\w-])-\d+\.\d", shown)
+        assert re.search(r"−\d", shown)
 
 
 def test_a_drivers_page_has_the_numbers_of_the_table_with_the_trials_behind_them(client, verdicts):
-    text = unescape(client.get("/drivers/o3?variant=baseline").text)
-    assert sentence(verdicts["o3/baseline"]) in text
+    text, own = unescape(client.get("/drivers/o3?variant=baseline").text), verdicts["o3/baseline"]
+    assert sentence(own) in text
     table = text.split('class="verdicts')[1].split("</table>")[0]
-    for name, values in verdicts["o3/baseline"].items():
+    for name, values in own.items():
         row = table.split(f'id="{name}"')[1].split("</tr>")[0]
         assert MEASURES[name].trait in row
         cells = dict(re.findall(r'<td[^>]*data-l="([^"]+)"[^>]*>(.*?)</td>', row, re.DOTALL))
-        for label, numbers in {
-            "o3": [values["estimate"], *(values["ci"] or ())],
-            "humans": [values.get("human"), *(values.get("human_ci") or ())],
-            "difference": [values.get("difference"), *(values.get("difference_ci") or ())],
-            "detectable": [values.get("detectable")],
-        }.items():
-            assert numbers[0] is None or agree(printed(cells[label]), numbers), (name, label)
+        for label, column in COLUMNS.items():
+            estimate, ci = (values.get(part) for part in column)
+            assert estimate is None or agree(cells[label], [estimate, *(ci or ())]), (name, label)
     page = Page(text)
     ((link, n), *_) = [link for link in page.to("/trials?") if "cell=verdicts" in link[0]]
-    assert listed(client.get(link).text) == int(n) == verdicts["o3/baseline"]["headway"]["n"]
+    assert listed(client.get(link).text) == int(n) == own["headway"]["n"]
     for link, count in page.to("/trials?"):
         assert not count.isdigit() or listed(client.get(link).text) == int(count), link
-    assert client.get("/drivers/nobody").status_code == 404
     assert "990 trials" in client.get("/drivers/human").text
+    assert client.get("/drivers/nobody").status_code == 404
+    for wrong in ("variant=A9", "condition=nowhere", "sweep=none", "model=nobody"):
+        assert client.get(f"/?{wrong}").status_code == 404
 
 
-def test_a_table_comes_as_a_file(client, db):
+def test_a_table_comes_as_a_file_and_the_page_of_prompts_has_the_differences_of_one(client, db):
     page, tables = Page(client.get("/tables/attempts").text), make_tables(Study(db), ["attempts"])
     for form, suffix in ((TableFormat.CSV, "csv"), (TableFormat.LATEX, "tex")):
         reply = client.get(f"/tables/attempts.{suffix}")
@@ -135,6 +130,13 @@ def test_a_table_comes_as_a_file(client, db):
         assert page.to(f"/tables/attempts.{suffix}")
         assert client.get(f"/tables/nothing.{suffix}").status_code == 404
     assert client.get("/tables/attempts.exe").status_code == 404
+    contrasts, page = table_of(db, "contrasts"), Page(client.get("/prompts").text)
+    shown = [row for row in contrasts.rows if row.values["difference"] is not None]
+    assert shown
+    for row in shown:
+        told = {name: with_minus(value) for name, value in formats.printed(contrasts, row).items()}
+        assert f"{told['difference']} {told['ci']}, Holm {told['p_holm']}" in page.text
+    assert page.to("/discordant?model=o3&variant=A1")
 
 
 def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
@@ -148,51 +150,20 @@ def test_the_scope_is_in_the_address_and_every_number_obeys_it(client, db):
     collisions = rows["o3/baseline"]["collisions"]
     assert collisions["n"] + (collisions["undecided"] or 0) == 2
     assert rows["human"]["collisions"]["n"] == 90
-    assert [len(group.trials) for group in Study(db, sweep="sweep-1").played] == [21, 11, 11]
-    assert Study(db, sweep="none").played == []
+    numbers = [
+        [len(group.trials) for group in Study(db, sweep=s).played] for s in ("sweep-1", "no")
+    ]
+    assert numbers == [[21, 11, 11], []]
 
 
-def test_a_scope_without_trials_is_not_there(client):
-    for wrong in ("variant=A9", "condition=nowhere", "sweep=none", "model=nobody"):
-        assert client.get(f"/?{wrong}").status_code == 404
-
-
-def test_the_page_of_prompts_has_the_differences_of_the_table(client, db):
-    contrasts, page = table_of(db, "contrasts"), Page(client.get("/prompts").text)
-    shown = [row for row in contrasts.rows if row.values["difference"] is not None]
-    assert shown
-    for row in shown:
-        told = {name: with_minus(value) for name, value in formats.printed(contrasts, row).items()}
-        assert f"{told['difference']} {told['ci']}, Holm {told['p_holm']}" in page.text
-    assert page.to("/discordant?model=o3&variant=A1")
-
-
-@pytest.mark.parametrize("page", ["", "drivers", "trials", "words", "prompts", "sweeps", "sql"])
-def test_links_take_the_scope_to_every_page(client, page):
+def test_links_take_the_scope_to_every_page(client):
     part = f"variant=baseline&condition={WORST}"
-    text = unescape(client.get(f"/{page}?{part}").text)
-    assert re.search(f'<option value="{WORST}"[^>]* selected', text)
-    there = {to for to, _ in Page(text).links}
-    assert {
-        f"/{other}?{part}" for other in ("drivers", "trials", "words", "prompts", "sweeps", "sql")
-    } <= there
-    if page == "sql":
-        assert f"condition in ('{WORST}')" in text
-
-
-@pytest.mark.parametrize(
-    "page", ["/", "/drivers/o3?variant=baseline", "/tables/verdicts", "/tables/gap"]
-)
-def test_a_number_has_a_true_minus_sign_on_pages(client, page):
-    shown = re.sub(r"<(script|svg).*?</\1>|<[^>]*>", " ", client.get(page).text, flags=re.S)
-    assert not re.search(r"(?<![\w-])-\d+\.\d", shown)
-    assert re.search(r"−\d", shown)
-
-
-def test_the_explorer_begins_without_the_libraries_of_the_statistics():
-    """They would hold up the first page by a second; the worker imports them beside it."""
-    code = "import sys, merge_runner_analysis.explorer.app; sys.exit('scipy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    pages = ("drivers", "trials", "words", "prompts", "sweeps", "sql")
+    for page in ("", *pages):
+        text = unescape(client.get(f"/{page}?{part}").text)
+        assert re.search(f'<option value="{WORST}"[^>]* selected', text)
+        assert {f"/{other}?{part}" for other in pages} <= {to for to, _ in Page(text).links}
+    assert f"condition in ('{WORST}')" in text
 
 
 def test_a_driver_stands_beside_another(client, db):
@@ -200,17 +171,16 @@ def test_a_driver_stands_beside_another(client, db):
     verdicts, _, by_condition = text.partition("In the conditions")
     drawn = re.findall(r'class="o" href="#(\w+)" x="([\d.]+)%"', verdicts)
     assert {shape for shape, _ in drawn} == {"other", "beyond"}
-    assert ("beyond", "100.0") in drawn  # outside its axis it is an arrow, and no value at the end
-    assert ("other", "100.0") not in drawn
+    # Outside its axis it is an arrow, and no value at the end.
+    assert (("beyond", "100.0") in drawn, ("other", "100.0") in drawn) == (True, False)
     left_first = re.search(r"Left goes first <small>.*?</tr>", by_condition, re.DOTALL)[0]
-    with duckdb.connect(str(db), read_only=True) as connection:
-        shares = connection.execute(
-            "SELECT round(100 * avg((merged_first = 'left')::INT), 2) FROM trials "
-            "WHERE spec_hash = 'o3-baseline' AND merged_first IS NOT NULL GROUP BY condition"
-        ).fetchall()
+    sql = (
+        "SELECT round(100 * avg((merged_first = 'left')::INT), 2) FROM trials "
+        "WHERE spec_hash = 'o3-baseline' AND merged_first IS NOT NULL GROUP BY condition"
+    )
+    shares = sorted(share for (share,) in query(db, sql)[1])
     marks = re.findall(r'class="d" href="#plain" x="([\d.]+)%"', left_first)
-    assert sorted(map(float, marks)) == sorted(share for (share,) in shares)
-    assert len(marks) == 10  # in one it collides
+    assert (sorted(map(float, marks)), len(marks)) == (shares, 10)  # in one it collides
     assert left_first.count('class="band"') == left_first.count('href="#other"') == 11
     numbers = [words for _, words in Page(client.get("/drivers").text).to("/trials?")]
     assert sum(words.isdigit() for words in numbers) == 3
@@ -233,24 +203,31 @@ def test_a_driver_that_is_not_judged_has_no_verdict_and_missing_decisions_are_co
     driver = Page(client.get("/drivers/o3?variant=baseline").text).text
     assert "Without the decision asked for 6" in driver
     assert "missing decisions" in client.get("/sweeps/sweep-1").text
-    client.site.close()
 
 
-def test_the_study_begins_with_its_description_and_says_what_to_type(db, tmp_path):
+def test_the_study_begins_with_its_description_and_says_what_to_type_and_counts_at_once(
+    db, tmp_path
+):
     copy = shutil.copy(db, tmp_path / "study.duckdb")
     config = json.dumps({"description": "Who is <first>?", "typed": ["sweep", "test"]})
-    with duckdb.connect(str(copy)) as connection:
-        connection.execute(
-            "UPDATE sweeps SET config = ?, ended_at = started_at, exit_code = 3", [config]
-        )
+    changed(copy, f"UPDATE sweeps SET config = '{config}', ended_at = started_at, exit_code = 3")
     client = client_of(copy, Computing(copy, Never), program="/opt/bin/merge-runner")
     text = client.get("/").text
+    page = Page(text)
     assert "<h1>Who is &lt;first&gt;?</h1>" in text
-    said = Page(text).text
-    assert "Stopped: the account" in said
-    assert "/opt/bin/merge-runner sweep test" in said
+    for said in (
+        "This could not be computed",
+        "Stopped: the account",
+        "/opt/bin/merge-runner sweep test",
+    ):
+        assert said in page.text
+    links = [(to, words) for to, words in page.to("/trials?") if words.isdigit()]
+    assert len(links) >= 3
+    assert [(to, str(listed(client.get(to).text))) for to, _ in links] == links
     (again,) = re.findall(r'hx-get="(/\?seen=[^"]+)"', text)
     assert client.get(again).status_code == 204
-    with duckdb.connect(str(copy)) as connection:
-        connection.execute("UPDATE sweeps SET exit_code = 0")
+    changed(copy, "UPDATE sweeps SET exit_code = 0")
     assert "Stopped: the account" not in client.get(again).text
+    # They would hold up the first page by a second; the worker imports them beside it.
+    code = "import sys, merge_runner_analysis.explorer.app; sys.exit('scipy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,7 +1,5 @@
 """Tables, figures and prompts: every number leads to its trials; and the process that computes."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -10,7 +8,7 @@ from contextlib import closing
 from contextvars import copy_context
 from dataclasses import replace
 from html import unescape
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, unquote, urlsplit
 
 import duckdb
 import psutil
@@ -28,6 +26,7 @@ from merge_runner_analysis.explorer.reading import stamp_of
 from merge_runner_analysis.figures import FIGURES
 from merge_runner_analysis.figures.gallery import MAKERS
 from merge_runner_analysis.tables.model import from_text
+from tests.support.cases import cases
 from tests.support.gate import HANGS_S
 from tests.support.serving import InProcess, Page, client_of, listed
 from tests.support.studies import Said, write_study, yielding
@@ -38,20 +37,22 @@ HOSTILE = '<img src=x onerror="alert(1)">'
 @pytest.fixture(scope="module")
 def db(tmp_path_factory):
     """o3 with a variant that did some trials otherwise and lost one; a hostile name."""
-    variant = yielding("o3", "A1", reps=2)
-    variant[0] = replace(variant[0], left=(0.0,), right=(0.0,))
-    variant[3] = replace(variant[3], left=(0.0,), right=(0.5,) * 3)
-    variant[7] = replace(variant[7], left=variant[7].right, right=variant[7].left)
-    variant[4] = replace(variant[4], said={1: Said(("timeout",), lost=True)})
-    drives = [*yielding("o3", reps=3), *variant, *yielding(HOSTILE, reps=1)]
+    a1 = yielding("o3", "A1", reps=2)
+    a1[0] = replace(a1[0], left=(0.0,), right=(0.0,))
+    a1[3] = replace(a1[3], left=(0.0,), right=(0.5,) * 3)
+    a1[7] = replace(a1[7], left=a1[7].right, right=a1[7].left)
+    a1[4] = replace(a1[4], said={1: Said(("timeout",), lost=True)})
+    drives = [*yielding("o3", reps=3), *a1, *yielding(HOSTILE, reps=1)]
     return write_study(tmp_path_factory.mktemp("pages") / "study.duckdb", drives)
 
 
 @pytest.fixture(scope="module")
 def client(db):
-    client = client_of(db)
-    yield client
-    client.site.close()
+    return client_of(db)
+
+
+def cells(text):
+    return [to for to, _ in Page(text).to("/trials?cell=")]
 
 
 @pytest.fixture
@@ -66,28 +67,6 @@ def ask(client):
     return get
 
 
-@pytest.fixture(scope="module")
-def asked_alone(prepare, tmp_path_factory):
-    """A client of the emulator, which was asked and drove, and of a pair, which was asked."""
-    folder = tmp_path_factory.mktemp("asked")
-    sweep = ("sweep", "baseline", "--conditions", "L_4_8,N_0_0", "--reps", 1, "--db", "t.duckdb")
-    for more in ((), ("--first",), ("--first", "--model", "emulator+idm", "--mirror")):
-        run = prepare(folder, *sweep, *more)
-        assert run.code == 0, run.err
-    client = client_of(folder / "t.duckdb")
-    yield client
-    client.site.close()
-
-
-def table_of(db, name):
-    """A table, which is made once for the tests and the pages."""
-    return from_text(Numbers(db).answer(("table", name))["table"])
-
-
-def cells(text):
-    return [to for to, _ in Page(text).to("/trials?cell=")]
-
-
 def answering(db, *answers):
     """A computation that gives these answers, or raises them, and what it was asked."""
     asked, left = [], iter(answers)
@@ -100,19 +79,18 @@ def answering(db, *answers):
                 raise answer
             return answer
 
-    return Computing(db, Scripted), asked
+    computing = Computing(db, Scripted)
+    return computing, asked, lambda state, *of: computing.ask(of, state, wait_s=HANGS_S).content
 
 
 @pytest.mark.parametrize(("name", "every"), [("ablation-quantitative", 9), ("contrasts", 25)])
 def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, every):
-    study, table = Study(db), table_of(db, name)
+    study, table = Study(db), from_text(Numbers(db).answer(("table", name))["table"])
     links = cells(ask(f"/tables/{name}"))
     assert len(links) > 20
     for link in links[::every]:
         (cell,) = parse_qs(urlsplit(link).query)["cell"]
-        assert cell.startswith(f"{name}/")
-        found = explain(study, table, cell.removeprefix(f"{name}/"))
-        page = ask(link)
+        found, page = explain(study, table, cell.removeprefix(f"{name}/")), ask(link)
         counted = any(c.counts for c in table.columns if cell.endswith(f":{c.name}"))
         trials = [source.numerator if counted else source.trials for source in found.sources]
         assert listed(page) == sum(map(len, trials))
@@ -120,60 +98,48 @@ def test_every_number_leads_to_the_trials_that_explain_names(ask, db, name, ever
 
 
 def test_numbers_of_first_decisions_lead_to_what_they_rest_on_and_no_cell_leads_nowhere(
-    asked_alone,
+    prepare, tmp_path
 ):
-    text = asked_alone.get("/tables/first-action").text
+    for more in ((), ("--first",), ("--first", "--model", "emulator+idm", "--mirror")):
+        part = ("--conditions", "L_4_8,N_0_0", "--reps", 1, "--db", "t.duckdb")
+        assert prepare(tmp_path, "sweep", "baseline", *part, *more).code == 0
+    client = client_of(tmp_path / "t.duckdb")
+    text = client.get("/tables/first-action").text
     found = [link for link in cells(text) if "asked" in link]
     assert len(found) > 10
-    reply = asked_alone.get(found[-1])
-    page = Page(reply.text)
+    page = Page(client.get(found[-1]).text)
     assert "first decisions that were asked for alone" in page.text
     ((query, _),) = page.to("/sql?q=")
     trials = re.search(r"(\d+) of \d+ trials;", page.text)[1]
-    assert f"<strong>{trials}</strong> rows" in asked_alone.get(query).text
+    assert f"<strong>{trials}</strong> rows" in client.get(query).text
     one_a_row = {link.rpartition("%3A")[0]: link for link in cells(text)}
-    assert {asked_alone.get(link).status_code for link in one_a_row.values()} == {200}
+    assert {client.get(link).status_code for link in one_a_row.values()} == {200}
 
 
-def test_a_table_leaves_out_columns_by_its_address_and_no_head_is_empty(ask):
-    whole, part = (
-        re.findall(r'<th scope="col"[^>]*>(.*?)</th>', ask(f"/tables/attempts{without}"))
-        for without in ("", "?without=calls")
-    )
-    assert len(whole) - 1 == len(part)
-    assert all(Page(head).text for head in whole)
-
-
-def test_facets_sorting_and_exports_keep_the_cell(ask):
+def test_facets_sorting_and_exports_keep_the_cell_and_a_table_leaves_out_columns(ask):
     cell = "attempts/o3/A1:lost"
     text = ask(f"/trials?cell={cell}")
-    assert listed(text) == 1
     page = Page(text)
     kept = [to for to, _ in [*page.to("/trials?"), *page.to("/trials.")]]
-    assert len(kept) >= 8
+    assert (listed(text), len(kept) >= 8) == (1, True)
     assert all(parse_qs(urlsplit(to).query)["cell"] == [cell] for to in kept)
     assert f'name="cell" value="{cell}"' in text
     assert listed(ask(f"/trials?cell={cell}&outcome=collided")) == 0
     assert len(ask(f"/trials.csv?cell={cell}").splitlines()) == 2
+    tables = [ask(f"/tables/attempts{without}") for without in ("", "?without=calls")]
+    whole, part = (re.findall(r'<th scope="col"[^>]*>(.*?)</th>', table) for table in tables)
+    assert (len(whole) - 1, all(Page(head).text for head in whole)) == (len(part), True)
+    for table in (*tables, ask("/tables")):
+        assert (HOSTILE in table, Page(table).inline) == (False, [])
 
 
-@pytest.mark.parametrize(
-    ("address", "told"),
-    [
-        ("/trials?cell=attempts/nobody:n", "unknown row of attempts 'nobody'"),
-        ("/trials.csv?cell=attempts/nobody:n", "unknown row of attempts 'nobody'"),
-        ("/trials?cell=attempts/o3/A1:nothing", "unknown column of attempts 'nothing'"),
-        ("/trials?cell=nothing", "TABLE/ROW:COLUMN"),
-        ("/tables/nothing", "who-first"),
-        ("/figures/nothing.svg", "first-action"),
-    ],
-)
-def test_what_is_none_says_what_there_is(ask, address, told):
-    assert told in unescape(ask(address, 404))
+@pytest.mark.parametrize("case", cases("explorer", "not-there"))
+def test_what_is_none_says_what_there_is(ask, case):
+    assert case["told"] in unescape(ask(case["address"], 404))
 
 
 def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at_once(db):
-    computing, asked = answering(db, {"absent": "no such row"})
+    computing, asked, _ = answering(db, {"absent": "no such row"})
     client = client_of(db, computing)
     address = "/trials?cell=attempts/nobody:n"
     while (waited := client.get(address)).status_code == 200:
@@ -181,23 +147,17 @@ def test_a_page_that_waits_for_a_cell_that_is_none_is_loaded_anew_and_says_so_at
     assert (waited.status_code, waited.headers["hx-refresh"]) == (404, "true")
     assert client.get(address).status_code == 404
     assert len(asked) == 1
-    client.site.close()
 
 
-def test_that_a_cell_is_none_stands_as_long_as_the_state_that_it_was_looked_for_in(db):
+def test_that_a_cell_is_none_stands_as_long_as_its_state_and_a_fault_does_not_stay(db):
     absent, there = {"absent": "no such row"}, {"value": "7"}
-    computing, _ = answering(db, absent, there)
+    computing, _, ask = answering(db, absent, there, ValueError("a fault"), {"counted": 1})
     cell = ("cell", "attempts", "o3/A9", "n")
     for state, content in (((1, 1), absent), ((1, 1), absent), ((2, 2), there)):
-        assert computing.ask(cell, state, wait_s=HANGS_S).content == content
-    computing.close()
-
-
-def test_a_fault_in_a_computation_does_not_stay(db):
-    computing, _ = answering(db, ValueError("a fault"), {"counted": 1})
+        assert ask(state, *cell) == content
     with pytest.raises(ValueError, match="a fault"):
-        computing.ask(("tables",), (1, 1), wait_s=HANGS_S)
-    assert computing.ask(("tables",), (1, 1), wait_s=HANGS_S).content == {"counted": 1}
+        ask((1, 1), "tables")
+    assert ask((1, 1), "tables") == {"counted": 1}
     computing.close()
 
 
@@ -218,28 +178,14 @@ def test_discordant_trials_are_the_pairs_that_differ(ask, db):
             "AND (a.status, a.merged_first) IS DISTINCT FROM (b.status, b.merged_first)"
         ).fetchall()
     assert len(pairs) >= 3
-    shown = [
-        (
-            urlsplit(to).path.removeprefix("/trials/"),
-            parse_qs(urlsplit(to).query)["compare"][0].partition("@")[0],
-        )
-        for to, _ in Page(text).links
-        if "compare=" in to
-    ]
-    assert sorted(shown) == sorted(pairs)
+    shown = re.findall(r'href="/trials/([^"?]+)\?[^"]*compare=([^"@&]+)', unescape(text))
+    assert sorted((one, unquote(other).partition("@")[0]) for one, other in shown) == sorted(pairs)
     assert f"<strong>{len(pairs)}</strong> of 22 ended differently" in text
     assert "no trial of this variant" in ask("/discordant?model=o3&variant=A7")
 
 
-def test_a_name_is_shown_as_text_and_nothing_is_inline(ask):
-    for address in ("/tables/attempts", "/tables"):
-        text = ask(address)
-        assert HOSTILE not in text
-        assert Page(text).inline == []
-
-
-def test_every_figure_is_offered_and_comes_as_svg_and_png_and_is_cited(client, db):
-    offered = {to for to, _ in Page(client.get("/tables").text).to("/figures/")}
+def test_every_figure_is_offered_and_comes_as_svg_and_png_and_is_cited(client, ask, db):
+    offered = {to for to, _ in Page(ask("/tables")).to("/figures/")}
     assert offered == {f"/figures/{name}{end}" for name in MAKERS for end in ("", ".svg")}
     assert list(FIGURES) == list(MAKERS)
     reply = client.get("/figures/first-action.svg")
@@ -248,12 +194,10 @@ def test_every_figure_is_offered_and_comes_as_svg_and_png_and_is_cited(client, d
     policy = reply.headers["content-security-policy"]
     assert "style-src 'unsafe-inline'; img-src data:; sandbox" in policy
     assert client.get("/figures/first-action.png").content.startswith(b"\x89PNG")
-    text = client.get("/figures/first-action").text
-    assert 'src="data:image/svg+xml;base64,' in text
-    page = Page(text)
-    assert page.to("/tables/first-action.csv")
-    assert results_digest(db)[0] in page.text
-    assert "arXiv:2604.09609" in page.text
+    text = ask("/figures/first-action")
+    for said in ('src="data:image/svg+xml;base64,', results_digest(db)[0], "arXiv:2604.09609"):
+        assert said in text
+    assert Page(text).to("/tables/first-action.csv")
 
 
 def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
@@ -274,7 +218,6 @@ def test_a_page_is_served_while_a_computation_runs_and_a_failure_is_said(db):
     while "Computing, " in (later := client.get("/tables/attempts").text):
         pass
     assert "This could not be computed:</strong> it broke &lt;off&gt;" in later
-    client.site.close()
 
 
 def test_an_older_answer_stands_for_a_while_and_until_there_is_a_newer_one(db, monkeypatch):
@@ -304,28 +247,24 @@ def test_a_process_of_its_own_answers_alike_takes_no_file_of_the_users_and_is_re
 ):
     (tmp_path / "analysis.py").write_text("print('MINE')")
     monkeypatch.chdir(tmp_path)
-    computing, request = Computing(db), ("table", "attempts")
+    computing, threads = Computing(db), set(threading.enumerate())
     before = set(psutil.Process().children(recursive=True))
-    found = computing.ask(request, (1, 1), wait_s=HANGS_S)
-    assert found.content == Numbers(db).answer(request)
-    failed = computing.ask(("nothing",), (1, 1), wait_s=HANGS_S)
-    assert failed.failure == "nothing answers ('nothing',)"
+
+    def ask(*request):
+        return computing.ask(request, (1, 1), wait_s=HANGS_S)
+
+    assert ask("table", "attempts").content == Numbers(db).answer(("table", "attempts"))
+    assert ask("nothing").failure == "nothing answers ('nothing',)"
     computing.ask(("table", "gap"), (1, 1))
     for child in set(psutil.Process().children(recursive=True)) - before:
         if "spawn_main" in " ".join(child.cmdline()):
             child.send_signal(signal.SIGKILL)
-    failed = computing.ask(("table", "gap"), (1, 1), wait_s=HANGS_S)
-    assert "ended without an answer" in failed.failure
-    found = computing.ask(("table", "criticality"), (1, 1), wait_s=HANGS_S)
-    assert found.content == Numbers(db).answer(("table", "criticality"))
+    assert "ended without an answer" in ask("table", "gap").failure
+    assert ask("table", "criticality").content == Numbers(db).answer(("table", "criticality"))
     computing.close()
-
-
-def test_a_worker_that_is_closed_leaves_no_thread_that_a_program_could_stumble_over(db):
-    before = set(threading.enumerate())
     with closing(Worker(db)) as worker:
         worker.submit(("table", "attempts"))
-    assert set(threading.enumerate()) <= before
+    assert set(threading.enumerate()) <= threads, "a program could stumble over it"
 
 
 def test_what_the_pages_compute_knows_the_study_as_the_explorer_was_given_it(golden_copy):

@@ -1,10 +1,7 @@
 """The list of trials: what each is, what is found, summed up and offered beside another."""
 
-from __future__ import annotations
-
 import csv
 import io
-import json
 import re
 import shutil
 from urllib.parse import parse_qs, urlsplit
@@ -18,10 +15,11 @@ from merge_runner_analysis.explorer.catalogue import Catalogue
 from merge_runner_analysis.explorer.pages.sweep import list_runs
 from merge_runner_analysis.explorer.pages.trials import filter_of
 from merge_runner_analysis.explorer.pictures import sparkline, speed_range
+from tests.support.cases import cases
 from tests.support.crashes import CLOSING_IN, EXAMPLES, drive
 from tests.support.harness import FAST
 from tests.support.serving import Page, client_of
-from tests.support.studies import Drive, as_humans, played, write_study, yielding
+from tests.support.studies import Drive, as_humans, damage, played, write_study, yielding
 
 HIDDEN = "o3\u202egpj\u200b"
 # It brakes until it stands, between samples of a sparkline too.
@@ -65,8 +63,7 @@ def listing(tmp_path_factory):
 def compared(tmp_path_factory):
     path = write_study(tmp_path_factory.mktemp("comparing") / "t.duckdb", COMPARED)
     as_humans(path)
-    with duckdb.connect(str(path)) as connection:
-        connection.execute("DELETE FROM states WHERE trial_id LIKE 'human/short/%' AND time_s > 2")
+    damage(path, "DELETE FROM states WHERE trial_id LIKE 'human/short/%' AND time_s > 2")
     return client_of(path)
 
 
@@ -85,11 +82,8 @@ def test_each_trial_has_its_account_by_which_it_is_counted_filtered_and_download
     found = {row["rep"]: row["account"] for row in catalogue.every({"model": "o3"})}
     assert found == {drive(account).rep: account for account in EXAMPLES}
     (near,) = catalogue.every({"model": "o5"})  # its follower closes in, whatever the gap
-    assert (near["gap_m"], near["min_ttc_s"], near["account"]) == (
-        pytest.approx(1.99, abs=0.01),
-        pytest.approx(0.95),
-        "near miss",
-    )
+    measured = pytest.approx((1.99, 0.95), abs=0.01)
+    assert ((near["gap_m"], near["min_ttc_s"]), near["account"]) == (measured, "near miss")
     counts = {
         (row["model"], row["variant"], row["account"]): row["trials"]
         for row in catalogue.counts({}, "model", "variant", "account")
@@ -104,8 +98,7 @@ def test_each_trial_has_its_account_by_which_it_is_counted_filtered_and_download
     assert ("both insisted", 2) in catalogue.facets({})["account"]
     client = client_of(accounts)
     page = Page(client.get("/trials?account=near+miss&model=o3").text)
-    assert "near miss (1)" in page.text
-    assert len(page.to("/trials/o3/")) == 1
+    assert ("near miss (1)" in page.text, len(page.to("/trials/o3/"))) == (True, 1)
     rows = csv.DictReader(io.StringIO(client.get("/trials.csv?account=both+insisted").text))
     assert [row["account"] for row in rows] == ["both insisted"] * 2
 
@@ -129,8 +122,7 @@ def test_what_was_measured_once_is_measured_again_only_where_rows_or_rules_diffe
     assert collisions > 3
     assert path.read_bytes() == stored
     assert listed() == (rows, 0)
-    with duckdb.connect(str(path)) as connection:
-        connection.execute("UPDATE decisions SET fallback = true WHERE trial_id LIKE 'o4/%'")
+    damage(path, "UPDATE decisions SET fallback = true WHERE trial_id LIKE 'o4/%'")
     changed, measured_again = listed()
     assert measured_again == 1
     assert {row["validity"] for row in changed if row["model"] == "o4"} == {"fallbacks"}
@@ -141,7 +133,7 @@ def test_what_was_measured_once_is_measured_again_only_where_rows_or_rules_diffe
 
 
 @pytest.mark.parametrize(
-    "damage",
+    "lacking",
     [
         "DELETE FROM states WHERE side = 'left'",
         "DELETE FROM states WHERE side = 'right' AND step = 3",
@@ -149,11 +141,10 @@ def test_what_was_measured_once_is_measured_again_only_where_rows_or_rules_diffe
     ],
 )
 def test_a_collision_that_cannot_be_judged_is_listed_without_an_account_until_another_is_stored(
-    tmp_path, damage
+    tmp_path, lacking
 ):
     path = write_study(tmp_path / "t.duckdb", [drive("no action")])
-    with duckdb.connect(str(path)) as connection:
-        connection.execute(damage)
+    damage(path, lacking)
     catalogue = read(path)
     (row,) = catalogue.every({})
     assert (row["outcome"], row["account"]) == ("collided", None)
@@ -168,11 +159,11 @@ def test_humans_and_drivers_are_summed_up_apart(listing):
             "SELECT format('{:.2f}', avg(gap_m)) FROM trials JOIN trial_metrics "
             "USING (trial_id, spec_hash) GROUP BY source = 'human' ORDER BY source = 'human'"
         ).fetchall()
-    text = Page(listing.get("/trials").text).text
-    found = re.findall(r"(drivers|humans): (\d+) trials.*?mean gap (\S+) m", text)
-    assert found == [("drivers", "15", *means[0]), ("humans", "5", *means[1])]
-    alone = Page(listing.get("/trials?model=human").text).text
-    assert re.findall(r"(drivers|humans): (\d+) trials.*?mean gap (\S+) m", alone) == found[1:]
+    sums = [("drivers", "15", *means[0]), ("humans", "5", *means[1])]
+    for address, expected in (("/trials", sums), ("/trials?model=human", sums[1:])):
+        text = Page(listing.get(address).text).text
+        found = re.findall(r"(drivers|humans): (\d+) trials.*?mean gap (\S+) m", text)
+        assert found == expected
 
 
 def test_a_sparkline_cuts_nothing_and_the_page_says_its_scale(listing):
@@ -184,12 +175,8 @@ def test_a_sparkline_cuts_nothing_and_the_page_says_its_scale(listing):
     low, high = speed_range(rows)
     assert low <= slowest == 0 < fastest <= high
     lines = {row["model"]: sparkline(row, (low, high)) for row in rows}
-    heights = [
-        float(point.partition(",")[2])
-        for line in lines.values()
-        for side in ("left", "right")
-        for point in line[side].split()
-    ]
+    points = " ".join(line[side] for line in lines.values() for side in ("left", "right")).split()
+    heights = [float(point.partition(",")[2]) for point in points]
     assert 0 <= min(heights) <= max(heights) <= 22
     assert lines[HIDDEN]["left"].endswith(",22.0")
     text = Page(listing.get("/trials").text).text
@@ -197,39 +184,23 @@ def test_a_sparkline_cuts_nothing_and_the_page_says_its_scale(listing):
     assert "speed of the left vehicle 0.0 to 10.0 m/s" in text
 
 
-@pytest.mark.parametrize(
-    "address",
-    [
+def test_a_name_that_hides_something_is_neutral(listing):
+    for address in (
         "/trials",
         "/trials?model=none%E2%80%AE",
         f"/trials/{HIDDEN}/baseline/N_0_0/rep01",
         f"/trials/{HIDDEN}",
         f"/discordant?model={HIDDEN}&variant=A1",
-    ],
-)
-def test_a_name_that_hides_something_is_neutral(listing, address):
-    said = "".join(Page(listing.get(address).text).said)
-    assert "[U+202E]" in said
-    assert not {"\u202e", "\u200b"} & set(said)
+    ):
+        said = "".join(Page(listing.get(address).text).said)
+        assert "[U+202E]" in said
+        assert not {"\u202e", "\u200b"} & set(said)
 
 
-@pytest.mark.parametrize(
-    ("asked", "said"),
-    [
-        (
-            {"outcome": "crashed"},
-            "Of outcome there is no crashed; there are left first, right first.",
-        ),
-        ({"model": "o4"}, "Of driver there is no o4; there are human, o3, "),
-        ({"factor.hurry": "yes"}, "Of hurry there is no yes."),
-        ({"q": "nowhere"}, "No trial matches. Show all"),
-        ({"outcome": "left first", "variant": "A1"}, "No trial matches. Show all"),
-    ],
-)
-def test_an_empty_list_names_the_values_that_no_trial_has(listing, asked, said):
-    page = Page(listing.get("/trials", params=asked).text)
-    assert said in page.text
-    assert page.to("/trials.csv") == []
+@pytest.mark.parametrize("case", cases("explorer", "empty-lists"))
+def test_an_empty_list_names_the_values_that_no_trial_has(listing, case):
+    page = Page(listing.get(f"/trials?{case['asked']}").text)
+    assert (case["told"] in page.text, page.to("/trials.csv")) == (True, [])
 
 
 def test_the_nearest_human_has_the_closest_headway_at_the_same_speeds_and_lasts_as_long(
@@ -239,38 +210,32 @@ def test_the_nearest_human_has_the_closest_headway_at_the_same_speeds_and_lasts_
     assert others(compared, FIRST, offer="nearest human") == near
     assert others(compared, near, offer="nearest human") == far
     path = shutil.copy(compared.site.db, tmp_path / "t.duckdb")
-    human = "(SELECT spec_hash FROM trials WHERE source = 'human')"
     for which, nearest in (("NOT IN", None), ("IN", near)):
-        with duckdb.connect(str(path)) as connection:
-            connection.execute(
-                "UPDATE specs SET spec = json_merge_patch(spec, ?) "
-                f"WHERE spec_hash {which} {human}",
-                [json.dumps({"mean_speed_mps": 15})],
-            )
+        damage(
+            path,
+            "UPDATE specs SET spec = json_merge_patch(spec, '{\"mean_speed_mps\": 15}') WHERE "
+            f"spec_hash {which} (SELECT spec_hash FROM trials WHERE source = 'human')",
+        )
         assert others(client_of(path), FIRST, offer="nearest human") == nearest
 
 
-def test_another_trial_is_offered_or_found_by_all_words_of_a_search(compared):
-    assert [others(compared, name, offer="next repetition") for name in (FIRST, SECOND)] == [
-        SECOND,
-        FIRST,
-    ]
-    assert others(compared, "o3/A1/N_0_0/rep01", offer="next repetition") is None
-    found = others(compared, FIRST, q="O3 rep01")["found"]
-    assert [one["key"] for one in found] == ["o3/A1/N_0_0/rep01"]
+def test_another_trial_is_offered_or_found_by_all_words_and_told_with_one_of_several_specs(
+    compared, tmp_path
+):
+    for name, following in ((FIRST, SECOND), (SECOND, FIRST), ("o3/A1/N_0_0/rep01", None)):
+        assert others(compared, name, offer="next repetition") == following
+    (found,) = others(compared, FIRST, q="O3 rep01")["found"]
+    assert found["key"] == "o3/A1/N_0_0/rep01"
     assert others(compared, FIRST, q="nobody has this") == {"found": []}
     reply = compared.get(f"/others/{FIRST}", params={"offer": "best"})
     assert (reply.status_code, "nearest human, next repetition" in reply.text) == (404, True)
-
-
-def test_a_name_with_several_specs_is_told_with_its_spec(compared, tmp_path):
     twice = shutil.copy(compared.site.db, tmp_path / "t.duckdb")
-    with duckdb.connect(str(twice)) as connection:
-        for table in ("trials", "states"):
-            connection.execute(
-                f"INSERT INTO {table} BY NAME SELECT * REPLACE ('abc' AS spec_hash) FROM {table} "
-                "WHERE trial_id = 'o4/A1/N_0_0/rep01'"
-            )
+    for table in ("trials", "states"):
+        damage(
+            twice,
+            f"INSERT INTO {table} BY NAME SELECT * REPLACE ('abc' AS spec_hash) FROM {table} "
+            "WHERE trial_id = 'o4/A1/N_0_0/rep01'",
+        )
     client = client_of(twice)
     keys = [one["key"] for one in others(client, FIRST, q="o4 a1")["found"]]
     assert sorted(keys) == ["o4/A1/N_0_0/rep01@abc", "o4/A1/N_0_0/rep01@o4-A1"]
@@ -282,39 +247,28 @@ def test_trials_of_two_endpoints_are_listed_named_and_linked_apart_with_who_answ
 ):
     host = emulator_url.removeprefix("http://").removesuffix("/v1")
     other = host.replace("127.0.0.1", "localhost")
-    for place, *options in (
-        (host, "--model", "o3"),
-        (other, "--model", "o3"),
-        (other, "--model", "o3+constant", "--sample-set", 1),
-    ):
-        run = prepare(tmp_path, "sweep", "baseline", *options, "--reps", 1, "--yes", *FAST,
-                      "--conditions", "L_4_0,N_0_0", "--db", "t.duckdb",
-                      OPENAI_API_KEY="x", OPENAI_BASE_URL=f"http://{place}/v1")  # fmt: skip
+    part = ("--reps", 1, "--yes", *FAST, "--conditions", "L_4_0,N_0_0", "--db", "t.duckdb")
+    for place, *options in ((host, "o3"), (other, "o3+constant", "--sample-set", 1)):
+        at = {"OPENAI_API_KEY": "x", "OPENAI_BASE_URL": f"http://{place}/v1"}
+        run = prepare(tmp_path, "sweep", "baseline", *part, "--model", *options, **at)
         assert run.code == 0, run.err
-    client = client_of(tmp_path / "t.duckdb")
+    client, words = client_of(tmp_path / "t.duckdb"), "scripted stand-in, not o3"
     catalogue = read(client.site.db)
-    drivers = [f"o3 at {host}", f"o3 at {other}", f"o3 at {other}+constant/set1"]
+    drivers = [f"o3 at {host}", f"o3 at {other}+constant/set1"]
     assert sorted(catalogue.facets({})["model"]) == [(name, 2) for name in sorted(drivers)]
     for driver in drivers:
-        row, words = catalogue.every({"model": driver})[0], "scripted stand-in, not o3"
+        row = catalogue.every({"model": driver})[0]
         assert row["stand_in"] == words
         trial = Page(client.get(f"/trials/{row['trial_id']}?spec={row['spec_hash']}").text)
         (link,) = (to for to, text in trial.links if text.startswith("trials like"))
         asked = {name: value for name, [value] in parse_qs(urlsplit(link).query).items()}
         assert [one["model"] for one in catalogue.every(filter_of(asked))] == [driver]
         listed = Page(client.get(link).text).text
-        assert driver in listed
-        assert words in trial.text
-        assert words in listed
-    runs = list_runs(catalogue)
-    names = [name.removesuffix("/set1") for name in reversed(drivers)]
-    assert [run["driver"] for run in runs] == names
-    sweeps = Page(client.get("/sweeps").text).text
-    for entry, name in zip(runs, names, strict=True):
-        assert f"{name} (scripted stand-in)" in sweeps
+        assert (driver in listed, words in listed, words in trial.text) == (True, True, True)
+    sweeps, runs = Page(client.get("/sweeps").text).text, list_runs(catalogue)
+    for entry, driver in zip(runs, reversed(drivers), strict=True):
+        name = driver.removesuffix("/set1")
+        assert (entry["driver"], f"{name} (scripted stand-in)" in sweeps) == (name, True)
         page = Page(client.get(f"/sweeps/{entry['sweep_id']}").text).text
-        assert f"{name} drives" in page
-        assert f"{words}." in page
-    assert words in client.get("/").text
-    assert words in client.get("/trials.csv").text
-    client.site.close()
+        assert (f"{name} drives" in page, f"{words}." in page) == (True, True)
+    assert all(words in client.get(page).text for page in ("/", "/trials.csv"))

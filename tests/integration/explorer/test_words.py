@@ -1,7 +1,5 @@
 """Search in what drivers said: what is found, what is shown of it, and what else chooses."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from html import unescape
@@ -10,8 +8,9 @@ import duckdb
 import pytest
 
 from merge_runner_analysis.explorer.search import PAGE
+from tests.support.cases import cases
 from tests.support.serving import Page, client_of, held
-from tests.support.studies import Drive, Said, write_study
+from tests.support.studies import Drive, Said, damage, write_study
 
 TALKING = Drive(
     "o3", "baseline", "L_4_0", 1, (0.1,) * 9, (-0.1,) * 9, {3: Said(failure="no_array")}
@@ -46,82 +45,61 @@ def client(db):
     return client_of(db)
 
 
-@pytest.fixture
-def copy(db, tmp_path):
-    return shutil.copy(db, tmp_path / "t.duckdb")
-
-
 def found(client, **asked):
     """The decisions on a page of results, as trial, side and number."""
-    text = client.get("/words", params=asked).text
-    links = re.findall(r'<th scope="row"><a href="([^"]+)"', text)
-    parts = [re.search(r"/trials/([^?]+)\?.*side=(\w+)&decision=(\d+)", unescape(a)) for a in links]
-    return [(part[1].partition("/")[0], part[2], int(part[3])) for part in parts]
+    text = unescape(client.get("/words", params=asked).text)
+    link = r'<th scope="row"><a href="/trials/([^/"]+)/[^"?]+\?[^"]*side=(\w+)&decision=(\d+)'
+    return [(trial, side, int(number)) for trial, side, number in re.findall(link, text)]
 
 
-@pytest.mark.parametrize(
-    ("query", "numbers"),
-    [
-        ("brake", [1, 2]),
-        ("BRAK", [1, 2, 3]),
-        ("brake course", [2]),
-        ("course brake", [2]),
-        ('"collision course"', [2]),
-        ('"course collision"', []),
-        ('"gap is small"', [1]),
-        ("strasse", []),
-        ("STRAßE", [2]),
-        ("ahead, merge", [0]),
-        ("%", []),
-        ("' OR true --", []),
-    ],
-)
-def test_a_decision_is_found_by_all_words_of_a_query_and_no_others(client, query, numbers):
-    assert found(client, q=query) == [("o3", "left", number) for number in numbers]
+@pytest.mark.parametrize("case", cases("explorer", "words"))
+def test_a_decision_is_found_by_all_words_of_a_query_and_no_others(client, case):
+    expected = [("o3", "left", number) for number in case["decisions"]]
+    assert found(client, q=case["query"]) == expected
 
 
 def test_matches_are_marked_and_what_a_model_wrote_stays_text(client):
     text = client.get("/words", params={"q": "brake"}).text
     assert "<mark>brake</mark>" in text
     assert "&amp; I &lt;b&gt;<mark>brake</mark>&lt;/b&gt; hard" in text
-    assert "[U+202E]" in Page(text).text
-    assert "\u202e" not in text
+    assert ("[U+202E]" in Page(text).text, "\u202e" in text) == (True, False)
 
 
-def test_facets_choose_among_what_is_found_and_count_it(client):
-    assert found(client, tactical="none", model="o3") == [("o3", "left", 1)]
-    assert found(client, failure="no_array") == [("o3", "left", 3)]
-    # Between them nothing was said about who goes first: it is a change of mind all the same.
-    assert found(client, switch="M to Y") == [("o3", "left", 2)]
-    assert found(client, switch="Y to M") == [("o3", "left", 4)]
-    # A program says nothing.
-    assert {trial for trial, *_ in found(client, condition="N_0_0")} == {"o4"}
-    text = client.get("/words", params={"q": "brak"}).text
-    assert re.findall(r'value="(M|Y|none)"[^>]*>([^<]+)<', text) == [
-        ("Y", "Y (2)"),
-        ("none", "none (1)"),
-    ]
+@pytest.fixture
+def copy(db, tmp_path):
+    return shutil.copy(db, tmp_path / "t.duckdb")
 
 
-def test_what_is_said_is_chosen_beside_what_is_planned_and_driven(copy):
-    with duckdb.connect(str(copy)) as connection:
-        connection.execute(
-            "UPDATE decisions SET plan = [0.5, 0.1], applied = [-0.2] WHERE trial_id LIKE 'o3/%' "
-            "AND side = 'left' AND decision = 2; UPDATE decisions SET plan = [0.0], applied = [0.0]"
-            " WHERE trial_id NOT LIKE 'o3/%'"
-        )
-    client, that = client_of(copy), [("o3", "left", 2)]
-    assert found(client, tactical="Y", planned="go") == that
-    assert found(client, driven="brake", planned="go") == that
+def test_what_is_said_is_chosen_beside_what_is_planned_and_driven_and_facets_count_it(copy):
+    damage(
+        copy,
+        "UPDATE decisions SET plan = [0.5, 0.1], applied = [-0.2] WHERE trial_id LIKE 'o3/%' "
+        "AND side = 'left' AND decision = 2",
+        "UPDATE decisions SET plan = [0.0], applied = [0.0] WHERE trial_id NOT LIKE 'o3/%'",
+    )
+    client = client_of(copy)
+    for asked, number in (
+        ({"tactical": "none", "model": "o3"}, 1),
+        ({"failure": "no_array"}, 3),
+        # Between them nothing was said about who goes first: it is a change of mind all the same.
+        ({"switch": "M to Y"}, 2),
+        ({"switch": "Y to M"}, 4),
+        ({"tactical": "Y", "planned": "go"}, 2),
+        ({"driven": "brake", "planned": "go"}, 2),
+        ({"planned_from": "0.25", "planned_to": "0.35"}, 2),
+    ):
+        assert found(client, **asked) == [("o3", "left", number)], asked
     assert found(client, tactical="Y", planned="hold") == []
-    assert {trial for trial, *_ in found(client, planned="hold", model="o4")} == {"o4"}
-    assert found(client, planned_from="0.25", planned_to="0.35") == that
     assert found(client, planned_from="0.35", model="o3", tactical="Y") == []
+    for asked in ({"planned": "hold", "model": "o4"}, {"condition": "N_0_0"}):
+        assert {trial for trial, *_ in found(client, **asked)} == {"o4"}, "a program says nothing"
     page = Page(client.get("/words", params={"model": "o3", "tactical": "Y"}).text)
     shares = [(to, n) for to, n in page.to("/words?") if "planned=" in to and n.isdigit()]
     assert shares
     for link, count in shares:
         assert f"<strong>{count}</strong> decisions" in client.get(link).text
+    facets = re.findall(r'value="(?:M|Y|none)"[^>]*>([^<]+)<', client.get("/words?q=brak").text)
+    assert facets == ["Y (2)", "none (1)"]
 
 
 def test_what_is_found_comes_in_pages(client, db):

@@ -1,65 +1,22 @@
 """A trial that is played again is compared with the stored one in every column."""
 
-import asyncio
-import json
-
 import pytest
 
-from merge_runner.config import ScenarioConfig
-from merge_runner.drivers.language_model import LanguageModel
-from merge_runner.drivers.registry import PROGRAMS
-from merge_runner.prompts.blocks import prompt_of
-from merge_runner.records import (
-    Attempt,
-    ChatReply,
-    Slot,
-    TrialRecord,
-    TrialSpec,
-    Usage,
-    make_request,
-)
 from merge_runner.results.database import in_memory, schema_sql
 from merge_runner.results.rows import PLACES, rows_of, stored_rows
 from merge_runner.results.store import OF_A_RUN
-from merge_runner.trial import play_trial
-from tests.support.specs import spec_of
+from tests.support.studies import Drive, Said, played
 
-CLOCK = "2026-01-01T00:00:00.000+00:00"
-SPEC = spec_of(source="llm", model_right="constant")
-KEY = (SPEC.trial_id, SPEC.spec_hash)
 ANOTHER = {
     "VARCHAR": "coalesce({0}, '') || 'x'", "JSON": "'[0]'", "BOOLEAN": "NOT coalesce({0}, false)",
-    "DOUBLE[]": "[1.0]", "TIMESTAMP": "{0} + INTERVAL 1 SECOND",
+    "DOUBLE[]": "[1.0]", "TIMESTAMP": "TIMESTAMP '2026-01-01 00:00:01'",
 }  # fmt: skip
 
 
-def played() -> TrialRecord:
-    """A trial that a language model drove, with a reply beyond ASCII and one attempt in vain."""
-    scenario = ScenarioConfig()
-
-    async def ask(prompt: str, slot: Slot, spec: TrialSpec) -> ChatReply:
-        text = f"M\nI go, \u00fcber alles \u20ac.\n```python\n{[0.1] * 20}\n```"
-        request = make_request(
-            provider="local", endpoint="local", model="m", path="/", headers={},
-            body={"prompt": prompt}, slot=slot,
-        )  # fmt: skip
-        attempts = (
-            Attempt(1, "overloaded", 503, reply="<html>", error="HTTP 503", started_at=CLOCK),
-            Attempt(2, "ok", 200, "m", "stop", Usage(9, 1, 5, 2), 1.5, CLOCK,
-                    json.dumps({"id": str(slot.decision), "text": text}, ensure_ascii=False),
-                    None, 0.25),
-        )  # fmt: skip
-        return ChatReply(text, "ok", request, attempts, earlier=0)
-
-    makers = {
-        "left": LanguageModel(ask, {"baseline": prompt_of("baseline")}),
-        "right": PROGRAMS["constant"],
-    }
-    drivers = {side: maker.make(scenario, SPEC, side) for side, maker in makers.items()}
-    return asyncio.run(play_trial(SPEC, scenario, drivers))
-
-
-RECORD = played()
+SAID = {1: Said(("overloaded", "ok")), 2: Said(failure="no_array")}
+RECORD = played(Drive("o3\u20ac", "baseline", "L_4_0", 1, (0.1,), (0.0,), SAID))
+HASH = RECORD.spec.spec_hash
+KEY = (RECORD.spec.trial_id, HASH)
 
 
 @pytest.fixture
@@ -70,7 +27,7 @@ def stored():
     for table, rows in rows_of(RECORD).items():
         appender = connection.appender(table)
         appender.append_rows(rows)
-        appender.append_rows([tuple("g" if v == "h" else v for v in row) for row in rows])
+        appender.append_rows([tuple("g" if v == HASH else v for v in row) for row in rows])
         appender.flush()
     yield connection
     connection.close()
@@ -86,21 +43,13 @@ def differing(connection, **how) -> list[str]:
     ]
 
 
-def columns():
-    with in_memory({}) as connection:
-        connection.execute(schema_sql())
-        return connection.execute(
-            "SELECT table_name, column_name, data_type FROM duckdb_columns() "
-            "WHERE table_name IN ('trials', 'states', 'decisions', 'calls') "
-            "AND column_name NOT IN ('trial_id', 'spec_hash')"
-        ).fetchall()
-
-
-COLUMNS = columns()
-
-
-def test_what_is_stored_as_it_was_played_differs_in_nothing(stored):
-    assert differing(stored) == []
+with in_memory({}) as connection:
+    connection.execute(schema_sql())
+    COLUMNS = connection.execute(
+        "SELECT table_name, column_name, data_type FROM duckdb_columns() "
+        "WHERE table_name IN ('trials', 'states', 'decisions', 'calls') "
+        "AND column_name NOT IN ('trial_id', 'spec_hash')"
+    ).fetchall()
 
 
 def change(stored, columns) -> None:
@@ -108,7 +57,7 @@ def change(stored, columns) -> None:
     for table, column, kind in columns:
         other = ANOTHER.get(kind, "coalesce({0}, 0) + 1").format(column)
         stored.execute(f"UPDATE {table} SET {column} = {other} WHERE rowid = "
-                       f"(SELECT min(rowid) FROM {table} WHERE spec_hash = 'h')")  # fmt: skip
+                       f"(SELECT min(rowid) FROM {table} WHERE spec_hash = '{HASH}')")  # fmt: skip
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -123,13 +72,16 @@ def test_every_second_column_that_is_changed_is_found_and_no_other(stored, first
 
 @pytest.mark.parametrize("place", [each for each in COLUMNS if each[1] in PLACES[each[0]]])
 def test_a_row_at_another_place_is_another_row(stored, place):
+    assert differing(stored) == []
     change(stored, [place])
     assert differing(stored) == [f"rows of {place[0]}"]
 
 
 def test_rows_that_lack_or_are_too_many_are_counted(stored):
-    stored.execute("DELETE FROM states WHERE spec_hash = 'h' AND step = 3")
-    stored.execute("INSERT INTO decisions FROM decisions WHERE spec_hash = 'h' AND decision = 1")
+    stored.execute(f"DELETE FROM states WHERE spec_hash = '{HASH}' AND step = 3")
+    stored.execute(
+        f"INSERT INTO decisions FROM decisions WHERE spec_hash = '{HASH}' AND decision = 1"
+    )
     states = stored_rows(stored, "states", [KEY])
     (difference,) = states.differences(KEY, rows_of(RECORD)["states"])
     assert difference.place == {"step": 3, "side": "left"}

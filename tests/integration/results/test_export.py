@@ -1,7 +1,5 @@
 """The exported folder: every table and view, explained, and nothing of anybody else's replaced."""
 
-from __future__ import annotations
-
 import csv
 
 import duckdb
@@ -10,6 +8,7 @@ import pytest
 from merge_runner.results.export import FACTORS, tables
 from merge_runner.results.recording import COLUMNS
 from merge_runner.results.store import query
+from tests.support import cases
 from tests.support.harness import PROJECT
 from tests.support.studies import write_study, yielding
 
@@ -67,59 +66,39 @@ def test_the_wide_trials_have_metrics_and_typed_factors_and_humans_stand_beside_
     assert wide.select("trial_id, gap_m").order("ALL").fetchall() == trials[1]
 
 
-@pytest.mark.parametrize(
-    ("levels", "kind"),
-    [
-        (["0.2", "1"], "DOUBLE"),
-        (["1", "2"], "BIGINT"),
-        (["1", "99999999999999999999"], "DOUBLE"),
-        (["true", "false"], "BOOLEAN"),
-        (["default", "1"], "VARCHAR"),
-        (["true", "1"], "VARCHAR"),
-    ],
-)
-def test_a_factor_has_the_type_that_all_its_levels_have(levels, kind):
+def test_a_factor_has_the_type_that_all_its_levels_have():
+    factors = cases.table("plans", "factors")
+    rows = [[name, level] for name, case in factors.items() for level in case["levels"]]
     with duckdb.connect() as connection:
         connection.execute("CREATE TABLE trial_factors (factor VARCHAR, value VARCHAR)")
-        connection.executemany("INSERT INTO trial_factors VALUES ('f', ?)", [[x] for x in levels])
-        assert connection.execute(FACTORS.format(only="")).fetchall() == [("f", kind)]
+        connection.executemany("INSERT INTO trial_factors VALUES (?, ?)", rows)
+        found = connection.execute(FACTORS.format(only="")).fetchall()
+    assert dict(found) == {name: case["kind"] for name, case in factors.items()}
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [("notes.txt", "mine"), ("dictionary.csv", "# mine"), ("trials.csv", "mine")],
-)
-async def test_a_folder_with_anything_else_is_left_as_it_is(
-    merge_runner, golden, tmp_path, name, content
-):
-    folder = tmp_path / "out"
-    folder.mkdir()
-    (folder / name).write_text(content)
-    run = await merge_runner("export", "out", "--db", golden / "golden.duckdb")
-    assert run.code == 2
-    assert "is there and no earlier export: name another folder" in run.err
-    assert [path.read_text() for path in folder.iterdir()] == [content]
+async def test_a_folder_with_anything_else_is_left_as_it_is(merge_runner, golden, tmp_path):
+    for name in ("notes.txt", "dictionary.csv", "trials.csv"):
+        folder = tmp_path / name.partition(".")[0]
+        folder.mkdir()
+        (folder / name).write_text("# mine")
+        run = await merge_runner("export", folder, "--db", golden / "golden.duckdb")
+        assert run.code == 2
+        assert "is there and no earlier export: name another folder" in run.err
+        assert [path.read_text() for path in folder.iterdir()] == ["# mine"]
+    run = await merge_runner("export", "out")
+    assert (run.code, "there is no database" in run.err) == (2, True)
+    assert not (tmp_path / "out").exists()
 
 
-def test_every_column_of_a_table_and_of_the_metrics_has_a_meaning():
+def test_every_column_of_a_table_and_of_the_metrics_has_a_meaning_which_is_documented():
+    described = (PROJECT / "docs/reference/tables.md").read_text()
     for table in tables():
         assert table.comment, table.name
         if not table.is_view or table.name == "trial_metrics":
             assert [column.name for column in table.columns if not column.comment] == []
-
-
-def test_the_documented_columns_are_those_of_the_code():
-    described = (PROJECT / "docs/reference/tables.md").read_text()
     (metrics,) = [table for table in tables() if table.name == "trial_metrics"]
     for column in metrics.columns[2:]:
         assert f"| `{column.name}` | {column.comment.replace('|', chr(92) + '|')} |" in described
     recording = (PROJECT / "docs/reference/recordings.md").read_text()
     for name, kind in COLUMNS.items():
         assert f"| `{name}` | {kind} | " in recording
-
-
-async def test_an_export_of_no_database_writes_nothing(merge_runner, tmp_path):
-    run = await merge_runner("export", "out")
-    assert run.code == 2
-    assert "there is no database" in run.err
-    assert list(tmp_path.iterdir()) == []

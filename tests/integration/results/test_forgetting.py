@@ -1,10 +1,7 @@
 """Sweeps leave the database, and nothing that is left misses them."""
 
-from __future__ import annotations
-
 import asyncio
 import json
-import shutil
 
 import pytest
 
@@ -14,29 +11,23 @@ PART = ("baseline", "--conditions", "N_0_0,L_4_8")
 DB = "results/merge.duckdb"
 
 
-@pytest.fixture(scope="module")
-def played(prepare, tmp_path_factory):
-    """A folder with two sweeps: the second has the trials of the first, and as many of its own."""
-    folder, ids = tmp_path_factory.mktemp("two"), []
-    for repetitions in (1, 2):
-        run = prepare(folder, "sweep", *PART, "--reps", repetitions, "--json")
-        assert run.code == 0, run.err
-        ids.append(run.summary["sweep_id"])
-    return folder, ids
-
-
 @pytest.fixture
-def two_sweeps(played, tmp_path):
-    """The ids of the sweeps, of which there is a copy in the folder of the test."""
-    folder, ids = played
-    for name in ("results", "cache"):
-        shutil.copytree(folder / name, tmp_path / name)
-    return ids
+async def two_sweeps(merge_runner):
+    """The ids of two sweeps: the second has the trials of the first, and as many of its own."""
+    runs = [await merge_runner("sweep", *PART, "--reps", reps, "--json") for reps in (1, 2)]
+    return [run.summary["sweep_id"] for run in runs]
 
 
 async def test_a_forgotten_sweep_takes_what_no_other_has_which_is_played_again_without_a_call(
     merge_runner, tmp_path, two_sweeps
 ):
+    for asked, said in (
+        ((two_sweeps[0],), "nothing was removed: add --yes"),
+        (("emulator/*", "--yes"), f"unknown sweep 'emulator/*'; valid: {two_sweeps[0]}"),
+        (("--yes",), ""),
+    ):
+        refused = await merge_runner("forget", *asked)
+        assert (refused.code, said in refused.err) == (2, True), refused.err
     whole = await merge_runner("digest")
     gone = await merge_runner("forget", two_sweeps[1], "--yes")
     assert gone.code == 0, gone.err
@@ -52,33 +43,20 @@ async def test_a_forgotten_sweep_takes_what_no_other_has_which_is_played_again_w
     assert (again["calls"]["live"], again["trials"]["stored_before"]) == (0, 2)
     assert (await merge_runner("digest")).out == whole.out
     assert (await merge_runner("tables", "attempts", "--format", "csv")).out != shown.out
-
-
-async def test_nothing_is_forgotten_without_a_yes_or_under_a_wrong_name_and_else_all_is(
-    merge_runner, tmp_path, two_sweeps
-):
-    for asked, said in (
-        ((two_sweeps[0],), "nothing was removed: add --yes"),
-        (("emulator/*", "--yes"), f"unknown sweep 'emulator/*'; valid: {two_sweeps[0]}"),
-        (("--yes",), ""),
-    ):
-        refused = await merge_runner("forget", *asked)
-        assert (refused.code, said in refused.err) == (2, True), refused.err
-    assert query(tmp_path / DB, "select count(*) from trials")[1] == [(4,)]
     assert (await merge_runner("forget", "*", "--yes")).code == 0
     for table in ("sweeps", "sweep_trials", "trials", "states", "decisions", "calls", "specs"):
         assert query(tmp_path / DB, f"from {table}")[1] == []
     assert json.loads((await merge_runner("audit", "--json")).out)["ok"]
 
 
-async def test_nothing_is_forgotten_while_a_sweep_is_running(merge_runner, tmp_path, two_sweeps):
+async def test_nothing_is_forgotten_while_a_sweep_is_running(merge_runner, tmp_path):
     running = await merge_runner.start("sweep", *PART, "--reps", 9, "--rpm", 60)
     try:
-        while not list((tmp_path / f"{DB}.progress").glob("*.json")):
+        while not (told := list((tmp_path / f"{DB}.progress").glob("*.json"))):
             await asyncio.sleep(0.02)
-        run = await merge_runner("forget", two_sweeps[0], "--yes")
+        run = await merge_runner("forget", told[0].stem, "--yes")
         assert (run.code, "is running into" in run.err) == (2, True)
     finally:
         running.kill()
         await running.wait()
-    assert (await merge_runner("forget", two_sweeps[0], "--yes")).code == 0, "it is dead"
+    assert (await merge_runner("forget", told[0].stem, "--yes")).code == 0, "it is dead"

@@ -1,12 +1,8 @@
 """What is said of the program is said of its own checkout, or of what is installed."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
-
-import pytest
 
 from tests.support.harness import PROJECT, environment
 
@@ -34,16 +30,11 @@ def committed(folder, *what):
     return git(folder, "rev-parse", "HEAD")
 
 
-@pytest.fixture
-def copied(tmp_path):
-    """Copies the package to a folder."""
-
-    def copy(folder):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(PROJECT / "merge_runner", folder / "merge_runner", ignore=ignored)
-        return folder
-
-    return copy
+def copied(folder):
+    """Copy the package to a folder."""
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(PROJECT / "merge_runner", folder / "merge_runner", ignore=ignored)
+    return folder
 
 
 def said_in(packages, **changes):
@@ -53,31 +44,24 @@ def said_in(packages, **changes):
     return done.stdout.splitlines()
 
 
-INSTALLED = ["('merge-runner 0.1.0', None)", "merge-runner 0.1.0, installed"]
+def test_a_users_repository_around_an_installed_copy_is_not_the_programs(tmp_path):
+    for place, tracked in (("", ()), (".venv/lib/site-packages", (".venv",))):
+        packages = copied(tmp_path / place)
+        committed(tmp_path, *tracked)
+        # A hook of that repository names it to everything that it runs.
+        for hook in ({}, {"GIT_DIR": str(tmp_path / ".git")}):
+            told = ["('merge-runner 0.1.0', None)", "merge-runner 0.1.0, installed"]
+            assert said_in(packages, **hook) == told
 
 
-@pytest.mark.parametrize(
-    ("place", "tracked"),
-    [("", ()), (".venv/lib/site-packages", ()), (".venv/lib/site-packages", (".venv",))],
-)
-def test_a_users_repository_around_an_installed_copy_is_not_the_programs(
-    tmp_path, copied, place, tracked
-):
-    packages = copied(tmp_path / place)
-    committed(tmp_path, *tracked)
-    # A hook of that repository names it to everything that it runs.
-    assert said_in(packages, GIT_DIR=str(tmp_path / ".git")) == said_in(packages) == INSTALLED
-
-
-def test_a_checkout_is_named_by_its_commit_and_whether_it_is_changed(tmp_path, copied):
+def test_a_checkout_is_named_by_its_commit_and_whether_it_is_changed(tmp_path):
     checkout = copied(tmp_path / "main")
     commit = committed(checkout, "merge_runner")
-    (checkout / "my-study").mkdir()
-    (checkout / "my-study/study.toml").write_text("a user's own")
-    named = f"merge-runner at commit {commit}"
-    assert said_in(checkout) == [f"('{commit}', False)", named]
+    (checkout / "study.toml").write_text("a user's own")
+    clean = [f"('{commit}', False)", f"merge-runner at commit {commit}"]
+    assert said_in(checkout) == clean
     git(checkout, "worktree", "add", "--quiet", tmp_path / "other")
-    assert said_in(tmp_path / "other")[0] == f"('{commit}', False)"
+    assert said_in(tmp_path / "other") == clean
     (checkout / "study.txt").write_text("changed")
-    changed = f"{named}, with changes that are not committed"
+    changed = f"{clean[1]}, with changes that are not committed"
     assert said_in(checkout) == [f"('{commit}', True)", changed]

@@ -1,11 +1,10 @@
 """The results database: whole trials, one version, read-only queries, and patience with locks."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import subprocess
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
@@ -23,24 +22,27 @@ from merge_runner.results.store import Store, query, results_digest, sweep_facts
 from merge_runner.run.local_runner import Flusher
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.trial import play_trial
+from tests.support.gate import HANGS_S
 from tests.support.harness import environment
 from tests.support.specs import spec_of
 
 SCENARIO = ScenarioConfig()
 SWEEP = {"sweep_id": "s1", "name": "baseline", "started_at": datetime(2026, 1, 1)}  # noqa: DTZ001
 SWEEP |= {"config": "{}", "versions": "{}"}
+# DuckDB takes -c for a person at a prompt, whom it would show a bar.
 SPILL = """
 import os, stat, sys
 from merge_runner.results.database import SETTINGS, in_memory
+asked = "SELECT current_setting('temp_directory'), current_setting('enable_progress_bar')"
 with in_memory({**SETTINGS, "memory_limit": "50MB"}) as connection:
-    [(folder,)] = connection.execute("SELECT current_setting('temp_directory')").fetchall()
+    [(folder, bar)] = connection.execute(asked).fetchall()
     connection.execute(
         "CREATE TABLE long AS SELECT range AS n, md5(range::VARCHAR) AS text FROM range(3000000)"
     )
     assert os.listdir(folder), "nothing was spilled"
-    print(folder, os.getpid(), oct(stat.S_IMODE(os.stat(folder).st_mode)))
+    print(folder, os.getpid(), oct(stat.S_IMODE(os.stat(folder).st_mode)), bar)
 """
-LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1]); print('held', flush=True); input()"
+LOCK = "import duckdb, sys; c = duckdb.connect(sys.argv[1], len(sys.argv) > 2); print(); input()"
 
 
 def keyed(record: TrialRecord) -> dict:
@@ -51,10 +53,6 @@ def played(condition="L_4_0", *, driver="projected-order", **of_spec) -> TrialRe
     trial = spec_of(condition, **of_spec)
     drivers = {side: PROGRAMS[driver].make(SCENARIO, trial, side) for side in ("left", "right")}
     return asyncio.run(play_trial(trial, SCENARIO, drivers))
-
-
-def failed(record: TrialRecord) -> TrialRecord:
-    return TrialRecord(record.spec, "failed", None, 1.0, "it broke", record.states[:4], ())
 
 
 @pytest.fixture
@@ -69,38 +67,25 @@ def store(path):
     return made
 
 
-def rows(path, sql):
-    return query(path, sql)[1]
-
-
-def test_a_trial_is_stored_whole_and_once(store, path):
+def test_a_trial_is_stored_whole_once_and_instead_of_one_that_had_failed(store, path):
     record = played()
-    store.write("s1", [record], patience_s=1)
-    store.write("s1", [record], patience_s=1)
-    assert rows(path, "select count(*) from trials") == [(1,)]
-    assert rows(path, "select count(*) from states") == [(len(record.states),)]
-    assert rows(path, "select count(*), count_if(valid) from decisions") == [
-        (len(record.decisions), len(record.decisions))
-    ]
-    stored = rows(path, "select step, side, position_m, velocity_mps from states order by all")
-    assert stored == sorted((s.step, s.side, s.position_m, s.velocity_mps) for s in record.states)
-
-
-def test_a_failed_trial_is_replaced_and_an_ended_one_never(store, path):
-    record = played()
-    store.write("s1", [failed(record)], patience_s=1)
+    error = TrialRecord(record.spec, "failed", None, 1.0, "it broke", record.states[:4], ())
+    store.write("s1", [error], patience_s=1)
     assert store.ended_trials(keyed(record)) == set()
     assert sweep_facts(path, "s1")["failed"] == [("m/baseline/L_4_0/rep01", "it broke")]
-    store.write("s1", [record], patience_s=1)
-    assert store.write("s1", [failed(record)], patience_s=1) == {}
-    assert rows(path, "select status, error from trials") == [("finished", None)]
-    assert rows(path, "select count(*) from states") == [(len(record.states),)]
+    for again in (record, record, error):
+        assert store.write("s1", [again], patience_s=1) == {}
+    assert query(path, "select status, error from trials")[1] == [("finished", None)]
+    decided = len(record.decisions)
+    counts = "select count(*), count_if(valid) from decisions"
+    assert query(path, counts)[1] == [(decided, decided)]
+    stored = query(path, "select step, side, position_m, velocity_mps from states order by all")[1]
+    assert stored == sorted((s.step, s.side, s.position_m, s.velocity_mps) for s in record.states)
 
 
 def test_a_trial_that_ends_otherwise_than_the_stored_one_is_named_and_not_stored(store, path):
     record = played()
-    assert store.write("s1", [record], patience_s=1) == {}
-    assert store.write("s1", [record], patience_s=1) == {}
+    store.write("s1", [record], patience_s=1)
     other = replace(played("L_4_8"), spec=record.spec)
     assert store.write("s1", [other], patience_s=1).keys() == {"m/baseline/L_4_0/rep01"}
     plan = record.decisions[3].decision
@@ -109,15 +94,19 @@ def test_a_trial_that_ends_otherwise_than_the_stored_one_is_named_and_not_stored
     assert store.write("s1", [decided], patience_s=1) == {
         "m/baseline/L_4_0/rep01": ["decisions.applied"]
     }
-    assert rows(path, "select count(*) from states") == [(len(record.states),)]
+    assert query(path, "select count(*) from states")[1] == [(len(record.states),)]
 
 
-def test_two_specs_of_one_trial_stay_apart(store, path):
+def test_two_specs_of_one_trial_stay_apart_and_a_changed_condition_needs_another_name(store, path):
     one, other = played(), played(spec_hash="g")
     store.write("s1", [one, other], patience_s=1)
     named = keyed(other) | {(one.spec.trial_id, "x"): one.spec}
     assert store.ended_trials(named) == {(one.spec.trial_id, "g")}
     assert results_digest(path)[1] == 2
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("UPDATE trials SET projected_headway_m = 3")
+    with pytest.raises(UsageError, match=r"is stored with a headway of 3 m .* a new name"):
+        store.ended_trials(keyed(one))
 
 
 def test_the_digest_sees_every_result_and_no_order(tmp_path):
@@ -167,131 +156,66 @@ def test_the_metrics_are_those_computed_by_hand(store, path):
         "time_to_merge_s": left[first - 1].time_s + part * 0.2,
     }
     columns = ", ".join(expected)
-    finished, collided = rows(path, f"select {columns} from trial_metrics order by trial_id")
+    sql = f"select {columns} from trial_metrics order by trial_id"
+    finished, collided = query(path, sql)[1]
     assert finished == pytest.approx(tuple(expected.values()))
     assert collided[:3] == (None, None, None), "a collided trial has no gap and no deviation"
 
 
 def test_a_name_means_another_file_in_another_folder(tmp_path, monkeypatch):
-    digests = []
     for folder in (tmp_path / "one", tmp_path / "two"):
         folder.mkdir()
         monkeypatch.chdir(folder)
         Store(Path("merge.duckdb")).begin_sweep(SWEEP, {"h": "{}"}, [])
-        digests.append(results_digest(Path("merge.duckdb")))
-    assert digests[0] == digests[1]
+        assert query(Path("merge.duckdb"), "SELECT sweep_id FROM sweeps")[1] == [("s1",)]
 
 
-def test_a_changed_condition_needs_another_name(store, path):
-    record = played()
-    store.write("s1", [record], patience_s=1)
-    key = (record.spec.trial_id, record.spec.spec_hash)
-    assert store.ended_trials({key: record.spec}) == {key}
-    with duckdb.connect(str(path)) as connection:
-        connection.execute("UPDATE trials SET projected_headway_m = 3")
-    with pytest.raises(UsageError, match=r"is stored with a headway of 3 m .* a new name"):
-        store.ended_trials({key: record.spec})
-
-
-def test_a_query_changes_nothing_and_reads_no_file(store, path, tmp_path):
-    (tmp_path / "secret.csv").write_text("a\n1\n")
-    for sql in (
-        "delete from trials",
-        f"select * from '{tmp_path / 'secret.csv'}'",
-        f"copy trials to '{tmp_path / 'out.csv'}'",
-        "set enable_external_access = true",
-        "select nothing",
-    ):
-        with pytest.raises(UsageError):
-            query(path, sql)
-    assert not (tmp_path / "out.csv").exists()
-
-
-def test_another_program_s_database_and_a_broken_one_are_refused(tmp_path):
-    foreign = tmp_path / "foreign.duckdb"
-    with duckdb.connect(str(foreign)) as connection:
+def test_another_program_s_database_is_refused(tmp_path):
+    with duckdb.connect(str(tmp_path / "foreign.duckdb")) as connection:
         connection.execute("CREATE TABLE mine (a INTEGER)")
     with pytest.raises(UsageError, match="not a database of merge-runner"):
-        Store(foreign)
-    broken = tmp_path / "broken.duckdb"
-    broken.write_bytes(b"not a database at all" * 1000)
-    with pytest.raises(UsageError, match="cannot be opened"):
-        Store(broken)
-
-
-def test_the_file_itself_says_what_its_columns_mean(store, path):
-    with duckdb.connect(str(path), read_only=True) as connection:
-        said = connection.execute(
-            "SELECT comment FROM duckdb_columns() WHERE (table_name, column_name) IN "
-            "(('trials', 'status'), ('trial_metrics', 'joint')) ORDER BY ALL"
-        ).fetchall()
-    assert said == [
-        ("finished, collided, timeout, failed",),
-        ("whether both are at least 0.5 m/s",),
-    ]
+        Store(tmp_path / "foreign.duckdb")
 
 
 @pytest.fixture
 def holder(path):
     """Another process that holds the database until its standard input closes."""
 
-    def hold():
-        command, pipe = [sys.executable, "-c", LOCK, str(path)], subprocess.PIPE
+    @contextmanager
+    def hold(*to):
+        command, pipe = [sys.executable, "-c", LOCK, str(path), *to], subprocess.PIPE
         process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
-        assert process.stdout.readline() == "held\n"
-        return process
+        assert process.stdout.readline() == "\n"
+        yield process
+        process.communicate("\n")
 
     return hold
 
 
 async def test_trials_wait_in_memory_while_the_database_is_locked(store, path, holder):
-    record = await asyncio.to_thread(played)
-    process = holder()
     said = []
     waiting = Flusher(store, "s1", said.append)
-    waiting.add(record)
-    closing = asyncio.create_task(waiting.close())
-    while not said:
-        await asyncio.sleep(0.05)
-    process.communicate("")
+    waiting.add(await asyncio.to_thread(played))
+    with holder() as process:
+        closing = asyncio.create_task(waiting.close())
+        while not said:
+            await asyncio.sleep(0.05)
     await closing
     assert f"1 trials wait to be stored: {path} is held by python" in said[0]
     assert f"(PID {process.pid}): close it there" in said[0]
-    assert rows(path, "select count(*) from trials") == [(1,)]
+    assert query(path, "select count(*) from trials")[1] == [(1,)]
 
 
-def test_a_database_that_this_process_holds_itself_is_named_at_once(store, path, monkeypatch):
-    def sleep(_):
-        pytest.fail("it was waited for")
-
-    monkeypatch.setattr("merge_runner.results.database.time.sleep", sleep)
+def test_a_database_that_this_process_holds_itself_is_named_unless_we_hold_it(store, path):
     own = "is open in this process .* as by duckdb.connect: close that connection"
     with duckdb.connect(path):
         with pytest.raises(StoreLocked, match=own):
             query(path, "SELECT 1")
         with pytest.raises(StoreLocked, match=own):
-            store.write("s1", [])
-    assert rows(path, "select 1") == [(1,)]
-
-
-def test_a_database_that_we_hold_in_this_process_is_waited_for(store, path, monkeypatch):
-    waited = []
-    monkeypatch.setattr("merge_runner.results.database.time.sleep", waited.append)
-    opened = open_database(path, read_only=True, patience_s=1, instance=Instance())
-    with opened, pytest.raises(StoreLocked, match="held by another program"):
+            store.write("s1", [], patience_s=HANGS_S)
+    ours = open_database(path, read_only=True, patience_s=1, instance=Instance())
+    with ours, pytest.raises(StoreLocked, match="held by another program"):
         store.write("s1", [], patience_s=0.01)
-    assert waited
-
-
-def test_a_slow_query_draws_no_bar_on_the_output():
-    # DuckDB takes -c for a person at a prompt.
-    asked = (
-        "from merge_runner.results.database import in_memory; query = "
-        "\"SELECT current_setting('enable_progress_bar')\"; "
-        "print(in_memory({}).execute(query).fetchone())"
-    )
-    run = subprocess.run([sys.executable, "-c", asked], capture_output=True, check=True)
-    assert run.stdout == b"(False,)\n"
 
 
 def test_what_does_not_fit_into_memory_goes_to_a_private_folder_that_ends_with_the_process(
@@ -299,23 +223,21 @@ def test_what_does_not_fit_into_memory_goes_to_a_private_folder_that_ends_with_t
 ):
     command, env = [sys.executable, "-c", SPILL], environment(TMPDIR=str(tmp_path))
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
-    folder, pid, mode = done.stdout.split()
+    folder, pid, mode, bar = done.stdout.split()
     assert Path(folder).parent == tmp_path
     assert pid not in folder
-    assert mode == "0o700"
+    assert (mode, bar) == ("0o700", "False")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_only_reads_does_not_open_the_file_for_writing(store, monkeypatch):
+def test_what_only_reads_does_not_open_the_file_for_writing(store, holder):
     record = played()
     store.write("s1", [record], patience_s=1)
-
-    def refuse(*_):
-        raise AssertionError("it is opened for writing")
-
-    monkeypatch.setattr("merge_runner.results.store.write_database", refuse)
-    assert store.ended_trials(keyed(record)) == set(keyed(record))
-    assert store.decisions_by_spec(["another"]) == []
+    with holder("read only"):
+        assert store.ended_trials(keyed(record)) == set(keyed(record))
+        assert store.decisions_by_spec(["another"]) == []
+        with pytest.raises(StoreLocked):
+            store.write("s1", [], patience_s=0.01)
 
 
 async def test_ctrl_c_that_comes_before_a_reading_is_waited_for_ends_it_too(

@@ -3,8 +3,6 @@
 Its workers share nothing, so that a lost one's trials are asked again as a whole.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json
@@ -25,6 +23,7 @@ from merge_runner.llm.ledger import Asked, Ledger
 from merge_runner.run import cluster
 from merge_runner.run.cluster import connected
 from tests.support.cluster import SIX, SMALL, all_held, ended, held_from, repetition_of, workers_of
+from tests.support.crossed_study import MODEL
 from tests.support.gate import HANGS_S, Gate
 from tests.support.harness import FAST, PROJECT, watched
 from tests.support.mock_server import FaultPlan
@@ -32,16 +31,10 @@ from tests.support.virtual_time import in_virtual_time, now_s
 
 ON_TWO = (*SIX, "--in-flight", 4, "--dask", "local:2")
 PAID = ("--model", "o3", "--yes", *FAST)
-DEAR = """
-[dear]
-provider = "emulator"
-format = "openai-chat"
-id = "scripted-driver"
-max_output_tokens = 4000
-price = {{ input = 1.0, output = 2.0, source = "mine" }}
-timeout_s = {hangs_s}
-deadline_s = {hangs_s}
-"""
+# A worker is given as long as a loaded machine may need.
+DEAR = MODEL.replace("price}, output = {price}", "price}, output = 2.0") + (
+    "timeout_s = {hangs_s}\ndeadline_s = {hangs_s}\n"
+)
 
 
 @in_virtual_time
@@ -51,38 +44,30 @@ async def test_a_coordinator_that_says_nothing_ends_its_workers_tasks():
     assert now_s() == 300
 
 
-@pytest.mark.parametrize(
-    "where", ["local:0", "local:x", "local", "", "http://host:1", "tcp://host", "none.json"]
-)
-async def test_a_word_that_names_no_cluster_is_refused(where):
-    with pytest.raises(UsageError, match="valid: local:N"):
-        async with connected(where):
-            pass
-
-
-async def test_what_cannot_be_on_a_cluster_is_told_in_one_line(merge_runner, monkeypatch, tmp_path):
+async def test_what_cannot_be_on_a_cluster_is_told_in_one_line(merge_runner, tmp_path):
+    for word in ("local:0", "local:x", "local", "", "http://host:1", "tcp://host", "none.json"):
+        with pytest.raises(UsageError, match="valid: local:N"):
+            async with connected(word):
+                pass
     (tmp_path / "distributed.py").write_text("raise ModuleNotFoundError('no distributed')")
-    without = {"PYTHONPATH": str(tmp_path)}
-    for asked, env, said in (
-        ((*SMALL, "--dask", "local:0"), {}, "valid: local:N"),
-        ((*SMALL, "--replay", "--dask", "local:2"), {}, "a replay needs no cluster"),
-        ((*SMALL, "--dask", "local:2"), without, "error: --dask needs the package distributed: "
-         "pip install distributed\n"),
-    ):  # fmt: skip
-        run = await merge_runner(*asked, **env)
-        assert (run.code, said in run.err, len(run.err.splitlines())) == (2, True, 1), run.err
-
-
-def loggers_levels():
-    return [logging.getLogger(name).level for name in ("", "distributed", "tornado")]
+    run = await merge_runner(*SMALL, "--dask", "local:2", PYTHONPATH=str(tmp_path))
+    told = "error: --dask needs the package distributed: pip install distributed\n"
+    assert (run.code, run.err) == (2, told)
+    run = await merge_runner(*SMALL, "--replay", "--dask", "local:2")
+    told = "a replay needs no cluster"
+    assert (run.code, told in run.err, len(run.err.splitlines())) == (2, True, 1)
 
 
 async def test_a_cluster_of_this_machine_leaves_its_host_as_it_is_and_needs_no_certain_port(
     recwarn, caplog, monkeypatch
 ):
+    def host():
+        levels = [logging.getLogger(name).level for name in ("", "distributed", "tornado")]
+        return {**os.environ}, levels
+
     import_module("distributed")  # its first import sets some of them
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    before, levels = {**os.environ}, loggers_levels()
+    before = host()
     with socket.socket() as held:
         with contextlib.suppress(OSError):  # somebody holds it already
             held.bind(("127.0.0.1", 8787))
@@ -92,32 +77,29 @@ async def test_a_cluster_of_this_machine_leaves_its_host_as_it_is_and_needs_no_c
             logging.getLogger("distributed.client").error("a lost worker")
             logging.getLogger("merge_runner").warning("ours")
     assert ([str(each.message) for each in recwarn], safe) == ([], "1")
-    assert ({**os.environ}, loggers_levels()) == (before, levels)
+    assert host() == before
     assert [each.message for each in caplog.records] == ["ours"]
 
 
 async def test_workers_of_another_scheduler_play_with_their_own_keys(merge_runner, scheduler):
     async with watched() as server:
         env = {"OPENAI_API_KEY": "a-dummy-key", "OPENAI_BASE_URL": f"{server.url}/v1"}
-        sweep = (*SMALL, "--model", "o3", "--yes", "--dask", scheduler.file)
         await scheduler("--no-nanny")
-        run = await merge_runner(*sweep, **env)
-        assert run.code == 2
-        assert "o3 needs a key: set OPENAI_API_KEY" in run.err
-        assert "(told by the Dask worker tcp://127.0.0.1:" in run.err
-        assert server.requests == 0
+        dask = ("--dask", scheduler.file)
+        run = await merge_runner(*SMALL, "--model", "o3", "--yes", *dask, **env)
+        assert (run.code, server.requests) == (2, 0)
+    assert "o3 needs a key: set OPENAI_API_KEY" in run.err
+    assert "(told by the Dask worker tcp://127.0.0.1:" in run.err
     assert "Traceback" not in run.err
 
 
 async def test_a_worker_with_other_source_is_refused(merge_runner, scheduler, tmp_path):
-    other = tmp_path / "other"
-    shutil.copytree(PROJECT / "merge_runner", other / "merge_runner")
-    with (other / "merge_runner/errors.py").open("a") as file:
+    other = shutil.copytree(PROJECT / "merge_runner", tmp_path / "other/merge_runner")
+    with (other / "errors.py").open("a") as file:
         file.write("# another one\n")
-    await scheduler("--no-nanny", PYTHONPATH=str(other))
+    await scheduler("--no-nanny", PYTHONPATH=str(other.parent))
     run = await merge_runner(*SMALL, "--dask", scheduler.file)
-    assert run.code == 2
-    assert "install the same one for all" in run.err
+    assert (run.code, "install the same one for all" in run.err) == (2, True)
     assert "Traceback" not in run.err
 
 
@@ -127,7 +109,7 @@ async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
     """What its attempts have cost is spent, and what the others may have stays reserved."""
     gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
     with (tmp_path / "models.toml").open("a") as file:
-        file.write(DEAR.format(hangs_s=HANGS_S))
+        file.write(DEAR.format(name="dear", price=1.0, hangs_s=HANGS_S))
     most_usd = asked_usd = 0.0
 
     async def middle(request, handler):
@@ -140,9 +122,8 @@ async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
         return reply
 
     async with watched(middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         priced = ("--model", "dear", "--yes", "--max-cost", 50, *FAST)
-        process = await started(*ON_TWO, *priced, **env)
+        process = await started(*ON_TWO, *priced, **server.env)
         await all_held(gate, trials=4)
         victim = next(w for w in workers_of(process.pid) if held_from(gate, w))
         lost = set(map(repetition_of, held_from(gate, victim)))
@@ -166,7 +147,7 @@ async def test_a_worker_that_is_killed_costs_its_task_and_nothing_else(
         assert len(kept) == 114
         assert spent > sum(kept) + most_usd, "what is lost is paid"
         requests = server.requests
-        plain = await merge_runner(*SIX, *priced, "--db", "plain", **env)
+        plain = await merge_runner(*SIX, *priced, "--db", "plain", **server.env)
         assert (plain.code, server.requests) == (0, requests), "a reply is not kept"
     digests = {(await merge_runner("digest", *db)).out for db in ((), ("--db", "plain"))}
     assert len(digests) == 1

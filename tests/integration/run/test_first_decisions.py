@@ -14,16 +14,15 @@ async def test_a_live_run_stops_after_20_invalid_decisions_and_keeps_what_was_an
     merge_runner,
 ):
     async with watched(faults=PROSE) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        stopped = await merge_runner(*SWEEP, **env)
+        stopped = await merge_runner(*SWEEP, **server.env)
         assert (stopped.code, server.requests) == (1, MOST_INVALID)
         (message,) = stopped.summary["messages"]
         assert message.startswith("none of the first 20 decisions of emulator is valid")
         assert 'The first reply is "M I would rather describe my plan in words than' in message
         assert "(no array). To mend that look at what" in message
-        again = await merge_runner(*SWEEP, **env)
+        again = await merge_runner(*SWEEP, **server.env)
         assert (again.code, server.requests) == (1, MOST_INVALID), "it asked on"
-        whole = await merge_runner(*SWEEP, "--reps", 1, "--keep-going", **env)
+        whole = await merge_runner(*SWEEP, "--reps", 1, "--keep-going", **server.env)
         assert whole.code == 0, whole.err
         assert whole.summary["invalid_decisions"] == whole.summary["decisions"] > MOST_INVALID
         assert whole.summary["fallbacks"] == whole.summary["invalid_decisions"]
@@ -32,38 +31,31 @@ async def test_a_live_run_stops_after_20_invalid_decisions_and_keeps_what_was_an
     assert replay.code == 0, "a replay plays what is recorded"
 
 
-@pytest.mark.parametrize(
-    "command",
-    [("sweep", "baseline", "--reps", 1), ("sweep", "baseline", "--first", "--reps", 1)],
-    ids=["sweep", "first"],
-)
-async def test_a_run_of_fewer_decisions_says_at_its_end_that_none_is_valid(merge_runner, command):
-    part = (*command, "--conditions", "N_0_0", "--json")
+@pytest.mark.parametrize("first", [(), ("--first",)])
+async def test_a_run_of_fewer_decisions_says_at_its_end_that_none_is_valid(merge_runner, first):
+    part = ("sweep", "baseline", *first, "--reps", 1, "--conditions", "N_0_0")
     async with watched(faults=PROSE) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         for _ in range(2):  # the second asks nothing
-            run = await merge_runner(*part, **env)
+            run = await merge_runner(*part, "--json", **server.env)
             assert run.code == run.summary["exit_code"] == 1
             decisions = run.summary["decisions"]
             assert run.summary["invalid_decisions"] == decisions < MOST_INVALID
             (message,) = run.summary["messages"]
-            assert message.startswith(
-                f"none of the first {decisions} decisions of emulator is valid. "
-            )
+            told = f"none of the first {decisions} decisions of emulator is valid. "
+            assert message.startswith(told)
             assert "(no array). To mend that look at what" in message
-        whole = await merge_runner(*part[:-1], "--keep-going", **env)
+        whole = await merge_runner(*part, "--keep-going", **server.env)
     assert whole.code == 0, whole.err
     told = f"decisions: {decisions}, {decisions} invalid (100.0%), {decisions} fallbacks"
     # Of no fallback was an earlier plan there.
-    assert ("--first" in command) or told in whole.out.splitlines()
+    assert first or told in whole.out.splitlines()
 
 
 async def test_a_run_in_batches_stops_after_the_first_round_and_pays_it_once(merge_runner):
     sweep = (*SWEEP, "--reps", 2, "--batch")
     async with watched(faults=PROSE) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         for _ in range(2):
-            stopped = await merge_runner(*sweep, **env)
+            stopped = await merge_runner(*sweep, **server.env)
             assert stopped.code == 1
             assert "none of the first 20 decisions of emulator" in stopped.summary["messages"][0]
         assert server.paths.count("/v1/batches") == 1, "it began another round"

@@ -1,8 +1,7 @@
 """A server of one's own: what it serves, and what is said where nobody listens."""
 
-from __future__ import annotations
-
 import json
+import re
 
 import pytest
 from aiohttp import web
@@ -32,7 +31,6 @@ price = "free"
 """
 # Nothing listens at this port, which is one of the system's.
 DEAD = "http://127.0.0.1:9/v1"
-LISTED = "serves scripted-driver, which is asked"
 
 
 def serving(*names, status=200):
@@ -47,29 +45,20 @@ def serving(*names, status=200):
     return middle
 
 
-@pytest.fixture
-def registry(tmp_path):
-    (tmp_path / "experiments").mkdir()
-    (tmp_path / "experiments/models.toml").write_text(REGISTRY)
-    (tmp_path / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 1\n")
-
-
-def models_asked(db):
-    found = query(db, "SELECT DISTINCT model_requested FROM calls")[1]
-    return [name for (name,) in found]
-
-
 async def test_a_server_s_one_model_is_asked_of_several_one_must_be_chosen_and_a_replay_finds_both(
-    merge_runner, tmp_path
+    merge_runner, tmp_path, monkeypatch
 ):
+    monkeypatch.setattr("merge_runner.run.sweep.LONG_WAIT_S", 0)
     async with watched(serving("qwen3-8b")) as server:
+        told = await merge_runner(*LOCAL, "--dry-run", LOCAL_BASE_URL=f"{server.url}/v1")
+        assert (told.summary["trials"], server.requests) == (1, 0)
         run = await merge_runner(*LOCAL, LOCAL_BASE_URL=f"{server.url}/v1")
         assert run.code == 0, run.err
-        assert "serves qwen3-8b, which is asked\n" in run.err
+        lists = " has not listed its models yet: .* serves qwen3-8b, which is asked\n"
+        assert re.search(lists, run.err, re.DOTALL)
         assert {json.loads(body)["model"] for body in server.asked if body} == {"qwen3-8b"}
     one = await merge_runner("digest")
     assert (await merge_runner("recording", "export", "local.parquet")).code == 0
-    recorded = ("--db", "recorded.duckdb", "--recording", "local.parquet", "--cache", "empty")
     async with watched(serving("qwen3-8b", "llama3.2:latest")) as server:
         at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
         unnamed = await merge_runner(*LOCAL, **at)
@@ -79,73 +68,44 @@ async def test_a_server_s_one_model_is_asked_of_several_one_must_be_chosen_and_a
         # Ollama knows a model by its name without the usual tag, too.
         chosen = await merge_runner(*LOCAL, "--db", "llama", **at, LOCAL_MODEL="llama3.2")
         assert chosen.code == 0, chosen.err
-    assert models_asked(tmp_path / "results/merge.duckdb") == ["qwen3-8b"]
-    assert models_asked(tmp_path / "llama") == ["llama3.2"]
-    cached = ("--db", "cached.duckdb")
-    assert (await merge_runner("replay", *LOCAL[1:], *cached)).code == 4
-    assert (await merge_runner("replay", *LOCAL[1:], *cached, LOCAL_MODEL="qwen3-8b")).code == 0
-    assert (await merge_runner("replay", *LOCAL[1:], *recorded)).code == 0
+    asked = query(tmp_path / "llama", "SELECT DISTINCT model_requested FROM calls")[1]
+    assert asked == [("llama3.2",)]
+    replay = ("replay", *LOCAL[1:], "--db")
+    recorded = ("recorded.duckdb", "--recording", "local.parquet", "--cache", "empty")
+    assert (await merge_runner(*replay, "cached.duckdb")).code == 4
+    assert (await merge_runner(*replay, "cached.duckdb", LOCAL_MODEL="qwen3-8b")).code == 0
+    assert (await merge_runner(*replay, *recorded)).code == 0
     for db in ("cached.duckdb", "recorded.duckdb"):
         assert (await merge_runner("digest", "--db", db)).out == one.out
 
 
-async def test_a_server_that_is_slow_to_list_its_models_is_waited_for_with_a_line(
-    merge_runner, emulator_url, monkeypatch
-):
-    monkeypatch.setattr("merge_runner.run.sweep.LONG_WAIT_S", 0)
-    run = await merge_runner(*LOCAL, LOCAL_BASE_URL=emulator_url)
-    assert run.code == 0, run.err
-    waits, asked = (run.err.index(said) for said in (" has not listed its models yet: ", LISTED))
-    assert waits < asked
-
-
-async def test_a_server_without_a_list_needs_a_name(merge_runner, registry):
-    async with watched(serving(status=404)) as server:
-        at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
-        assert (await merge_runner(*NAMED, **at)).code == 0
-        run = await merge_runner(*LOCAL, **at)
-        assert run.code == 2
-        assert "models that it does not list (HTTP 404" in run.err
-        assert "name one with LOCAL_MODEL" in run.err
-
-
-@pytest.mark.parametrize(
-    ("url", "said"),
-    [
+async def test_where_nobody_answers_the_run_ends_within_seconds_with_what_to_start(merge_runner):
+    for url, said in (
         (DEAD, f"nothing listens at {DEAD}: start a server (docs/how-to/local-models.md)"),
         ("http://gpu.invalid:8000/v1", "http://gpu.invalid:8000/v1 cannot be reached ("),
-    ],
-)
-async def test_where_nobody_answers_the_run_ends_within_seconds_with_what_to_start(
-    merge_runner, url, said
-):
-    run = await merge_runner(*LOCAL, LOCAL_BASE_URL=url)
-    assert run.code == 1
-    (line,) = run.err.splitlines()
-    for each in (said, "start a server", "or set LOCAL_BASE_URL"):
-        assert each in line
+    ):
+        run = await merge_runner(*LOCAL, LOCAL_BASE_URL=url)
+        (line,) = run.err.splitlines()
+        told = [each in line for each in (said, "start a server", "or set LOCAL_BASE_URL")]
+        assert (run.code, all(told)) == (1, True), line
 
 
-async def test_no_trial_has_failed_where_nothing_was_ever_answered(merge_runner, registry):
+async def test_no_trial_has_failed_where_nothing_was_ever_answered(merge_runner, tmp_path):
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments/models.toml").write_text(REGISTRY)
+    (tmp_path / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 1\n")
     run = await merge_runner(*NAMED, LOCAL_BASE_URL=DEAD)
-    assert run.code == 1
-    assert run.err.count(f"nothing listens at {DEAD}") == 1
+    assert (run.code, run.err.count(f"nothing listens at {DEAD}")) == (1, 1)
     assert run.summary["trials"]["failed"] == 0
-    async with watched(serving("qwen3")) as server:
-        again = await merge_runner(*NAMED, LOCAL_BASE_URL=f"{server.url}/v1")
+    async with watched(serving(status=404)) as server:
+        at = {"LOCAL_BASE_URL": f"{server.url}/v1"}
+        again = await merge_runner(*NAMED, **at)
         assert again.code == 0, again.err
-        # And when all has been played, no server is needed.
-    stored = await merge_runner(*NAMED, LOCAL_BASE_URL=f"{server.url}/v1")
-    assert stored.code == 0, stored.err
-    assert stored.summary["trials"]["stored_before"] == 1
-
-
-async def test_a_dry_run_asks_nobody_for_a_name(merge_runner):
-    async with watched(serving("qwen3-8b")) as server:
-        run = await merge_runner(*LOCAL, "--dry-run", LOCAL_BASE_URL=f"{server.url}/v1")
-        assert server.requests == 0
-    assert run.code == 0, run.err
-    assert run.summary["trials"] == 1
+        run = await merge_runner(*LOCAL, **at)
+        assert run.code == 2
+        assert re.search("models that it does not list .HTTP 404.*one with LOCAL_MODEL", run.err)
+    stored = await merge_runner(*NAMED, **at)  # where all has been played, no server is needed
+    assert (stored.code, stored.summary["trials"]["stored_before"]) == (0, 1), stored.err
 
 
 def test_only_a_server_of_ones_own_can_be_asked_for_a_name(tmp_path):

@@ -1,7 +1,5 @@
 """The glossary of the pages is the one of the docs, and none of its marks is left."""
 
-from __future__ import annotations
-
 import re
 
 from merge_runner_analysis.explorer.glossary import sections

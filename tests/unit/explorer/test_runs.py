@@ -1,7 +1,5 @@
 """What a page says of a run, by what is stored of it and what its process tells."""
 
-from __future__ import annotations
-
 from datetime import datetime
 
 import pytest

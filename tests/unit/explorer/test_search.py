@@ -1,19 +1,12 @@
-"""What is shown of a text in which something is looked for."""
-
-from __future__ import annotations
+"""What is marked in a text in which something is looked for, and in a prompt that changed."""
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_runner_analysis.explorer.search import (
-    BEFORE,
-    LONGEST_QUERY,
-    MOST_TERMS,
-    SHOWN,
-    pieces_of,
-    terms_of,
-)
+from merge_runner_analysis.explorer.prompts import parts_of
+from merge_runner_analysis.explorer.search import BEFORE, LONGEST_QUERY, SHOWN, pieces_of, terms_of
+from tests.support.cases import cases
 
 
 @settings(max_examples=50)
@@ -51,20 +44,25 @@ def test_of_a_long_text_the_part_with_the_first_match_is_shown():
     ]
 
 
-@pytest.mark.parametrize(
-    ("query", "terms"),
-    [
-        ("", ()),
-        ("  brake   gap ", ("brake", "gap")),
-        ('"collision  course" brake', ("collision course", "brake")),
-        ('"never closed', ("never closed",)),
-        ('brake "" brake', ("brake",)),
-        ("a " * 200, ("a",)),
-        ("abcdefghijklm", ("abcdefghijklm",)),
-        (" ".join("abcdefghijklmnop"), tuple("abcdefghijklmnop"[:MOST_TERMS])),
-        ("x" * (LONGEST_QUERY + 1), ("x" * LONGEST_QUERY,)),
-    ],
-    ids=lambda value: str(value)[:20],
-)
-def test_a_query_is_some_words_and_phrases(query, terms):
-    assert terms_of(query) == terms
+@pytest.mark.parametrize("case", cases("explorer", "terms"))
+def test_a_query_is_some_words_and_phrases(case):
+    assert terms_of(case["query"]) == tuple(case["terms"])
+    assert terms_of("a " * 200) == ("a",)
+    assert terms_of("x" * (LONGEST_QUERY + 1)) == ("x" * LONGEST_QUERY,)
+
+
+WORDS = st.lists(st.sampled_from(["give", "way", ",", "3.5", "\n", "m/s"])).map(" ".join)
+
+
+@settings(max_examples=30)
+@given(WORDS, WORDS)
+def test_a_compared_prompt_holds_the_prompt_in_order(before, now):
+    pieces = [piece for part in parts_of(now, before) for piece in part.pieces]
+    kept = "".join(text for change, text in pieces if change != "gone")
+    assert kept.split() == now.split()
+
+
+def test_only_what_changed_is_marked_in_a_line_of_many_equal_words():
+    many = "I see a car. " * 500
+    (part,) = parts_of(f"{many}It is 7 m ahead.", f"{many}It is 9 m ahead.")
+    assert [(c, t.strip()) for c, t in part.pieces if c != "same"] == [("gone", "9"), ("new", "7")]

@@ -1,7 +1,5 @@
 """Records as rows of the tables."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

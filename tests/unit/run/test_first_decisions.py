@@ -25,30 +25,25 @@ def test_one_valid_decision_is_enough_and_each_model_is_counted_by_itself():
 
 async def test_trials_wait_for_the_first_valid_decision_of_each_of_their_models():
     first, begun = FirstDecisions(MOST_INVALID, one_by_one=True), []
+    end = asyncio.Event()
 
-    async def trial(number, models, end):
+    async def trial(number, *models):
         async with first.turn(models):
             begun.append(number)
             await end.wait()
 
-    async def settled():
-        for _ in range(10):
-            await asyncio.sleep(0)
-        return sorted(begun)
-
-    never, soon = asyncio.Event(), asyncio.Event()
     async with asyncio.TaskGroup() as group:
-        group.create_task(trial(1, ["a"], never))
-        group.create_task(trial(2, ["b", "a"], never))
-        group.create_task(trial(3, ["a", "b"], soon))
-        group.create_task(trial(4, ["c"], never))
-        group.create_task(trial(5, ["a"], never))
-        assert await settled() == [1, 4]
-        first.count("a", VALID)
-        assert await settled() == [1, 2, 4, 5]  # b has decided nothing yet
-        first.count("b", INVALID)
-        assert await settled() == [1, 2, 4, 5]
-        first.count("b", VALID)
-        assert await settled() == [1, 2, 3, 4, 5]
-        never.set()
-        soon.set()
+        for number, models in enumerate(("a", "ba", "ab", "c", "a")):
+            group.create_task(trial(number, *models))
+        for model, decision, expected in (
+            ("", None, [0, 3]),
+            ("a", VALID, [0, 1, 3, 4]),  # b has decided nothing yet
+            ("b", INVALID, [0, 1, 3, 4]),
+            ("b", VALID, [0, 1, 2, 3, 4]),
+        ):
+            if decision:
+                first.count(model, decision)
+            for _ in range(10):
+                await asyncio.sleep(0)
+            assert sorted(begun) == expected
+        end.set()

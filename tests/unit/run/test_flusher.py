@@ -1,7 +1,5 @@
 """Room for trials that are not stored yet."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from dataclasses import replace
@@ -15,58 +13,56 @@ from tests.support.gate import HANGS_S
 from tests.support.specs import spec_of
 
 SPEC = spec_of()
+HELD = StoreLocked("somebody reads")
 MB = 2**20
 
 
-def trial(size):
-    """A trial whose only reply has so many bytes."""
-    reply = ChatReply("", "ok", None, (Attempt(1, "ok", reply="x" * size),), 0)
-    decision = DecisionRow(0, 0.0, "left", Decision((), (), reply=reply))
-    return TrialRecord(SPEC, "finished", None, 1.0, None, (), (decision,))
+class Scripted:
+    """A store that raises what it is told to, or notes what it is given once it may go on."""
 
-
-class Refusing:
-    """A store that raises what it is told to."""
-
-    def __init__(self, error):
-        self.error = error
-
-    def write(self, sweep_id, batch, *, patience_s):
-        raise self.error
-
-
-@pytest.mark.parametrize("error", [StoreLocked("somebody reads"), KeyError("a fault of ours")])
-async def test_trials_wait_for_no_reader_and_no_flusher_that_is_gone(error):
-    store = Refusing(error)
-    flusher = Flusher(store, "sweep", lambda line: None)
-    for _ in range(2 * MOST_PENDING):
-        flusher.add(trial(0))
-    await asyncio.wait_for(flusher.room(), HANGS_S)
-    store.error = StoreError("that is the end")
-    with pytest.raises(StoreError):
-        await asyncio.wait_for(flusher.close(), HANGS_S)
-
-
-class Slow:
-    """A store that notes what it is given at once, when it is told to go on."""
-
-    def __init__(self):
-        self.written = []
-        self.go_on = threading.Event()
+    def __init__(self, error=None):
+        self.error, self.written, self.go_on = error, [], threading.Event()
+        if error:
+            self.go_on.set()
 
     def write(self, sweep_id, batch, *, patience_s):
         self.go_on.wait()
-        self.written.append(len(batch))
+        if self.error:
+            raise self.error
+        self.written.append([record.spec.order for record in batch])
         return {}
+
+    @property
+    def orders(self):
+        return [order for batch in self.written for order in batch]
+
+
+def flusher_of(store, say=lambda line: None):
+    return Flusher(store, "sweep", say)
+
+
+@pytest.mark.parametrize("error", [StoreLocked("somebody reads"), KeyError("a fault of ours")])
+async def test_trials_wait_for_no_reader_and_no_flusher_that_is_gone_and_what_is_dropped_is_told(
+    error,
+):
+    store = Scripted(error)
+    flusher = flusher_of(store)
+    for order in range(2 * MOST_PENDING):
+        flusher.add(ended(order))
+    await asyncio.wait_for(flusher.room(), HANGS_S)
+    store.error = StoreError("the disk is full")
+    said = r"the disk is full\. When|the writer of results has failed \(Key"
+    with pytest.raises(StoreError, match=f"^{2 * MOST_PENDING} trials are not stored: ({said})"):
+        await asyncio.wait_for(flusher.close(), HANGS_S)
 
 
 async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
-    store = Slow()
-    flusher = Flusher(store, "sweep", lambda line: None)
+    store = Scripted()
+    flusher = flusher_of(store)
     most = MOST_PENDING_BYTES // (5 * MB) + 1
     for _ in range(most):
         await asyncio.wait_for(flusher.room(), HANGS_S)
-        flusher.add(trial(5 * MB))
+        flusher.add(ended(size=5 * MB))
     waiting = asyncio.create_task(flusher.room())
     await asyncio.sleep(0.01)
     assert not waiting.done()
@@ -74,31 +70,24 @@ async def test_long_replies_wait_and_are_written_in_parts_of_bounded_size():
     async with asyncio.timeout(HANGS_S):
         await waiting
     await flusher.close()
-    assert (sum(store.written), max(store.written)) == (most, 3)
+    assert (len(store.orders), max(map(len, store.written))) == (most, 3)
 
 
 async def test_trials_are_stored_in_few_transactions():
-    store = Slow()
+    store = Scripted()
     store.go_on.set()
-    flusher = Flusher(store, "sweep", lambda line: None)
+    flusher = flusher_of(store)
     for _ in range(300):
-        flusher.add(trial(0))
+        flusher.add(ended())
     await flusher.close()
-    assert store.written == [256, 44]
+    assert [*map(len, store.written)] == [256, 44]
 
 
-class Held(Slow):
-    """A store that another program holds until it is told to go on."""
-
-    def write(self, sweep_id, batch, *, patience_s):
-        if not self.go_on.is_set():
-            raise StoreLocked("somebody reads")
-        self.written.extend(record.spec.order for record in batch)
-        return {}
-
-
-def ended(order, status="finished", size=0):
-    return replace(trial(size), spec=replace(SPEC, order=order), status=status)
+def ended(order=0, status="finished", size=0):
+    """A trial whose only reply has so many bytes."""
+    reply = ChatReply("", "ok", None, (Attempt(1, "ok", reply="x" * size),), 0)
+    decision = DecisionRow(0, 0.0, "left", Decision((), (), reply=reply))
+    return TrialRecord(replace(SPEC, order=order), status, None, 1.0, None, (), (decision,))
 
 
 async def is_refused(flusher):
@@ -110,8 +99,8 @@ async def is_refused(flusher):
 
 @pytest.mark.parametrize("known", [True, False])
 async def test_while_the_database_is_held_256_trials_stay_in_memory_and_the_failed_ones(known):
-    store, said = Held(), []
-    flusher = Flusher(store, "sweep", said.append)
+    store, said = Scripted(HELD), []
+    flusher = flusher_of(store, said.append)
     flusher.add(ended(0))
     if known:
         await is_refused(flusher)
@@ -119,50 +108,36 @@ async def test_while_the_database_is_held_256_trials_stay_in_memory_and_the_fail
         flusher.add(ended(order, "failed" if order in (300, 400) else "collided"))
         await asyncio.wait_for(flusher.room(), HANGS_S)
     await is_refused(flusher)
-    assert [spec.order for spec in flusher.dropped] == [*range(256, 300), *range(301, 400),
-                                                        *range(401, 500)]  # fmt: skip
+    kept = [*range(256), 300, 400]
+    dropped = [order for order in range(500) if order not in kept]
+    assert [spec.order for spec in flusher.dropped] == dropped
     assert flusher.problem == "500 trials wait to be stored: somebody reads"
     closing = asyncio.create_task(flusher.close())
     async with asyncio.timeout(HANGS_S):
         while "500 trials wait to be stored: somebody reads. Ctrl-C ends" not in str(said):
             await asyncio.sleep(0.05)
-        store.go_on.set()
+        store.error = None
         await closing
-    assert store.written == [*range(256), 300, 400]
+    assert store.orders == kept
     assert (flusher.left, flusher.problem) == (242, "")
     # They may come again, and are stored by the next call.
     flusher.add(ended(256))
     await asyncio.wait_for(flusher.close(), HANGS_S)
-    assert store.written[-1] == 256
+    assert store.orders[-1] == 256
 
 
-async def test_while_the_database_is_held_a_first_long_reply_stays_always():
-    store = Held()
-    flusher = Flusher(store, "sweep", lambda line: None)
-    flusher.add(ended(0, size=MOST_PENDING_BYTES + 1))
-    await is_refused(flusher)
-    flusher.add(ended(1))
-    assert [spec.order for spec in flusher.dropped] == [1]
-    store.go_on.set()
-    await flusher.close()
-    assert store.written == [0]
-
-
-async def test_while_the_database_is_held_replies_stay_in_memory_up_to_a_bound():
-    store = Held()
-    flusher = Flusher(store, "sweep", lambda line: None)
-    for order in range(6):
-        flusher.add(ended(order, size=MOST_PENDING_BYTES // 4))
+@pytest.mark.parametrize(
+    ("sizes", "kept"),
+    [([MOST_PENDING_BYTES // 4] * 6, [0, 1, 2]), ([MOST_PENDING_BYTES + 1, 0], [0])],
+)
+async def test_while_the_database_is_held_replies_stay_in_memory_up_to_a_bound(sizes, kept):
+    """The first one always."""
+    store = Scripted(HELD)
+    flusher = flusher_of(store)
+    for order, size in enumerate(sizes):
+        flusher.add(ended(order, size=size))
         await is_refused(flusher)
-    store.go_on.set()
+    store.error = None
     await flusher.close()
-    assert store.written == [0, 1, 2]
-    assert [spec.order for spec in flusher.dropped] == [3, 4, 5]
-
-
-async def test_what_is_dropped_counts_as_not_stored_where_the_disk_is_full():
-    flusher = Flusher(Refusing(StoreError("the disk is full")), "sweep", lambda line: None)
-    for order in range(300):
-        flusher.add(ended(order))
-    with pytest.raises(StoreError, match=r"^300 trials are not stored: the disk is full\. When"):
-        await asyncio.wait_for(flusher.close(), HANGS_S)
+    assert store.orders == kept
+    assert [spec.order for spec in flusher.dropped] == [*range(len(kept), len(sizes))]

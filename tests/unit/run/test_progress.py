@@ -1,7 +1,5 @@
 """What is shown while a sweep runs."""
 
-from __future__ import annotations
-
 import re
 from datetime import UTC, datetime, timedelta
 
@@ -9,6 +7,8 @@ import pytest
 
 from merge_runner.llm.client import Meter
 from merge_runner.records import Attempt, Usage
+from merge_runner.run.estimate import Estimate
+from merge_runner.run.progress import estimate_lines
 from tests.support.standings import progress, runner
 
 
@@ -44,6 +44,8 @@ def test_every_figure_is_that_of_the_meters():
     # 3 of 10 trials have ended but only 46 of 210 calls are made: the larger share tells.
     spent_s, left_s = times(fields["time"])
     assert left_s == pytest.approx(spent_s * 7 / 3, abs=3)
+    standing = shown.standing("s")
+    assert (standing.ended, standing.failed) == (9, 1)  # of 17, with those stored before
 
 
 def test_the_calls_tell_the_time_left_while_no_trial_has_ended():
@@ -71,3 +73,12 @@ def test_replies_that_cost_more_than_is_counted_are_a_warning():
     warning = dict(rows(progress(runner(meter))))["WARNING"]
     assert warning.startswith("0: replies are of the service tier 'priority'")
     assert "tiers = { priority = 2.0 }" in warning
+
+
+@pytest.mark.parametrize(
+    ("trials", "told"), [(0, "none: all of them are stored"), (3, "3 that have not ended yet")]
+)
+def test_a_dry_run_says_how_many_trials_are_left(trials, told):
+    left = Estimate("o3", trials, 18 * trials, 0, 0, 0.0, None, 0.1 * trials, 0, True, False)
+    assert [*estimate_lines(left)][:2] == ["driver  o3", f"trials  {told}"]
+    assert trials or len([*estimate_lines(left)]) == 2

@@ -1,7 +1,5 @@
 """What takes long on a Dask cluster: who is gone or stands still, and the limits of all workers."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math
@@ -19,12 +17,22 @@ from tests.support.mock_server import FaultPlan
 from tests.support.virtual_time import fullest_window
 
 
-async def test_where_no_scheduler_listens_it_says_so_soon(merge_runner):
-    async with asyncio.timeout(HANGS_S):
-        run = await merge_runner(*SMALL, "--dask", "127.0.0.1:1")
-    assert run.code == 2
+async def test_where_no_scheduler_listens_and_where_no_model_answers_it_says_so_soon(
+    merge_runner, emulator_url
+):
+    run = await merge_runner(*SMALL, "--dask", "127.0.0.1:1")
+    assert (run.code, len(run.err.splitlines())) == (2, 1)
     assert run.err.startswith("error: no Dask scheduler answers at 127.0.0.1:1 within 10 s")
-    assert len(run.err.splitlines()) == 1
+    o3 = (*SMALL, "--model", "o3", "--yes", *FAST, "--dask", "local:1")
+    dead = await merge_runner(*o3, OPENAI_API_KEY="x", OPENAI_BASE_URL="http://127.0.0.1:9/v1")
+    assert (dead.code, dead.summary["trials"]["failed"]) == (1, 0)
+    run = await merge_runner(*o3, OPENAI_API_KEY="x", OPENAI_BASE_URL=emulator_url)
+    assert (run.code, run.summary["scripted"]) == (0, True), run.err
+    async with watched(faults=FaultPlan(rates={"malformed": 1.0})) as server:
+        part = ("sweep", "baseline", "--reps", 4, "--in-flight", 2, "--dask", "local:1", "--json")
+        stopped = await merge_runner(*part, **server.env)
+    assert (stopped.code, server.requests < 100) == (1, True), "it asked all"
+    assert "decisions of emulator is valid" in stopped.summary["messages"][0]
 
 
 async def test_a_scheduler_that_dies_ends_the_run_in_one_line(merge_runner, scheduler):
@@ -49,8 +57,7 @@ async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
 ):
     gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
     async with watched(gate.middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await started(*SIX, "--in-flight", 3, "--dask", "local:3", **env)
+        process = await started(*SIX, "--in-flight", 3, "--dask", "local:3", **server.env)
         await all_held(gate, trials=3)
         still = next(w for w in workers_of(process.pid) if held_from(gate, w))
         still.suspend()
@@ -65,7 +72,9 @@ async def test_a_worker_that_stands_still_holds_up_its_own_trials_alone(
     assert not gate.asked_again
 
 
-async def test_requests_a_minute_hold_over_all_workers(merge_runner):
+async def test_three_workers_keep_the_requests_a_minute_and_come_to_the_results_of_one_process(
+    merge_runner,
+):
     times = []
 
     async def middle(request, handler):
@@ -73,14 +82,23 @@ async def test_requests_a_minute_hold_over_all_workers(merge_runner):
         return await handler(request)
 
     async with watched(middle) as server:
-        run = await merge_runner(
-            *SIX, "--in-flight", 3, "--dask", "local:3", "--rpm", 600,
-            EMULATOR_BASE_URL=f"{server.url}/v1",
-        )  # fmt: skip
-    assert run.code == 0, run.err
-    # Half a second's worth goes at a time at each worker, and may come a little late; one limiter
-    # of 600 for each would let three times as many through.
-    assert fullest_window(times, [1] * len(times), length=1.0) <= 1.5 * 10 + 3
+        on_three = ("--in-flight", 3, "--dask", "local:3", "--rpm", 600)
+        run = await merge_runner(*SIX, *on_three, **server.env)
+        assert (run.code, "on 3 workers" in run.err) == (0, True), run.err
+        # Half a second's worth goes at a time at each worker, and may come a little late; one
+        # limiter of 600 for each would let three times as many through.
+        assert fullest_window(times, [1] * len(times), length=1.0) <= 1.5 * 10 + 3
+        assert set(server.asked.values()) == {1}
+        assert run.summary["calls"] == {"live": server.requests, "cached": 0}
+        again = await merge_runner(*SIX, "--db", "again", **server.env)
+        assert again.summary["calls"]["live"] == 0, "all is recorded"
+    one = await merge_runner(*SIX, "--db", "one", "--cache", "new")
+    assert one.code == 0, one.err
+    digest = (await merge_runner("digest")).out
+    assert (digest, "6 trials" in digest) == (
+        (await merge_runner("digest", "--db", "one")).out,
+        True,
+    )
 
 
 async def test_the_cost_cap_holds_over_all_workers_and_a_higher_one_goes_on(merge_runner, tmp_path):
@@ -114,42 +132,6 @@ async def test_the_cost_cap_holds_over_all_workers_and_a_higher_one_goes_on(merg
     assert done.summary["set_aside_usd"] == 0
 
 
-async def test_no_valid_decision_ends_a_run_on_a_cluster_too(merge_runner):
-    async with watched(faults=FaultPlan(rates={"malformed": 1.0})) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        sweep = ("sweep", "baseline", "--reps", 4, "--in-flight", 2, "--dask", "local:1", "--json")
-        stopped = await merge_runner(*sweep, **env)
-    assert stopped.code == 1, stopped.err
-    assert "decisions of emulator is valid" in stopped.summary["messages"][0]
-    assert server.requests < 100, "it asked all"
-
-
-async def test_who_answers_a_worker_is_known_and_where_nobody_does(merge_runner, emulator_url):
-    o3 = (*SMALL, "--model", "o3", "--yes", *FAST, "--dask", "local:1")
-    dead = await merge_runner(*o3, OPENAI_API_KEY="x", OPENAI_BASE_URL="http://127.0.0.1:9/v1")
-    assert (dead.code, dead.summary["trials"]["failed"]) == (1, 0)
-    run = await merge_runner(*o3, OPENAI_API_KEY="x", OPENAI_BASE_URL=emulator_url)
-    assert (run.code, run.summary["scripted"]) == (0, True), run.err
-
-
-async def test_three_workers_come_to_the_results_of_one_process(merge_runner):
-    sweep = ("sweep", "baseline", "--reps", 1, "--json")
-    async with watched() as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(*sweep, "--in-flight", 6, "--dask", "local:3", **env)
-        assert run.code == 0, run.err
-        assert "on 3 workers" in run.err
-        assert set(server.asked.values()) == {1}
-        assert run.summary["calls"] == {"live": server.requests, "cached": 0}
-        again = await merge_runner(*sweep, "--db", "again", **env)
-        assert again.summary["calls"]["live"] == 0, "all is recorded"
-    one = await merge_runner(*sweep, "--db", "one", "--cache", "new")
-    assert one.code == 0, one.err
-    digest = (await merge_runner("digest")).out
-    assert digest == (await merge_runner("digest", "--db", "one")).out
-    assert "11 trials" in digest
-
-
 async def test_what_stops_a_sweep_stops_it_at_all_workers_in_one_line(merge_runner):
     async def middle(request, handler):
         if server.requests > 12:
@@ -171,8 +153,7 @@ async def test_what_stops_a_sweep_stops_it_at_all_workers_in_one_line(merge_runn
 async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, tmp_path):
     gate = Gate(math.inf, tmp_path, decisions=3)  # of some ten: each trial begins, and none ends
     async with watched(gate.middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await started(*SIX, "--in-flight", 4, "--dask", "local:2", **env)
+        process = await started(*SIX, "--in-flight", 4, "--dask", "local:2", **server.env)
         await all_held(gate, trials=4)
         process.send_signal(signal.SIGINT)
         for worker in workers_of(process.pid):
@@ -183,7 +164,7 @@ async def test_ctrl_c_saves_what_the_workers_have_asked(merge_runner, started, t
         assert code == 130, err
         assert "the replies of 2 tasks are saved first" in err
         assert "Traceback" not in err
-        run = await merge_runner(*SIX, **env)
+        run = await merge_runner(*SIX, **server.env)
     assert run.code == 0, run.err
     assert not gate.asked_again
     assert len(set(gate.asked)) == 114

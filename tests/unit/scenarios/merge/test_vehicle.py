@@ -5,24 +5,16 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from merge_runner.scenarios.merge.vehicle import advance, net_acceleration, time_to_reach
+from tests.support.cases import cases
 
 speeds = st.floats(0, 30)
 accelerations = st.floats(-5, 5)
 steps = st.floats(0.01, 2)
 
 
-@pytest.mark.parametrize(
-    ("velocity", "acceleration", "moved", "new_velocity"),
-    [
-        (10.0, 0.0, 2.0, 10.0),
-        (10.0, 2.5, 2.05, 10.5),
-        (10.0, -2.5, 1.95, 9.5),
-        (0.0, 1.0, 0.02, 0.2),
-        (0.3, -2.5, 0.3**2 / 5, 0.0),  # it stops within the step
-        (0.0, -2.5, 0.0, 0.0),
-    ],
-)
-def test_a_step_is_s_plus_v_dt_plus_half_a_dt_squared(velocity, acceleration, moved, new_velocity):
+@pytest.mark.parametrize("case", cases("track", "steps"))
+def test_a_step_is_s_plus_v_dt_plus_half_a_dt_squared(case):
+    velocity, acceleration, moved, new_velocity = case
     wanted = pytest.approx((50.0 + moved, new_velocity), abs=1e-12)
     assert advance(50.0, velocity, acceleration, 0.2) == wanted
 
@@ -48,14 +40,11 @@ def test_two_half_steps_equal_one_step(velocity, acceleration, step):
 @given(speeds, accelerations, steps)
 def test_time_to_reach_inverts_the_motion(velocity, acceleration, step):
     distance, _ = advance(0.0, velocity, acceleration, step)
+    assert time_to_reach(0.0, velocity, acceleration) == 0.0
     assume(distance > 1e-6)
     seconds = time_to_reach(distance, velocity, acceleration)
     assert 0 < seconds <= step + 1e-6
     assert advance(0.0, velocity, acceleration, seconds)[0] == pytest.approx(distance, rel=1e-6)
-
-
-def test_no_distance_takes_no_time():
-    assert time_to_reach(0.0, 0.0, 2.5) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -72,36 +72,26 @@ def test_acceleration_stays_within_its_bound_and_explains_every_change_of_speed(
     world = start(name)
     for left, right in pairs:
         drive(world, left, right, 5)
+    rows = [(row.step, row.side) for row in world.states()]
+    assert rows == [(step, side) for step in range(len(rows) // 2) for side in SIDES]
     for side in SIDES:
         rows = trace(world, side)
-        for (_, _, _, before, _), (_, _, _, after, acceleration) in pairwise(rows):
+        assert rows[0][4] == 0.0
+        for (_, then_s, _, before, _), (step, now_s, _, after, acceleration) in pairwise(rows):
+            assert (now_s, now_s - then_s) == (step / 5, pytest.approx(0.2))
             assert abs(acceleration) <= A_MAX_MPS2 + 1e-9
             assert after - before == pytest.approx(acceleration * 0.2, abs=1e-9)
 
 
-def test_each_side_executes_its_own_action_times_the_greatest_acceleration():
-    world = start()
+def test_each_side_executes_its_own_action_less_the_resistance_unless_it_cruises():
+    world, resisted = start(), start(resistance="human")
     world.advance({"left": 1.0, "right": -0.5})
     assert [trace(world, side)[1][2:] for side in SIDES] == [
         (pytest.approx(52.05), 10.5, 2.5),
         (pytest.approx(51.975), 9.75, -1.25),
     ]
-
-
-def test_resistance_slows_a_driven_vehicle_and_not_a_cruising_one():
-    world = start(resistance="human")
-    world.advance({"left": 0.0, "right": None})
-    left, right = world.states()[2:]
-    assert (left.acceleration_mps2, right.acceleration_mps2) == (-1.0, 0.0)
-    assert right.velocity_mps == 10.0
-
-
-def test_the_trace_has_a_row_for_every_side_and_step_from_time_0_on():
-    world = start()
-    drive(world, 0.0, -0.4, steps=3)
-    rows = [(row.step, row.time_s, row.side) for row in world.states()]
-    assert rows == [(k, t, s) for k, t in enumerate([0.0, 0.2, 0.4, 0.6]) for s in SIDES]
-    assert [row.acceleration_mps2 for row in world.states()[:2]] == [0.0, 0.0]
+    resisted.advance({"left": 0.0, "right": None})
+    assert [trace(resisted, side)[1][3:] for side in SIDES] == [(9.8, -1.0), (10.0, 0.0)]
 
 
 @pytest.mark.parametrize(
@@ -142,56 +132,33 @@ def test_who_merged_first_is_told_apart_within_one_step():
     assert (world.status, world.merged_first()) == ("finished", "left")
 
 
-@pytest.mark.parametrize(("history_start", "length"), [("cruise", 10), ("empty", 0)])
-def test_before_control_the_histories_show_cruising_or_nothing(history_start, length):
+@pytest.mark.parametrize("history_start", ["cruise", "empty"])
+@pytest.mark.parametrize("steps", [0, 1, 3, 12])
+def test_histories_hold_the_last_ten_steps_before_now_after_cruising_or_nothing(
+    history_start, steps
+):
+    """The oldest value comes first, and the other's present speed is not history."""
     world = start("L_4_-8", history_start=history_start)
-    for side, other_mps in (("left", 10.4), ("right", 9.6)):
-        seen = world.observe(side)
-        histories = (seen.own_accelerations_mps2, seen.other_speeds_mps)
-        assert histories == ((0.0,) * length, (other_mps,) * length)
-
-
-@pytest.mark.parametrize(
-    ("history_start", "accelerations", "speeds"),
-    [
-        ("cruise", (0.0,) * 7 + (0.25, 0.5, 0.75), (10.0,) * 8 + (9.95, 9.85)),
-        ("empty", (0.25, 0.5, 0.75), (10.0, 9.95, 9.85)),
-    ],
-)
-def test_histories_begin_with_the_start_of_control(history_start, accelerations, speeds):
-    """The oldest value comes first, and the other's present speed (9.70 m/s) is not history."""
-    world = start(history_start=history_start)
-    for k in (1, 2, 3):
-        world.advance({"left": 0.1 * k, "right": -0.1 * k})
-    seen = world.observe("left")
-    assert seen.own_accelerations_mps2 == pytest.approx(accelerations)
-    assert seen.other_speeds_mps == pytest.approx(speeds)
-    assert seen.other_speed_mps == pytest.approx(9.7)
-
-
-def test_histories_hold_the_last_ten_steps():
-    world = start()
-    for k in range(1, 13):
+    for k in range(1, steps + 1):
         world.advance({"left": 0.01 * k, "right": -0.01 * k})
-    seen, executed = world.observe("left"), [A_MAX_MPS2 * 0.01 * k for k in range(3, 13)]
-    assert seen.own_accelerations_mps2 == pytest.approx(executed)
-    # The speeds before steps 3 to 12, that is after steps 2 to 11.
-    *speeds, now_mps = [row[3] for row in trace(world, "right")[2:]]
-    assert (seen.other_speeds_mps, seen.other_speed_mps) == (tuple(speeds), now_mps)
-
-
-def test_an_observation_holds_the_own_position_and_what_the_other_did_in_the_last_step():
-    world = start()
-    assert world.observe("left").other_acceleration_mps2 == 0
-    world.advance({"left": 0.2, "right": -0.1})
-    for side, other_action in (("left", -0.1), ("right", 0.2)):
+    for side, sign in (("left", 1), ("right", -1)):
+        executed = [sign * A_MAX_MPS2 * 0.01 * k for k in range(1, steps + 1)]
+        *speeds, now_mps = [row[3] for row in trace(world, OTHER[side])]
+        if history_start == "cruise":
+            executed, speeds = [0.0] * 10 + executed, speeds[:1] * 10 + speeds
+            speeds = speeds if steps else [now_mps] * 10
         seen = world.observe(side)
-        assert seen.other_acceleration_mps2 == pytest.approx(other_action * A_MAX_MPS2)
-        assert seen.own_position_m == trace(world, side)[1][2]
+        assert seen.own_accelerations_mps2 == pytest.approx(executed[-10:])
+        assert (seen.other_speeds_mps, seen.other_speed_mps) == (tuple(speeds[-10:]), now_mps)
+        assert seen.own_position_m == trace(world, side)[-1][2]
+        last = -sign * A_MAX_MPS2 * 0.01 * steps
+        assert seen.other_acceleration_mps2 == pytest.approx(last)
 
 
-def test_an_observation_is_told_from_the_own_seat():
+def test_an_observation_is_told_from_the_own_seat_once_both_are_out_of_their_tunnels():
     world = start("L_4_-8")
+    assert [row.position_m for row in world.states()] == pytest.approx([57.5385, 50.0], abs=1e-4)
+    assert all(map(world.in_control, SIDES))
     # The left vehicle is ahead at 57.54 m, so to it the other is behind.
     for side, own, other, ahead, to_merge in (
         ("left", 9.6, 10.4, -7.5385, 42.4615),
@@ -215,12 +182,6 @@ def test_a_vehicle_that_stops_within_a_step_has_executed_less_than_it_commanded(
     assert world.observe("left").own_accelerations_mps2[-3:] == pytest.approx((-2.25, -0.5, 0.0))
 
 
-def test_control_starts_for_both_when_both_are_out_of_their_tunnels():
-    world = start("L_4_-8")
-    assert [row.position_m for row in world.states()] == pytest.approx([57.5385, 50.0], abs=1e-4)
-    assert all(map(world.in_control, SIDES))
-
-
 def test_own_exit_starts_at_the_earlier_exit_and_the_other_cruises_on_to_its_own():
     world = start("L_4_-8", control_start="own_exit")
     # 4.0224 s into the run the left vehicle is out, and the right one 50 - 0.7852 * 10.4 m far.
@@ -235,7 +196,7 @@ def test_own_exit_starts_at_the_earlier_exit_and_the_other_cruises_on_to_its_own
     assert {row[3] for row in trace(world, "right")} == {10.4}
 
 
-def test_the_road_turns_straight_behind_the_own_merge_point():
+def test_the_road_turns_straight_behind_the_own_merge_point_or_for_both_at_once():
     world = start()
     while (seen := world.observe("left")).road == "merge":
         assert seen.distance_to_merge_m > 0
@@ -244,16 +205,13 @@ def test_the_road_turns_straight_behind_the_own_merge_point():
     assert (world.time_s, seen.distance_to_merge_m) == (5.0, None)
     other = world.observe("right")
     assert (other.road, other.distance_to_merge_m > 0) == ("merge", True)
-
-
-def test_the_road_turns_straight_for_both_at_once_where_the_scenario_says_so():
     world = start("L_4_-8", straight_after="both")
     drive(world, 0.5, -0.25, steps=20)
-    assert world.states()[-2].position_m > 100 > world.states()[-1].position_m
-    assert [world.observe(side).road for side in SIDES] == ["merge", "merge"]
     # The leader is told how far it is past the merge point.
+    assert world.states()[-2].position_m > 100
     assert world.observe("left").distance_to_merge_m < 0
     while world.states()[-1].position_m < 100:
+        assert [world.observe(side).road for side in SIDES] == ["merge", "merge"]
         world.advance({"left": 0.5, "right": -0.25})
     assert world.status is None
     assert [world.observe(side).road for side in SIDES] == ["straight", "straight"]
