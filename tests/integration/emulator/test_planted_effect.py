@@ -1,7 +1,5 @@
 """An effect that a study plants in the emulator is what its analysis finds in the long run."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The emulator as a server, and within the process of a sweep."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 from urllib.parse import urlsplit

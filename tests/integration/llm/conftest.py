@@ -1,7 +1,5 @@
 """Servers on loopback, and nothing of the user's settings."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.support.emulator_fixtures import emulator

@@ -4,8 +4,6 @@ A client with a cap asks an emulator that bills as much as an honest server coul
 tells in `usage`, and the whole output cap for each request that no reply shows to be free.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools

@@ -1,7 +1,5 @@
 """A cap that holds whatever happens, and money that ends trials instead of beginning many."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math

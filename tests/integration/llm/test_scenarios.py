@@ -3,8 +3,6 @@
 The real client asks an emulator over loopback, in virtual time: see virtual_time.py.
 """
 
-from __future__ import annotations
-
 import os
 from contextlib import asynccontextmanager
 

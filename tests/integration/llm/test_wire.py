@@ -1,7 +1,5 @@
 """What a server says on the wire beyond one whole answer to one request."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """A batch server fails in over 30 ways: the digest is the plain run's, no answer is paid twice."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

@@ -1,7 +1,5 @@
 """Sweeps in batches: the results of any other, and nothing is paid twice, whatever dies when."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

@@ -1,7 +1,5 @@
 """kill -9 at any instant: what was answered is used, and the end is that of a quiet run."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Databases that lie elsewhere, hold more or less than ours, or cannot take what is written."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Replies as long as reasoning texts are: nothing holds many of them in memory."""
 
-from __future__ import annotations
-
 import os
 from itertools import islice
 

@@ -1,7 +1,5 @@
 """What is spent is known and bounded, over all runs of a sweep, also where a process dies."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import shutil

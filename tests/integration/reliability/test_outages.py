@@ -1,7 +1,5 @@
 """A provider that is down, another model behind a name, and waits that are told."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 

@@ -1,7 +1,5 @@
 """Disks that are full, read-only, locked or damaged: one clear line, and nothing good is lost."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Two runs at once on one cache: two models share it, and one model is asked by one run."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 

@@ -1,7 +1,5 @@
 """The batch modes of three providers, on the clock: what their clients ask for."""
 
-from __future__ import annotations
-
 import email
 import json
 import time

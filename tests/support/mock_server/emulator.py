@@ -1,7 +1,5 @@
 """The emulator with faults and batch modes, as a server on loopback."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

@@ -1,7 +1,5 @@
 """The errors of three providers, as their servers put them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import httpx

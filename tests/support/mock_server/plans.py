@@ -1,7 +1,5 @@
 """What goes wrong on purpose, each fault a function of the seed, the slot and the attempt."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """The emulator's answers in every wire format, carried within the process."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """The first live call of a run goes alone, and ends it where no other one would fare better."""
 
-from __future__ import annotations
-
 import asyncio
 from functools import partial
 

@@ -1,7 +1,5 @@
 """When a call is tried again, and until when: by the clock of its server."""
 
-from __future__ import annotations
-
 import asyncio
 from itertools import pairwise
 

@@ -3,8 +3,6 @@
 `HYPOTHESIS_EXAMPLES=2000 pytest -n0 tests/unit/reliability/test_cache_machine.py` plays many more.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

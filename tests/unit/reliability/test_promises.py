@@ -3,8 +3,6 @@
 ``python -m tests.unit.reliability.test_promises --write`` writes the rows of the pages.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 import tomllib

@@ -1,7 +1,5 @@
 """A study finds the effect that it planted in the emulator."""
 
-from __future__ import annotations
-
 from merge_runner_analysis.stats.regressions import WHO_FIRST_TERMS
 from merge_runner_analysis.tables import table
 

@@ -3,8 +3,6 @@
 The calls are written out here, and not read from the registry: a changed parameter there is seen.
 """
 
-from __future__ import annotations
-
 import email
 import json
 import re

@@ -1,7 +1,5 @@
 """The providers' own libraries take the emulator, and the mock's batch modes, for the real ones."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

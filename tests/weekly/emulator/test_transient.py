@@ -1,7 +1,5 @@
 """A sweep with any one transient fault ends like one without."""
 
-from __future__ import annotations
-
 import pytest
 
 from merge_runner.results.store import results_digest

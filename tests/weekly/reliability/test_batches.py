@@ -1,7 +1,5 @@
 """Sweeps in batches that are killed, or change their mode."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import random

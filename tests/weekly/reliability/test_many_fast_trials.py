@@ -1,7 +1,5 @@
 """Thousands of trials of a program that decides 20 times a second: in bounded memory and time."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A database opens in the oldest DuckDB that is promised, with every table and view."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Two processes on one key of an account."""
 
-from __future__ import annotations
-
 import json
 import time
 

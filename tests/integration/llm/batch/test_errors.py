@@ -1,7 +1,5 @@
 """What services make of servers that refuse, break off or say what they should not."""
 
-from __future__ import annotations
-
 import json
 import socket
 from datetime import UTC, datetime, timedelta

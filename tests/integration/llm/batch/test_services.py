@@ -1,7 +1,5 @@
 """The services of all formats against the emulator."""
 
-from __future__ import annotations
-
 import asyncio
 
 import httpx

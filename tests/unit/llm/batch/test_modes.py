@@ -1,7 +1,5 @@
 """Which models have a batch mode, and at what price."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Rounds through the client, over a batch mode in memory that misbehaves as told."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import random
