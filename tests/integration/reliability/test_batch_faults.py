@@ -5,12 +5,12 @@ import json
 import re
 from collections import Counter
 
-import httpx
 import pytest
 from aiohttp import web
 
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import Options, make_plan
+from tests.integration.reliability.test_batches import account, answered
 from tests.support.harness import run_sweep, watched
 from tests.support.mock_server import BatchPlan, FaultPlan
 
@@ -25,13 +25,9 @@ price = {{ input = 2.0, output = 8.0, source = "made up" }}
 batch = {{ price_factor = 0.5, source = "made up" }}
 """
 # One decision of two drivers in 3 conditions: one batch.
-STUDY = """
-repetitions = 1
-conditions = ["L_4_0", "N_0_0", "R_-4_8"]
-[scenario]
-timeout_s = 1
-"""
+STUDY = 'repetitions = 1\nconditions = ["L_4_0", "N_0_0", "R_-4_8"]\n[scenario]\ntimeout_s = 1\n'
 LINES = 6
+ENDS = (("completed", None, None), (None, "ended", None), (None, None, True))
 KINDS = {
     "upload": re.compile("POST .*/files"),
     "create": re.compile("POST (/v1/batches|/v1/messages/batches|.*:batchGenerateContent)"),
@@ -126,9 +122,7 @@ def goes_back():
             created[body.get("name", body.get("id", "")).rpartition("/")[2]] = body
         elif batch in ended and batch in created:
             return web.json_response(created.pop(batch))
-        elif {body.get("status"), body.get("processing_status"), body.get("done")} & {
-            "completed", "ended", True
-        }:  # fmt: skip
+        elif (body.get("status"), body.get("processing_status"), body.get("done")) in ENDS:
             ended.add(batch)
         return reply
 
@@ -203,7 +197,7 @@ PLAIN = {}
 def play(tmp_path, monkeypatch):
     """Plays a sweep of a provider; returns its digest and the server's counts."""
     brief = {"ENDING_S": 1.0, "ARRIVAL_S": (0.5, 0.5), "SHORTEST_POLL_S": 0.05}
-    for name, value in {**brief, "backoff_s": lambda *_: 0.05}.items():
+    for name, value in (brief | {"backoff_s": lambda *_: 0.05}).items():
         monkeypatch.setattr(f"merge_runner.llm.batch.rounds.{name}", value)
 
     async def run(provider, middles=(), plan=None, **options):
@@ -211,19 +205,15 @@ def play(tmp_path, monkeypatch):
         (tmp_path / "models.toml").write_text(registry)
         (tmp_path / "study.toml").write_text(STUDY)
         async with watched(chain(middles), plan) as server:
-            for name in ("OPENAI", "ANTHROPIC", "GEMINI"):
-                monkeypatch.setenv(f"{name}_API_KEY", "a-dummy-key")
-            monkeypatch.setenv("OPENAI_BASE_URL", f"{server.url}/v1")
-            monkeypatch.setenv("ANTHROPIC_BASE_URL", server.url)
-            monkeypatch.setenv("GOOGLE_GEMINI_BASE_URL", server.url)
+            for name, value in account(server).items():
+                monkeypatch.setenv(name, value)
             plan = make_plan(str(tmp_path / "study.toml"), "model", trust=True)
             db = tmp_path / f"{len([*tmp_path.iterdir()])}.duckdb"
             settings = Options(db, db.with_suffix(""), quiet=True, **options)
             outcome = await run_sweep(plan, settings, say=[].append)
-            async with httpx.AsyncClient() as client:
-                counts = (await client.get(f"{server.url}/emulator/answered")).json()
+            counts = await answered(server)
         assert outcome["exit_code"] == 0, outcome["messages"]
-        return results_digest(db), counts
+        return results_digest(db), sum(counts, Counter()).total()
 
     return run
 
@@ -234,6 +224,6 @@ async def test_no_fault_of_a_batch_server_changes_a_result(play, case):
     if provider not in PLAIN:
         PLAIN[provider], *_ = await play(provider)
     faults = FaultPlan(seed=1, batch=BatchPlan(**{"delay_s": 0.2, **plan}))
-    digest, counts = await play(provider, middles(), faults, batch=True, max_cost_usd=5)
+    digest, count = await play(provider, middles(), faults, batch=True, max_cost_usd=5)
     assert digest == PLAIN[provider]
-    assert sum(each["answered"] for each in counts) <= LINES + again
+    assert count <= LINES + again

@@ -27,16 +27,9 @@ price = { input = 2.0, output = 8.0, source = "made up" }
 
 
 def account(server):
-    key, at = "a-dummy-key", server.url
-    return {
-        "OPENAI_API_KEY": key,
-        "OPENAI_BASE_URL": f"{at}/v1",
-        "ANTHROPIC_API_KEY": key,
-        "ANTHROPIC_BASE_URL": at,
-        "GEMINI_API_KEY": key,
-        "GOOGLE_GEMINI_BASE_URL": at,
-        "EMULATOR_BASE_URL": f"{at}/v1",
-    }
+    keys = {f"{name}_API_KEY": "a-dummy-key" for name in ("OPENAI", "ANTHROPIC", "GEMINI")}
+    urls = dict.fromkeys(("ANTHROPIC_BASE_URL", "GOOGLE_GEMINI_BASE_URL"), server.url)
+    return keys | urls | server.env | {"OPENAI_BASE_URL": f"{server.url}/v1"}
 
 
 @pytest.fixture
@@ -127,14 +120,12 @@ async def test_ctrl_c_loses_nothing_that_waits_in_a_batch(merge_runner, priced):
 
 
 async def test_what_cannot_go_in_batches_is_refused_in_one_line(merge_runner):
+    sweep = ("sweep", "baseline", "--batch")
     for options in ("--replay", "--dask local:1", "--model constant", "--model emulator"):
-        run = await merge_runner(
-            "sweep", "baseline", "--batch", *options.split(), EMULATOR_BASE_URL=""
-        )
+        run = await merge_runner(*sweep, *options.split(), EMULATOR_BASE_URL="")
         assert (run.code, run.out, run.err.count("error: ")) == (2, "", 1)
         assert "leave it, --replay or --dask out" in run.err.splitlines()[-1]
-    local = {"LOCAL_MODEL": "m", "EMULATOR_BASE_URL": ""}
-    run = await merge_runner("sweep", "baseline", "--batch", "--model", "local", **local)
+    run = await merge_runner(*sweep, "--model", "local", LOCAL_MODEL="m", EMULATOR_BASE_URL="")
     said, _, valid = run.err.splitlines()[-1].partition("; valid with --batch: ")
     assert "local has no batch mode that is known" in said
     assert "o3" in valid

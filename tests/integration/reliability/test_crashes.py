@@ -8,12 +8,11 @@ import signal
 import sqlite3
 
 from merge_runner.records import SLOT_HEADER
-from merge_runner.results.store import results_digest
+from merge_runner.results.store import query, results_digest
 from tests.support.harness import watched
 from tests.support.mock_server import FaultPlan
 
 SWEEP = ("sweep", "baseline", "--reps", 1, "--in-flight", 8, "--json")
-KILLS = 6
 
 
 class Slots:
@@ -46,21 +45,19 @@ def kept(folder):
     }
 
 
-async def test_a_sweep_that_is_killed_again_and_again_asks_nothing_answered_again(
-    merge_runner, quiet, tmp_path
-):
+async def kill_again_and_again(merge_runner, folder, quiet, kills):
+    """A sweep that is killed so many times asks nothing answered again, and ends as a quiet one."""
     chance = random.Random(4)
     slots = Slots()
     killed = 0
     again = []  # how many slots each run asked again
     durable = []  # after each kill: the requests up to then, and the slots with a reply on disk
-    async with watched(slots.middle, FaultPlan(latency_s=0.02)) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        for _ in range(KILLS):
-            process = await merge_runner.start(*SWEEP, **env)
+    async with watched(slots.middle, FaultPlan(latency_s=0.05)) as server:
+        for _ in range(kills):
+            process = await merge_runner.start(*SWEEP, **server.env)
             before, seen = len(slots.asked), set(slots.asked)
             # Some die while they open the files, most of them in the midst of calls.
-            asked = asyncio.create_task(slots.until(before + chance.randrange(30)))
+            asked = asyncio.create_task(slots.until(before + chance.randrange(180 // kills)))
             ended = asyncio.create_task(process.wait())
             await asyncio.wait([asked, ended], return_when=asyncio.FIRST_COMPLETED)
             asked.cancel()
@@ -69,9 +66,9 @@ async def test_a_sweep_that_is_killed_again_and_again_asks_nothing_answered_agai
                 process.kill()
             killed += await ended == -signal.SIGKILL
             again.append(len(seen.intersection(slots.asked[before:])))
-            durable.append((len(slots.asked), kept(tmp_path / "cache/responses")))
-        last = await merge_runner(*SWEEP, **env)
-    assert killed == KILLS
+            durable.append((len(slots.asked), kept(folder / "cache/responses")))
+        last = await merge_runner(*SWEEP, **server.env)
+    assert killed == kills
     assert last.code == 0, last.err
     for position, answered in durable:
         assert answered.isdisjoint(slots.asked[position:]), "an answered call was made again"
@@ -79,7 +76,13 @@ async def test_a_sweep_that_is_killed_again_and_again_asks_nothing_answered_agai
     assert max(again) <= 16
     used = last.summary["calls"]["live"] + last.summary["calls"]["cached"]
     assert used <= len(set(slots.asked)) < len(slots.asked)
-    assert results_digest(tmp_path / "results/merge.duckdb") == quiet
+    assert results_digest(folder / "results/merge.duckdb") == quiet
+
+
+async def test_a_sweep_that_is_killed_again_and_again_asks_nothing_answered_again(
+    merge_runner, quiet, tmp_path
+):
+    await kill_again_and_again(merge_runner, tmp_path, quiet, kills=6)
 
 
 async def test_attempts_of_a_run_that_died_are_found_in_the_next_one(merge_runner, tmp_path):
@@ -94,20 +97,17 @@ async def test_attempts_of_a_run_that_died_are_found_in_the_next_one(merge_runne
     (tmp_path / "short.toml").write_text(study)
     sweep = ("sweep", "short.toml", "--model", "emulator", "--json")
     async with watched(middle, FaultPlan(rates={"server_error": 0.1}, seed=3)) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        process = await merge_runner.start(*sweep, **env)
+        process = await merge_runner.start(*sweep, **server.env)
         await hanging.wait()
         process.terminate()
         release.set()
         await process.wait()
-        done = await merge_runner(*sweep, **env)
+        done = await merge_runner(*sweep, **server.env)
     assert done.code == 0, done.err
-    attempts = await merge_runner(
-        "sql",
-        "select count(*) as n, count(distinct (side, decision, attempt)) as distinct_n, "
-        "count(*) filter (fate = 'retried') as retried from attempts",
-        "--format", "json",
-    )  # fmt: skip
-    (told,) = json.loads(attempts.out)
-    assert told["n"] == told["distinct_n"] == server.requests
-    assert told["retried"] > 0
+    ((total, distinct, retried),) = query(
+        tmp_path / "results/merge.duckdb",
+        "select count(*), count(distinct (side, decision, attempt)), "
+        "count(*) filter (fate = 'retried') from attempts",
+    )[1]
+    assert total == distinct == server.requests
+    assert retried > 0

@@ -14,6 +14,13 @@ SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "
 # its up to 24 calls could cost 0.14 USD (16,000 tokens of output).
 SHORT = "[repetitions]\nbaseline = 4\n[scenario]\ntimeout_s = 12\n"
 ROOM_FOR_SOME = 0.9
+ONE = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
+ENTRY = """[{name}]
+provider = "openai"
+format = "openai-chat"
+id = "{id}"
+max_output_tokens = {tokens}
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -59,9 +66,8 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         assert f"{bill.usd:.2f} of {ROOM_FOR_SOME} over all runs" in run.err.splitlines()[-2]
         assert "raise --max-cost, or the study's budget, and run the same command" in run.err
         # What is finished is balanced: no condition is far ahead of another one.
-        counts = await sql(
-            merge_runner, "select condition, count(*) as n from trials group by all order by n"
-        )
+        query = "select condition, count(*) as n from trials group by all order by n"
+        counts = await sql(merge_runner, query)
         assert len(counts) == 3
         assert counts[-1]["n"] - counts[0]["n"] <= 2
         spent = bill.usd
@@ -73,19 +79,16 @@ async def test_the_cap_holds_over_all_runs_and_a_higher_one_goes_on(merge_runner
         assert done.code == 0, done.err
         (calls,) = await sql(merge_runner, "select count(*) as n from calls")
         assert calls["n"] == server.requests, "nothing was paid for twice"
-        caps = await sql(
-            merge_runner,
-            "select (config->>'max_cost_usd')::double as cap from sweeps order by started_at",
-        )
-        assert [row["cap"] for row in caps] == [ROOM_FOR_SOME, ROOM_FOR_SOME, 50]
+        query = "select (config->>'max_cost_usd')::double as cap from sweeps order by started_at"
+        caps = [row["cap"] for row in await sql(merge_runner, query)]
+        assert caps == [ROOM_FOR_SOME, ROOM_FOR_SOME, 50]
     assert done.summary["sweep_cost_usd"] == pytest.approx(bill.usd)
     assert done.summary["set_aside_usd"] == 0
-    (costs,) = await sql(merge_runner, "select sum(cost_usd) as usd from trial_costs")
-    assert costs["usd"] == pytest.approx(bill.usd)
-    (whole,) = await sql(
-        merge_runner, "select cost_usd as usd from sweep_costs order by sweep_id desc limit 1"
-    )
-    assert whole["usd"] == pytest.approx(bill.usd)
+    for query in (
+        "select sum(cost_usd) as usd from trial_costs",
+        "select cost_usd as usd from sweep_costs order by sweep_id desc limit 1",
+    ):
+        assert await sql(merge_runner, query) == [{"usd": pytest.approx(bill.usd)}]
 
 
 async def test_one_cap_holds_over_several_sweeps(merge_runner, experiments):
@@ -112,16 +115,15 @@ async def test_a_begun_trial_that_cannot_be_paid_is_suspended_with_its_replies(m
         return web.json_response(body)
 
     async with watched(middle) as server:
-        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
         env = account(server)
-        run = await merge_runner(*sweep, "--max-cost", 2.5, **env)
+        run = await merge_runner(*ONE, "--max-cost", 2.5, **env)
         assert run.code == 3, run.err
         assert run.summary["trials"]["suspended"] == 1
         assert run.summary["sweep_cost_usd"] + run.summary["set_aside_usd"] <= 2.5
         assert run.summary["set_aside_usd"] > 0.1
         first = server.requests
         assert first > 15
-        done = await merge_runner(*sweep, "--max-cost", 30, **env)
+        done = await merge_runner(*ONE, "--max-cost", 30, **env)
     assert done.code == 0, done.err
     assert done.summary["calls"]["cached"] >= first - run.summary["attempts_of_unknown_cost"] - 1
 
@@ -153,12 +155,8 @@ async def test_what_a_run_has_in_flight_is_not_released_and_stays_set_aside_when
     assert "another merge-runner works with" in refused.err
     assert run.summary["attempts_of_unknown_cost"] == 3
     assert 0.38 < run.summary["set_aside_usd"] < 0.45
-    fates = await sql(
-        merge_runner,
-        "select outcome, fate, cached, count(*) as n from attempts where outcome = 'unknown' "
-        "group by all",
-    )
-    assert fates == [{"outcome": "unknown", "fate": "retried", "cached": True, "n": 3}]
+    query = "select fate, cached from attempts where outcome = 'unknown'"
+    assert await sql(merge_runner, query) == [{"fate": "retried", "cached": True}] * 3
 
 
 async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_runner, tmp_path):
@@ -187,10 +185,8 @@ async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_r
 
 
 async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, experiments):
-    (experiments / "models.toml").write_text(
-        '[mine]\nprovider = "openai"\nformat = "openai-chat"\nid = "nobody-knows"\n'
-        "max_output_tokens = 1000\n"
-    )
+    entry = ENTRY.format(name="mine", id="nobody-knows", tokens=1000)
+    (experiments / "models.toml").write_text(entry)
     async with watched() as server:
         env = account(server)
         sweep = ("sweep", "baseline", "--model", "mine", "--conditions", "L_4_0", "--json", *FAST)
@@ -212,18 +208,14 @@ async def test_runs_of_two_models_under_one_cap_never_pass_it_and_both_end(
 ):
     (experiments / "baseline.toml").write_text(f"[budget]\ntotal_usd = 0.4\n{SHORT}")
     with (experiments / "models.toml").open("a") as registry:
-        registry.write(
-            '[twin]\nprovider = "openai"\nformat = "openai-chat"\nid = "o3-twin"\n'
-            'max_output_tokens = 16000\nprice = { input = 2.0, output = 8.0, source = "here" }\n'
-        )
+        price = 'price = { input = 2.0, output = 8.0, source = "here" }\n'
+        registry.write(ENTRY.format(name="twin", id="o3-twin", tokens=16_000) + price)
     bill = Bill()
     async with watched(bill.middle) as server:
         env = account(server)
         sweep = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--reps", 1, "--yes")
-        runs = [
-            await merge_runner.start(*sweep, *FAST, "--model", model, **env)
-            for model in ("o3", "twin")
-        ]
+        twins = ("o3", "twin")
+        runs = [await merge_runner.start(*sweep, *FAST, "--model", name, **env) for name in twins]
         codes = [await run.wait() for run in runs]
     assert {*codes} <= {0, 3}
     assert 0 < bill.usd <= 0.4
@@ -237,15 +229,10 @@ async def test_a_gateways_error_may_be_charged_whatever_its_form(merge_runner, e
             return web.Response(status=502, text="<html>502 Bad Gateway</html>")
         return web.json_response({"error": {"message": "Overloaded."}}, status=503)
 
-    (experiments / "models.toml").write_text(
-        '[brief]\nprovider = "openai"\nformat = "openai-chat"\nid = "o3"\ndeadline_s = 2\n'
-        "max_output_tokens = 16000\n"
-    )
+    brief = ENTRY.format(name="brief", id="o3", tokens=16_000) + "deadline_s = 2\n"
+    (experiments / "models.toml").write_text(brief)
     async with watched(middle) as server:
-        run = await merge_runner(
-            "sweep", "baseline", "--reps", 1, "--conditions", "L_4_0", "--model", "brief",
-            "--yes", "--json", **account(server),
-        )  # fmt: skip
+        run = await merge_runner(*ONE, "--model", "brief", **account(server))
     assert run.code == 1
     attempts = run.summary["attempts"]
     assert attempts["server_error"] > 0 < attempts["overloaded"]
@@ -261,9 +248,7 @@ async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(
         return await handler(request)
 
     async with watched(middle) as server:
-        env = account(server)
-        sweep = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
-        assert (await merge_runner(*sweep, **env)).code == 0
+        assert (await merge_runner(*ONE, **account(server))).code == 0
     told = await merge_runner("ledger")
     driver = f"o3 at {server.url.removeprefix('http://')}"
     assert "\nbaseline/o3/set0  0." in told.out

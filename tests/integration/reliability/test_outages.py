@@ -7,7 +7,8 @@ import pytest
 from aiohttp import web
 
 from merge_runner.records import SLOT_HEADER
-from tests.support.harness import FAST, PROJECT, watched
+from merge_runner.results.store import query
+from tests.support.harness import FAST, PROJECT, Watched, watched
 
 MODELS = """
 [patient]
@@ -21,12 +22,12 @@ deadline_s = {deadline_s}
 """
 
 
-def configured(folder, deadline_s):
-    """A copy of the baseline sweep with a model that is given up soon."""
+def configured(folder, deadline_s, *options):
+    """The baseline sweep of a copy whose model is given up soon."""
     (folder / "experiments").mkdir(exist_ok=True)
     (folder / "experiments/models.toml").write_text(MODELS.format(deadline_s=deadline_s))
     (folder / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 10\n")
-    return ("sweep", "baseline", "--model", "patient", "--json")
+    return ("sweep", "baseline", "--model", "patient", "--json", *options)
 
 
 class Service:
@@ -54,11 +55,9 @@ async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tm
         return down() if broken and not mended else await handler(request)
 
     mended = False
-    sweep = configured(tmp_path, deadline_s=1.2)
+    sweep = configured(tmp_path, 1.2, "--reps", 1, "--conditions", "L_4_8,N_0_0,L_4_0")
     async with watched(middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        sweep = (*sweep, "--reps", 1, "--conditions", "L_4_8,N_0_0,L_4_0")
-        run = await merge_runner(*sweep, **env)
+        run = await merge_runner(*sweep, **server.env)
         assert run.code == 1
         assert run.summary["trials"]["finished"] == 2
         ((trial, error),) = run.summary["failed"].items()
@@ -66,36 +65,30 @@ async def test_one_trial_fails_with_a_reason_and_the_rest_go_on(merge_runner, tm
         assert "no answer within 1 s (HTTP 503: The engine is down.), 2 attempts" in error
         before = server.requests
         mended = True
-        again = await merge_runner(*sweep, **env)
+        again = await merge_runner(*sweep, **server.env)
         assert again.code == 0, again.err
     # The attempts in vain are not forgotten, and what had been answered was not asked again.
-    told = await merge_runner(
-        "sql",
-        "select fate, count(*) as n from attempts where outcome = 'overloaded' group by all",
-        "--format", "json",
-    )  # fmt: skip
-    assert json.loads(told.out) == [{"fate": "retried", "n": 2}]
+    told = "select fate from attempts where outcome = 'overloaded'"
+    assert query(tmp_path / "results/merge.duckdb", told)[1] == [("retried",)] * 2
     assert server.requests - before < 20
     assert again.summary["trials"]["stored_before"] == 2
 
 
 async def test_when_everything_fails_the_list_is_not_burnt(merge_runner, tmp_path):
     service = Service(working=False)
-    sweep = (*configured(tmp_path, deadline_s=0.6), "--reps", 2)
+    sweep = configured(tmp_path, 0.6, "--reps", 2)
     async with watched(service.middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(*sweep, "--in-flight", 4, **env)
+        run = await merge_runner(*sweep, "--in-flight", 4, **server.env)
         assert run.code == 1, run.err
-        assert (
-            "the last 10 trials with patient failed and no call was answered in between" in run.err
-        )
+        said = "the last 10 trials with patient failed and no call was answered in between"
+        assert said in run.err
         assert "run the same command to go on" in run.err
         assert run.summary["trials"]["failed"] <= 14
         # Two sides of at most 14 of 22 trials, with two or three attempts each.
         assert server.requests <= 2 * 14 * 3
         service.working = True
-        configured(tmp_path, deadline_s=60)
-        again = await merge_runner(*sweep, "--in-flight", 20, **env)
+        configured(tmp_path, 60)
+        again = await merge_runner(*sweep, "--in-flight", 20, **server.env)
     assert again.code == 0, again.err
     assert again.summary["trials"]["finished"] + again.summary["trials"]["collided"] == 22
 
@@ -140,9 +133,7 @@ async def test_a_quota_that_is_used_up_in_the_midst_fails_no_trial(merge_runner,
         return await handler(request)
 
     async with watched(middle) as server:
-        run = await merge_runner(
-            *configured(tmp_path, deadline_s=600), EMULATOR_BASE_URL=f"{server.url}/v1"
-        )
+        run = await merge_runner(*configured(tmp_path, 600), **server.env)
     assert (run.code, run.summary["trials"]["failed"]) == (3, 0), run.err
     assert USED_UP in run.err
 
@@ -151,12 +142,9 @@ async def test_errors_within_a_200_and_odd_bodies_in_the_midst_of_a_run_cost_no_
     merge_runner, tmp_path
 ):
     odd = [
-        {"error": {"type": "overloaded_error", "message": "Overloaded"}},
-        {"error": {"type": "api_error", "message": "m"}},
-        {"error": {"message": "m", "code": 529}},
-        {"error": "Model unloaded."},
-        STREAM,
-        {"status": "up"},
+        *({"error": {"type": f"{name}_error", "message": "m"}} for name in ("overloaded", "api")),
+        *({"error": {"message": "m", "code": 529}}, {"error": "Model unloaded."}),
+        *(STREAM, {"status": "up"}),
     ]
 
     async def middle(request, handler):
@@ -164,17 +152,15 @@ async def test_errors_within_a_200_and_odd_bodies_in_the_midst_of_a_run_cost_no_
             return as_reply(odd.pop())
         return await handler(request)
 
-    sweep = configured(tmp_path, deadline_s=600)
+    sweep = configured(tmp_path, 600, "--reps", 1, "--conditions", "L_4_8,N_0_0")
     async with watched(middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(*sweep, "--reps", 1, "--conditions", "L_4_8,N_0_0", **env)
+        run = await merge_runner(*sweep, **server.env)
     assert run.code == 0, run.err
     assert not odd
 
 
 async def test_nobody_listens(merge_runner, tmp_path):
-    sweep = configured(tmp_path, deadline_s=0.6)
-    run = await merge_runner(*sweep, EMULATOR_BASE_URL="http://127.0.0.1:9/v1")
+    run = await merge_runner(*configured(tmp_path, 0.6), **Watched("http://127.0.0.1:9").env)
     assert run.code == 1
     assert "the first call of this run: no answer within 1 s" in run.err
     assert run.summary["attempts"].keys() == {"no_connection"}
@@ -187,14 +173,12 @@ async def test_waits_are_told(merge_runner, tmp_path, monkeypatch):
     async def middle(request, handler):
         if server.requests > 1:
             return await handler(request)
-        return web.json_response(
-            {"error": {"message": "Slow down."}}, status=429, headers={"retry-after": "2"}
-        )
+        error = {"error": {"message": "Slow down."}}
+        return web.json_response(error, status=429, headers={"retry-after": "2"})
 
-    sweep = configured(tmp_path, deadline_s=60)
     async with watched(middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
-        run = await merge_runner(*sweep, "--reps", 1, "--conditions", "L_4_8", **env)
+        sweep = configured(tmp_path, 60, "--reps", 1, "--conditions", "L_4_8")
+        run = await merge_runner(*sweep, **server.env)
     assert run.code == 0
     (told,) = [text for text in run.err.splitlines() if "decision 0 waits until" in text]
     assert "L_4_8 rep 1" in told
@@ -227,13 +211,12 @@ async def test_another_model_behind_a_name_stops_a_strict_sweep(merge_runner):
 
 async def test_recorded_trials_do_not_hide_an_outage(merge_runner, tmp_path):
     service = Service(working=True)
-    sweep = configured(tmp_path, deadline_s=0.6)
+    sweep = configured(tmp_path, 0.6, "--in-flight", 3)
     async with watched(service.middle) as server:
-        env = {"EMULATOR_BASE_URL": f"{server.url}/v1"}
         part = ("--reps", 2, "--conditions", "L_4_0,L_4_8,N_0_0")
-        assert (await merge_runner(*sweep, *part, "--in-flight", 3, **env)).code == 0
+        assert (await merge_runner(*sweep, *part, **server.env)).code == 0
         service.working = False
-        run = await merge_runner(*sweep, "--reps", 4, "--in-flight", 3, "--db", "new", **env)
+        run = await merge_runner(*sweep, "--reps", 4, "--db", "new", **server.env)
     assert run.code == 1
     assert "no call was answered in between" in run.err
     assert run.summary["trials"]["failed"] <= 13

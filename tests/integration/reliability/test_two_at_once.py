@@ -7,6 +7,7 @@ import pytest
 
 from merge_runner.errors import UsageError
 from merge_runner.llm.durable import ModelLocks
+from merge_runner.results.store import query
 from tests.support.harness import FAST, watched
 from tests.support.mock_server import FaultPlan
 
@@ -18,30 +19,23 @@ MODELS = ("emulator", "o3")
 
 def account(server):
     """Where both the emulator and o3 are asked."""
-    return {
-        "EMULATOR_BASE_URL": f"{server.url}/v1",
-        "OPENAI_API_KEY": "a-dummy-key",
-        "OPENAI_BASE_URL": f"{server.url}/v1",
-    }
+    key = {"OPENAI_API_KEY": "a-dummy-key"}
+    return server.env | key | {"OPENAI_BASE_URL": f"{server.url}/v1"}
 
 
-async def test_runs_of_two_models_share_a_cache_and_lose_no_row(merge_runner):
+async def test_runs_of_two_models_share_a_cache_and_lose_no_row(merge_runner, tmp_path):
     async with watched(faults=FaultPlan(latency_s=0.05)) as server:
         env = account(server)
         runs = [await merge_runner.start(*SWEEP, "--model", model, **env) for model in MODELS]
         summaries = [json.loads((await run.communicate())[0]) for run in runs]
     assert [run.returncode for run in runs] == [0, 0]
     assert sum(summary["calls"]["live"] for summary in summaries) == server.requests
-    counted = await merge_runner(
-        "sql",
-        "select count(*) as rows, count(distinct (trial_id, side, decision, attempt)) as calls, "
-        "(select count(*) from trials) as trials, "
-        "(select count(*) from sweep_trials) as linked from calls",
-        "--format", "json",
-    )  # fmt: skip
-    assert json.loads(counted.out) == [
-        {"rows": server.requests, "calls": server.requests, "trials": 4, "linked": 4}
-    ]
+    (counted,) = query(
+        tmp_path / "results/merge.duckdb",
+        "select count(*), count(distinct (trial_id, side, decision, attempt)), "
+        "(select count(*) from trials), (select count(*) from sweep_trials) from calls",
+    )[1]
+    assert counted == (server.requests, server.requests, 4, 4)
 
 
 async def test_a_second_live_run_of_a_model_names_the_first_and_asks_nothing(merge_runner):

@@ -1,5 +1,7 @@
 """A model that understands nothing and answers in a valid form: it rehearses any prompt."""
 
+from dataclasses import replace
+
 import pytest
 
 from merge_runner.config import ScenarioConfig
@@ -13,30 +15,14 @@ from merge_runner.scenarios.merge.world import World
 
 SCENARIO = ScenarioConfig()
 SLOT = Slot("N_0_0", 1, "left", 0, 0)
-OTHER_SLOTS = [
-    Slot("L_4_0", 1, "left", 0, 0),
-    Slot("N_0_0", 2, "left", 0, 0),
-    Slot("N_0_0", 1, "right", 0, 0),
-    Slot("N_0_0", 1, "left", 1, 0),
-    Slot("N_0_0", 1, "left", 0, 1),
-]
+SEEN = World(SCENARIO, CONDITIONS["L_4_8"], TRACK).observe("left")
+PROMPTS = [render_prompt(SEEN, None, prompt=prompt_of(v), scenario=SCENARIO) for v in VARIANTS]
 
 
 @pytest.mark.parametrize(
     ("prompt", "actions"),
     [
-        *(
-            (
-                render_prompt(
-                    World(SCENARIO, CONDITIONS["L_4_8"], TRACK).observe("left"),
-                    None,
-                    prompt=prompt_of(variant),
-                    scenario=SCENARIO,
-                ),
-                SCENARIO.plan_actions,
-            )
-            for variant in VARIANTS
-        ),
+        *((prompt, SCENARIO.plan_actions) for prompt in PROMPTS),
         ("Sie fahren 10.5 m/s und 120.0 m vor ihnen liegt ein Stau. Nennen Sie 45 Zahlen.", 45),
         ("Give me fifteen numbers between -1 and 1.", 15),
         ("", 20),
@@ -52,9 +38,11 @@ def test_any_prompt_gets_a_word_and_a_plan_of_the_length_that_it_asks_for(prompt
 
 
 def test_the_draw_is_a_function_of_the_prompt_and_of_each_part_of_the_slot():
-    assert answer("a", SLOT) == answer("a", SLOT)
-    others = {answer("a", slot) for slot in [None, *OTHER_SLOTS]} | {answer("b", SLOT)}
-    assert answer("a", SLOT) not in others
+    changes = {"condition": "L_4_0", "repetition": 2, "side": "right", "decision": 1}
+    changes["sample_set"] = 1
+    slots = [None, *(replace(SLOT, **{name: value}) for name, value in changes.items())]
+    others = {answer("a", slot) for slot in slots} | {answer("b", SLOT)}
+    assert answer("a", SLOT) == answer("a", SLOT) not in others
 
 
 def test_both_words_and_the_whole_range_of_actions_are_drawn_alike():

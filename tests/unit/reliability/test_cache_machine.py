@@ -23,7 +23,7 @@ from hypothesis.stateful import (
 
 from merge_runner.errors import TrialSuspended
 from merge_runner.llm.cache import CachedCall, ResponseCache
-from merge_runner.llm.ledger import Asked, Budget, Ledger, PaidAttempt
+from merge_runner.llm.ledger import Asked, Budget, Ledger
 from merge_runner.records import Attempt, Slot, make_request
 
 QUESTIONS = 4
@@ -32,16 +32,9 @@ WORST_USD = 10
 # Nothing is cut off from its power here, so nothing needs to wait for a disk.
 IN_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None
 EXAMPLES = int(os.environ.get("HYPOTHESIS_EXAMPLES", "25"))
+NAMED = {"provider": "openai", "endpoint": "openai", "model": "m", "path": "/p", "headers": {}}
 REQUESTS = [
-    make_request(
-        provider="openai",
-        endpoint="openai",
-        model="m",
-        path="/p",
-        headers={},
-        body={"prompt": number},
-        slot=Slot("A1", 1, "left", number, 0),
-    )
+    make_request(**NAMED, body={"prompt": number}, slot=Slot("A1", 1, "left", number, 0))
     for number in range(QUESTIONS)
 ]
 questions = st.integers(0, QUESTIONS - 1)
@@ -51,14 +44,10 @@ costs = st.integers(0, WORST_USD)
 class Process:
     """One merge-runner on the folder: what it has open, and the calls that it has in flight."""
 
-    def __init__(self, folder: Path, cap_usd: float) -> None:
+    def __init__(self, folder, cap_usd):
         self.cache = ResponseCache(folder)
         self.budget = Budget(Ledger(self.cache, "s"), cap_usd)
-        self.in_flight_calls: dict[int, tuple[PaidAttempt, list[Attempt]]] = {}
-
-    def die(self) -> None:
-        """Leave everything as it lies: the kernel closes the files, and nothing is put in order."""
-        self.cache.close()
+        self.in_flight_calls = {}  # the paid attempt and the attempts before, by question
 
 
 class CacheMachine(RuleBasedStateMachine):
@@ -68,31 +57,22 @@ class CacheMachine(RuleBasedStateMachine):
     ``charged_usd`` is what the server has charged, of which the program may know nothing.
     """
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.place = Path(tempfile.mkdtemp(dir=IN_MEMORY))
-        self.cap_usd = 3.0 * WORST_USD
-        self.charged_usd = 0.0
-        self.answered: dict[int, CachedCall] = {}
-        self.tried: dict[int, tuple[Attempt, ...]] = {}
-        self.made = 0
-        self.damaged: set[int] = set()
+        self.cap_usd, self.charged_usd, self.made = 3.0 * WORST_USD, 0.0, 0
+        self.answered, self.tried, self.damaged = {}, {}, set()
         self.loop = asyncio.new_event_loop()
-        self.running: dict[int, Process] = {}
+        self.running = {}
 
-    def teardown(self) -> None:
+    def teardown(self):
         for process in self.running.values():
-            process.die()
+            process.cache.close()
         self.loop.close()
         shutil.rmtree(self.place)
 
     def wait(self, job):
         return self.loop.run_until_complete(asyncio.wait_for(job, 20))
-
-    def process(self, number: int) -> Process:
-        if number not in self.running:
-            self.running[number] = Process(self.place, self.cap_usd)
-        return self.running[number]
 
     @rule(question=questions)
     def ask(self, question):
@@ -100,8 +80,10 @@ class CacheMachine(RuleBasedStateMachine):
 
         Each process has a model, and its questions, of its own: others may not ask it meanwhile.
         """
-        process = self.process(question % PROCESSES)
-        key = REQUESTS[question].key
+        number, key = question % PROCESSES, REQUESTS[question].key
+        if number not in self.running:
+            self.running[number] = Process(self.place, self.cap_usd)
+        process = self.running[number]
         if question in process.in_flight_calls:
             return
         process.cache.set_damage_aside(key)
@@ -115,9 +97,7 @@ class CacheMachine(RuleBasedStateMachine):
             self.tried.pop(question, None)
             process.in_flight_calls[question] = paid, earlier
 
-    def paid_for(
-        self, process: Process, question: int, earlier: list[Attempt]
-    ) -> PaidAttempt | None:
+    def paid_for(self, process, question, earlier):
         """Set the worst case aside; None where there is no money, or none before others end."""
 
         async def at_once():
@@ -140,18 +120,18 @@ class CacheMachine(RuleBasedStateMachine):
         except (TrialSuspended, asyncio.CancelledError):
             return None
 
-    def landed(self, number: int, data) -> tuple[int, PaidAttempt, list[Attempt]]:
-        process = self.running[number]
-        question = data.draw(st.sampled_from(sorted(process.in_flight_calls)))
-        return question, *process.in_flight_calls.pop(question)
+    def in_flight(self):
+        return [each.in_flight_calls for each in self.running.values() if each.in_flight_calls]
 
-    def in_flight(self) -> list[int]:
-        return [number for number, process in self.running.items() if process.in_flight_calls]
+    def landed(self, data):
+        calls = data.draw(st.sampled_from(self.in_flight()))
+        question = data.draw(st.sampled_from(sorted(calls)))
+        return question, *calls.pop(question)
 
     @precondition(in_flight)
     @rule(data=st.data(), cost=costs)
     def answer(self, data, cost):
-        question, paid, attempts = self.landed(data.draw(st.sampled_from(self.in_flight())), data)
+        question, paid, attempts = self.landed(data)
         self.made += 1
         self.charged_usd += cost
         reply = f'{{"text": "ä {self.made}"}}'
@@ -167,7 +147,7 @@ class CacheMachine(RuleBasedStateMachine):
     @rule(data=st.data(), cost=costs, known=st.booleans())
     def fail(self, data, cost, known):
         """An attempt brings no answer, and what it cost is told or not."""
-        question, paid, attempts = self.landed(data.draw(st.sampled_from(self.in_flight())), data)
+        question, paid, attempts = self.landed(data)
         self.charged_usd += cost
         told = float(cost) if known else None
         attempts.append(Attempt(len(attempts) + 1, "server_error", 500, cost_usd=told))
@@ -179,10 +159,9 @@ class CacheMachine(RuleBasedStateMachine):
     @rule(data=st.data(), cost=costs)
     def kill(self, data, cost):
         """The server charges for what is in flight all the same."""
-        number = data.draw(st.sampled_from(sorted(self.running)))
-        process = self.running.pop(number)
+        process = self.running.pop(data.draw(st.sampled_from(sorted(self.running))))
         self.charged_usd += cost * len(process.in_flight_calls)
-        process.die()
+        process.cache.close()  # the kernel closes the files, and nothing is put in order
 
     @rule(more=st.integers(1, 4 * WORST_USD))
     def raise_the_cap(self, more):
@@ -203,15 +182,13 @@ class CacheMachine(RuleBasedStateMachine):
             if not others:
                 return
             rowid, name = data.draw(st.sampled_from(calls or others) | st.sampled_from(others))
-            ((content,),) = database.execute(
-                "SELECT CAST(value AS BLOB) FROM Cache WHERE rowid = ?", [rowid]
-            )
+            read = "SELECT CAST(value AS BLOB) FROM Cache WHERE rowid = ?"
+            ((content,),) = database.execute(read, [rowid])
             self.damaged.add(rowid)
             changed = bytearray(content or b"x")
             changed[data.draw(st.integers(0, len(changed) - 1))] ^= data.draw(st.integers(1, 255))
-            database.execute(
-                "UPDATE Cache SET value = CAST(? AS TEXT) WHERE rowid = ?", [bytes(changed), rowid]
-            )
+            write = "UPDATE Cache SET value = CAST(? AS TEXT) WHERE rowid = ?"
+            database.execute(write, [bytes(changed), rowid])
         for question, request in enumerate(REQUESTS):
             if request.key == name:
                 self.answered.pop(question, None)
@@ -221,11 +198,10 @@ class CacheMachine(RuleBasedStateMachine):
 
     @invariant()
     def the_sum_never_passes_the_cap(self):
-        if not self.running:
-            return
-        counted_usd = Ledger(next(iter(self.running.values())).cache, "s").read().committed_usd
-        assert self.charged_usd <= counted_usd + 1e-6
-        assert counted_usd <= self.cap_usd + 1e-6
+        for process in self.running.values():
+            counted_usd = Ledger(process.cache, "s").read().committed_usd
+            assert self.charged_usd <= counted_usd + 1e-6
+            assert counted_usd <= self.cap_usd + 1e-6
 
     @invariant()
     def every_stored_byte_is_what_was_answered(self):

@@ -7,8 +7,9 @@ import email
 import json
 import re
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from email.policy import HTTP
+from typing import NamedTuple
 
 import pytest
 from aiohttp import web
@@ -19,7 +20,7 @@ from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.models import read_models
 from merge_runner.records import Slot, make_request
-from tests.support.harness import PROJECT, Watched, watched
+from tests.support.harness import PROJECT, listening, watched
 from tests.weekly.emulator.test_sdks import (
     _no_settings_of_the_user,  # noqa: F401 # a fixture of every test here
     gemini_client,
@@ -33,14 +34,13 @@ CAP = 16000
 KEY = "dummy"
 
 
-@dataclass(frozen=True)
-class Sent:
+class Sent(NamedTuple):
     """A request as a server sees it, without what names the library and this one request."""
 
     call: str
-    key: str | None
+    key: str
     content_type: str
-    upload: dict[str, str]
+    upload: dict
     body: object
 
 
@@ -57,16 +57,13 @@ async def seen(request):
         body = json.loads(raw)
         if "/v1beta/" in request.path:
             body = camel(body)
+    headers = {name.lower(): value for name, value in request.headers.items()}
     return Sent(
-        call=f"{request.method} {request.path_qs}",
-        key=request.headers.get("authorization") or request.headers.get("x-goog-api-key"),
-        content_type=content_type.partition(";")[0],
-        upload={
-            name.lower(): value
-            for name, value in request.headers.items()
-            if name.lower().startswith("x-goog-upload-")
-        },
-        body=body,
+        f"{request.method} {request.path_qs}",
+        headers.get("authorization") or headers.get("x-goog-api-key"),
+        content_type.partition(";")[0],
+        {name: value for name, value in headers.items() if name.startswith("x-goog-upload-")},
+        body,
     )
 
 
@@ -98,9 +95,8 @@ async def recorded():
 @asynccontextmanager
 async def transport_of(name, url):
     """The connection of a model of the registry to a server, with a key."""
-    openai = MODELS[name].provider == "openai"
-    variables = {"OPENAI_BASE_URL": f"{url}/v1"} if openai else {"GOOGLE_GEMINI_BASE_URL": url}
-    env = {**variables, "OPENAI_API_KEY": KEY, "GEMINI_API_KEY": KEY}
+    env = {"OPENAI_BASE_URL": f"{url}/v1", "GOOGLE_GEMINI_BASE_URL": url}
+    env |= {"OPENAI_API_KEY": KEY, "GEMINI_API_KEY": KEY}
     endpoint = resolve_endpoint(name, MODELS[name], env)
     transport = HttpTransport(endpoint, connections=1)
     yield transport, endpoint
@@ -111,15 +107,9 @@ def request_of(name, prompt):
     """What a model is asked in a sweep."""
     entry = MODELS[name]
     wire = FORMATS[entry.format].request(entry, prompt)
-    return make_request(
-        provider=entry.provider,
-        endpoint=entry.provider,
-        model=entry.id,
-        path=wire.path,
-        headers=wire.headers,
-        body=wire.body,
-        slot=Slot("N_0_0", 1, "left", 0, 0),
-    )
+    named = {"provider": entry.provider, "endpoint": entry.provider, "model": entry.id}
+    sent = {"path": wire.path, "headers": wire.headers, "body": wire.body}
+    return make_request(**named, **sent, slot=Slot("N_0_0", 1, "left", 0, 0))
 
 
 async def ask_chat(url, prompt, **call):
@@ -187,25 +177,16 @@ async def batch_server():
 
     async def handle(request):
         requests.append(await seen(request))
-        url = {"x-goog-upload-url": f"{server.url}/upload/v1beta/files?upload_id=a"}
-        done = {"x-goog-upload-status": "final"}
+        upload = {"x-goog-upload-url": f"{url}/upload/v1beta/files?upload_id=a"}
         reply = {
             "id": "file-1" if "file" in request.path else "batch-1",
             "name": "batches/1",
-            "file": {"name": "files/1", "uri": f"{server.url}/v1beta/files/1"},
+            "file": {"name": "files/1", "uri": f"{url}/v1beta/files/1"},
         }
-        return web.json_response(reply, headers={**url, **done})
+        return web.json_response(reply, headers=upload | {"x-goog-upload-status": "final"})
 
-    app = web.Application()
-    app.router.add_route("*", "/{path:.*}", handle)
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
-    await runner.setup()
-    await web.TCPSite(runner, "127.0.0.1", 0).start()
-    server = Watched(f"http://127.0.0.1:{runner.addresses[0][1]}")
-    try:
-        yield server.url, requests
-    finally:
-        await runner.cleanup()
+    async with listening(handle) as url:
+        yield url, requests
 
 
 async def submitted(name, url, prompt):
@@ -242,9 +223,8 @@ async def test_a_batch_of_gemini_is_created_as_by_googles_library(driving_prompt
     async with batch_server() as (url, requests):
         await submitted("gemini-2.5-pro", url, driving_prompt)
         ours, requests[:] = requests[:], []
-        (tmp_path / "batch.jsonl").write_text(
-            json.dumps(ours[1].body, separators=(",", ":")) + "\n"
-        )
+        content = json.dumps(ours[1].body, separators=(",", ":")) + "\n"
+        (tmp_path / "batch.jsonl").write_text(content)
         async with gemini_client(url).aio as client:
             file = await client.files.upload(
                 file=tmp_path / "batch.jsonl",
