@@ -1,6 +1,7 @@
 """An effect that a study plants in the emulator is what its analysis finds in the long run."""
 
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -22,7 +23,7 @@ REPETITIONS = range(1, 201)
 
 
 @cache
-def first_prompt(condition: str, side: str) -> str:
+def first_prompt(condition, side):
     scenario = ScenarioConfig()
     seen = World(scenario, CONDITIONS[condition], TRACK).observe(side)
     return render_prompt(seen, None, prompt=prompt_of("baseline"), scenario=scenario)
@@ -36,13 +37,12 @@ def told(condition, repetition, side, effect, added=""):
 def firsts(effect, added=""):
     """Who goes first by the letters of both, as trials; contested ones did not finish."""
     rows = []
-    for name in HUMAN_CONDITIONS:
+    for name, n in product(HUMAN_CONDITIONS, REPETITIONS):
         c = CONDITIONS[name]
-        for n in REPETITIONS:
-            letters = [told(name, n, side, effect, added)[0] for side in SIDES]
-            who = {("M", "Y"): "left", ("Y", "M"): "right"}.get(tuple(letters))
-            status = "finished" if who else "collided"
-            rows.append((name, c.projected_headway_m, c.relative_velocity_mps, status, who))
+        letters = "".join(told(name, n, side, effect, added)[0] for side in SIDES)
+        who = {"MY": "left", "YM": "right"}.get(letters)
+        status = "finished" if who else "collided"
+        rows.append((name, c.projected_headway_m, c.relative_velocity_mps, status, who))
     columns = ["condition", "projected_headway_m", "relative_velocity_mps"]
     return pd.DataFrame(rows, columns=[*columns, "status", "merged_first"])
 
@@ -91,12 +91,9 @@ def test_trials_of_two_effects_are_independent():
 
 def test_the_planted_gap_opens_a_wider_gap():
     def hardest(gap_m):
-        told_all = (
-            parse_reply(told("N_0_0", n, side, PlantedEffect(x_gap_m=gap_m)), 20).plan[0]
-            for n in range(1, 101)
-            for side in SIDES
-        )
-        return np.mean(np.abs(list(told_all)))
+        effect = PlantedEffect(x_gap_m=gap_m)
+        answers = (told("N_0_0", *each, effect) for each in product(range(1, 101), SIDES))
+        return np.mean([abs(parse_reply(each, 20).plan[0]) for each in answers])
 
     assert hardest(0) < hardest(2) < hardest(4)
 

@@ -11,7 +11,6 @@ from merge_runner.emulator.handler import Emulator
 from merge_runner.llm.formats import FORMATS
 from merge_runner.records import ANSWERED_FIELD, SCRIPTED_FIELD, SCRIPTED_HEADER
 
-WIRES = ("openai-chat", "openai-responses", "gemini", "anthropic")
 PATHS = {
     "openai-chat": "/v1/chat/completions",
     "openai-responses": "/v1/responses",
@@ -19,7 +18,7 @@ PATHS = {
     "anthropic": "/v1/messages",
 }
 SLOT = {"condition": "L_4_8", "repetition": 1, "side": "left", "decision": 0, "sample_set": 0}
-all_wires = pytest.mark.parametrize("wire", WIRES)
+all_wires = pytest.mark.parametrize("wire", PATHS)
 
 
 @pytest.fixture
@@ -35,14 +34,8 @@ def headers_for(slot=SLOT, attempt=None):
 
 async def ask(client, wire, prompt, headers=None, **parameters):
     """The reply to a prompt, and its JSON."""
-    entry = ModelEntry(
-        provider="emulator",
-        format=wire,
-        id="some-model",
-        max_output_tokens=4000,
-        parameters=parameters,
-    )
-    body = FORMATS[wire].request(entry, prompt).body
+    named = {"provider": "emulator", "format": wire, "id": "some-model", "parameters": parameters}
+    body = FORMATS[wire].request(ModelEntry(**named, max_output_tokens=4000), prompt).body
     reply = await client.post(PATHS[wire], json=body, headers=headers)
     return reply, reply.json()
 
@@ -54,17 +47,16 @@ def without_ids(body):
 
 
 async def test_all_formats_give_the_same_answer_and_counts(client, driving_prompt):
-    readings = [
-        FORMATS[wire].read((await ask(client, wire, driving_prompt, headers_for()))[1])
-        for wire in WIRES
-    ]
-    assert {reading.model_served for reading in readings} == {"some-model"}
-    assert len({reading.text for reading in readings}) == 1
-    usage = readings[0].usage
-    counts = {(r.usage.output_tokens, r.usage.reasoning_tokens) for r in readings}
-    assert counts == {(usage.output_tokens, usage.reasoning_tokens)}
-    assert {r.usage.input_tokens for r in readings} == {len(driving_prompt.encode()) // 4}
-    assert usage.output_tokens == usage.reasoning_tokens + len(readings[0].text.encode()) // 4
+    asked = [(wire, await ask(client, wire, driving_prompt, headers_for())) for wire in PATHS]
+    readings = [FORMATS[wire].read(body) for wire, (_, body) in asked]
+    ((model, text, *counts),) = {
+        (r.model_served, r.text, u.input_tokens, u.output_tokens - u.reasoning_tokens)
+        for r in readings
+        for u in [r.usage]
+    }
+    assert model == "some-model"
+    assert counts == [len(said.encode()) // 4 for said in (driving_prompt, text)]
+    assert len({r.usage.reasoning_tokens for r in readings}) == 1
 
 
 @pytest.mark.parametrize(
@@ -153,11 +145,10 @@ async def test_every_wire_format_plants(client, driving_prompt, wire):
 
 
 async def test_the_models_are_listed_and_nothing_else_is_there(client):
-    listed = await client.get("/v1/models")
-    (model,) = listed.json()["data"]
-    assert (listed.json()["object"], model["id"], model["object"]) == (
-        "list", "scripted-driver", "model"
-    )  # fmt: skip
+    listed = (await client.get("/v1/models")).json()
+    (model,) = listed["data"]
+    assert (listed["object"], model["object"]) == ("list", "model")
+    assert model["id"] == "scripted-driver"
     for path in ("/nothing", "/v1/chat/completions"):
         missing = await client.get(path)
         assert (missing.status_code, missing.headers[SCRIPTED_HEADER]) == (404, "true")
