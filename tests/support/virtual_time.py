@@ -7,6 +7,7 @@ import functools
 import types
 from unittest import mock
 
+import pytest
 from asyncio_throttle import throttler
 
 # Loopback delivers at once, but maybe by another thread of the kernel.
@@ -14,21 +15,18 @@ PATIENCE_S = 0.002
 DAY_S = 86400
 
 
-class VirtualTimeLoop(asyncio.SelectorEventLoop):
-    """Its clock jumps to the next timer when no socket is ready and no thread works for it."""
+class VirtualTime:
+    """A loop's clock: it jumps to the next timer when no socket is ready and no thread works."""
 
-    def __init__(self):
-        self._now_s = 0.0
-        self._working = 0
-        super().__init__()
-        self._wait_for_sockets = self._selector.select
-        self._selector.select = self._select
+    def __init__(self, loop):
+        self.now_s, self._working = 0.0, 0
+        self._sockets, self._wait_for_sockets = loop._selector, loop._selector.select
+        self._run_in_executor = loop.run_in_executor
+        loop.time, loop.run_in_executor = lambda: self.now_s, self._work
+        loop._selector.select = self._select
 
-    def time(self):
-        return self._now_s
-
-    def run_in_executor(self, *args):
-        work = super().run_in_executor(*args)
+    def _work(self, *args):
+        work = self._run_in_executor(*args)
         self._working += 1
         work.add_done_callback(self._worked)
         return work
@@ -43,10 +41,10 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         if timeout is None or self._working:
             return self._wait_for_sockets(None)
         # There is always the loop's own pipe, by which threads wake it.
-        if len(self._selector.get_map()) > 1:
+        if len(self._sockets.get_map()) > 1:
             ready = self._wait_for_sockets(PATIENCE_S)
         if not ready:
-            self._now_s += timeout
+            self.now_s += timeout
         return ready
 
 
@@ -54,22 +52,41 @@ def in_virtual_time(test):
     """Run a test in virtual time; whoever would wait for ever waits for a day."""
 
     async def limited(*args, **kwargs):
+        VirtualTime(asyncio.get_running_loop())
         async with asyncio.timeout(DAY_S):
             await test(*args, **kwargs)
 
     @functools.wraps(test)
     def run(*args, **kwargs):
-        # The throttle reads the system's clock, which the clock of a plain loop is, too.
-        clock = mock.patch.object(throttler, "time", types.SimpleNamespace(monotonic=now_s))
-        with clock, asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
+        with mock.patch.object(throttler, "time", THROTTLE), asyncio.Runner() as runner:
             runner.run(limited(*args, **kwargs))
 
     return run
 
 
+@pytest.fixture
+async def virtual_time(monkeypatch):
+    """The same for a test's own loop."""
+
+    def give_up():
+        for task in asyncio.all_tasks(loop):
+            task.cancel()
+
+    loop = asyncio.get_running_loop()
+    VirtualTime(loop)
+    monkeypatch.setattr(throttler, "time", THROTTLE)
+    day = loop.call_later(DAY_S, give_up)
+    yield
+    day.cancel()
+
+
 def now_s():
     """The virtual time."""
     return asyncio.get_running_loop().time()
+
+
+# The throttle reads the system's clock, which the clock of a plain loop is, too.
+THROTTLE = types.SimpleNamespace(monotonic=now_s)
 
 
 def fullest_window(times, weights, length=60.0):

@@ -23,7 +23,9 @@ from merge_runner.llm.limiter import Limiter, Pause
 from merge_runner.records import Attempt, Usage
 from merge_runner.run.cluster import Desk, ToldLedger
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
-from tests.support.virtual_time import in_virtual_time, now_s
+from tests.support.virtual_time import now_s
+
+pytestmark = pytest.mark.usefixtures("virtual_time")
 
 
 def gemini(*texts):
@@ -42,7 +44,6 @@ def paused():
     return limiter
 
 
-@in_virtual_time
 async def test_a_second_ask_is_answered_from_the_cache(make):
     client = make(answer("first"), answer("second"))
     first, second = [await client.ask("prompt", slot()) for _ in range(2)]
@@ -57,7 +58,6 @@ async def test_a_second_ask_is_answered_from_the_cache(make):
     assert (later.meter.calls_cached, later.meter.calls_shared) == (1, 0)
 
 
-@in_virtual_time
 async def test_two_who_ask_the_same_at_once_share_one_call(make):
     client = make(answer("first"), answer("second"))
     replies = await asyncio.gather(*(client.ask("prompt", slot()) for _ in range(2)))
@@ -66,7 +66,6 @@ async def test_two_who_ask_the_same_at_once_share_one_call(make):
     assert (meter.calls_live, meter.calls_cached, meter.calls_shared) == (1, 1, 1)
 
 
-@in_virtual_time
 async def test_every_slot_is_a_sample_of_its_own(make):
     client = make(*(answer(str(number)) for number in range(20)))
     slots = [slot(repetition, side) for repetition in range(1, 11) for side in ("left", "right")]
@@ -76,7 +75,6 @@ async def test_every_slot_is_a_sample_of_its_own(make):
     assert len({request.body for request in client.transport.sent}) == 1
 
 
-@in_virtual_time
 async def test_what_is_sent_is_what_is_kept(make, cache):
     client = make(answer())
     reply = await client.ask("Où?", slot())
@@ -88,7 +86,6 @@ async def test_what_is_sent_is_what_is_kept(make, cache):
     assert reply.attempts[0].reply == client.transport.replies[0].body
 
 
-@in_virtual_time
 async def test_passing_failures_are_tried_again_and_all_attempts_are_kept(make, cache):
     client = make(
         TransportFailure("timeout", "no reply within 600 s"),
@@ -115,7 +112,6 @@ async def test_passing_failures_are_tried_again_and_all_attempts_are_kept(make, 
     assert reply.text == "M"
 
 
-@in_virtual_time
 async def test_words_that_no_file_can_hold_lose_no_reply(make, cache):
     """JSON can spell half a surrogate pair; a file cannot."""
     odd = json.dumps({"error": {"message": "\ud800"}, "model": "\udfff"})
@@ -125,7 +121,6 @@ async def test_words_that_no_file_can_hold_lose_no_reply(make, cache):
     assert cache.get(reply.request.key).attempts == reply.attempts
 
 
-@in_virtual_time
 async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
     key = (await make(answer("old")).ask("prompt", slot())).request.key
     with diskcache.Cache(str(cache.folder)) as stock:
@@ -145,7 +140,6 @@ async def test_a_damaged_reply_is_told_set_aside_and_asked_again(make, cache):
     assert (await make(answer("third")).ask("prompt", slot())).text == "new"
 
 
-@in_virtual_time
 async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, tmp_path):
     caches = [ResponseCache(tmp_path) for _ in range(2)]
     clients = [make(answer(f"from {n}"), cache=caches[n]) for n in range(2)]
@@ -157,7 +151,6 @@ async def test_two_processes_that_ask_the_same_go_on_with_the_same_reply(make, t
         own.close()
 
 
-@in_virtual_time
 async def test_two_entries_of_one_model_that_ask_the_same_make_one_call(make):
     under_way = {}
     clients = [make(answer(f"from {n}"), under_way=under_way) for n in range(2)]
@@ -166,7 +159,6 @@ async def test_two_entries_of_one_model_that_ask_the_same_make_one_call(make):
     assert replies[0].text == replies[1].text
 
 
-@in_virtual_time
 async def test_an_unknown_model_stops_at_once(make):
     client = make(error(404, code="model_not_found"))
     with pytest.raises(EndpointRefused, match="'m-1'"):
@@ -174,7 +166,6 @@ async def test_an_unknown_model_stops_at_once(make):
     assert len(client.transport.sent) == 1
 
 
-@in_virtual_time
 async def test_a_rejected_request_fails_this_call_alone(make, cache):
     client = make(error(500), error(400, "bad temperature"), answer())
     with pytest.raises(CallFailed, match="bad temperature") as caught:
@@ -197,7 +188,6 @@ async def test_a_rejected_request_fails_this_call_alone(make, cache):
         (answer(""), "empty", ""),
     ],
 )
-@in_virtual_time
 async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make, reply, outcome, text):
     client = make(reply, answer("a better one"))
     for cached in (False, True):
@@ -218,7 +208,6 @@ async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make, reply, ou
         ([gemini(), error(500), gemini(), gemini("M")], "empty server_error empty ok"),
     ],
 )
-@in_virtual_time
 async def test_an_empty_answer_of_gemini_is_asked_at_most_twice_again(make, replies, expected):
     client = make(*replies, format="gemini")
     reply = await client.ask("prompt", slot())
@@ -228,7 +217,6 @@ async def test_an_empty_answer_of_gemini_is_asked_at_most_twice_again(make, repl
 
 
 @pytest.mark.parametrize("told", [{"prompt_tokens": 0}, {}, {"prompt_tokens": "many"}], ids=str)
-@in_virtual_time
 async def test_more_output_than_there_can_be_is_paid_whatever_is_said_of_the_input(make, told):
     choice = {"message": {"content": "M"}, "finish_reason": "stop"}
     usage = {**told, "completion_tokens": 5_000_000.0}
@@ -239,7 +227,6 @@ async def test_more_output_than_there_can_be_is_paid_whatever_is_said_of_the_inp
     assert (spent.overrun_usd > 39, spent.reserved_usd) == (True, 0)
 
 
-@in_virtual_time
 async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     client = make(answer("paid for"))
     client.transport.open.clear()
@@ -256,7 +243,6 @@ async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     assert outcomes(kept.attempts) == ["ok"]
 
 
-@in_virtual_time
 async def test_one_of_two_who_gives_up_does_not_take_the_answer_from_the_other(make):
     client = make(answer("shared"))
     client.transport.open.clear()
@@ -268,7 +254,6 @@ async def test_one_of_two_who_gives_up_does_not_take_the_answer_from_the_other(m
     assert len(client.transport.sent) == 1
 
 
-@in_virtual_time
 async def test_a_call_that_nobody_waits_for_any_more_takes_neither_a_turn_nor_money(make):
     client = make(answer(), limiter=paused(), cap=1.0, price=PRICE)
     asked = await begun(client.ask("prompt", slot()))
@@ -279,7 +264,6 @@ async def test_a_call_that_nobody_waits_for_any_more_takes_neither_a_turn_nor_mo
     assert (now_s(), len(client.transport.sent)) == (300, 1)
 
 
-@in_virtual_time
 async def test_who_asks_anew_for_a_call_that_is_just_given_up_gets_an_answer(make):
     client = make(answer(), limiter=paused())
     asked = await begun(client.ask("prompt", slot()))
@@ -293,7 +277,6 @@ async def test_who_asks_anew_for_a_call_that_is_just_given_up_gets_an_answer(mak
     assert client.under_way == {}
 
 
-@in_virtual_time
 async def test_a_call_in_flight_that_nobody_waits_for_any_more_is_not_tried_again(make, cache):
     client = make(error(503), answer())
     client.transport.open.clear()
@@ -308,7 +291,6 @@ async def test_a_call_in_flight_that_nobody_waits_for_any_more_is_not_tried_agai
     assert outcomes(attempts) == ["overloaded"]
 
 
-@in_virtual_time
 async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
     client = make(answer(), price=PRICE, cap=0.0015, limiter=paused())
     asked = [await begun(client.ask("prompt", slot(n))) for n in (1, 2)]
@@ -323,7 +305,6 @@ async def test_drain_gives_up_calls_that_wait_for_their_turn(make):
         await client.ask("prompt", slot(3))
 
 
-@in_virtual_time
 @pytest.mark.parametrize("told", [False, True])
 @pytest.mark.parametrize("drains", [False, True])
 async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache, drains, told):
@@ -346,7 +327,6 @@ async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache
 
 
 @pytest.mark.parametrize("in_flight", [False, True])
-@in_virtual_time
 async def test_drain_does_not_wait_for_another_attempt(make, in_flight):
     client = make(error(503, retry_after="300"), answer())
     if in_flight:
@@ -359,7 +339,6 @@ async def test_drain_does_not_wait_for_another_attempt(make, in_flight):
     assert (len(client.transport.sent), now_s()) == (1, 0)
 
 
-@in_virtual_time
 async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, tmp_path):
     own = ResponseCache(tmp_path)
     client = make(answer("paid for"), cache=own)
@@ -372,7 +351,6 @@ async def test_drain_does_not_lose_an_answer_that_is_just_being_saved(make, tmp_
     own.close()
 
 
-@in_virtual_time
 async def test_a_call_knows_itself_whether_it_is_in_flight(make):
     """A cluster's worker takes its meter away twice a second; that gives no call up."""
     client = make(error(503, retry_after="300"), answer("paid for"))
@@ -394,7 +372,6 @@ async def test_a_call_knows_itself_whether_it_is_in_flight(make):
 @pytest.mark.parametrize(
     ("served", "mismatches"), [("m-1", {}), ("m", {}), ("m-2", {"m-1 -> m-2": 1}), (None, {})]
 )
-@in_virtual_time
 async def test_a_model_that_was_not_asked_for_is_counted(make, served, mismatches):
     client = make(answer(model=served), aliases=("m",))
     reply = await client.ask("prompt", slot())
@@ -402,7 +379,6 @@ async def test_a_model_that_was_not_asked_for_is_counted(make, served, mismatche
     assert client.meter.mismatches == mismatches
 
 
-@in_virtual_time
 async def test_what_an_attempt_costs_comes_from_its_tokens(make):
     client = make(error(500), answer(usage=(1000, 500)), answer(usage=None), price=PRICE)
     reply = await client.ask("prompt", slot())
@@ -411,7 +387,6 @@ async def test_what_an_attempt_costs_comes_from_its_tokens(make):
     assert client.meter.cost_usd == pytest.approx(0.006)
 
 
-@in_virtual_time
 async def test_a_price_that_nobody_knows_is_counted_and_not_guessed(make):
     client = make(answer(), id="no-such-model", price="genai-prices")
     assert (await client.ask("prompt", slot())).attempts[0].cost_usd is None
@@ -423,7 +398,6 @@ def worst_case_usd(client):
     return len(client.transport.sent[0].body.encode()) * 2e-6 + 100 * 8e-6
 
 
-@in_virtual_time
 async def test_no_call_is_made_that_could_pass_the_cap(make):
     client = make(answer(usage=(10, 5)), price=PRICE)
     await client.ask("prompt", slot())
@@ -437,7 +411,6 @@ async def test_no_call_is_made_that_could_pass_the_cap(make):
     assert too_little.transport.sent == []
 
 
-@in_virtual_time
 async def test_calls_in_flight_are_waited_for_and_their_actual_cost_counts(make):
     client = make(answer(usage=(10, 5)), price=PRICE, cap=0.0015)
     await asyncio.gather(*(client.ask("prompt", slot(n)) for n in range(1, 6)))
@@ -445,7 +418,6 @@ async def test_calls_in_flight_are_waited_for_and_their_actual_cost_counts(make)
     assert worst_case_usd(client) * 2 > 0.0015
 
 
-@in_virtual_time
 async def test_a_call_above_the_token_limit_gives_its_money_back(make):
     client = make(answer(), price=PRICE, cap=0.0015, limiter=Limiter(tpm=50))
     for repetition in (1, 2):
@@ -461,7 +433,6 @@ async def test_a_call_above_the_token_limit_gives_its_money_back(make):
         (error(500), False),
     ],
 )
-@in_virtual_time
 async def test_an_attempt_that_is_refused_or_never_sent_is_not_charged(make, failure, charged):
     client = make(failure, answer(), price=PRICE, cap=0.0015)
     if not charged:
@@ -472,7 +443,6 @@ async def test_an_attempt_that_is_refused_or_never_sent_is_not_charged(make, fai
     assert len(client.transport.sent) == 1
 
 
-@in_virtual_time
 async def test_a_rate_limit_makes_all_calls_of_the_key_wait(make):
     shared = Pause()
     client = make(error(429, retry_after="30"), answer(), limiter=Limiter(pause=shared))
@@ -483,7 +453,6 @@ async def test_a_rate_limit_makes_all_calls_of_the_key_wait(make):
     assert other.transport.times == [30]
 
 
-@in_virtual_time
 async def test_a_rate_limit_without_a_delay_makes_all_calls_wait_as_long_as_its_own(make):
     client = make(error(429), error(429), error(429), answer())
     asked = [await begun(client.ask("prompt", slot(n))) for n in (1, 2)]
@@ -492,7 +461,6 @@ async def test_a_rate_limit_without_a_delay_makes_all_calls_wait_as_long_as_its_
     assert client.transport.times[1] >= 0.5
 
 
-@in_virtual_time
 async def test_a_failing_server_makes_only_its_own_call_wait(make):
     client = make(error(503, retry_after="30"), answer())
     first = await begun(client.ask("prompt", slot()))
@@ -504,7 +472,6 @@ async def test_a_failing_server_makes_only_its_own_call_wait(make):
     ("status", "raised", "words"),
     [(503, CallFailed, "come back tomorrow"), (429, QuotaExhausted, "86400 s.*come back tomorrow")],
 )
-@in_virtual_time
 async def test_a_limit_longer_than_the_deadline_ends_the_run_and_an_outage_its_call(
     make, status, raised, words
 ):
@@ -514,7 +481,6 @@ async def test_a_limit_longer_than_the_deadline_ends_the_run_and_an_outage_its_c
     assert (len(client.transport.sent), now_s()) == (1, 0)
 
 
-@in_virtual_time
 async def test_a_sealed_replay_misses_what_is_not_recorded(make):
     await make(answer("recorded")).ask("prompt", slot())
     client = make(answer("another"))
@@ -540,7 +506,6 @@ async def test_an_answer_that_an_earlier_version_kept_is_read_by_the_rules_of_no
     assert reply.attempts[-1].usage == Usage(10, output_tokens=5), "it was kept without"
 
 
-@in_virtual_time
 async def test_the_actual_tokens_take_the_place_of_the_estimate(make):
     """The estimate is the whole cap; the tokens that a reply tells free the rest at once."""
     client = make(answer(usage=(10, 5)), limiter=Limiter(tpm=200))
@@ -549,14 +514,12 @@ async def test_the_actual_tokens_take_the_place_of_the_estimate(make):
     assert client.transport.times == [0, 0, 0]
 
 
-@in_virtual_time
 async def test_the_call_with_the_lowest_order_is_sent_first(make):
     client = make(answer(), limiter=paused())
     await asyncio.gather(*(client.ask("prompt", slot(n + 1), order=n) for n in (3, 1, 2, 0)))
     assert [request.slot.repetition for request in client.transport.sent] == [1, 2, 3, 4]
 
 
-@in_virtual_time
 async def test_a_dearer_service_tier_is_kept_priced_where_its_price_is_known_and_else_counted(
     make,
 ):
@@ -572,7 +535,6 @@ async def test_a_dearer_service_tier_is_kept_priced_where_its_price_is_known_and
     assert not tiered.meter.underpriced
 
 
-@in_virtual_time
 async def test_the_worst_case_of_a_dearer_tier_that_is_asked_for_is_its_own(make):
     price = PRICE.model_copy(update={"tiers": {"priority": 2.0}})
     worst = []

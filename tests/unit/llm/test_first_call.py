@@ -9,8 +9,9 @@ from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import TransportFailure
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
-from tests.support.virtual_time import in_virtual_time, now_s
+from tests.support.virtual_time import now_s
 
+pytestmark = pytest.mark.usefixtures("virtual_time")
 WEB_PAGE = raw("\n<!DOCTYPE html><html>Welcome</html>")
 PROXY_407 = TransportFailure("proxy_refused", "the proxy says 407", sent=False, action="refused")
 REFUSED = TransportFailure("no_connection", "refused", sent=False)
@@ -34,7 +35,6 @@ def ask_all(client, number=5):
     return [asyncio.create_task(client.ask("prompt", slot(n))) for n in range(1, number + 1)]
 
 
-@in_virtual_time
 async def test_the_others_wait_until_the_first_call_is_answered(begin):
     client = begin(answer())
     client.transport.open.clear()
@@ -48,7 +48,6 @@ async def test_the_others_wait_until_the_first_call_is_answered(begin):
     assert set(client.transport.times) == {0}, "they then go at once"
 
 
-@in_virtual_time
 async def test_what_passes_is_tried_again_by_one_call_alone(begin):
     client = begin(error(503), error(429), TransportFailure("timeout", "no reply"), answer())
     await asyncio.gather(*ask_all(client))
@@ -74,7 +73,6 @@ async def test_what_passes_is_tried_again_by_one_call_alone(begin):
         (PROXY_407, r"HTTPS_PROXY.*nothing was sent.*\(the proxy says 407\)"),
     ],
 )
-@in_virtual_time
 async def test_a_wrong_configuration_is_told_by_one_call(begin, reply, advice):
     client = begin(reply)
     tasks = ask_all(client)
@@ -105,7 +103,6 @@ async def test_a_wrong_configuration_is_told_by_one_call(begin, reply, advice):
         ),
     ],
 )
-@in_virtual_time
 async def test_what_may_pass_is_told_after_three_of_them_within_seconds(begin, reply, advice):
     client = begin(reply)
     with pytest.raises(EndpointRefused, match=advice):
@@ -117,7 +114,6 @@ async def test_what_may_pass_is_told_after_three_of_them_within_seconds(begin, r
 
 
 @pytest.mark.parametrize("body", ["data: {}", "<html>", "", {"status": "up"}, {"error": "m"}])
-@in_virtual_time
 async def test_in_the_midst_of_a_run_what_is_not_understood_is_asked_again(begin, body):
     client = begin(answer(), *[raw(body)] * 4, answer())
     await client.ask("prompt", slot())
@@ -125,7 +121,6 @@ async def test_in_the_midst_of_a_run_what_is_not_understood_is_asked_again(begin
     assert len(client.transport.sent) == 6
 
 
-@in_virtual_time
 async def test_an_endpoint_that_has_answered_before_is_given_three_tries_and_may_think_alone(begin):
     client = begin(raw("data: {}", content_type="text/event-stream"), known=True)
     with pytest.raises(EndpointRefused, match="SSE"):
@@ -135,7 +130,6 @@ async def test_an_endpoint_that_has_answered_before_is_given_three_tries_and_may
     assert (await client.ask("prompt", slot())).outcome == "empty"
 
 
-@in_virtual_time
 async def test_a_first_call_that_waits_says_so_once_with_what_came_last_and_until_when(begin):
     client = begin(*[error(503, "warming up")] * 5, answer(), deadline_s=600)
     await client.ask("prompt", slot())
@@ -154,7 +148,6 @@ async def test_a_first_call_that_waits_says_so_once_with_what_came_last_and_unti
     assert len(silent.meter.notes) == 1
 
 
-@in_virtual_time
 async def test_where_nobody_listens_the_run_ends_within_seconds(begin):
     client = begin(REFUSED)
     with pytest.raises(ProviderDown, match=r"refused: check the network, or set OPENAI_BASE_URL"):
@@ -162,7 +155,6 @@ async def test_where_nobody_listens_the_run_ends_within_seconds(begin):
     assert 5 <= now_s() < 12
 
 
-@in_virtual_time
 async def test_a_server_that_has_answered_is_waited_for_as_long_as_a_call_may_take(begin):
     client = begin(answer(), *[REFUSED] * 9, answer())
     assert (await client.ask("prompt", slot())).outcome == "ok"
@@ -170,13 +162,11 @@ async def test_a_server_that_has_answered_is_waited_for_as_long_as_a_call_may_ta
     assert now_s() > 60
 
 
-@in_virtual_time
 async def test_a_server_that_just_starts_is_waited_for(begin):
     client = begin(REFUSED, REFUSED, answer())
     assert (await client.ask("prompt", slot())).outcome == "ok"
 
 
-@in_virtual_time
 async def test_no_answer_to_the_first_call_within_its_deadline_ends_the_run(begin):
     client = begin(error(503, "down"), deadline_s=60)
     tasks = ask_all(client)
@@ -190,7 +180,6 @@ async def test_no_answer_to_the_first_call_within_its_deadline_ends_the_run(begi
     assert len(client.transport.sent) == sent
 
 
-@in_virtual_time
 async def test_a_prompt_that_is_refused_for_its_content_fails_alone(begin):
     flagged = raw({"error": {"message": "flagged", "code": "invalid_prompt"}}, 400)
     client = begin(flagged, answer())
@@ -200,7 +189,6 @@ async def test_a_prompt_that_is_refused_for_its_content_fails_alone(begin):
     assert [reply.outcome for reply in others] == ["ok", "ok"]
 
 
-@in_virtual_time
 async def test_an_answer_that_is_recorded_needs_no_first_call(begin):
     await begin(answer()).ask("prompt", slot())
     client = begin(error(401))
@@ -208,7 +196,6 @@ async def test_an_answer_that_is_recorded_needs_no_first_call(begin):
     assert client.transport.sent == []
 
 
-@in_virtual_time
 async def test_a_first_call_that_is_given_up_lets_the_next_one_go(begin):
     client = begin(answer())
     client.transport.open.clear()
@@ -221,7 +208,6 @@ async def test_a_first_call_that_is_given_up_lets_the_next_one_go(begin):
     await asyncio.gather(*asked, return_exceptions=True)
 
 
-@in_virtual_time
 async def test_a_web_page_is_free_where_no_model_ever_answered_and_may_be_charged_elsewhere(begin):
     for free in (WEB_PAGE, PROXY_407):
         stray = begin(free, price=PRICE, cap=1.0)
@@ -233,7 +219,6 @@ async def test_a_web_page_is_free_where_no_model_ever_answered_and_may_be_charge
     assert gateway.budget.ledger.read().open_attempts == 1
 
 
-@in_virtual_time
 async def test_where_a_model_has_answered_before_one_refused_prompt_does_not_end_every_run(begin):
     client = begin(error(400), error(400), answer(), known=True)
     first, second, *others = await asyncio.gather(*ask_all(client), return_exceptions=True)

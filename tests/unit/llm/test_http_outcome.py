@@ -17,7 +17,7 @@ from merge_runner.llm.http_outcome import (
     server_delay_s,
     why_refused,
 )
-from tests.support.cases import by_format, cases
+from tests.support.cases import by_format, cases, table
 
 
 def judged(wire, status, body, headers=None):
@@ -47,23 +47,12 @@ def openrouter(message, **within):
     return {"error": {"code": 429, "message": message, "metadata": {"headers": within}}}
 
 
-@pytest.mark.parametrize(
-    ("headers", "within", "delay_s"),
-    [
-        ({"x-ratelimit-reset": "60"}, {}, 60),
-        ({"x-ratelimit-reset": "60", "x-ratelimit-remaining": "0"}, {}, 60),
-        ({"x-ratelimit-reset": "60", "x-ratelimit-remaining": "7"}, {}, None),
-        ({"x-ratelimit-reset": "soon"}, {}, None),
-        ({"x-ratelimit-reset": "60", "retry-after": "3"}, {}, 3),
-        ({}, {"X-RateLimit-Reset": str(1_800_000_030_000), "X-RateLimit-Remaining": "0"}, 30),
-        ({}, {"X-RateLimit-Reset": str(1_800_000_030)}, 30),
-        ({}, {"X-RateLimit-Reset": str(1_700_000_000)}, None),
-    ],
-)
-def test_the_reset_of_a_used_up_limit_is_a_delay(headers, within, delay_s):
-    error = RawReply(429, headers, json.dumps(openrouter("Rate limit exceeded", **within))).error
+@pytest.mark.parametrize("case", cases("http_outcomes", "resets"))
+def test_the_reset_of_a_used_up_limit_is_a_delay(case):
+    body = json.dumps(openrouter("Rate limit exceeded", **case.get("within", {})))
+    error = RawReply(429, case.get("headers", {}), body).error
     now = datetime.fromtimestamp(1_800_000_000, UTC)
-    assert server_delay_s(error, FORMATS["openai-chat"], now) == delay_s
+    assert server_delay_s(error, FORMATS["openai-chat"], now) == case.get("delay_s")
 
 
 def test_a_quota_of_a_day_says_when_it_opens_again_unless_that_is_not_known():
@@ -99,39 +88,10 @@ def test_what_no_call_of_a_run_would_fare_better_with(case):
         assert "\n" not in why_refused(reason, "local", entry, outcome)
 
 
-@pytest.mark.parametrize(
-    ("url", "reason"),
-    [
-        ("http://localhost/v1/v1/messages", "path_twice"),
-        ("http://localhost/x/v1beta/v1beta/models/m:generateContent", "path_twice"),
-        ("http://localhost/v1/chat/completions/chat/completions", "path_twice"),
-        ("http://localhost/v1/messages", "unknown_model"),
-        ("http://localhost/v1/v1beta/messages", "unknown_model"),
-        ("anthropic/v1/messages", "unknown_model"),
-    ],
-)
+@pytest.mark.parametrize(("url", "reason"), table("http_outcomes", "urls").items())
 def test_a_path_that_stands_twice_in_a_url_is_no_unknown_model(url, reason):
     body = {"type": "error", "error": {"type": "not_found_error", "message": "m"}}
     assert reason_of(judged("anthropic", 404, body), url) == reason
-
-
-PARTS = [{"type": "thinking", "thinking": [{"type": "text", "text": "M"}]}]
-
-
-@pytest.mark.parametrize(
-    ("message", "finish", "reason"),
-    [
-        ({"content": None, "reasoning_content": "M\nI go first."}, "stop", "reasoning_alone"),
-        ({"content": None, "reasoning": "M\nI go first."}, "stop", "reasoning_alone"),
-        ({"content": PARTS}, "stop", "reasoning_alone"),
-        ({"content": None, "reasoning": "M\nI go first."}, "length", None),
-        ({"content": ""}, "stop", None),
-        ({"content": "<think>M</think>"}, "stop", None),
-    ],
-)
-def test_an_answer_that_is_nothing_but_reasoning_is_told(message, finish, reason):
-    body = {"choices": [{"message": message, "finish_reason": finish}]}
-    assert reason_of(judged("openai-chat", 200, body), "") == reason
 
 
 @pytest.mark.parametrize("word", ["abort", "network_error", "insufficient_system_resource"])
@@ -148,21 +108,9 @@ def test_a_body_that_is_nested_too_deep_is_no_json(status, outcome):
     assert (found.action, found.name) == ("retry", outcome)
 
 
-@pytest.mark.parametrize(
-    ("body", "message"),
-    [
-        ({"error": {"message": "the words", "type": "t"}}, "the words"),
-        ({"error": {"message": "the words\n* in  lines\n"}}, "the words * in lines"),
-        ([{"error": {"message": "the words"}}], "the words"),
-        ({"error": "the words"}, "the words"),
-        ({"message": "the words", "object": "error"}, "the words"),
-        ("some\n  text\twithout JSON", "some text without JSON"),
-        ("x" * 1000, "x" * 200),
-        ("", "no reason is given"),
-    ],
-)
-def test_the_servers_words_are_the_message(body, message):
-    assert judged("openai-chat", 400, body).message == f"HTTP 400: {message}"
+@pytest.mark.parametrize("case", cases("http_outcomes", "words"))
+def test_the_servers_words_are_the_message(case):
+    assert judged("openai-chat", 400, case["body"]).message == f"HTTP 400: {case['says']}"
 
 
 def test_what_was_read_of_a_failed_answer_is_kept():
@@ -217,23 +165,12 @@ class Stubborn(WireFormat):
         return 11.0 if "soon" in error.names else None
 
 
-@pytest.mark.parametrize(
-    ("status", "code", "headers", "name", "delay_s"),
-    [
-        (429, "insufficient_quota", {}, "request_too_large", None),
-        (503, "soon", {}, "overloaded", 11),
-        (503, "soon", {"retry-after": "13"}, "overloaded", 13),
-        # What only another format knows, as a gateway may pass it on.
-        (400, "model_not_found", {}, "unknown_model", None),
-        (429, "enforced_spend_limit_reached", {}, "quota_exhausted", None),
-    ],
-)
-def test_a_formats_own_word_on_an_error_goes_before_that_of_others(
-    status, code, headers, name, delay_s
-):
-    body = {"error": {"message": "m", "type": "invalid_request_error", "code": code}}
-    found = judge(RawReply(status, headers, json.dumps(body)), Stubborn())
-    assert (found.name, found.delay_s) == (name, delay_s)
+@pytest.mark.parametrize("case", cases("http_outcomes", "own_word"))
+def test_a_formats_own_word_on_an_error_goes_before_that_of_others(case):
+    body = {"error": {"message": "m", "type": "invalid_request_error", "code": case["code"]}}
+    reply = RawReply(case["status"], case.get("headers", {}), json.dumps(body))
+    found = judge(reply, Stubborn())
+    assert (found.name, found.delay_s) == (case["is"], case.get("delay_s"))
 
 
 @pytest.mark.parametrize("case", cases("http_outcomes", "charged"))
@@ -257,15 +194,6 @@ def test_usage_in_an_error_is_read_in_every_format(status, wire, told):
     assert (usage.input_tokens, usage.output_tokens) == (7, 9)
 
 
-@pytest.mark.parametrize(
-    ("body", "page"),
-    [
-        ("<!DOCTYPE html><p>", True),
-        ("\ufeff\n <HTML lang=en>", True),
-        ('{"html": "<html>"}', False),
-        ("<hr>", False),
-        ("", False),
-    ],
-)
-def test_a_web_page_is_told_from_all_else(body, page):
-    assert RawReply(200, {}, body).is_web_page == page
+def test_a_web_page_is_told_from_all_else():
+    pages = ("<!DOCTYPE html><p>", "\ufeff\n <HTML lang=en>", '{"html": "<html>"}', "<hr>", "")
+    assert [RawReply(200, {}, body).is_web_page for body in pages] == [True, True, *[False] * 3]

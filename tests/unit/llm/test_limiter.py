@@ -10,6 +10,7 @@ from merge_runner.llm.limiter import Limiter, Pause
 from tests.support.clients import ticks
 from tests.support.virtual_time import fullest_window, in_virtual_time, now_s
 
+pytestmark = pytest.mark.usefixtures("virtual_time")
 MINUTE = 60.0
 
 
@@ -48,13 +49,11 @@ async def served(limiter, count=1, tokens=0):
     return queue.times
 
 
-@in_virtual_time
 async def test_no_limits_pass_everybody_at_once():
     assert await served(Limiter(), 50, tokens=10**9) == [0.0] * 50
 
 
 @pytest.mark.parametrize("limits", [{}, {"rpm": 600}, {"tpm": 100}], ids=str)
-@in_virtual_time
 async def test_the_lowest_order_goes_first_and_within_it_the_first_come(limits):
     limiter = Limiter(**limits)
     limiter.pause(1)
@@ -67,7 +66,6 @@ async def test_the_lowest_order_goes_first_and_within_it_the_first_come(limits):
     assert queue.names == sorted(queue.names)
 
 
-@in_virtual_time
 async def test_a_late_arrival_of_an_older_trial_goes_first():
     queue = Queue(Limiter(rpm=1))
     for name in ("first", "second", "third"):
@@ -79,20 +77,17 @@ async def test_a_late_arrival_of_an_older_trial_goes_first():
 
 
 @pytest.mark.parametrize("rpm", [1, 7, 50, 245, 500])
-@in_virtual_time
 async def test_no_window_holds_more_requests_than_the_limit(rpm):
     times = await served(Limiter(rpm=rpm), int(rpm * 1.1) + 2)
     assert fullest_window(times, [1] * len(times)) <= rpm
 
 
 @pytest.mark.parametrize("rpm", [60, 500])
-@in_virtual_time
 async def test_requests_flow_evenly_and_not_a_window_at_once(rpm):
     times = await served(Limiter(rpm=rpm), rpm // 3)
     assert fullest_window(times, [1] * len(times), length=1.0) <= 2 * rpm / 60
 
 
-@in_virtual_time
 async def test_an_idle_limiter_saves_up_no_requests():
     limiter = Limiter(rpm=10)
     await served(limiter)
@@ -100,7 +95,6 @@ async def test_an_idle_limiter_saves_up_no_requests():
     assert fullest_window(await served(limiter, 30), [1] * 30) <= 10
 
 
-@in_virtual_time
 async def test_a_turn_that_a_pause_holds_up_is_not_one_too_many_after_it():
     limiter = Limiter(rpm=4)
     queue = Queue(limiter)
@@ -114,7 +108,6 @@ async def test_a_turn_that_a_pause_holds_up_is_not_one_too_many_after_it():
     assert fullest_window(queue.times, [1] * 9) <= 4
 
 
-@in_virtual_time
 async def test_short_windows_work_alike():
     times = await served(Limiter(rpm=20, tpm=100, window_s=0.3), 50, tokens=7)
     assert fullest_window(times, [1] * 50, 0.3) <= 20
@@ -134,12 +127,10 @@ async def test_no_window_holds_more_tokens_than_the_limit(asked):
     assert fullest_window(queue.times, queue.tokens) <= 100
 
 
-@in_virtual_time
 async def test_tokens_come_back_after_a_window():
     assert await served(Limiter(tpm=100), 4, tokens=50) == [0, 0, MINUTE, MINUTE]
 
 
-@in_virtual_time
 async def test_a_heavy_request_at_the_head_is_not_overtaken():
     queue = Queue(Limiter(tpm=100))
     for name, tokens in [("filling", 60), ("heavy", 100), ("light", 1), ("lighter", 0)]:
@@ -150,7 +141,6 @@ async def test_a_heavy_request_at_the_head_is_not_overtaken():
     assert queue.names == ["filling", "heavy", "light", "lighter"]
 
 
-@in_virtual_time
 async def test_settling_lower_frees_tokens_for_those_who_wait():
     queue = Queue(Limiter(tpm=100))
     settle = await queue.ask("first", 90)
@@ -162,7 +152,6 @@ async def test_settling_lower_frees_tokens_for_those_who_wait():
     assert queue.times == [0, 0]
 
 
-@in_virtual_time
 async def test_settling_higher_holds_others_back():
     queue = Queue(Limiter(tpm=100))
     (await queue.ask("first", 10))(80)
@@ -171,7 +160,6 @@ async def test_settling_higher_holds_others_back():
     assert queue.times == [0, MINUTE]
 
 
-@in_virtual_time
 async def test_settling_after_the_window_changes_nothing():
     queue = Queue(Limiter(tpm=100))
     settle = await queue.ask("first", 50)
@@ -204,7 +192,6 @@ async def test_settled_tokens_are_what_counts(asked):
     assert fullest_window(times, actual) <= 100
 
 
-@in_virtual_time
 async def test_who_has_given_up_is_skipped_and_takes_no_place():
     queue = Queue(Limiter(rpm=1))
     tasks = [queue.ask(number) for number in range(5)]
@@ -216,7 +203,6 @@ async def test_who_has_given_up_is_skipped_and_takes_no_place():
     assert queue.times[-1] < 2.1 * MINUTE
 
 
-@in_virtual_time
 async def test_who_has_given_up_holds_back_nobody_with_its_tokens():
     queue = Queue(Limiter(tpm=100))
     queue.ask("first", 90)
@@ -228,7 +214,6 @@ async def test_who_has_given_up_holds_back_nobody_with_its_tokens():
     assert queue.times == [0, 1]
 
 
-@in_virtual_time
 async def test_a_pause_holds_everybody_and_a_shorter_one_does_not_end_it():
     limiter = Limiter()
     queue = Queue(limiter)
@@ -242,7 +227,6 @@ async def test_a_pause_holds_everybody_and_a_shorter_one_does_not_end_it():
     assert queue.times == [40, 40]
 
 
-@in_virtual_time
 async def test_a_pause_is_shared_by_all_limiters_of_one_key():
     shared = Pause()
     one, other, stranger = Limiter(pause=shared), Limiter(pause=shared), Limiter()
@@ -251,7 +235,6 @@ async def test_a_pause_is_shared_by_all_limiters_of_one_key():
     assert times == [[30], [30], [0]]
 
 
-@in_virtual_time
 async def test_a_request_above_the_token_limit_is_refused_with_advice():
     limiter = Limiter(tpm=100)
     with pytest.raises(UsageError, match=r"101 tokens.*100 tokens.*--tpm"):

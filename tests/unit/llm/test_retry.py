@@ -9,8 +9,9 @@ from merge_runner.errors import CallFailed
 from merge_runner.llm.http_outcome import backoff_s
 from merge_runner.llm.limiter import Limiter
 from tests.support.clients import answer, error, slot
-from tests.support.virtual_time import in_virtual_time, now_s
+from tests.support.virtual_time import now_s
 
+pytestmark = pytest.mark.usefixtures("virtual_time")
 BUSY = error(503)
 
 
@@ -19,7 +20,6 @@ def waits(client):
     return [later - earlier for earlier, later in pairwise(client.transport.times)]
 
 
-@in_virtual_time
 async def test_waits_double_from_half_a_second_to_a_minute(make):
     client = make(*[BUSY] * 11, answer())
     await client.ask("prompt", slot())
@@ -29,14 +29,12 @@ async def test_waits_double_from_half_a_second_to_a_minute(make):
     assert backoff_s(10**9) == 60
 
 
-@in_virtual_time
 async def test_waits_differ_so_that_those_who_failed_together_do_not_return_together(make):
     clients = [make(BUSY, answer()) for _ in range(10)]
     await asyncio.gather(*(client.ask("p", slot(n)) for n, client in enumerate(clients, 1)))
     assert len({waits(client)[0] for client in clients}) > 1
 
 
-@in_virtual_time
 async def test_the_delay_that_a_server_asks_for_is_slept_and_cannot_shorten_the_backoff(make):
     asked = [error(503, retry_after=delay) for delay in ("17.5", "90", "0.001")]
     client = make(*asked, answer())
@@ -46,7 +44,6 @@ async def test_the_delay_that_a_server_asks_for_is_slept_and_cannot_shorten_the_
     assert third >= 2
 
 
-@in_virtual_time
 async def test_attempts_and_waits_count_against_the_deadline(make):
     client = make(error(503, "no room", retry_after="30"), deadline_s=100.0, timeout_s=60)
     with pytest.raises(CallFailed, match=r"no answer within 100 s.*no room") as caught:
@@ -56,7 +53,6 @@ async def test_attempts_and_waits_count_against_the_deadline(make):
     assert now_s() < 91, "a wait that would pass the deadline is not begun"
 
 
-@in_virtual_time
 async def test_the_wait_for_a_turn_does_not_count(make):
     again = error(503, retry_after="10")
     client = make(again, again, answer(), deadline_s=50.0, limiter=Limiter(rpm=1))
@@ -65,7 +61,6 @@ async def test_the_wait_for_a_turn_does_not_count(make):
     assert client.transport.timeouts == pytest.approx([50, 40, 30], abs=0.01)
 
 
-@in_virtual_time
 async def test_a_wait_that_the_deadline_does_not_allow_is_told(make):
     client = make(error(503, retry_after="3600"), deadline_s=60.0)
     with pytest.raises(CallFailed, match="asks to wait 3600 s, longer than a call"):

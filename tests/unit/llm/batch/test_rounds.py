@@ -32,6 +32,7 @@ from merge_runner.records import Slot
 from tests.support.clients import answer, error
 from tests.support.virtual_time import in_virtual_time, now_s
 
+pytestmark = pytest.mark.usefixtures("virtual_time")
 PRICE = Price(input=1.0, output=100.0, source="made up")
 # Of the tokens of an answer, in USD.
 ONE_USD = (10 * 1.0 + 5 * 100.0) / 1e6
@@ -184,7 +185,6 @@ def outcomes(reply):
     return [(attempt.outcome, attempt.batch_id) for attempt in reply.attempts]
 
 
-@in_virtual_time
 async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
     service = Memory()
     run = Run(cache, service)
@@ -202,7 +202,6 @@ async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
     assert not Run(cache, service).rounds.batches
 
 
-@in_virtual_time
 async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
     class Watching(Memory):
         async def create(self, lines, mark):
@@ -217,7 +216,6 @@ async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
     assert aside == [pytest.approx(3 * (bytes_of_one + 100 * 100.0) / 1e6 / 2)]
 
 
-@in_virtual_time
 async def test_a_line_that_failed_expired_or_is_missing_is_asked_alone_at_the_full_price(cache):
     service = Memory()
     service.fates = {2: [error(500)], 3: [error(429)], 4: [None], 5: ["missing"]}
@@ -235,7 +233,6 @@ async def test_a_line_that_failed_expired_or_is_missing_is_asked_alone_at_the_fu
     assert spending.open_attempts == 1
 
 
-@in_virtual_time
 async def test_a_request_that_is_refused_fails_its_call_alone(cache):
     service = Memory()
     service.fates = {1: [error(400, code="invalid_request_error")]}
@@ -244,7 +241,6 @@ async def test_a_request_that_is_refused_fails_its_call_alone(cache):
     assert other.text == "batched 2"
 
 
-@in_virtual_time
 async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cache):
     service = Memory()
     service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 2
@@ -259,7 +255,6 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cac
     assert not Run(cache, service).rounds.batches
 
 
-@in_virtual_time
 async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
     service = Memory()
     service.states = [BatchStatus(failure=BatchFailed("smaller", "enqueued"))]
@@ -271,7 +266,6 @@ async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves
 
 
 @pytest.mark.parametrize("named_late", [True, False])
-@in_virtual_time
 async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(cache, named_late):
     service = Memory()
     if named_late:  # the file that has them
@@ -284,7 +278,6 @@ async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(ca
     assert (run.alone.asked, service.partial) == ([], 0)
 
 
-@in_virtual_time
 async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache, monkeypatch):
     async def is_full(*_):
         raise CacheFailed("the disk is full")
@@ -318,7 +311,6 @@ async def left_behind(cache, service, repetitions=1, **options):
     return run
 
 
-@in_virtual_time
 async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_path):
     class Slow(Memory):
         async def status(self, batch_id):
@@ -337,7 +329,6 @@ async def test_two_caches_of_one_account_never_take_the_same_batch(cache, tmp_pa
         await two.end()
 
 
-@in_virtual_time
 async def test_a_creation_that_comes_into_effect_late_is_not_repeated(cache):
     class Late(Memory):
         async def create(self, lines, mark):
@@ -354,7 +345,6 @@ async def test_a_creation_that_comes_into_effect_late_is_not_repeated(cache):
     assert service.sizes == [2]
 
 
-@in_virtual_time
 async def test_a_single_line_that_finds_no_room_is_asked_alone(cache):
     service = Memory()
     service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 1000
@@ -364,7 +354,6 @@ async def test_a_single_line_that_finds_no_room_is_asked_alone(cache):
     assert len(service.creations) == 999
 
 
-@in_virtual_time
 async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
     class Down(Memory):
         async def create(self, lines, mark):
@@ -383,7 +372,6 @@ async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
     assert len(service.creations) == 1
 
 
-@in_virtual_time
 async def test_an_answer_whose_money_was_released_is_spent_and_is_no_overrun(cache):
     service = Memory()
     left = await left_behind(cache, service, cap=10)
@@ -396,7 +384,6 @@ async def test_an_answer_whose_money_was_released_is_spent_and_is_no_overrun(cac
     assert not run.client.meter.notes
 
 
-@in_virtual_time
 async def test_results_that_never_come_are_waited_for_an_hour(cache):
     class WithoutResults(Memory):
         async def results(self, paths):
@@ -411,7 +398,6 @@ async def test_results_that_never_come_are_waited_for_an_hour(cache):
     assert 3500 <= now_s() - began_s < 3800
 
 
-@in_virtual_time
 async def test_what_a_batch_answered_unreadably_stays_set_aside(cache):
     class Broken(Memory):
         async def results(self, paths):
@@ -427,7 +413,6 @@ async def test_what_a_batch_answered_unreadably_stays_set_aside(cache):
 @pytest.mark.parametrize(
     ("kind", "raised", "code"), [("quota", QuotaExhausted, 3), ("refused", EndpointRefused, 2)]
 )
-@in_virtual_time
 async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothing(
     cache, kind, raised, code
 ):
@@ -443,7 +428,6 @@ async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothin
     assert not Run(cache, service).rounds.batches
 
 
-@in_virtual_time
 async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cache):
     service = Memory()
     service.creations = [BatchFailed("again", "no", sent=False)] * 99
@@ -457,7 +441,6 @@ async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cac
     assert Ledger(cache, "test").read().open_attempts == 0
 
 
-@in_virtual_time
 async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
     service = Memory()
     service.states = [BatchFailed("again", "HTTP 503")] * 12
@@ -478,7 +461,6 @@ async def killed(run, repetitions, service):
 
 
 @pytest.mark.parametrize("step", ["before the creation", "after the creation", "while it waits"])
-@in_virtual_time
 async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice(cache, step):
     service = Memory()
     service.step = step
@@ -508,7 +490,6 @@ class SetBack(datetime):
         return datetime.now(tz) - timedelta(hours=cls.hours)
 
 
-@in_virtual_time
 async def test_of_a_failed_batch_and_its_smaller_ones_the_smaller_are_taken_up_whatever_the_clock(
     cache, monkeypatch
 ):
@@ -530,7 +511,6 @@ async def test_of_a_failed_batch_and_its_smaller_ones_the_smaller_are_taken_up_w
 
 
 @pytest.mark.parametrize("dies", [False, True])
-@in_virtual_time
 async def test_a_batch_that_may_have_been_created_where_it_takes_no_mark_is_asked_alone(
     cache, dies
 ):
@@ -549,7 +529,6 @@ async def test_a_batch_that_may_have_been_created_where_it_takes_no_mark_is_aske
     assert service.sizes == [2, 2]  # the next round is a batch again
 
 
-@in_virtual_time
 async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache):
     service = Memory()
     await left_behind(cache, service, repetitions=2)
@@ -558,7 +537,6 @@ async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache):
     assert later.alone.asked == [3]
 
 
-@in_virtual_time
 async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache):
     service = Memory()
     first = await left_behind(cache, service, repetitions=2, scope="first")
@@ -569,7 +547,6 @@ async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache):
     assert second.ledger.read().spent_usd == 0.0
 
 
-@in_virtual_time
 async def test_a_batch_that_is_gone_stops_the_run_unless_it_asks_singly(cache):
     service = Memory()
     await left_behind(cache, service)
@@ -584,7 +561,6 @@ async def test_a_batch_that_is_gone_stops_the_run_unless_it_asks_singly(cache):
 
 
 @pytest.mark.parametrize("kind", ["refused", "quota"])
-@in_virtual_time
 async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind):
     service = Memory()
     await left_behind(cache, service)
@@ -598,7 +574,6 @@ async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind)
     assert outcomes(reply) == [("ok", "batch-0")]
 
 
-@in_virtual_time
 async def test_under_a_cap_a_round_takes_what_fits_and_the_next_ones_the_rest(cache):
     service = Memory()
     run = Run(cache, service, cap=0.06)
