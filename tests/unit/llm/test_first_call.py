@@ -8,6 +8,7 @@ import pytest
 from merge_runner.errors import CallFailed, EndpointRefused, ProviderDown
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.llm.http_outcome import TransportFailure
+from tests.support.cases import cases
 from tests.support.clients import PRICE, answer, begun, error, raw, slot, ticks
 from tests.support.virtual_time import now_s
 
@@ -29,6 +30,12 @@ def cache(tmp_path):
 def begin(make):
     """A client whose run begins."""
     return partial(make, passed=False)
+
+
+def reply_of(case):
+    if "failure" in case:
+        return TransportFailure(**case["failure"])
+    return raw(case["body"], case.get("status", 200), **case.get("headers", {}))
 
 
 def ask_all(client, number=5):
@@ -56,56 +63,22 @@ async def test_what_passes_is_tried_again_by_one_call_alone(begin):
     assert first_three == sorted(set(first_three)), "one at a time"
 
 
-@pytest.mark.parametrize(
-    ("reply", "advice"),
-    [
-        (error(401), "set OPENAI_API_KEY to a valid one"),
-        (error(404), "see `merge-runner models`"),
-        (raw({"error": {"message": "m", "param": "temperature"}}, 400), r"look at \[my-model\] in"),
-        (error(400, "max_tokens is too large"), r"look at \[my-model\] in"),
-        (error(405), "set OPENAI_BASE_URL"),
-        (raw("moved", 301), "set OPENAI_BASE_URL"),
-        (WEB_PAGE, "does not speak openai-chat"),
-        (raw({"status": "up"}), "does not speak openai-chat"),
-        (raw("data: {}", content_type="text/event-stream"), r"events \(SSE\).*text/event-stream"),
-        (raw("\ufffd", content_encoding="br"), r"Content-Encoding \(br\) that cannot be read"),
-        (answer(None, reasoning_content="M"), "lies in `reasoning_content`.*enable_thinking"),
-        (PROXY_407, r"HTTPS_PROXY.*nothing was sent.*\(the proxy says 407\)"),
-    ],
-)
-async def test_a_wrong_configuration_is_told_by_one_call(begin, reply, advice):
-    client = begin(reply)
+@pytest.mark.parametrize("case", cases("refusals", "at_once"))
+async def test_a_wrong_configuration_is_told_by_one_call(begin, case):
+    client = begin(reply_of(case))
     tasks = ask_all(client)
-    with pytest.raises(EndpointRefused, match=advice) as caught:
+    with pytest.raises(EndpointRefused, match=case["told"]) as caught:
         await tasks[0]
     await client.drain()
-    assert len(client.transport.sent) == 1
-    assert "\n" not in str(caught.value)
-    assert all(
-        isinstance(result, BaseException)
-        for result in await asyncio.gather(*tasks, return_exceptions=True)
-    )
+    assert (len(client.transport.sent), "\n" in str(caught.value)) == (1, False)
+    results = await asyncio.gather(*tasks, return_exceptions=True)
+    assert all(isinstance(result, BaseException) for result in results)
 
 
-@pytest.mark.parametrize(
-    ("reply", "advice"),
-    [
-        (raw({"error": "Unexpected endpoint (POST /x)"}), "set OPENAI_BASE_URL.*Unexpected endp"),
-        (raw(""), "set OPENAI_BASE_URL.*an empty body"),
-        (raw('{"choices": ['), "does not speak openai-chat"),
-        (
-            TransportFailure("connection_lost", "Got more than 9", reason="unreadable_reply"),
-            "64 KiB.*Got more than 9",
-        ),
-        (
-            TransportFailure("proxy_refused", "HTTP 503", sent=False, reason="proxy_refused"),
-            "HTTPS_PROXY.*HTTP 503",
-        ),
-    ],
-)
-async def test_what_may_pass_is_told_after_three_of_them_within_seconds(begin, reply, advice):
-    client = begin(reply)
-    with pytest.raises(EndpointRefused, match=advice):
+@pytest.mark.parametrize("case", cases("refusals", "after_three"))
+async def test_what_may_pass_is_told_after_three_of_them_within_seconds(begin, case):
+    client, reply = begin(reply_of(case)), reply_of(case)
+    with pytest.raises(EndpointRefused, match=case["told"]):
         await client.ask("prompt", slot())
     assert len(client.transport.sent) == 3
     assert now_s() < 5

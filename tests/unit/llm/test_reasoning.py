@@ -1,6 +1,7 @@
 """Reasoning within a reply's text: kept apart from the answer, and never read as one."""
 
 import json
+import re
 
 import pytest
 from hypothesis import given, settings
@@ -10,7 +11,7 @@ from merge_runner.llm.formats import FORMATS, reasoning_of
 from merge_runner.llm.http_outcome import RawReply, judge
 from merge_runner.llm.reasoning import split_reasoning
 from merge_runner.prompts.parse import parse_reply
-from tests.support.cases import by_format
+from tests.support.cases import by_format, cases
 
 ANSWER = f"M\nI am ahead.\n```python\n{[0.1] * 20}\n```"
 OTHER = f"Brake? ```python\n{[-0.9] * 20}\n``` No."
@@ -24,6 +25,13 @@ HARMONY = (
     "<|channel|>analysis<|message|>",
     "<|end|><|start|>assistant<|channel|>final<|message|>",
 )
+
+
+def filled(text):
+    """The text of a case."""
+    words = {"ANSWER": ANSWER, "OTHER": OTHER, "REST": ANSWER[2:]}
+    words |= {"GO": str([0.1] * 20), "BRAKE": str([-0.9] * 20)}
+    return re.sub("|".join(words), lambda match: words[match[0]], text)
 
 
 def body(wire, text, finish=None):
@@ -66,54 +74,17 @@ def test_a_reply_that_ends_within_its_reasoning_is_truncated(wire, opening, clos
     assert judged(wire, body(wire, again))[:2] == ("truncated", "")
 
 
-@pytest.mark.parametrize(
-    ("text", "answer"),
-    [
-        # Chat templates write the opening tag themselves.
-        (f"{OTHER}\n</think>\n\n{ANSWER}", ANSWER),
-        (f"{OTHER}</think>{ANSWER}", ANSWER),
-        (f"{OTHER} </think>\n{ANSWER}", ANSWER),
-        (f"{OTHER}\n</think> {ANSWER}", ANSWER),
-        (f"{OTHER}<|end|><|start|>assistant<|channel|>final<|message|>{ANSWER}", ANSWER),
-        # The last one counts.
-        (f"<think>a</think>\nb\n</think>\n{ANSWER}", ANSWER),
-        (f"<think>a</think><reasoning>{OTHER}</reasoning>{ANSWER}", ANSWER),
-        # In quotes it is a mention, on both sides of the answer's begin.
-        (f"<think>I close with `</think>`. {OTHER}</think>{ANSWER}", ANSWER),
-        (f"<think>{OTHER}</think>{ANSWER}\nI left '</think>' out.", f"{ANSWER}\nI left '</think>'"),
-        # A fence is no quotation mark.
-        (f"<think>```\n{[-0.9] * 20}\n```</think>```python\n{[0.1] * 20}\n```", "```python"),
-        # Harmony: other channels, constraints, marks of the end, and none of them at all.
-        (f"<|start|>assistant{HARMONY[0]}a{HARMONY[1]}{ANSWER}<|return|>", ANSWER),
-        (f"<|channel|>commentary<|message|>{OTHER}{HARMONY[1]}{ANSWER}<|end|>", ANSWER),
-        (f"<|channel|>final <|constrain|>json<|message|>{ANSWER}", ANSWER),
-        (f"<|channel|>final<|message|>{ANSWER}<|end|><|start|>assistant{HARMONY[0]}a", ANSWER),
-        (f"analysis{OTHER}assistantfinal{ANSWER}", ANSWER),
-        # A stray tag at the end of an answer closes nothing.
-        (f"<think>{OTHER}</think>{ANSWER}\n</think>\n", ANSWER),
-    ],
-)
-def test_the_answer_is_what_follows_the_last_closing_tag(text, answer):
+@pytest.mark.parametrize("case", cases("reasoning", "answered"))
+def test_the_answer_is_what_follows_the_last_closing_tag(case):
+    text, answer = map(filled, case)
     parts = split_reasoning(text)
     assert parts.answer.strip().startswith(answer)
     assert (parts.cut, parse_reply(parts.answer, 20).plan) == (False, (0.1,) * 20)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        ANSWER,
-        f"{ANSWER}\n</think>\n",
-        f"M\nI never write `</think>` or <think>.\n{ANSWER[2:]}",
-        f"M\nI never write </think> in my replies.\n{ANSWER[2:]}",
-        f"M\nI think (</think>) that I go.\n{ANSWER[2:]}",
-        f"M\nA reply has a <|channel|> and [THINK].\n{ANSWER[2:]}",
-        f"M\n<think> is where others begin.\n{ANSWER[2:]}",
-        f"analysis: I go first.\n{ANSWER}",
-    ],
-)
-def test_a_tag_that_is_only_mentioned_eats_no_answer(text):
-    assert split_reasoning(text) == ("", text, False)
+@pytest.mark.parametrize("case", cases("reasoning", "mentioned"))
+def test_a_tag_that_is_only_mentioned_eats_no_answer(case):
+    assert split_reasoning(filled(case)) == ("", filled(case), False)
 
 
 @given(st.text() | st.text("<>/|[]\u25c1\u25b7 \nthink"))
