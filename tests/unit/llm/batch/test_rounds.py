@@ -177,6 +177,16 @@ class Run:
         await self.rounds.close()
 
 
+@pytest.fixture
+def service():
+    return Memory()
+
+
+@pytest.fixture
+def run(cache, service):
+    return Run(cache, service)
+
+
 def texts(replies):
     return [each.text for each in replies]
 
@@ -185,9 +195,7 @@ def outcomes(reply):
     return [(attempt.outcome, attempt.batch_id) for attempt in reply.attempts]
 
 
-async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache):
-    service = Memory()
-    run = Run(cache, service)
+async def test_what_is_asked_together_is_one_batch_at_half_the_price(cache, service, run):
     replies = await run.ask(20)
     assert texts(replies) == [f"batched {number}" for number in range(1, 21)]
     assert service.sizes == [20]
@@ -216,13 +224,16 @@ async def test_what_is_set_aside_for_a_batch_is_half_of_its_worst_case(cache):
     assert aside == [pytest.approx(3 * (bytes_of_one + 100 * 100.0) / 1e6 / 2)]
 
 
-async def test_a_line_that_failed_expired_or_is_missing_is_asked_alone_at_the_full_price(cache):
-    service = Memory()
+async def test_a_line_that_failed_expired_or_is_missing_is_asked_alone_at_the_full_price(
+    service, run
+):
     service.fates = {2: [error(500)], 3: [error(429)], 4: [None], 5: ["missing"]}
-    run = Run(cache, service)
-    replies = await run.ask(5)
+    service.fates[6] = [error(400, code="invalid_request_error")]
+    replies = await run.ask(6)
+    refused = replies.pop()
+    assert isinstance(refused, CallFailed)
     assert texts(replies) == ["batched 1", "alone 2", "alone 3", "alone 4", "alone 5"]
-    assert (service.sizes, sorted(run.alone.asked)) == ([5], [2, 3, 4, 5])
+    assert (service.sizes, sorted(run.alone.asked)) == ([6], [2, 3, 4, 5])
     ended = ("server_error", "rate_limited", "expired", "no_result")
     assert list(map(outcomes, replies[1:])) == [[(e, "batch-0"), ("ok", None)] for e in ended]
     # Only what has no result may have been charged.
@@ -233,18 +244,8 @@ async def test_a_line_that_failed_expired_or_is_missing_is_asked_alone_at_the_fu
     assert spending.open_attempts == 1
 
 
-async def test_a_request_that_is_refused_fails_its_call_alone(cache):
-    service = Memory()
-    service.fates = {1: [error(400, code="invalid_request_error")]}
-    refused, other = await Run(cache, service).ask(2)
-    assert isinstance(refused, CallFailed)
-    assert other.text == "batched 2"
-
-
-async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cache):
-    service = Memory()
+async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cache, service, run):
     service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 2
-    run = Run(cache, service)
     assert texts(await run.ask(8)) == [f"batched {number}" for number in range(1, 9)]
     assert sorted(service.sizes) == [2, 2, 4]
     assert len(run.said) == 1
@@ -255,10 +256,8 @@ async def test_a_batch_that_is_too_large_goes_in_halves_and_so_do_later_ones(cac
     assert not Run(cache, service).rounds.batches
 
 
-async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(cache):
-    service = Memory()
+async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves_too(service, run):
     service.states = [BatchStatus(failure=BatchFailed("smaller", "enqueued"))]
-    run = Run(cache, service)
     replies = await run.ask(4)
     assert texts(replies) == [f"batched {number}" for number in range(1, 5)]
     assert service.sizes == [4, 2, 2]
@@ -266,24 +265,24 @@ async def test_a_batch_that_fails_for_its_size_after_its_creation_goes_in_halves
 
 
 @pytest.mark.parametrize("named_late", [True, False])
-async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(cache, named_late):
-    service = Memory()
+async def test_results_that_are_fewer_than_the_provider_counts_are_read_again(
+    named_late, service, run
+):
     if named_late:  # the file that has them
         service.batches["early"] = []
         service.states = [BatchStatus(["early"], results=2)] * 2
     else:
         service.states, service.partial = [BatchStatus(["batch-0"], results=2)] * 2, 1
-    run = Run(cache, service)
     assert texts(await run.ask(2)) == ["batched 1", "batched 2"]
     assert (run.alone.asked, service.partial) == ([], 0)
 
 
-async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(cache, monkeypatch):
+async def test_what_could_not_be_kept_is_fetched_again_and_not_paid_twice(
+    cache, monkeypatch, service, run
+):
     async def is_full(*_):
         raise CacheFailed("the disk is full")
 
-    service = Memory()
-    run = Run(cache, service)
     with monkeypatch.context() as patch:
         patch.setattr(cache, "put", is_full)
         assert {type(each) for each in await run.ask(2)} == {CacheFailed}
@@ -345,10 +344,8 @@ async def test_a_creation_that_comes_into_effect_late_is_not_repeated(cache):
     assert service.sizes == [2]
 
 
-async def test_a_single_line_that_finds_no_room_is_asked_alone(cache):
-    service = Memory()
+async def test_a_single_line_that_finds_no_room_is_asked_alone(service, run):
     service.creations = [BatchFailed("smaller", "enqueued", sent=False)] * 1000
-    run = Run(cache, service)
     (reply,) = await asyncio.wait_for(run.ask(), 120)
     assert reply.text == "alone 1"
     assert len(service.creations) == 999
@@ -372,8 +369,7 @@ async def test_a_creation_under_way_is_not_repeated_once_the_run_ends(cache):
     assert len(service.creations) == 1
 
 
-async def test_an_answer_whose_money_was_released_is_spent_and_is_no_overrun(cache):
-    service = Memory()
+async def test_an_answer_whose_money_was_released_is_spent_and_is_no_overrun(cache, service):
     left = await left_behind(cache, service, cap=10)
     left.ledger.release()
     run = Run(cache, service, cap=10)
@@ -414,11 +410,9 @@ async def test_what_a_batch_answered_unreadably_stays_set_aside(cache):
     ("kind", "raised", "code"), [("quota", QuotaExhausted, 3), ("refused", EndpointRefused, 2)]
 )
 async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothing(
-    cache, kind, raised, code
+    cache, kind, raised, code, service, run
 ):
-    service = Memory()
     service.creations = [BatchFailed(kind, "no", sent=False)] * 1000
-    run = Run(cache, service)
     replies = await run.ask(3)
     assert {(type(each), each.exit_code) for each in replies} == {(raised, code)}
     assert kind == "quota" or "leave --batch out" in str(replies[0])
@@ -428,10 +422,8 @@ async def test_a_creation_that_is_refused_for_good_ends_the_run_and_costs_nothin
     assert not Run(cache, service).rounds.batches
 
 
-async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cache):
-    service = Memory()
+async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cache, service, run):
     service.creations = [BatchFailed("again", "no", sent=False)] * 99
-    run = Run(cache, service)
     assert {type(each) for each in await run.ask(3)} == {ProviderDown}
     await run.end()
     assert run.ledger.read().open_attempts == 3  # whether it was created is not known yet
@@ -441,10 +433,8 @@ async def test_where_no_batch_can_be_created_the_next_run_looks_for_it_first(cac
     assert Ledger(cache, "test").read().open_attempts == 0
 
 
-async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(cache):
-    service = Memory()
+async def test_a_provider_that_is_down_while_a_batch_waits_is_waited_for(service, run):
     service.states = [BatchFailed("again", "HTTP 503")] * 12
-    run = Run(cache, service)
     assert texts(await run.ask()) == ["batched 1"]
     assert run.said == ["m: HTTP 503; it is asked again until it answers"]
 
@@ -461,8 +451,9 @@ async def killed(run, repetitions, service):
 
 
 @pytest.mark.parametrize("step", ["before the creation", "after the creation", "while it waits"])
-async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice(cache, step):
-    service = Memory()
+async def test_a_run_that_dies_at_any_step_is_taken_up_and_nothing_is_paid_twice(
+    cache, step, service
+):
     service.step = step
     first = Run(cache, service)
     await killed(first, 5, service)
@@ -512,9 +503,8 @@ async def test_of_a_failed_batch_and_its_smaller_ones_the_smaller_are_taken_up_w
 
 @pytest.mark.parametrize("dies", [False, True])
 async def test_a_batch_that_may_have_been_created_where_it_takes_no_mark_is_asked_alone(
-    cache, dies
+    cache, dies, service
 ):
-    service = Memory()
     service.takes_mark = False
     if dies:  # before its id is noted
         service.step = "after the creation"
@@ -529,16 +519,14 @@ async def test_a_batch_that_may_have_been_created_where_it_takes_no_mark_is_aske
     assert service.sizes == [2, 2]  # the next round is a batch again
 
 
-async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache):
-    service = Memory()
+async def test_a_run_that_asks_singly_waits_for_what_is_in_a_batch(cache, service):
     await left_behind(cache, service, repetitions=2)
     later = Run(cache, service, submits=False)
     assert texts(await later.ask(3)) == ["batched 1", "batched 2", "alone 3"]
     assert later.alone.asked == [3]
 
 
-async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache):
-    service = Memory()
+async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache, service):
     first = await left_behind(cache, service, repetitions=2, scope="first")
     second = Run(cache, service, scope="second")
     assert texts(await second.ask(2)) == ["batched 1", "batched 2"]
@@ -547,8 +535,7 @@ async def test_another_sweeps_batch_is_settled_in_that_sweeps_ledger(cache):
     assert second.ledger.read().spent_usd == 0.0
 
 
-async def test_a_batch_that_is_gone_stops_the_run_unless_it_asks_singly(cache):
-    service = Memory()
+async def test_a_batch_that_is_gone_stops_the_run_unless_it_asks_singly(cache, service):
     await left_behind(cache, service)
     service.batches.clear()
     (stopped,) = await Run(cache, service).ask()
@@ -561,8 +548,7 @@ async def test_a_batch_that_is_gone_stops_the_run_unless_it_asks_singly(cache):
 
 
 @pytest.mark.parametrize("kind", ["refused", "quota"])
-async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind):
-    service = Memory()
+async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind, service):
     await left_behind(cache, service)
     for _ in range(2):
         service.states = [BatchFailed(kind, "HTTP 401", sent=False)]
@@ -574,8 +560,7 @@ async def test_a_batch_that_is_refused_to_a_key_is_never_asked_anew(cache, kind)
     assert outcomes(reply) == [("ok", "batch-0")]
 
 
-async def test_under_a_cap_a_round_takes_what_fits_and_the_next_ones_the_rest(cache):
-    service = Memory()
+async def test_under_a_cap_a_round_takes_what_fits_and_the_next_ones_the_rest(cache, service):
     run = Run(cache, service, cap=0.06)
     replies = await run.ask(20)
     assert texts(replies) == [f"batched {number}" for number in range(1, 21)]
