@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from merge_runner.errors import MergeRunnerError, RecordingError, UsageError
 from merge_runner.llm.cache import CachedCall, ResponseCache, TextDisk
 from merge_runner.records import Attempt, ChatRequest, Slot, Usage, make_request
+from tests.support.cases import cases
 from tests.support.json_values import paths, replaced
 
 
@@ -117,14 +118,6 @@ def test_an_entry_survives_its_text_form(recorded):
     assert CachedCall.from_json(recorded.to_json()) == recorded
 
 
-async def test_a_reply_is_readable_by_others_as_soon_as_put_returns(cache, folder):
-    other = ResponseCache(folder)
-    assert other.get(entry(1).request.key) is None
-    await put(cache, entry(1))
-    assert other.get(entry(1).request.key) == entry(1)
-    other.close()
-
-
 PUT_AND_DIE = """
 import asyncio, os, sys
 from pathlib import Path
@@ -142,10 +135,11 @@ def test_a_reply_outlives_a_process_that_dies_after_put(folder):
     reopened.close()
 
 
-async def test_many_concurrent_puts_are_all_kept(cache, folder):
+async def test_many_concurrent_puts_are_all_kept_and_readable_by_others(cache, folder):
     written = [entry(number, reply=said("x" * 5000)) for number in range(200)]
-    await put(cache, *written)
     other = ResponseCache(folder)
+    assert other.get(written[0].request.key) is None
+    await put(cache, *written)
     assert [other.get(each.request.key) for each in written] == written
     assert {each.request.key for each in other.entries()} == {w.request.key for w in written}
     other.close()
@@ -379,22 +373,6 @@ def test_a_folder_of_another_format_is_refused_and_left_alone(
     assert (folder / "cache.db").read_bytes() == before
 
 
-# What SQL can make of a row, and what each says of it.
-ODD_ROWS = {
-    "no UTF-8": "value = CAST(replace(CAST(value AS BLOB), x'6b6570', x'ff6570') AS TEXT)",
-    "a bit": "value = CAST(x'9b' || substr(CAST(value AS BLOB), 2) AS TEXT)",
-    "truncated in a character": "value = CAST(CAST(value AS BLOB) || x'c3' AS TEXT)",
-    "NUL": "value = CAST(substr(CAST(value AS BLOB), 1, 60) || x'00' AS TEXT)",
-    "truncated": "value = substr(value, 1, 99)",
-    "blob": "value = CAST(value AS BLOB)",
-    "integer": "value = 7",
-    "NULL": "value = NULL",
-    "mode": "mode = 9",
-    "no mode": "mode = NULL",
-    "of another call": "value = (SELECT value FROM Cache WHERE key = :other)",
-}
-
-
 def changed(folder, sql, **values):
     """Change one row behind the back of the cache."""
     with contextlib.closing(sqlite3.connect(folder / "cache.db")) as database, database:
@@ -411,7 +389,7 @@ def row_of(folder, name):
     return row
 
 
-@pytest.mark.parametrize("change", ODD_ROWS.values(), ids=ODD_ROWS)
+@pytest.mark.parametrize("change", cases("cache_rows"))
 def test_an_odd_row_is_told_set_aside_as_it_is_and_the_rest_goes_on(cache, folder, change):
     odd, good = entry(1, reply=said("kept")), entry(2, cost_usd=2)
     key = odd.request.key
@@ -456,67 +434,14 @@ def model_folder(tmp_path_factory):
     return folder
 
 
-@contextlib.contextmanager
-def copy_of(model_folder):
-    with tempfile.TemporaryDirectory() as place:
-        yield Path(shutil.copytree(model_folder, Path(place) / "responses"))
-
-
-@settings(max_examples=25)
-@given(st.data())
-def test_any_one_changed_byte_of_any_row_never_blocks_the_rest(model_folder, data):
-    """Nor is it taken for an answer."""
-    with copy_of(model_folder) as folder:
-        name = change_a_byte(folder, data)
-        try:
-            cache = ResponseCache(folder)
-        except UsageError:  # the mark of the format can be that of a newer one
-            assert name == "format"
-            return
-        with contextlib.closing(cache):
-            for each in FULL:
-                key = each.request.key
-                try:
-                    kept = cache.get(key)
-                except RecordingError:
-                    kept = None
-                assert kept in (each, None) if name == key else kept == each
-                cache.set_damage_aside(key)
-                cache.set_damage_aside(entry(9).request.key)
-                assert cache.put_now([each]) == [each]
-            assert by_key(*cache.entries()).keys() == by_key(*FULL).keys()
-            assert cache.unanswered(entry(9).request.key) in (entry(9).attempts, ())
-            assert endpoints(cache, "m") == ["openai"]
-
-
-def change_a_byte(folder, data):
-    """Change one byte of one row of the copy; returns the row's name."""
-    with contextlib.closing(sqlite3.connect(folder / "cache.db")) as database, database:
-        names = [name for (name,) in database.execute("SELECT key FROM Cache ORDER BY key")]
-        name = data.draw(st.sampled_from(names))
-        column = data.draw(st.sampled_from(["value", "value", "value", "key"]))
-        ((content,),) = database.execute(
-            f"SELECT CAST({column} AS BLOB) FROM Cache WHERE key = ?", [name]
-        )
-        database.execute(
-            f"UPDATE Cache SET {column} = CAST(? AS TEXT) WHERE key = ?",
-            [with_another_byte(content or b"x", data), name],
-        )
-    return name
-
-
-def with_another_byte(content, data):
-    changed = bytearray(content)
-    changed[data.draw(st.integers(0, len(changed) - 1))] ^= data.draw(st.integers(1, 255))
-    return bytes(changed)
-
-
 @settings(max_examples=25)
 @given(st.data())
 def test_any_one_changed_byte_of_the_file_is_harmless_or_an_error_of_ours(model_folder, data):
-    with copy_of(model_folder) as folder:
-        file = folder / "cache.db"
-        file.write_bytes(with_another_byte(file.read_bytes(), data))
+    with tempfile.TemporaryDirectory() as place:
+        folder = shutil.copytree(model_folder, Path(place) / "responses")
+        changed = bytearray((folder / "cache.db").read_bytes())
+        changed[data.draw(st.integers(0, len(changed) - 1))] ^= data.draw(st.integers(1, 255))
+        (folder / "cache.db").write_bytes(changed)
         found = {}
         with (
             contextlib.suppress(MergeRunnerError),

@@ -3,7 +3,6 @@
 The real client asks an emulator over loopback, in virtual time: see virtual_time.py.
 """
 
-import os
 from contextlib import asynccontextmanager
 
 import aiohttp
@@ -31,16 +30,6 @@ MODELS = {
 }
 TIMEOUT_S, DEADLINE_S = 600, 1200
 EXIT_CODES = {"CallFailed": 1, "EndpointRefused": 2, "QuotaExhausted": 3}
-
-
-@pytest.fixture(autouse=True)
-def _no_settings_of_the_user(monkeypatch, tmp_path):
-    for name in list(os.environ):
-        if name.upper().endswith("_PROXY"):
-            monkeypatch.delenv(name)
-    # Nothing here speaks TLS, and to load the certificates takes longer than most of the tests.
-    monkeypatch.delenv("SSL_CERT_FILE", raising=False)
-    monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path))
 
 
 @pytest.fixture(autouse=True)

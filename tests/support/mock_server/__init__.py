@@ -1,14 +1,7 @@
 """The emulator as test equipment: with every fault of a provider, and three batch modes."""
 
 from tests.support.mock_server.emulator import application, serve, served
-from tests.support.mock_server.plans import TRANSIENT, BatchPlan, FaultPlan, transient_faults
+from tests.support.mock_server.faults import TRANSIENT, BatchPlan, FaultPlan, transient_faults
 
-__all__ = [
-    "TRANSIENT",
-    "BatchPlan",
-    "FaultPlan",
-    "application",
-    "serve",
-    "served",
-    "transient_faults",
-]
+__all__ = ["TRANSIENT", "BatchPlan", "FaultPlan", "application", "serve", "served"]
+__all__ += ["transient_faults"]

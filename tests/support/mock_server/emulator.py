@@ -7,37 +7,19 @@ import socket
 import struct
 import threading
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
-import httpx
 from aiohttp import web
 
 from merge_runner.emulator import server
-from merge_runner.emulator.handler import (
-    CHAT,
-    GEMINI,
-    MESSAGES,
-    RESPONSES,
-    Asked,
-    Emulator,
-    as_json,
-    as_response,
-)
+from merge_runner.emulator.handler import SERVED, Emulator, as_json, as_response
 from merge_runner.llm.formats import FORMATS
 from merge_runner.records import SCRIPTED_HEADER
 from tests.support.mock_server.batches import MODES, Batches, BrokenOff
-from tests.support.mock_server.errors import ERRORS, as_error
-from tests.support.mock_server.plans import FaultPlan
+from tests.support.mock_server.faults import BREAKS, ERRORS, FaultPlan, as_error
 
-BREAKS = ("hang", "reset", "truncated_body")
-WIRES = {
-    CHAT.path: "openai-chat",
-    RESPONSES.path: "openai-responses",
-    GEMINI.path: "gemini",
-    MESSAGES.path: "anthropic",
-}
+NAMES = ("openai-chat", "openai-responses", "gemini", "anthropic")
+WIRES = dict(zip((wire.path for wire in SERVED), NAMES, strict=True))
 PROSE = "M\n\nI would rather describe my plan in words than write a list of numbers."
 # A linger time of zero sends a reset instead of an orderly close.
 RESET_AT_CLOSE = struct.pack("ii", 1, 0)
@@ -46,14 +28,14 @@ RESET_AT_CLOSE = struct.pack("ii", 1, 0)
 class FaultyEmulator(Emulator):
     """Fails as its plan says, plays batch modes, and counts its answers: each would be billed."""
 
-    def __init__(self, plan: FaultPlan | None = None) -> None:
+    def __init__(self, plan=None):
         self.plan = plan or FaultPlan()
         super().__init__()
-        self._answered: Counter[tuple[str, str | None, str | None]] = Counter()
+        self._answered = Counter()
         self._batches = Batches(self)
         self._routes = [route for mode in MODES for route in mode(self._batches).routes()]
 
-    async def respond(self, request: httpx.Request) -> httpx.Response:
+    async def respond(self, request):
         """Answer a request; raises BrokenOff."""
         path = request.url.path
         if path == "/emulator/answered":
@@ -64,14 +46,14 @@ class FaultyEmulator(Emulator):
                 return handler(request, **named.groupdict())
         return await super().respond(request)
 
-    def count(self) -> list[dict[str, Any]]:
+    def count(self):
         """How often each request was answered; one without a ``custom_id`` was asked singly."""
         return [
             {"body_sha256": body, "slot": slot, "custom_id": custom_id, "answered": count}
             for (body, slot, custom_id), count in self._answered.items()
         ]
 
-    async def reply(self, asked: Asked, attempt: int) -> httpx.Response:
+    async def reply(self, asked, attempt):
         """The response, or what takes its place; raises BrokenOff."""
         fault = self.plan.fault(asked.where, attempt)
         answer = self.answer(asked, attempt, fault)
@@ -92,9 +74,7 @@ class FaultyEmulator(Emulator):
             return as_response((await response.aread())[:-20], 200, response.headers)
         return response
 
-    def answer(
-        self, asked: Asked, attempt: int, fault: str | None = None, custom_id: str | None = None
-    ) -> dict[str, Any]:
+    def answer(self, asked, attempt, fault=None, custom_id=None):
         """The body of an answer, which is counted."""
         body = super().answer(asked, attempt)
         if fault not in (*ERRORS, *BREAKS, "rate_limit", "bad_gateway"):
@@ -107,12 +87,12 @@ class FaultyEmulator(Emulator):
 
 
 @web.middleware
-async def _break_off(request: web.Request, handler) -> web.StreamResponse:
+async def _break_off(request, handler):
     """Cut the connection before or within the reply."""
     try:
         return await handler(request)
     except BrokenOff as exc:
-        transport, fault = request.transport, exc.fault  # None once the client has gone
+        transport, fault = request.transport, str(exc)  # None once the client has gone
     if transport is not None and fault == "truncated_body":
         transport.write(
             b"HTTP/1.1 200 OK\r\ncontent-type: application/json\r\n"
@@ -127,20 +107,20 @@ async def _break_off(request: web.Request, handler) -> web.StreamResponse:
     return web.Response(status=500)  # which nobody gets: the connection has ended
 
 
-def application(plan: FaultPlan | None = None) -> web.Application:
+def application(plan=None):
     """An emulator as an application of aiohttp."""
     app = server.application(FaultyEmulator(plan))
     app.middlewares.append(_break_off)
     return app
 
 
-async def serve(port: int, plan: FaultPlan | None = None) -> tuple[web.AppRunner, str]:
+async def serve(port, plan=None):
     """Start an emulator on a loopback port (0: any free one); returns it with its base URL."""
     return await server.serve(port, application(plan))
 
 
 @contextmanager
-def served(plan: FaultPlan) -> Iterator[str]:
+def served(plan):
     """Serve an emulator by a thread of its own; yields its base URL."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever)

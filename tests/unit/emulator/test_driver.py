@@ -10,14 +10,16 @@ from merge_runner.drivers.language_model import LanguageModel
 from merge_runner.emulator.driver import NEEDED, Seen, answer, read_prompt
 from merge_runner.prompts.blocks import VARIANTS, Variant, prompt_of, render_prompt
 from merge_runner.prompts.parse import parse_reply
-from merge_runner.records import SIDES, ChatReply, Slot, TrialSpec, make_request
+from merge_runner.records import SIDES, ChatReply, Slot
 from merge_runner.scenarios.merge.conditions import CONDITIONS
 from merge_runner.scenarios.merge.geometry import TRACK
 from merge_runner.scenarios.merge.world import World
 from merge_runner.trial import play_trial
+from tests.support.specs import spec_of
 
 SCENARIO = ScenarioConfig()
 REPETITIONS = range(1, 11)
+SLOT = Slot("L_4_0", 1, "right", 5, 0)
 
 
 def first_prompt(condition, side, variant="baseline"):
@@ -51,34 +53,11 @@ async def play(condition, repetition):
     """A trial in this process, the scripted driver on either side."""
 
     async def ask(prompt, slot, _):
-        request = make_request(
-            provider="emulator",
-            endpoint="emulator",
-            model="scripted-driver",
-            path="/",
-            headers={},
-            body={"prompt": prompt},
-            slot=slot,
-        )
-        return ChatReply(answer(prompt, slot), "ok", request, (), earlier=0)
+        return ChatReply(answer(prompt, slot), "ok", None, (), earlier=0)
 
-    spec = TrialSpec(
-        trial_id="t",
-        spec_hash="h",
-        source="llm",
-        model_left="emulator",
-        model_right="emulator",
-        variant="baseline",
-        condition=condition,
-        repetition=repetition,
-        sample_set=0,
-        order=0,
-        kinematics=CONDITIONS[condition],
-    )
-    drivers = {
-        side: LanguageModel(ask, {"baseline": prompt_of("baseline")}).make(SCENARIO, spec, side)
-        for side in SIDES
-    }
+    spec = spec_of(condition, repetition=repetition, variant="baseline")
+    model = LanguageModel(ask, {"baseline": prompt_of("baseline")})
+    drivers = {side: model.make(SCENARIO, spec, side) for side in SIDES}
     return await play_trial(spec, SCENARIO, drivers)
 
 
@@ -93,14 +72,11 @@ def trials():
     return asyncio.run(play_all())
 
 
-def test_draws_are_the_same_on_every_machine():
+def test_draws_are_the_same_on_every_machine_and_keep_their_arguments_apart():
     # Committed recordings hold answers that were drawn like this.
     assert draw("who first", "N_0_0", 1, 0) == 0.05226905135811813
     assert draw_index(3, "words", 7) == 1
     assert draw_between(-2, 2, "gap") == -0.6744470744659119
-
-
-def test_draws_keep_their_arguments_apart():
     assert draw("a", "bc") != draw("ab", "c")
     assert draw("a", 1) == draw("a", "1")
 
@@ -113,19 +89,6 @@ def test_draws_fill_their_range_and_stay_in_it():
     between = [draw_between(-3, 5, n) for n in range(1000)]
     assert -3 <= min(between) < -2.9
     assert 4.9 < max(between) < 5
-
-
-def test_an_answer_depends_on_prompt_and_slot_alone():
-    questions = [
-        (FIRST_PROMPTS[condition, side], Slot(condition, repetition, side, number, 0))
-        for condition in CONDITIONS
-        for repetition in (1, 2)
-        for side in SIDES
-        for number in (0, 1)
-    ]
-    forwards = [answer(*question) for question in questions]
-    backwards = [answer(*question) for question in reversed(questions)]
-    assert forwards == backwards[::-1]
 
 
 @pytest.mark.parametrize(
@@ -217,27 +180,22 @@ def test_ten_repetitions_of_a_condition_differ_and_another_sample_set_does(trial
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_merge_prompt_of_any_variant_gets_a_valid_plan_and_the_token_it_asks_for(variant):
-    for condition in CONDITIONS:
-        for side in SIDES:
-            prompt = first_prompt(condition, side, variant)
-            for slot in (None, Slot(condition, 1, side, 0, 0)):
-                parsed = parse_reply(answer(prompt, slot), SCENARIO.plan_actions)
-                assert parsed.failure is None
-                assert len(parsed.plan) == SCENARIO.plan_actions
-                assert parsed.rationale
-                assert (parsed.tactical is None) == (variant == "A7")
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("relative_m", [-10.0, 5.0, 10.0])
-def test_a_straight_prompt_of_any_variant_gets_a_valid_plan_and_no_token(variant, relative_m):
-    prompt = straight_prompt(variant, [0.1] * 15, relative_distance_m=relative_m)
-    for slot in (None, Slot("L_4_0", 1, "right", 5, 0)):
-        parsed = parse_reply(answer(prompt, slot), SCENARIO.plan_actions)
-        assert parsed.failure is None
-        assert parsed.tactical is None
-        assert parsed.rationale
+def test_a_prompt_of_any_variant_gets_a_valid_plan_and_the_token_that_it_asks_for(variant):
+    merging = [
+        (first_prompt(condition, side, variant), Slot(condition, 1, side, 0, 0), variant == "A7")
+        for condition in CONDITIONS
+        for side in SIDES
+    ]
+    straight = [
+        (straight_prompt(variant, [0.1] * 15, relative_distance_m=metres), SLOT, True)
+        for metres in (-10.0, 5.0, 10.0)
+    ]
+    for prompt, slot, without_token in merging + straight:
+        for asked in (None, slot):
+            parsed = parse_reply(answer(prompt, asked), SCENARIO.plan_actions)
+            assert (parsed.failure, len(parsed.plan)) == (None, SCENARIO.plan_actions)
+            assert parsed.rationale
+            assert (parsed.tactical is None) == without_token
 
 
 def test_the_plan_has_as_many_actions_as_the_prompt_asks_for():
