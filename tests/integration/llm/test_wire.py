@@ -14,6 +14,7 @@ from merge_runner.config import Endpoint
 from merge_runner.llm.formats import FORMATS
 from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure, server_delay_s
+from tests.support.cases import cases
 from tests.support.raw_server import a_request, head, ok, raw_server
 
 
@@ -87,10 +88,6 @@ async def test_bytes_beyond_an_answer_never_answer_the_next_request(surplus):
         taken.set()
         await said.wait()
         assert [await ask(transport), await ask(transport)] == ["b", "b"]
-
-
-@pytest.mark.parametrize("surplus", SURPLUS.values(), ids=SURPLUS)
-async def test_bytes_that_come_with_an_answer_never_answer_the_next_request(surplus):
     (first, *others), _ = await said_to(3, ok(chat("a")) + surplus, ok(chat("b")))
     # What is no HTTP may take the answer with it that it came with.
     assert first in ("a", "connection_lost")
@@ -214,33 +211,13 @@ async def test_a_connection_that_is_half_closed_is_not_used_again():
     assert (said, [request.talk for request in requests]) == (["a", "a"], [1, 2])
 
 
-WRONG = {
-    "too short a length": head(content_length=5) + chat("a"),
-    "two lengths": head(content_length=5).replace(
-        b"\r\n\r\n", b"\r\ncontent-length: 6\r\n\r\nabcdef"
-    ),
-    "length and chunks": head(content_length=5, transfer_encoding="chunked")
-    + b"5\r\nabcde\r\n0\r\n\r\n",
-    "a length below zero": head(content_length=-5) + b"abcde",
-    "a length of many digits": head(content_length="9" * 30) + b"abcde",
-    "a length in words": head(content_length="five") + b"abcde",
-    "a chunk of many digits": head(transfer_encoding="chunked") + b"f" * 30 + b"\r\nabcde",
-    "a status of many digits": b"HTTP/1.1 " + b"9" * 30 + b" X\r\n\r\n",
-    "another protocol": b"HTTP/2.0 200 OK\r\n\r\n",
-}
-
-
-@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize("wrong", cases("wrong_lengths"))
 async def test_a_wrong_length_ends_its_attempt_and_no_other(wrong):
-    async with raw_server(wrong, ok(chat("b"))) as server, transport_to(server.url) as transport:
+    answers = wrong.encode("latin-1"), ok(chat("b"))
+    async with raw_server(*answers) as server, transport_to(server.url) as transport:
         with contextlib.suppress(json.JSONDecodeError):  # what such a length leaves of a body
             assert await ask(transport, timeout_s=0.2) in ("connection_lost", "timeout")
         assert await ask(transport) == "b"
-
-
-async def test_a_length_that_is_too_long_is_waited_for_until_the_timeout():
-    endless = head(content_length=500) + chat("a")
-    assert (await said_to(2, endless, ok(chat("b")), at_1=0.05))[0] == ["timeout", "b"]
 
 
 async def test_of_a_header_that_is_sent_several_times_no_value_is_lost():

@@ -17,32 +17,8 @@ from tests.support.batch_fixtures import KEY, endpoint_at, lines
 from tests.support.cases import by_format, cases, table
 from tests.support.json_values import paths, replaced
 
-CREATE = {
-    "openai-chat": "POST /v1/files",
-    "openai-responses": "POST /v1/files",
-    "anthropic": "POST /v1/messages/batches",
-    "gemini": "POST /upload/v1beta/files",
-}
-BATCH = {
-    "openai-chat": "GET /v1/batches/b1",
-    "anthropic": "GET /v1/messages/batches/b1",
-    "gemini": "GET /v1beta/batches/b1",
-}
-# Where batches are listed, and the member of a list that has them.
-LISTS = {
-    "openai-chat": ("GET /v1/batches", "data"),
-    "gemini": ("GET /v1beta/batches", "operations"),
-}
-RESULTS = {
-    "openai-chat": "GET /v1/files/f1/content",
-    "anthropic": "GET /v1/messages/batches/b1/results",
-    "gemini": "GET /v1beta/files/f1:download",
-}
-ENDED = {
-    "openai-chat": {"status": "completed", "output_file_id": "f1"},
-    "anthropic": {"id": "b1", "processing_status": "ended"},
-    "gemini": {"done": True, "response": {"responsesFile": "files/f1"}},
-}
+ADDRESSES, ENDED = table("batches", "addresses"), table("batches", "ended")
+CREATE, BATCH, LISTS, RESULTS = ADDRESSES.values()
 
 
 async def failure(service, form):
@@ -73,9 +49,10 @@ async def test_each_refusal_of_a_creation_says_what_to_do(server, service_at, fo
     assert kind != "again" or failed.delay_s == 7
 
 
-@pytest.mark.parametrize(
-    "url", ["", "x", "@127.0.0.1:1/x", "http://[::1", "http://h/\u00e9", "/" + "x" * 8050]
-)
+URLS = ["", "x", "@127.0.0.1:1/x", "http://[::1", "http://h/\u00e9", "/" + "x" * 8050]
+
+
+@pytest.mark.parametrize("url", URLS)
 async def test_an_upload_goes_to_no_other_host_and_to_no_odd_place(server, service_at, url):
     server.replies[CREATE["gemini"]] = (200, {}, {"x-goog-upload-url": url})
     failed = await failure(service_at(server.url, "gemini"), "gemini")
@@ -145,41 +122,21 @@ async def keys(service):
     return [key for key, _ in results], failed
 
 
-@pytest.mark.parametrize(
-    "broken",
-    [
-        b'{"custom_id": "b", "res',
-        b"[1, 2]",
-        b'"text"',
-        b'{"result": {"type": "succeeded"}}',
-        b'{"custom_id": 7, "result": {}}',
-        b'{"custom_id": "b", "result": {"type": "strange"}}',
-    ],
-)
+@pytest.mark.parametrize("broken", cases("batches", "broken"))
 async def test_a_result_that_cannot_be_used_costs_no_other_one(server, service_at, broken):
-    results_at(server, (200, jsonl(succeeded("a"), broken, succeeded("c"), b"")))
+    parts = [b"\r", jsonl(succeeded("a")), b"", broken.encode(), jsonl(succeeded("c")) + b"\r", b""]
+    results_at(server, (200, b"\n".join(parts)))
     service = service_at(server.url, "anthropic", most_bytes=4000)
     assert await keys(service) == (["a", "", "c"], None)
 
 
-@pytest.mark.parametrize(
-    ("line", "body"),
-    [
-        # A lone surrogate can be kept.
-        (
-            rb'{"custom_id": "a", "result": {"type": "succeeded", "message": {"x": "\ud83d"}}}',
-            r'{"x": "\ud83d"}',
-        ),
-        (
-            jsonl({"custom_id": "a", "result": {"type": "succeeded", "message": {"x": KEY}}}),
-            '{"x": "[key]"}',
-        ),
-    ],
-)
-async def test_a_result_can_be_kept_and_echoes_no_key(server, service_at, line, body):
-    results_at(server, (200, line))
+@pytest.mark.parametrize(("said", "kept"), [(r"\ud83d", r"\ud83d"), (KEY, "[key]")])
+async def test_a_result_can_be_kept_and_echoes_no_key(server, service_at, said, kept):
+    """A lone surrogate can be kept."""
+    message = f'{{"type": "succeeded", "message": {{"x": "{said}"}}}}'
+    results_at(server, (200, f'{{"custom_id": "a", "result": {message}}}'.encode()))
     (((_, result),), _) = await read(service_at(server.url, "anthropic"))
-    assert result.body == body
+    assert result.body == f'{{"x": "{kept}"}}'
 
 
 async def test_results_that_break_off_can_be_read_again(server, service_at):
@@ -249,25 +206,24 @@ async def test_a_list_that_turns_in_a_circle_ends(server, service_at):
 
 
 @pytest.mark.parametrize(
-    ("form", "what"),
-    [*((form, "status") for form in BATCH), *((form, "find") for form in LISTS)],
+    ("form", "where"),
+    [*BATCH.items(), *((form, at) for form, (at, _) in LISTS.items())],
     indirect=["form"],
 )
 @pytest.mark.parametrize(
-    ("status", "kind"),
-    [(status, "lost") for status in (404, 410)]
-    + [(status, "again") for status in (405, 413, 429, 500)]
-    + [(401, "refused")],
+    ("kind", "statuses"),
+    {"lost": (404, 410), "again": (405, 413, 429, 500), "refused": (401,)}.items(),
 )
 async def test_a_batch_that_may_exist_is_never_asked_singly(
-    server, service_at, form, what, status, kind
+    server, service_at, form, where, kind, statuses
 ):
-    where = BATCH[form] if what == "status" else LISTS[form][0]
-    server.replies[where] = (status, error("m" * 10_000))
-    with pytest.raises(BatchFailed) as failed:
-        await getattr(service_at(server.url, form), what)("b1")
-    assert failed.value.kind == kind
-    assert len(str(failed.value)) < 600, "no more than a reader takes"
+    service = service_at(server.url, form)
+    for status in statuses:
+        server.replies[where] = (status, error("m" * 10_000))
+        with pytest.raises(BatchFailed) as failed:
+            await (service.status("b1") if where == BATCH[form] else service.find("b1"))
+        assert failed.value.kind == kind
+        assert len(str(failed.value)) < 600, "no more than a reader takes"
 
 
 @pytest.mark.parametrize(("status", "kind"), [(404, "again"), (410, "lost"), (500, "again")])
@@ -280,12 +236,6 @@ async def test_a_file_of_answers_that_is_not_there_yet_is_asked_for_again(
     server.replies["GET /v1/files/f2/content"] = (200, jsonl(line))
     told, failed = await keys(service_at(server.url, "openai-chat"))
     assert (told, failed.kind) == ([], kind)
-
-
-async def test_blank_lines_and_those_of_windows_are_results_of_nothing(server, service_at):
-    body = b"\r\n".join([b"", jsonl(succeeded("a")), b"", jsonl(succeeded("b")), b"", b""])
-    results_at(server, (200, body), succeeded=2)
-    assert await keys(service_at(server.url, "anthropic")) == (["a", "b"], None)
 
 
 def listed(form, mark, created, batch_id="b1"):
