@@ -1,7 +1,5 @@
 """Fixtures for the whole program."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

@@ -1,7 +1,5 @@
 """The program, whose audit at a run's end takes for ever: it queries, or its file is held."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

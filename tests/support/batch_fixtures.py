@@ -1,7 +1,5 @@
 """Batch services over HTTP: to the emulator, or to a server that says what a test tells it."""
 
-from __future__ import annotations
-
 import pytest
 from aiohttp import web
 

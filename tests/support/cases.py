@@ -1,7 +1,5 @@
 """Cases that are data: tables of the files in tests/cases, whose keys are the ids of tests."""
 
-from __future__ import annotations
-
 import tomllib
 
 import pytest

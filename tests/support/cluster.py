@@ -1,7 +1,5 @@
 """Clusters of Dask that tests start, watch and kill."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import sys

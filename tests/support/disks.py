@@ -1,7 +1,5 @@
 """Folders that cannot be written or are full."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import subprocess

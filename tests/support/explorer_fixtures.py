@@ -1,7 +1,5 @@
 """A real browser at the explorer that a module of tests serves as its ``site``."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from importlib.resources import files

@@ -1,7 +1,5 @@
 """A server that holds its answers, so that a test can do something in the midst of a sweep."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math

@@ -4,8 +4,6 @@ It holds the shipped recordings of the emulator and of smollm2, three programs, 
 trial that failed and one whose words are hostile, and a crossed study with a plug-in of its own.
 """
 
-from __future__ import annotations
-
 import fcntl
 import shutil
 from pathlib import Path

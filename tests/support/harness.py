@@ -1,7 +1,5 @@
 """The program as a user runs it, and a server that tests can watch."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """A trial in which a model says what nobody should."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

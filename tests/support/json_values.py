@@ -1,7 +1,5 @@
 """JSON values with one value in them changed."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 
 

@@ -1,7 +1,5 @@
 """The program as a user runs it: in the tests' own process, or as one of its own."""
 
-from __future__ import annotations
-
 import asyncio
 import contextvars
 import gc

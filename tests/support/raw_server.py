@@ -13,8 +13,6 @@ and the request, which may say anything at any time:
         await talk.say(ok(CHAT) * 2)
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

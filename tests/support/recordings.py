@@ -1,7 +1,5 @@
 """Files as the experiment's recorder writes them, of trials driven by simple drivers."""
 
-from __future__ import annotations
-
 import csv
 import io
 import zipfile

@@ -1,7 +1,5 @@
 """An emulator that plays what providers are known to send, of tests/cases/scenarios.toml."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import tomllib

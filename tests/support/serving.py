@@ -1,7 +1,5 @@
 """The explorer in the tests' own process, what a page says, and a program that holds a database."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

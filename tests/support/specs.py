@@ -1,7 +1,5 @@
 """The spec of a trial, for tests that need one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from merge_runner.records import TrialSpec

@@ -1,7 +1,5 @@
 """The progress of a sweep of the emulator, as far as a display asks for it."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 from merge_runner.llm.ledger import Spending

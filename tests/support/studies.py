@@ -1,7 +1,5 @@
 """Databases for the analysis: trials driven by constant actions, written as any sweep's are."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Sweeps that are answered by servers which others wrote."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest

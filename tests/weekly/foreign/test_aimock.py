@@ -1,7 +1,5 @@
 """A server that others wrote in another language: aimock, where it is installed."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

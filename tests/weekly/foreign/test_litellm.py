@@ -1,7 +1,5 @@
 """A gateway that others wrote, before what fails: LiteLLM's proxy, where it is installed."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import socket

@@ -1,7 +1,5 @@
 """A server that others wrote, and that grades its clients: LLMock, in all four formats."""
 
-from __future__ import annotations
-
 import asyncio
 
 import pytest
