@@ -23,27 +23,17 @@ from dataclasses import dataclass, field
 from merge_runner.records import ChatRequest, Slot, make_request
 
 # A reply that every client of the format openai-chat takes for an answer.
-CHAT = json.dumps(
-    {
-        "id": "chatcmpl-1",
-        "model": "m",
-        "choices": [{"message": {"content": "an answer"}, "finish_reason": "stop"}],
-        "usage": {"prompt_tokens": 1, "completion_tokens": 1},
-    }
-).encode()
+CHOICE = {"message": {"content": "an answer"}, "finish_reason": "stop"}
+USAGE = {"prompt_tokens": 1, "completion_tokens": 1}
+CHAT = json.dumps({"id": "1", "model": "m", "choices": [CHOICE], "usage": USAGE}).encode()
 
 
 def a_request(number: int = 0, prompt: str | None = None, slot: Slot | None = None) -> ChatRequest:
     """What a client sends to any such server."""
-    return make_request(
-        provider="openai",
-        endpoint="openai",
-        model="m",
-        path="/chat/completions",
-        headers={},
-        body={"prompt": prompt or f"number {number}"},
-        slot=slot or Slot("N_0_0", 1, "left", number, 0),
-    )
+    named = {"provider": "openai", "endpoint": "openai", "model": "m", "path": "/chat/completions"}
+    body = {"prompt": prompt or f"number {number}"}
+    slot = slot or Slot("N_0_0", 1, "left", number, 0)
+    return make_request(**named, headers={}, body=body, slot=slot)
 
 
 def head(status: int = 200, **headers: object) -> bytes:
@@ -69,9 +59,8 @@ class Request:
     @property
     def headers(self) -> dict[str, str]:
         """By lower-case name."""
-        pairs = (
-            line.split(":", 1) for line in self.head.decode("latin-1").split("\r\n")[1:] if line
-        )
+        lines = self.head.decode("latin-1").split("\r\n")[1:]
+        pairs = (line.split(":", 1) for line in lines if line)
         return {name.lower(): value.strip() for name, value in pairs}
 
 

@@ -108,15 +108,14 @@ class Trials:
         trial = [each(self.case["trial"])] if "trial" in self.case else []
         self.budget = Budget(Ledger(self.cache, self.scope), self.case.get("cap"), *trial)
 
-    async def reserves(self, trial, worst):
-        self.paid[trial] = await set_aside(self.budget, trial, worst)
-
-    def job(self, trial, verb, worst=0, actual="0"):
+    async def job(self, trial, verb, worst=0, actual="0"):
         if verb == "begins":
-            return self.budget.admit(trial)
-        if verb == "reserves":
-            return self.reserves(trial, float(worst))
-        return attempt(self.budget, trial, float(worst), None if actual == "?" else float(actual))
+            await self.budget.admit(trial)
+        elif verb == "reserves":
+            self.paid[trial] = await set_aside(self.budget, trial, float(worst))
+        else:
+            spent = None if actual == "?" else float(actual)
+            await attempt(self.budget, trial, float(worst), spent)
 
     async def play(self, step):
         trial, verb, *more = step.split()
@@ -207,10 +206,12 @@ async def test_spending_that_nobody_can_have_spent_is_not_believed(ledger, cache
 O3 = Asked("o3 at gateway", "L_4_0 rep 1 left, decision 3", 0.25)
 
 
-async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
-    for key, outcome in (("a", "timeout"), ("b", "timeout"), ("c", "server_error")):
-        ledger.reserve(key, 1, 0.25, None, O3)
-        await ledger.settle(key, *tried(None, outcome), O3.driver)
+async def test_what_is_set_aside_is_told_with_the_reason_of_each_attempt(ledger):
+    retried = enumerate(("timeout", "connection_lost", "server_error"), 1)
+    for key, number, outcome in (("a", 1, "timeout"), *(("b", *one) for one in retried)):
+        ledger.reserve(key, number, 0.25, None, O3)
+        actual = 0.0 if outcome == "connection_lost" else None
+        await ledger.settle(key, Attempt(number, outcome, cost_usd=actual), O3.driver)
     ledger.reserve("d", 1, 0.125, None, O3)
     ledger.reserve("paid", 1, 0.25, None, O3)
     await ledger.settle("paid", *tried(0.1), O3.driver)
@@ -223,15 +224,6 @@ async def test_what_is_set_aside_is_told_with_its_reasons(ledger):
     assert sum(r["usd"] for r in reasons) == pytest.approx(ledger.read().reserved_usd)
     assert {(r["driver"], r["slot"]) for r in reasons} == {(O3.driver, O3.slot)}
     assert reasons[0]["first"] <= reasons[0]["last"]
-
-
-async def test_a_retried_call_keeps_the_reason_of_each_attempt(ledger):
-    for number, outcome in enumerate(("timeout", "connection_lost", "bad_body"), 1):
-        ledger.reserve("key", number, 0.25, None, O3)
-        actual = 0.0 if outcome == "connection_lost" else None
-        last = Attempt(number, outcome, cost_usd=actual)
-        await ledger.settle("key", last, O3.driver)
-    assert {r["outcome"]: r["attempts"] for r in ledger.reasons()} == {"timeout": 1, "bad_body": 1}
 
 
 async def test_what_is_released_counts_no_longer(ledger, cache):
@@ -261,10 +253,9 @@ async def test_a_task_s_share_gives_way_to_what_the_task_has_spent_and_open(ledg
 async def test_an_answer_that_was_kept_right_before_a_kill_is_settled_by_the_next_run(
     ledger, cache
 ):
+    named = dict.fromkeys(("provider", "endpoint", "model", "path"), "openai")
     slot = Slot("N_0_0", 1, "left", 0, 0)
-    request = make_request(
-        provider="openai", endpoint="e", model="m", path="/p", headers={}, body={}, slot=slot
-    )
+    request = make_request(**named, headers={}, body={}, slot=slot)
     for key in (request.key, "another"):
         ledger.reserve(key, 1, 0.25, None, O3)
     await cache.put(CachedCall(request, (Attempt(1, "ok", 200, cost_usd=0.125, reply="{}"),)))
@@ -313,13 +304,8 @@ def test_a_ledger_that_cannot_be_written_is_no_damaged_one(tmp_path):
     ledger = Ledger(cache, "sweep")
     ledger.reserve("key", 1, 0.25, None, O3)
     cache.money.write("PRAGMA max_page_count = 1")
-
-    def fill():
-        for number in range(1_000):
-            ledger.reserve(f"key {number}", 1, 0.25, None, O3)
-
     with pytest.raises(CacheFailed, match="cannot be written: database or disk is full"):
-        fill()
+        [ledger.reserve(f"key {number}", 1, 0.25, None, O3) for number in range(1_000)]
     cache.close()
 
 

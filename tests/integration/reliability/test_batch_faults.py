@@ -27,7 +27,6 @@ batch = {{ price_factor = 0.5, source = "made up" }}
 # One decision of two drivers in 3 conditions: one batch.
 STUDY = 'repetitions = 1\nconditions = ["L_4_0", "N_0_0", "R_-4_8"]\n[scenario]\ntimeout_s = 1\n'
 LINES = 6
-ENDS = (("completed", None, None), (None, "ended", None), (None, None, True))
 KINDS = {
     "upload": re.compile("POST .*/files"),
     "create": re.compile("POST (/v1/batches|/v1/messages/batches|.*:batchGenerateContent)"),
@@ -109,26 +108,6 @@ async def no_json(request, handler):
     return web.Response(text="<html>welcome</html>", content_type="text/html")
 
 
-def goes_back():
-    """A middleware that shows the state of the creation once more after the end was shown."""
-    created, ended = {}, set()
-
-    async def middle(request, handler):
-        reply = await handler(request)
-        if "json" not in reply.content_type or request.path.startswith("/emulator"):
-            return reply
-        body, batch = json.loads(reply.body), request.path.rpartition("/")[2]
-        if request.method == "POST":
-            created[body.get("name", body.get("id", "")).rpartition("/")[2]] = body
-        elif batch in ended and batch in created:
-            return web.json_response(created.pop(batch))
-        elif (body.get("status"), body.get("processing_status"), body.get("done")) in ENDS:
-            ended.add(batch)
-        return reply
-
-    return middle
-
-
 def changed(kind, members):
     """A middleware that changes members of what is said."""
 
@@ -158,20 +137,19 @@ CASES = {
     "500 before an upload and after a creation, a web page at a state, cut results": (
         "openai",
         lambda: (first("upload", status(500)), first("create", failed_after),
-                 first("state", no_json), first("results", cut_after), lines(odd), goes_back()),
+                 first("state", no_json), first("results", cut_after), lines(odd)),
         {"failed": 0.4, "late_results": 2}, 0,
     ),
     "500 after an upload, before a creation and at results, expired lines, few tokens": (
         "gemini",
         lambda: (first("upload", failed_after), first("create", status(500)),
-                 first("results", status(500)), lines(odd), goes_back()),
+                 first("results", status(500)), lines(odd)),
         {"expired": 0.4, "enqueued_tokens": 4_000}, 0,
     ),
     "429 at a creation, 503 at a state, short results that are cut": (
         "anthropic",
         lambda: (first("create", status(429, **{"retry-after": "0"})),
-                 first("state", status(503), 2), first("results", cut_after, 2),
-                 lines(odd), goes_back()),
+                 first("state", status(503), 2), first("results", cut_after, 2), lines(odd)),
         {"short_results": 1}, 0,
     ),
     "a second answer, a broken line": (

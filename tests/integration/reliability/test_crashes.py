@@ -7,7 +7,7 @@ import random
 import signal
 import sqlite3
 
-from merge_runner.records import SLOT_HEADER
+from merge_runner.records import SLOT_HEADER, canonical_json
 from merge_runner.results.store import query, results_digest
 from tests.support.harness import watched
 from tests.support.mock_server import FaultPlan
@@ -15,23 +15,9 @@ from tests.support.mock_server import FaultPlan
 SWEEP = ("sweep", "baseline", "--reps", 1, "--in-flight", 8, "--json")
 
 
-class Slots:
-    """What the server was asked, and what it answered, in their order."""
-
-    def __init__(self):
-        self.asked = []
-        self.something = asyncio.Event()
-
-    async def middle(self, request, handler):
-        slot = request.headers[SLOT_HEADER]
-        self.asked.append(slot)
-        self.something.set()
-        return await handler(request)
-
-    async def until(self, requests):
-        while len(self.asked) < requests:
-            self.something.clear()
-            await self.something.wait()
+def slots(server):
+    """What the server was asked, in order."""
+    return [headers[SLOT_HEADER.lower()] for headers in server.headers]
 
 
 def kept(folder):
@@ -39,43 +25,38 @@ def kept(folder):
     with contextlib.closing(sqlite3.connect(f"file:{folder}/cache.db?mode=ro", uri=True)) as cache:
         rows = cache.execute("SELECT value FROM Cache WHERE length(key) = 64").fetchall()
     entries = [json.loads(text[text.index("{") :])["entry"] for (text,) in rows]
-    return {
-        json.dumps(entry["request"]["slot"], sort_keys=True, separators=(",", ":"))
-        for entry in entries
-    }
+    return {canonical_json(entry["request"]["slot"]) for entry in entries}
 
 
 async def kill_again_and_again(merge_runner, folder, quiet, kills):
     """A sweep that is killed so many times asks nothing answered again, and ends as a quiet one."""
-    chance = random.Random(4)
-    slots = Slots()
-    killed = 0
+    chance, killed = random.Random(4), 0
     again = []  # how many slots each run asked again
     durable = []  # after each kill: the requests up to then, and the slots with a reply on disk
-    async with watched(slots.middle, FaultPlan(latency_s=0.05)) as server:
+    async with watched(faults=FaultPlan(latency_s=0.05)) as server:
         for _ in range(kills):
             process = await merge_runner.start(*SWEEP, **server.env)
-            before, seen = len(slots.asked), set(slots.asked)
+            before = slots(server)
             # Some die while they open the files, most of them in the midst of calls.
-            asked = asyncio.create_task(slots.until(before + chance.randrange(180 // kills)))
-            ended = asyncio.create_task(process.wait())
-            await asyncio.wait([asked, ended], return_when=asyncio.FIRST_COMPLETED)
-            asked.cancel()
+            enough = len(before) + chance.randrange(180 // kills)
+            while server.requests < enough and process.returncode is None:
+                await asyncio.sleep(0.005)
             await asyncio.sleep(chance.uniform(0, 0.05))
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
-            killed += await ended == -signal.SIGKILL
-            again.append(len(seen.intersection(slots.asked[before:])))
-            durable.append((len(slots.asked), kept(folder / "cache/responses")))
+            killed += await process.wait() == -signal.SIGKILL
+            again.append(len(set(before).intersection(slots(server)[len(before) :])))
+            durable.append((server.requests, kept(folder / "cache/responses")))
         last = await merge_runner(*SWEEP, **server.env)
     assert killed == kills
     assert last.code == 0, last.err
+    asked = slots(server)
     for position, answered in durable:
-        assert answered.isdisjoint(slots.asked[position:]), "an answered call was made again"
+        assert answered.isdisjoint(asked[position:]), "an answered call was made again"
     # Both drivers of at most eight trials are in flight when the process dies.
     assert max(again) <= 16
     used = last.summary["calls"]["live"] + last.summary["calls"]["cached"]
-    assert used <= len(set(slots.asked)) < len(slots.asked)
+    assert used <= len(set(asked)) < len(asked)
     assert results_digest(folder / "results/merge.duckdb") == quiet
 
 

@@ -223,24 +223,6 @@ async def test_runs_of_two_models_under_one_cap_never_pass_it_and_both_end(
     assert calls["n"] <= server.requests
 
 
-async def test_a_gateways_error_may_be_charged_whatever_its_form(merge_runner, experiments):
-    async def middle(request, handler):
-        if server.requests % 2:
-            return web.Response(status=502, text="<html>502 Bad Gateway</html>")
-        return web.json_response({"error": {"message": "Overloaded."}}, status=503)
-
-    brief = ENTRY.format(name="brief", id="o3", tokens=16_000) + "deadline_s = 2\n"
-    (experiments / "models.toml").write_text(brief)
-    async with watched(middle) as server:
-        run = await merge_runner(*ONE, "--model", "brief", **account(server))
-    assert run.code == 1
-    attempts = run.summary["attempts"]
-    assert attempts["server_error"] > 0 < attempts["overloaded"]
-    unknown = sum(attempts.values())  # also one that the deadline cuts off
-    assert run.summary["attempts_of_unknown_cost"] == unknown
-    assert run.summary["set_aside_usd"] == pytest.approx(0.137 * unknown, rel=0.1)
-
-
 async def test_what_is_set_aside_is_shown_with_its_reasons_and_released_by_name(merge_runner):
     async def middle(request, handler):
         if server.requests in (3, 5):

@@ -96,9 +96,8 @@ async def test_gemini_reads_its_content(emulator, driving_prompt, api_version):
     assert parse_reply(reply.text, 20).plan
     assert (reply.candidates[0].finish_reason.name, reply.model_version) == ("STOP", MODEL)
     assert usage.prompt_token_count == len(driving_prompt) // 4
-    assert usage.total_token_count == (
-        usage.prompt_token_count + usage.candidates_token_count + usage.thoughts_token_count
-    )
+    parts = (usage.prompt_token_count, usage.candidates_token_count, usage.thoughts_token_count)
+    assert usage.total_token_count == sum(parts)
 
 
 async def test_every_library_raises_its_rate_limit_error(limited, driving_prompt):
@@ -131,11 +130,10 @@ async def test_openai_creates_polls_lists_and_reads_a_batch(batches, driving_pro
     url = "/v1/chat/completions"
     body = {"model": MODEL, "messages": [{"role": "user", "content": driving_prompt}]}
     line = {"custom_id": "line-0", "method": "POST", "url": url, "body": body}
+    terms = {"endpoint": url, "completion_window": "24h", "metadata": {"mark": "m1"}}
     async with openai_client(batches) as client:
         file = await client.files.create(file=("in.jsonl", jsonl(line)), purpose="batch")
-        created = await client.batches.create(
-            input_file_id=file.id, endpoint=url, completion_window="24h", metadata={"mark": "m1"}
-        )
+        created = await client.batches.create(input_file_id=file.id, **terms)
         assert (created.status, created.metadata) == ("in_progress", {"mark": "m1"})
         states = [(await client.batches.retrieve(created.id)).status for _ in range(3)]
         assert states == ["in_progress", "in_progress", "completed"]
@@ -168,15 +166,13 @@ async def test_gemini_creates_polls_and_reads_a_batch(batches, driving_prompt):
             file=io.BytesIO(jsonl({"key": "line-0", "request": request})),
             config={"mime_type": "application/jsonl"},
         )
-        created = await client.batches.create(
-            model=MODEL, src=file.name, config={"display_name": "m1"}
-        )
+        named = {"display_name": "m1"}
+        created = await client.batches.create(model=MODEL, src=file.name, config=named)
         assert (created.state.name, created.display_name) == ("JOB_STATE_PENDING", "m1")
         states = [(await client.batches.get(name=created.name)).state.name for _ in range(3)]
         assert states == ["JOB_STATE_PENDING", "JOB_STATE_RUNNING", "JOB_STATE_SUCCEEDED"]
         batch = await client.batches.get(name=created.name)
         content = await client.files.download(file=batch.dest.file_name)
-    (line,) = content.splitlines()
-    told = json.loads(line)
+    told = json.loads(content)
     assert told["key"] == "line-0"
     assert parse_reply(told["response"]["candidates"][0]["content"]["parts"][0]["text"], 20).plan

@@ -5,6 +5,7 @@ import io
 import json
 from dataclasses import replace
 from itertools import islice
+from operator import attrgetter
 
 import pytest
 from aiohttp import web
@@ -12,8 +13,10 @@ from typer.testing import CliRunner
 
 from benchmarks.recorder import longer
 from merge_runner.cli import app
+from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.recording import read_recording
+from merge_runner.results.store import query, results_digest
 from tests.support.harness import RECORDING, watched
 
 SIZE, REPS = 20_480, 5
@@ -46,8 +49,8 @@ def long(prepare, tmp_path_factory):
 
 def _lengthened(entry):
     (*others, last) = entry.attempts
-    reply = longer(last.reply, SIZE, entry.request.key)
-    return replace(entry, attempts=(*others, replace(last, reply=reply)))
+    longest = replace(last, reply=longer(last.reply, SIZE, entry.request.key))
+    return replace(entry, attempts=(*others, longest))
 
 
 def command(folder, *arguments):
@@ -64,35 +67,29 @@ def test_a_thousand_long_replies_are_audited_and_looked_up_in_the_cache(long):
 
 
 def test_a_thousand_long_replies_are_queried(long):
-    query = "SELECT call_key, reply, reply->>'$.model' AS model FROM calls ORDER BY call_key"
-    rows = list(csv.DictReader(io.StringIO(command(long, "sql", query, "--format", "csv"))))
+    asked = "SELECT call_key, reply, reply->>'$.model' AS model FROM calls ORDER BY call_key"
+    rows = list(csv.DictReader(io.StringIO(command(long, "sql", asked, "--format", "csv"))))
     assert len(rows) > 1_000
     assert min(len(row["reply"]) for row in rows) > 0.9 * SIZE
 
 
 def test_a_query_that_needs_too_much_memory_says_what_to_do(long):
-    query = "SELECT len(string_agg(reply || n::VARCHAR)) FROM calls, range(100) AS numbers(n)"
-    db = ("--db", str(long / "results/merge.duckdb"))
-    run = CliRunner().invoke(app, ["sql", query, *db])
-    assert "ask for fewer rows or columns at once" in str(run.exception)
+    big = "SELECT len(string_agg(reply || n::VARCHAR)) FROM calls, range(100) AS numbers(n)"
+    with pytest.raises(UsageError, match="ask for fewer rows or columns at once"):
+        query(long / "results/merge.duckdb", big)
 
 
 def test_long_replies_are_recorded_and_replayed_in_an_order_of_their_own(long, prepare):
     file = long / "long.parquet"
     assert prepare(long, "recording", "export", file, "--cache", "cache").code == 0
     assert [path.name for path in long.glob("*long.parquet*")] == ["long.parquet"]
-    slots = [(e.request.slot.as_dict(), e.request.key) for e in read_recording(file)]
-    assert slots == sorted(
-        slots, key=lambda told: [told[0][name] for name in (
-            "condition", "repetition", "side", "decision", "sample_set")]
-    )  # fmt: skip
+    slots = [e.request.slot for e in read_recording(file)]
+    order = attrgetter("condition", "repetition", "side", "decision", "sample_set")
+    assert slots == sorted(slots, key=order)
     again = prepare(long, "replay", "baseline", "--reps", REPS, "--recording", file,
                     "--db", "again.duckdb", "--cache", "none", "--json")  # fmt: skip
     assert again.code == 0, again.err
-    digests = [
-        prepare(long, "digest", "--db", db).out for db in ("again.duckdb", "results/merge.duckdb")
-    ]
-    assert digests[0] == digests[1]
+    assert results_digest(long / "again.duckdb") == results_digest(long / "results/merge.duckdb")
 
 
 @pytest.mark.parametrize(("reply_mb", "trials", "seconds"), [(15, 1, 8), (2, 4, 30)])
@@ -114,13 +111,10 @@ async def test_every_reply_below_max_reply_mb_is_stored(
     )
     async with watched(middle) as server:
         run = await merge_runner(
-            "sweep", "study.toml", "--model", "patient", "--conditions", "L_4_0", "--json",
-            EMULATOR_BASE_URL=f"{server.url}/v1",
-        )  # fmt: skip
-    if server.requests != 2 * trials * seconds:
-        pytest.fail(run.err)  # whatever is stored
-    assert run.code == 0, run.err
-    query = "SELECT count(*) AS calls, min(len(reply)) AS shortest FROM calls"
-    (stored,) = json.loads((await merge_runner("sql", query, "--format", "json")).out)
-    assert stored["calls"] == server.requests
-    assert stored["shortest"] > len(thought)
+            "sweep", "study.toml", "--model", "patient", "--conditions", "L_4_0", **server.env
+        )
+    assert (run.code, server.requests) == (0, 2 * trials * seconds), run.err
+    stored = "SELECT count(*), min(len(reply)) FROM calls"
+    ((calls, shortest),) = query(tmp_path / "results/merge.duckdb", stored)[1]
+    assert calls == server.requests
+    assert shortest > len(thought)
