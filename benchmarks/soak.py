@@ -30,9 +30,10 @@ from benchmarks.processes import PROJECT, RUNNER
 from merge_runner.emulator.server import HOST
 from merge_runner.records import ATTEMPT_HEADER, SLOT_HEADER, Slot, call_key
 from merge_runner.results.store import results_digest
-from tests.support.mock_server import FaultPlan, application, transient_faults
+from tests.support.mock_server import TRANSIENT, FaultPlan, application
 
-FAULT_RATE, SEED = 0.2, 15
+# Each equally often, 0.2 in all.
+FAULTS = FaultPlan(seed=15, rates=dict.fromkeys(TRANSIENT, 0.2 / len(TRANSIENT)))
 LOOK_S = 0.2
 INPUT_USD, OUTPUT_USD = 2, 8  # per million tokens
 MODELS = f"""
@@ -184,7 +185,7 @@ async def measure(folder: Path, trials: int, lives_s: float) -> Figures:
     """The figures of a soak: so many trials, killed so long after each run's first request."""
     watch, process = Watch(), Process()
     began = time.monotonic()
-    async with serving(watch, transient_faults(FAULT_RATE, SEED)) as url:
+    async with serving(watch, FAULTS) as url:
         (folder / "killed").mkdir()
         sweep = Sweep(folder / "killed", trials, url)
         kills = await to_its_end(sweep, watch, process, lives_s)

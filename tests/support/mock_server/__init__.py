@@ -1,7 +1,6 @@
 """The emulator as test equipment: with every fault of a provider, and three batch modes."""
 
 from tests.support.mock_server.emulator import application, serve, served
-from tests.support.mock_server.faults import TRANSIENT, BatchPlan, FaultPlan, transient_faults
+from tests.support.mock_server.faults import TRANSIENT, BatchPlan, FaultPlan
 
 __all__ = ["TRANSIENT", "BatchPlan", "FaultPlan", "application", "serve", "served"]
-__all__ += ["transient_faults"]

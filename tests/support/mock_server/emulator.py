@@ -26,7 +26,10 @@ RESET_AT_CLOSE = struct.pack("ii", 1, 0)
 
 
 class FaultyEmulator(Emulator):
-    """Fails as its plan says, plays batch modes, and counts its answers: each would be billed."""
+    """Fails as its plan says, plays batch modes, and counts its answers: each would be billed.
+
+    What was answered without a ``custom_id`` was asked singly.
+    """
 
     def __init__(self, plan=None):
         self.plan = plan or FaultPlan()
@@ -40,18 +43,13 @@ class FaultyEmulator(Emulator):
         path = request.url.path
         if path == "/emulator/answered":
             self._batches.settle()
-            return as_json(self.count())
+            names = ("body_sha256", "slot", "custom_id", "answered")
+            counts = ((*asked, count) for asked, count in self._answered.items())
+            return as_json([dict(zip(names, each, strict=True)) for each in counts])
         for method, pattern, handler in self._routes:
             if method == request.method and (named := re.fullmatch(pattern, path)):
                 return handler(request, **named.groupdict())
         return await super().respond(request)
-
-    def count(self):
-        """How often each request was answered; one without a ``custom_id`` was asked singly."""
-        return [
-            {"body_sha256": body, "slot": slot, "custom_id": custom_id, "answered": count}
-            for (body, slot, custom_id), count in self._answered.items()
-        ]
 
     async def reply(self, asked, attempt):
         """The response, or what takes its place; raises BrokenOff."""

@@ -76,11 +76,6 @@ class FaultPlan:
         return None
 
 
-def transient_faults(rate: float, seed: int) -> FaultPlan:
-    """Every transient fault equally often, ``rate`` in all."""
-    return FaultPlan(seed=seed, rates=dict.fromkeys(TRANSIENT, rate / len(TRANSIENT)))
-
-
 def error_body(wire, status, message):
     """The body of an error."""
     openai, gemini, anthropic = NAMES[status]

@@ -116,13 +116,6 @@ def test_both_sides_agree_on_who_goes_first_unless_the_trial_is_contested():
     assert contested == list(range(contested[0], 31, 3))
 
 
-def test_who_goes_first_does_not_change_within_a_trial():
-    for decision in range(10):
-        slot = Slot("L_4_8", 3, "left", decision, 0)
-        told = answer(FIRST_PROMPTS["L_4_8", "left"], slot).split("\n")[0]
-        assert told == first_token("L_4_8", 3, "left")
-
-
 @pytest.mark.parametrize("condition", CONDITIONS)
 def test_the_share_of_left_first_follows_the_human_odds(condition):
     h = CONDITIONS[condition].projected_headway_m

@@ -137,10 +137,3 @@ def key_of_parts(endpoint, path, header, prompt, condition):
 def test_no_two_tuples_of_parts_share_a_key(two):
     one, other = two
     assert (key_of_parts(*one) == key_of_parts(*other)) == (one == other)
-
-
-@settings(max_examples=50)
-@given(prompt=st.text(), other=st.text())
-def test_a_prompt_cannot_pretend_to_be_another_part(prompt, other):
-    spelt = f'{prompt}"}},"endpoint":{canonical_json(other)}'
-    assert key(body={"p": spelt}) != key(body={"p": prompt}, endpoint=other)

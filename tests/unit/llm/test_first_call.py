@@ -129,15 +129,10 @@ async def test_where_nobody_listens_the_run_ends_within_seconds(begin):
 
 
 async def test_a_server_that_has_answered_is_waited_for_as_long_as_a_call_may_take(begin):
-    client = begin(answer(), *[REFUSED] * 9, answer())
-    assert (await client.ask("prompt", slot())).outcome == "ok"
+    client = begin(REFUSED, REFUSED, answer(), *[REFUSED] * 9, answer())
+    assert (await client.ask("prompt", slot())).outcome == "ok", "a server that just starts"
     assert (await client.ask("prompt", slot(2))).outcome == "ok"
     assert now_s() > 60
-
-
-async def test_a_server_that_just_starts_is_waited_for(begin):
-    client = begin(REFUSED, REFUSED, answer())
-    assert (await client.ask("prompt", slot())).outcome == "ok"
 
 
 async def test_no_answer_to_the_first_call_within_its_deadline_ends_the_run(begin):

@@ -3,8 +3,6 @@
 import json
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from merge_runner.config import ModelEntry
 from merge_runner.llm.formats import FORMATS
@@ -96,24 +94,3 @@ def test_no_value_in_the_place_of_another_makes_it_raise(wire):
             reading = FORMATS[wire].read(replaced(SAMPLES[wire], path, value))
             assert reading.outcome in OUTCOMES
             assert isinstance(reading.text, str)
-
-
-NAMES = sorted({path[-1] for s in SAMPLES.values() for path in paths(s)} - {0, 1}, key=str)
-json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
-    lambda inner: (
-        st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(NAMES), inner, max_size=4)
-    ),
-    max_leaves=15,
-)
-
-
-@settings(max_examples=50)
-@given(
-    st.sampled_from(list(FORMATS)),
-    st.dictionaries(st.sampled_from(NAMES) | st.text(), json_values, max_size=6),
-)
-def test_no_json_object_makes_it_raise(wire, payload):
-    reading = FORMATS[wire].read(payload)
-    assert reading.outcome in OUTCOMES
-    assert isinstance(reading.text, str)

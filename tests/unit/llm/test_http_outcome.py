@@ -17,7 +17,9 @@ from merge_runner.llm.http_outcome import (
     server_delay_s,
     why_refused,
 )
+from merge_runner.records import Usage
 from tests.support.cases import by_format, cases, table
+from tests.support.json_values import paths
 
 
 def judged(wire, status, body, headers=None):
@@ -120,9 +122,10 @@ def test_what_was_read_of_a_failed_answer_is_kept():
     assert (reading.model_served, reading.usage.input_tokens) == ("m-1", 7)
 
 
+SAMPLES = [json.loads(body) for body in table("wire_bodies", "samples").values()]
 NAMES = [
-    *("error", "message", "type", "code", "status", "details", "choices", "violations"),
-    *("quotaId", "retryDelay", "reason", "error_code", "finish_reason", "output"),
+    *sorted({path[-1] for sample in SAMPLES for path in paths(sample)} - {0, 1}, key=str),
+    *("error", "details", "violations", "quotaId", "retryDelay", "reason", "error_code"),
 ]
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -133,7 +136,7 @@ json_values = st.recursive(
 )
 
 
-@settings(max_examples=50)
+@settings(max_examples=100)
 @given(
     st.sampled_from(list(FORMATS)),
     st.sampled_from([200, 400, 402, 404, 429, 500]),
@@ -144,7 +147,7 @@ json_values = st.recursive(
 def test_no_body_makes_it_raise(wire, status, body):
     found = judged(wire, status, body)
     assert found.action in ("accept", "retry", "fail", "quota", "refused")
-    assert found.name
+    assert (bool(found.name), isinstance(found.reading.text, str)) == (True, True)
 
 
 class Stubborn(WireFormat):
@@ -179,19 +182,12 @@ def test_what_may_be_charged_though_no_usage_is_told(case):
     assert may_be_charged(reply, case.get("provider")) == case["charged"]
 
 
-@pytest.mark.parametrize("status", [400, 429, 500, 503])
-@pytest.mark.parametrize(
-    ("wire", "told"),
-    [
-        ("openai-chat", {"usage": {"prompt_tokens": 7, "completion_tokens": 9}}),
-        ("openai-responses", {"usage": {"input_tokens": 7, "output_tokens": 9}}),
-        ("anthropic", {"usage": {"input_tokens": 7, "output_tokens": 9}}),
-        ("gemini", {"usageMetadata": {"promptTokenCount": 7, "candidatesTokenCount": 9}}),
-    ],
-)
-def test_usage_in_an_error_is_read_in_every_format(status, wire, told):
-    usage = judged(wire, status, {"error": {"message": "m"}} | told).reading.usage
-    assert (usage.input_tokens, usage.output_tokens) == (7, 9)
+@pytest.mark.parametrize(("wire", "case"), by_format("wire_bodies", "usage"))
+def test_usage_in_an_error_is_read_in_every_format(wire, case):
+    told = {"usageMetadata" if wire == "gemini" else "usage": json.loads(case["body"])}
+    counts = Usage(*(None if count == -1 else count for count in case["counts"]))
+    for status in (400, 429, 500, 503):
+        assert judged(wire, status, {"error": {"message": "m"}} | told).reading.usage == counts
 
 
 def test_a_web_page_is_told_from_all_else():
