@@ -105,7 +105,7 @@ async def _break_off(request, handler):
     return web.Response(status=500)  # which nobody gets: the connection has ended
 
 
-def application(plan=None):
+def application(plan: FaultPlan | None = None) -> web.Application:
     """An emulator as an application of aiohttp."""
     app = server.application(FaultyEmulator(plan))
     app.middlewares.append(_break_off)
