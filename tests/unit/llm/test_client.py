@@ -37,6 +37,12 @@ def outcomes(attempts):
     return [attempt.outcome for attempt in attempts]
 
 
+async def held(client):
+    """A call that is sent, and answered once ``client.transport.open`` is set."""
+    client.transport.open.clear()
+    return await begun(client.ask("prompt", slot()))
+
+
 def paused():
     """A limiter that gives no turn for five minutes."""
     limiter = Limiter()
@@ -149,13 +155,6 @@ async def test_two_entries_of_one_model_that_ask_the_same_make_one_call(make):
     assert replies[0].text == replies[1].text
 
 
-async def test_an_unknown_model_stops_at_once(make):
-    client = make(error(404, code="model_not_found"))
-    with pytest.raises(EndpointRefused, match="'m-1'"):
-        await client.ask("prompt", slot())
-    assert len(client.transport.sent) == 1
-
-
 async def test_a_rejected_request_fails_this_call_alone(make, cache):
     client = make(error(500), error(400, "bad temperature"), answer())
     with pytest.raises(CallFailed, match="bad temperature") as caught:
@@ -165,6 +164,10 @@ async def test_a_rejected_request_fails_this_call_alone(make, cache):
     assert list(cache.entries()) == []
     assert cache.unanswered(caught.value.request.key) == caught.value.attempts
     assert (await client.ask("prompt", slot(2))).outcome == "ok"
+    unknown = make(error(404, code="model_not_found"))  # which no other request would mend
+    with pytest.raises(EndpointRefused, match="'m-1'"):
+        await unknown.ask("prompt", slot(3))
+    assert len(unknown.transport.sent) == 1
 
 
 async def test_an_answer_that_is_of_no_use_is_an_answer_and_kept(make):
@@ -213,8 +216,7 @@ async def test_more_output_than_there_can_be_is_paid_whatever_is_said_of_the_inp
 
 async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
     client = make(answer("paid for"))
-    client.transport.open.clear()
-    asked = await begun(client.ask("prompt", slot()))
+    asked = await held(client)
     assert client.in_flight_calls == 1
     asked.cancel()
     drained = await begun(client.drain())
@@ -229,8 +231,7 @@ async def test_who_gives_up_does_not_lose_the_call_in_flight(make, cache):
 
 async def test_one_of_two_who_gives_up_does_not_take_the_answer_from_the_other(make):
     client = make(answer("shared"))
-    client.transport.open.clear()
-    first, second = [await begun(client.ask("prompt", slot())) for _ in range(2)]
+    first, second = [await held(client) for _ in range(2)]
     first.cancel()
     await ticks()
     client.transport.open.set()
@@ -263,8 +264,7 @@ async def test_who_asks_anew_for_a_call_that_is_just_given_up_gets_an_answer(mak
 
 async def test_a_call_in_flight_that_nobody_waits_for_any_more_is_not_tried_again(make, cache):
     client = make(error(503), answer())
-    client.transport.open.clear()
-    asked = await begun(client.ask("prompt", slot()))
+    asked = await held(client)
     (call,) = client.under_way.values()
     asked.cancel()
     await ticks()
@@ -313,9 +313,7 @@ async def test_a_call_that_waits_for_its_coordinator_can_be_given_up(make, cache
 @pytest.mark.parametrize("in_flight", [False, True])
 async def test_drain_does_not_wait_for_another_attempt(make, in_flight):
     client = make(error(503, retry_after="300"), answer())
-    if in_flight:
-        client.transport.open.clear()
-    asked = await begun(client.ask("prompt", slot()))
+    asked = await (held(client) if in_flight else begun(client.ask("prompt", slot())))
     drained = await begun(client.drain())
     client.transport.open.set()
     await drained
@@ -484,9 +482,7 @@ async def test_the_call_with_the_lowest_order_is_sent_first(make):
     assert [request.slot.repetition for request in client.transport.sent] == [1, 2, 3, 4]
 
 
-async def test_a_dearer_service_tier_is_kept_priced_where_its_price_is_known_and_else_counted(
-    make,
-):
+async def test_a_dearer_service_tier_is_kept_priced_where_its_price_is_known_and_else_counted(make):
     paid = json.loads(answer(usage=(1_000_000, 0)).body) | {"service_tier": "priority"}
     plain = make(raw(paid), price=PRICE)
     reply = await plain.ask("prompt", slot())

@@ -21,10 +21,7 @@ TAGS = [
     ("\u25c1think\u25b7", "\u25c1/think\u25b7"),
     ("<THINK>", "</THINK>"),
 ]
-HARMONY = (
-    "<|channel|>analysis<|message|>",
-    "<|end|><|start|>assistant<|channel|>final<|message|>",
-)
+HARMONY = ("<|channel|>analysis<|message|>", "<|end|><|start|>assistant<|channel|>final<|message|>")
 
 
 def filled(text):
