@@ -1,7 +1,5 @@
 """A client whose server answers as a test says, in the test's process."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import sqlite3

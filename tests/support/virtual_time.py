@@ -1,7 +1,5 @@
 """Time that passes at once: waits of hours in a test of milliseconds, with real sockets."""
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import types

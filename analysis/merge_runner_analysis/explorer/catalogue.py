@@ -122,7 +122,7 @@ BEGUN = f"""
 CREATE SEQUENCE numbers;
 CREATE TABLE judged (trial_id VARCHAR, spec_hash VARCHAR, collision VARCHAR, stand_in VARCHAR,
     caution VARCHAR);
-CREATE TABLE listed AS {LISTING};
+CREATE TABLE listed AS FROM ({LISTING}) LIMIT 0;
 CREATE TABLE noted (trial_id VARCHAR, spec_hash VARCHAR, tag VARCHAR);
 CREATE TABLE others (requested VARCHAR, served VARCHAR);
 CREATE TABLE shared (number INTEGER, of_several STRUCT(reply UBIGINT, usd DOUBLE)[]);

@@ -9,9 +9,11 @@ import threading
 from contextvars import copy_context
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import jinja2
 from duckdb import DuckDBPyConnection
+from jinja2.bccache import Bucket
 from starlette.responses import Response
 
 from merge_runner.errors import MergeRunnerError
@@ -49,6 +51,21 @@ MACROS = ("scope", "words", "computed", "mark", "conditions", "trust", "notes")
 SCOPE = ("sweep", "model", "variant", "condition")
 # What hangs under these, each with one list of all.
 LISTS = {"Tables and figures": "tables", "Notes": "notes"}
+
+
+class Compiled(jinja2.BytecodeCache):
+    """Templates that this process has compiled: an export and a server share them."""
+
+    kept: ClassVar[dict[str, bytes]] = {}
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Take a template from what is kept, if it is there."""
+        if bucket.key in self.kept:
+            bucket.bytecode_from_string(self.kept[bucket.key])
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Keep a template."""
+        self.kept[bucket.key] = bucket.bytecode_to_string()
 
 
 class NotThere(Exception):
@@ -106,6 +123,7 @@ class Site:
             loader=jinja2.FileSystemLoader(TEMPLATES),
             autoescape=True,
             auto_reload=False,
+            bytecode_cache=Compiled(),
             undefined=jinja2.StrictUndefined,
             # Whatever a page says shows itself; what a form sends back is escaped before.
             finalize=lambda value: visible(value) if type(value) is str else value,

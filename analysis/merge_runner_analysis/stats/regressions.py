@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.optimize import brentq, linprog, minimize
+from scipy.optimize import brentq, linprog
 from scipy.special import expit
 
 from merge_runner_analysis.stats import intervals
@@ -32,8 +32,8 @@ MIN_PAIRS = 3  # fewer say nothing of how pairs vary
 STEADY_GAP_M = 0.01
 # Equivalence margin of I4: how far relative velocity alone may move the gap.
 GAP_MARGIN_M = 1.0
-# The largest slope of a likelihood at its top: what is aimed at, and what is still taken for one.
-FLAT, SLOPING = 1e-8, 1e-3
+# At its top a likelihood gains less than this by another step; so many steps lead there, or none.
+FLAT, MOST_STEPS = 1e-9, 100
 # Below this logarithm of its determinant the information is singular but for rounding.
 SINGULAR = -600.0
 # A bound is looked for in steps that widen so much, up to so many standard errors.
@@ -51,27 +51,29 @@ class Counts:
     def fit(self, term: int = -1, value: float = 0.0, start: Array | None = None) -> Fit | None:
         """Return the fit, with one ``term`` held at a value, or None where it does not converge.
 
-        Quasi-Newton steps on Firth's score, since far from the estimate and under separation the
-        information misses the curvature of the penalty.
+        Newton's method, with the curvature of the penalty too: far from the estimate and under
+        separation the information misses it. Where the likelihood bends upwards, a step goes uphill
+        all the same (Nocedal and Wright 2006, section 3.4); each is halved until it gains.
         """
         b = np.zeros(self.design.shape[1]) if start is None else start.copy()
         free = np.arange(len(b)) != term
         b[~free] = value
-        origin = b[free]
-        try:  # in these units the first step is Newton's
-            unit = np.linalg.inv(np.linalg.cholesky(self.information(b)[np.ix_(free, free)])).T
-        except np.linalg.LinAlgError:
-            return None
-
-        def loss(steps: Array) -> tuple[float, Array]:
-            b[free] = origin + unit @ steps
-            likelihood, score = self._penalised(b)
-            return -likelihood, -unit.T @ score[free]
-
-        found = minimize(loss, 0 * origin, jac=True, method="BFGS", options={"gtol": FLAT})
-        b[free] = origin + unit @ found.x
-        flat = np.isfinite(found.fun) and np.abs(found.jac).max(initial=0) < SLOPING
-        return Fit(self, b, -float(found.fun)) if flat else None
+        here, step = self._penalised(b), np.zeros_like(b)
+        for _ in range(MOST_STEPS):
+            if here is None:
+                return None
+            bends, directions = np.linalg.eigh(here.curvature[np.ix_(free, free)])
+            uphill = directions.T @ here.score[free]
+            step[free] = directions @ (uphill / np.maximum(np.abs(bends), FLAT))
+            is_last = here.score @ step < FLAT
+            there = self._penalised(b + step)
+            while not is_last and (there is None or there.likelihood < here.likelihood):
+                step /= 2
+                there = self._penalised(b + step)
+            b, here = b + step, there
+            if is_last and here:
+                return Fit(self, b, here.likelihood)
+        return None
 
     def infinite(self) -> NDArray[np.bool_]:
         """Return which coefficients have no finite maximum likelihood estimate, (terms,).
@@ -90,23 +92,36 @@ class Counts:
         p = expit(self.design @ b)
         return np.asarray((self.design.T * (self.n * p * (1 - p))) @ self.design)
 
-    def _penalised(self, b: Array) -> tuple[float, Array]:
-        """Return the log-likelihood of ``b`` with Firth's penalty, and its gradient, (terms,).
+    def _penalised(self, b: Array) -> Penalised | None:
+        """Return the log-likelihood of ``b`` with Firth's penalty; None where that is singular.
 
         The penalty is half the logarithm of the determinant of the information: Jeffreys' prior.
         Firth's score adds to each residual the leverage times (1/2 - p): as if each trial were
         split, and half of its leverage had gone either way (Heinze and Schemper 2002).
         """
-        linear, information = self.design @ b, self.information(b)
+        design, linear, information = self.design, self.design @ b, self.information(b)
         sign, log_determinant = np.linalg.slogdet(information)
         if sign <= 0 or log_determinant < SINGULAR:
-            return -np.inf, np.zeros_like(b)
-        likelihood = self.chosen @ linear - self.n @ np.logaddexp(0, linear)
+            return None
+        likelihood = self.chosen @ linear - self.n @ np.logaddexp(0, linear) + log_determinant / 2
         p = expit(linear)
-        spread = ((self.design @ np.linalg.inv(information)) * self.design).sum(axis=1)
-        leverage = self.n * p * (1 - p) * spread
-        score = (self.chosen - self.n * p + leverage * (0.5 - p)) @ self.design
-        return float(likelihood + log_determinant / 2), score
+        weighted = design * np.sqrt(self.n * p * (1 - p))[:, None]
+        hat = weighted @ np.linalg.inv(information) @ weighted.T
+        leverage = np.diag(hat)
+        score = (self.chosen - self.n * p + leverage * (0.5 - p)) @ design
+        turned = design * (1 - 2 * p)[:, None]  # as the weights change with the linear predictor
+        second = (design.T * (leverage * (1 - 6 * p * (1 - p)))) @ design
+        penalty = (second - turned.T @ hat**2 @ turned) / 2
+        return Penalised(float(likelihood), score, information - penalty)
+
+
+@dataclass(frozen=True, slots=True)
+class Penalised:
+    """A penalised log-likelihood, its gradient (terms,) and less its Hessian, (terms, terms)."""
+
+    likelihood: float
+    score: Array
+    curvature: Array
 
 
 @dataclass(frozen=True, slots=True)
