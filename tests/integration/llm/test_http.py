@@ -54,12 +54,11 @@ def dead_port():
         yield reserved.getsockname()[1]
 
 
-def request_for(slot=SLOT, **changes):
+def request_for(**changes):
     named = {"provider": "openai", "endpoint": "openai", "model": "some-model"}
-    headers = {"anthropic-version": "2023-06-01"}
+    said = {"path": "/chat/completions", "headers": {"anthropic-version": "2023-06-01"}}
     body = {"prompt": "Gr\u00fc\u00dfe, \u2212 \U0001f697", "a": 1.0}
-    said = {"path": "/chat/completions", "headers": headers, "body": body}
-    return replace(make_request(**named, **said, slot=slot), **changes)
+    return replace(make_request(**named, **said, body=body, slot=SLOT), **changes)
 
 
 def endpoint_at(url, provider="openai", identity=None, auth_headers=None):
@@ -72,8 +71,8 @@ def entry(provider, url=None):
 
 
 @contextlib.asynccontextmanager
-async def transport_to(endpoint, connections=2):
-    transport = HttpTransport(endpoint, connections=connections)
+async def transport_to(endpoint, connections=2, **options):
+    transport = HttpTransport(endpoint, connections=connections, **options)
     try:
         yield transport
     finally:

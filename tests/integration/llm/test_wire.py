@@ -10,22 +10,16 @@ from uuid import UUID
 import httpx
 import pytest
 
-from merge_runner.config import Endpoint
 from merge_runner.llm.formats import FORMATS
-from merge_runner.llm.http import HttpTransport
 from merge_runner.llm.http_outcome import TransportFailure, server_delay_s
+from tests.integration.llm.test_http import endpoint_at
+from tests.integration.llm.test_http import transport_to as at_endpoint
 from tests.support.cases import cases
 from tests.support.raw_server import a_request, head, ok, raw_server
 
 
-@contextlib.asynccontextmanager
-async def transport_to(url, provider="openai", connections=1, **options):
-    endpoint = Endpoint(provider, provider, url, {})
-    transport = HttpTransport(endpoint, connections=connections, **options)
-    try:
-        yield transport
-    finally:
-        await transport.close()
+def transport_to(url, connections=1, **options):
+    return at_endpoint(endpoint_at(url), connections, **options)
 
 
 def chat(text):

@@ -1,4 +1,4 @@
-"""A batch server fails in over 30 ways: the digest is the plain run's, no answer is paid twice."""
+"""A batch server fails in many ways: the digest is the plain run's, no answer is paid twice."""
 
 import asyncio
 import json

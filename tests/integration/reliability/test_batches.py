@@ -46,8 +46,7 @@ async def answered(server):
         counts = (await client.get(f"{server.url}/emulator/answered")).json()
     batched, alone = Counter(), Counter()
     for each in counts:
-        where = alone if each["custom_id"] is None else batched
-        where[each["slot"]] += each["answered"]
+        (alone if each["custom_id"] is None else batched)[each["slot"]] += each["answered"]
     return batched, alone
 
 

@@ -28,12 +28,12 @@ def kept(folder):
     return {canonical_json(entry["request"]["slot"]) for entry in entries}
 
 
-async def kill_again_and_again(merge_runner, folder, quiet, kills):
+async def kill_again_and_again(merge_runner, folder, quiet, *, kills, latency_s):
     """A sweep that is killed so many times asks nothing answered again, and ends as a quiet one."""
     chance, killed = random.Random(4), 0
     again = []  # how many slots each run asked again
     durable = []  # after each kill: the requests up to then, and the slots with a reply on disk
-    async with watched(faults=FaultPlan(latency_s=0.05)) as server:
+    async with watched(faults=FaultPlan(latency_s=latency_s)) as server:
         for _ in range(kills):
             process = await merge_runner.start(*SWEEP, **server.env)
             before = slots(server)
@@ -63,7 +63,7 @@ async def kill_again_and_again(merge_runner, folder, quiet, kills):
 async def test_a_sweep_that_is_killed_again_and_again_asks_nothing_answered_again(
     merge_runner, quiet, tmp_path
 ):
-    await kill_again_and_again(merge_runner, tmp_path, quiet, kills=6)
+    await kill_again_and_again(merge_runner, tmp_path, quiet, kills=6, latency_s=0.02)
 
 
 async def test_attempts_of_a_run_that_died_are_found_in_the_next_one(merge_runner, tmp_path):

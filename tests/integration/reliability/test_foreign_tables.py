@@ -53,7 +53,7 @@ async def test_ctrl_c_within_a_query_ends_it_in_one_line(merge_runner, db):
         await asyncio.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, err = await process.communicate()
-    assert (process.returncode, "Traceback" in err.decode()) == (130, False), err
+    assert (process.returncode, b"Traceback" in err) == (130, False), err
 
 
 def test_an_output_that_cannot_be_written_is_one_line(db):
