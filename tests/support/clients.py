@@ -23,9 +23,7 @@ class Server:
 
     def __init__(self, *replies):
         self.replies = list(replies)
-        self.sent = []
-        self.times = []
-        self.timeouts = []
+        self.sent, self.times, self.timeouts = [], [], []
         self.answered = 0
         self.open = asyncio.Event()
         self.open.set()
@@ -97,14 +95,8 @@ def make(cache):
 
     def make(*replies, limiter=None, cap=None, cache=cache, passed=True, known=False, **changes):
         under_way = changes.pop("under_way", {})
-        fields = {
-            "provider": "openai",
-            "format": "openai-chat",
-            "id": "m-1",
-            "max_output_tokens": 100,
-            "price": "free",
-        }
-        entry = ModelEntry(**{**fields, **changes})
+        fields = {"provider": "openai", "format": "openai-chat", "id": "m-1", "price": "free"}
+        entry = ModelEntry(**{**fields, "max_output_tokens": 100, **changes})
         return LlmClient(
             name="my-model",
             entry=entry,

@@ -20,14 +20,9 @@ from merge_runner.records import Slot
 from tests.support.scenarios import CASES, ScenarioPlan, playing
 from tests.support.virtual_time import in_virtual_time, now_s
 
-CHAT, RESPONSES, GEMINI, ANTHROPIC = "openai-chat", "openai-responses", "gemini", "anthropic"
-OPENAI = (CHAT, RESPONSES)
-MODELS = {
-    CHAT: "o3-2025-04-16",
-    RESPONSES: "o3-2025-04-16",
-    GEMINI: "gemini-2.5-pro",
-    ANTHROPIC: "claude-sonnet-4-6",
-}
+OPENAI, GEMINI = ("openai-chat", "openai-responses"), "gemini"
+MODELS = dict.fromkeys(OPENAI, "o3-2025-04-16")
+MODELS |= {GEMINI: "gemini-2.5-pro", "anthropic": "claude-sonnet-4-6"}
 TIMEOUT_S, DEADLINE_S = 600, 1200
 EXIT_CODES = {"CallFailed": 1, "EndpointRefused": 2, "QuotaExhausted": 3}
 

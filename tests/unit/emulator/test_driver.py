@@ -91,16 +91,14 @@ def test_draws_fill_their_range_and_stay_in_it():
     assert 4.9 < max(between) < 5
 
 
-@pytest.mark.parametrize(
-    "change", [{"repetition": 2}, {"sample_set": 1}, {"decision": 1}, {"side": "right"}]
-)
-def test_each_part_of_a_slot_changes_some_plan(change):
+def test_each_part_of_a_slot_changes_some_plan():
     def actions(**changes):
         slots = [replace(Slot(condition, 1, "left", 0, 0), **changes) for condition in CONDITIONS]
         return [first_action(FIRST_PROMPTS[s.condition, "left"], s) for s in slots]
 
     assert actions() == actions()
-    assert actions() != actions(**change)
+    for change in ({"repetition": 2}, {"sample_set": 1}, {"decision": 1}, {"side": "right"}):
+        assert actions() != actions(**change)
 
 
 def test_both_sides_agree_on_who_goes_first_unless_the_trial_is_contested():

@@ -51,11 +51,8 @@ class Memory:
     wire = FORMATS["openai-chat"]
 
     def __init__(self):
-        self.batches = {}
-        self.marks = {}
-        self.fates = {}
-        self.creations = []
-        self.states = []
+        self.batches, self.marks, self.fates = {}, {}, {}
+        self.creations, self.states = [], []
         self.answered = Counter()
         self.partial = 0
         self.step, self.died = "", asyncio.Event()
