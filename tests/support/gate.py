@@ -8,22 +8,14 @@ from pathlib import Path
 
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.records import SLOT_HEADER
+from tests.support.harness import a_model
 
 # Only what never ends takes so long, however loaded the machine is.
 HANGS_S = 300
 
 
 # The emulator as it ships, but for its patience, which a loaded machine would outlast.
-PATIENT = f"""
-[emulator]
-provider = "emulator"
-format = "openai-chat"
-id = "scripted-driver"
-max_output_tokens = 4000
-price = "free"
-timeout_s = {HANGS_S}
-deadline_s = {HANGS_S}
-"""
+PATIENT = a_model(timeout_s=HANGS_S, deadline_s=HANGS_S)
 
 
 class Gate:

@@ -60,6 +60,19 @@ def plugin(folder: Path, source: str, module: str = "dummies") -> dict[str, str]
     return {"PYTHONPATH": os.pathsep.join(map(str, (folder, PROJECT)))}
 
 
+def a_model(name: str = "emulator", **fields: object) -> str:
+    """An entry of models.toml: that of the emulator, but for these fields."""
+
+    def toml(value: object) -> str:
+        if not isinstance(value, dict):
+            return json.dumps(value)
+        return f"{{ {', '.join(f'{key} = {toml(each)}' for key, each in value.items())} }}"
+
+    named = {"provider": "emulator", "format": "openai-chat", "id": "scripted-driver"}
+    told = {**named, "max_output_tokens": 4000, "price": "free", **fields}
+    return "\n".join([f"[{name}]", *(f"{key} = {toml(value)}" for key, value in told.items()), ""])
+
+
 def asked_to_write(arguments: Sequence[str], what: str) -> None:
     """Leave the program unless it is told to ``--write``, for which it says what that would do."""
     parser = argparse.ArgumentParser(allow_abbrev=False)

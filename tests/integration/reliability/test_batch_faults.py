@@ -10,20 +10,12 @@ from aiohttp import web
 
 from merge_runner.results.store import results_digest
 from merge_runner.run.plan import Options, make_plan
-from tests.integration.reliability.test_batches import account, answered
-from tests.support.harness import run_sweep, watched
+from tests.integration.reliability.test_batches import PRICE, account, answered
+from tests.support.harness import a_model, run_sweep, watched
 from tests.support.mock_server import BatchPlan, FaultPlan
 
 FORMATS = {"openai": "openai-chat", "anthropic": "anthropic", "gemini": "gemini"}
-REGISTRY = """
-[model]
-provider = "{provider}"
-format = "{format}"
-id = "some-model"
-max_output_tokens = 4000
-price = {{ input = 2.0, output = 8.0, source = "made up" }}
-batch = {{ price_factor = 0.5, source = "made up" }}
-"""
+BATCH = {"price_factor": 0.5, "source": "made up"}
 # One decision of two drivers in 3 conditions: one batch.
 STUDY = 'repetitions = 1\nconditions = ["L_4_0", "N_0_0", "R_-4_8"]\n[scenario]\ntimeout_s = 1\n'
 LINES = 6
@@ -179,8 +171,8 @@ def play(tmp_path, monkeypatch):
         monkeypatch.setattr(f"merge_runner.llm.batch.rounds.{name}", value)
 
     async def run(provider, middles=(), plan=None, **options):
-        registry = REGISTRY.format(provider=provider, format=FORMATS[provider])
-        (tmp_path / "models.toml").write_text(registry)
+        fields = {"provider": provider, "format": FORMATS[provider], "price": PRICE, "batch": BATCH}
+        (tmp_path / "models.toml").write_text(a_model("model", **fields))
         (tmp_path / "study.toml").write_text(STUDY)
         async with watched(chain(middles), plan) as server:
             for name, value in account(server).items():

@@ -11,19 +11,12 @@ import httpx
 import pytest
 
 from merge_runner.results.store import results_digest
-from tests.support.harness import FAST, PROJECT, watched
+from tests.support.harness import FAST, PROJECT, a_model, watched
 from tests.support.mock_server import BatchPlan, FaultPlan
 
 TWO = ("--conditions", "L_4_0,N_0_0", "--reps", 1)
 # A stand-in that costs something, so that there is money to lose; it is told the slot.
-PRICED = """
-[priced]
-provider = "emulator"
-format = "openai-chat"
-id = "scripted-driver"
-max_output_tokens = 4000
-price = { input = 2.0, output = 8.0, source = "made up" }
-"""
+PRICE = {"input": 2.0, "output": 8.0, "source": "made up"}
 
 
 def account(server):
@@ -36,7 +29,7 @@ def account(server):
 def priced(tmp_path):
     """A model that costs something, in trials of four decisions."""
     shutil.copytree(PROJECT / "experiments", tmp_path / "experiments")
-    (tmp_path / "models.toml").write_text(PRICED)
+    (tmp_path / "models.toml").write_text(a_model("priced", price=PRICE))
     (tmp_path / "short.toml").write_text("[repetitions]\nbaseline = 1\n[scenario]\ntimeout_s = 4\n")
 
 
@@ -82,8 +75,8 @@ async def rows(merge_runner, query, db="results/merge.duckdb"):
 
 
 async def test_a_sweep_in_batches_is_paid_and_replayed_as_any_other(merge_runner, priced, tmp_path):
-    terms = 'batch = { price_factor = 0.5, source = "as at its provider" }'
-    (tmp_path / "models.toml").write_text(PRICED + terms)
+    terms = {"price_factor": 0.5, "source": "as at its provider"}
+    (tmp_path / "models.toml").write_text(a_model("priced", price=PRICE, batch=terms))
     sweep = ("short.toml", *TWO, "--model", "priced", "--json")
     async with watched(faults=FaultPlan(batch=BatchPlan(delay_s=0.1))) as server:
         run = await merge_runner("sweep", *sweep, "--batch", "--yes", *FAST, **account(server))

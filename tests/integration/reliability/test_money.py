@@ -7,7 +7,7 @@ import shutil
 import pytest
 from aiohttp import web
 
-from tests.support.harness import FAST, PROJECT, as_a_model, watched
+from tests.support.harness import FAST, PROJECT, a_model, as_a_model, watched
 
 SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "o3", "--json")
 # o3 at 2 and 8 USD per million tokens: a trial of the emulator costs about 0.08 USD, and each of
@@ -15,12 +15,7 @@ SWEEP = ("sweep", "baseline", "--conditions", "L_4_0,N_0_0,R_-4_8", "--model", "
 SHORT = "[repetitions]\nbaseline = 4\n[scenario]\ntimeout_s = 12\n"
 ROOM_FOR_SOME = 0.9
 ONE = (*SWEEP, "--reps", 1, "--conditions", "L_4_0", "--yes", *FAST)
-ENTRY = """[{name}]
-provider = "openai"
-format = "openai-chat"
-id = "{id}"
-max_output_tokens = {tokens}
-"""
+O3 = {"provider": "openai", "max_output_tokens": 16_000}
 
 
 @pytest.fixture(autouse=True)
@@ -185,7 +180,7 @@ async def test_hits_cost_nothing_and_the_estimate_counts_what_is_missing(merge_r
 
 
 async def test_an_unknown_price_is_said_and_needs_yes(merge_runner, experiments):
-    entry = ENTRY.format(name="mine", id="nobody-knows", tokens=1000)
+    entry = a_model("mine", **O3, id="nobody-knows", price="genai-prices")
     (experiments / "models.toml").write_text(entry)
     async with watched() as server:
         env = account(server)
@@ -208,8 +203,8 @@ async def test_runs_of_two_models_under_one_cap_never_pass_it_and_both_end(
 ):
     (experiments / "baseline.toml").write_text(f"[budget]\ntotal_usd = 0.4\n{SHORT}")
     with (experiments / "models.toml").open("a") as registry:
-        price = 'price = { input = 2.0, output = 8.0, source = "here" }\n'
-        registry.write(ENTRY.format(name="twin", id="o3-twin", tokens=16_000) + price)
+        price = {"input": 2.0, "output": 8.0, "source": "here"}
+        registry.write("\n" + a_model("twin", **O3, id="o3-twin", price=price))
     bill = Bill()
     async with watched(bill.middle) as server:
         env = account(server)

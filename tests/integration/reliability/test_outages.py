@@ -8,24 +8,14 @@ from aiohttp import web
 
 from merge_runner.records import SLOT_HEADER
 from merge_runner.results.store import query
-from tests.support.harness import FAST, PROJECT, Watched, watched
-
-MODELS = """
-[patient]
-provider = "emulator"
-format = "openai-chat"
-id = "scripted-driver"
-max_output_tokens = 2000
-price = "free"
-timeout_s = 2
-deadline_s = {deadline_s}
-"""
+from tests.support.harness import FAST, PROJECT, Watched, a_model, watched
 
 
 def configured(folder, deadline_s, *options):
     """The baseline sweep of a copy whose model is given up soon."""
     (folder / "experiments").mkdir(exist_ok=True)
-    (folder / "experiments/models.toml").write_text(MODELS.format(deadline_s=deadline_s))
+    times = {"timeout_s": 2, "deadline_s": deadline_s}
+    (folder / "experiments/models.toml").write_text(a_model("patient", **times))
     (folder / "experiments/baseline.toml").write_text("[repetitions]\nbaseline = 10\n")
     return ("sweep", "baseline", "--model", "patient", "--json", *options)
 

@@ -3,7 +3,7 @@
 import pytest
 
 from merge_runner.results.store import results_digest
-from tests.support.harness import watched
+from tests.support.harness import a_model, watched
 from tests.support.mock_server import TRANSIENT, FaultPlan
 
 # What a fault is to the client, if not what it is called.
@@ -11,16 +11,7 @@ OTHERS = {"rate_limit": "rate_limited", "bad_gateway": "server_error", "hang": "
 OTHERS |= dict.fromkeys(("reset", "truncated_body"), "connection_lost")
 OTHERS |= {"truncated_json": "bad_body"}
 # Little patience, and a prompt every 4 s of driving, so that no sweep takes long.
-MODELS = """
-[emulator]
-provider = "emulator"
-format = "openai-chat"
-id = "scripted-driver"
-max_output_tokens = 4000
-price = "free"
-timeout_s = 0.5
-deadline_s = 60
-"""
+MODELS = a_model(timeout_s=0.5, deadline_s=60)
 SWEEP = "repetitions = { baseline = 1 }\n[scenario]\nprompt_rate_hz = 0.25\n"
 COMMAND = ("sweep", "baseline", "--json", "--conditions", "N_0_0,L_4_8,R_-4_0,L_0_-8")
 # Six calls fail, each once, and at most one decision of a trial, so that no waits add up.

@@ -17,19 +17,10 @@ from merge_runner.errors import UsageError
 from merge_runner.llm.cache import ResponseCache
 from merge_runner.results.recording import read_recording
 from merge_runner.results.store import query, results_digest
-from tests.support.harness import RECORDING, watched
+from tests.support.harness import RECORDING, a_model, watched
 
 SIZE, REPS = 20_480, 5
 REPLAY = ("replay", "baseline", "--reps", REPS, "--cache", "cache", "--json")
-PATIENT = """
-[patient]
-provider = "emulator"
-format = "openai-chat"
-max_output_tokens = 4000
-price = "free"
-id = "some-model"
-timeout_s = 100
-"""
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +96,7 @@ async def test_every_reply_below_max_reply_mb_is_stored(
         body["choices"][0]["message"] = said
         return web.json_response(body)
 
-    (tmp_path / "models.toml").write_text(PATIENT)
+    (tmp_path / "models.toml").write_text(a_model("patient", timeout_s=100))
     (tmp_path / "study.toml").write_text(
         f"[repetitions]\nbaseline = {trials}\n[scenario]\ntimeout_s = {seconds}\n"
     )
