@@ -10,7 +10,8 @@ OTHER = {"left": "right", "right": "left"}
 
 
 def spec(condition, repetition=1):
-    return spec_of(condition, repetition=repetition)
+    trial_id = f"m/baseline/{condition}/rep{repetition:02d}"
+    return spec_of(condition, repetition=repetition, trial_id=trial_id)
 
 
 def both(program):

@@ -29,7 +29,8 @@ for module in sys.argv[2:]:
 def test_the_sources_have_the_same_hash_on_every_python(python):
     modules = {name: program.driver.__module__ for name, program in PROGRAMS.items()}
     command = [python, "-c", HASHED, PROJECT / "merge_runner/drivers", *modules.values()]
-    done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True)
+    roots = os.environ | {"PYTHONPATH": f"{PROJECT}:{PROJECT / 'plugins'}"}
+    done = subprocess.run(command, env=roots, capture_output=True, text=True, check=True)
     assert dict(zip(modules, done.stdout.split(), strict=True)) == {
         name: source_digest(program.driver) for name, program in PROGRAMS.items()
     }

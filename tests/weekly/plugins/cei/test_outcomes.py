@@ -26,11 +26,12 @@ def both(tmp_path_factory):
     db = tmp_path_factory.mktemp("cei") / "merge.duckdb"
 
     records = [asyncio.run(played(*trial, task, cei(set="K0"))) for trial in TRIALS]
-    Store(db).add_recorded(records, {"test": canonical_json({"scenario": task.model_dump()})})
+    spec = canonical_json({"scenario": task.model_dump()})
+    Store(db).add_recorded(records, {records[0].spec.spec_hash: spec})
     trials = [simulated(*trial, task) for trial in TRIALS]
     study = model(task)
     frame = measured(study.task, trials, simulate(study, trials))
-    ids = [f"test/baseline/{condition}/rep{n:02d}" for condition, n in TRIALS]
+    ids = [record.spec.trial_id for record in records]
     stored = load("SELECT * FROM trials JOIN trial_metrics USING (trial_id, spec_hash)", db)
     states = load("SELECT * FROM states ORDER BY step", db)
     return frame.assign(trial_id=ids).set_index("trial_id"), stored.set_index("trial_id"), states
