@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import re
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
@@ -20,6 +21,7 @@ STUDY_PLUGINS = "study_plugins"
 _OF_A_STUDY = re.compile(rf"{STUDY_PLUGINS}_[0-9a-f]+(?=\.)")
 # The registry makes no decision, and what is typed into a notebook is in no file.
 WITHOUT = (f"{SHARED}.registry", "__main__")
+_PARSING = threading.Lock()
 
 
 @cache
@@ -75,7 +77,7 @@ def code_of(source: str) -> tuple[str, ...]:
             lines[row - 1] = lines[row - 1][:column].rstrip()
         elif token.type == NL and not lines[row - 1].strip():
             dropped.add(row)
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(_parsed(text)):
         if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
             continue
         first, last = node.lineno, node.end_lineno or node.lineno
@@ -86,9 +88,15 @@ def code_of(source: str) -> tuple[str, ...]:
     return tuple(line for row, line in enumerate(lines, 1) if row not in dropped)
 
 
+def _parsed(source: str) -> ast.AST:
+    """The tree of a source, made by one thread at a time: Python 3.11 counts the depth for all."""
+    with _PARSING:
+        return ast.parse(source)
+
+
 def _imported(source: str, package: str) -> Iterator[str]:
     """What a module of a package may import, also within functions."""
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(_parsed(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
