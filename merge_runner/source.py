@@ -77,7 +77,7 @@ def code_of(source: str) -> tuple[str, ...]:
             lines[row - 1] = lines[row - 1][:column].rstrip()
         elif token.type == NL and not lines[row - 1].strip():
             dropped.add(row)
-    for node in ast.walk(_parsed(text)):
+    for node in ast.walk(parsed(text)):
         if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Constant):
             continue
         first, last = node.lineno, node.end_lineno or node.lineno
@@ -88,7 +88,7 @@ def code_of(source: str) -> tuple[str, ...]:
     return tuple(line for row, line in enumerate(lines, 1) if row not in dropped)
 
 
-def _parsed(source: str) -> ast.AST:
+def parsed(source: str) -> ast.Module:
     """The tree of a source, made by one thread at a time: Python 3.11 counts the depth for all."""
     with _PARSING:
         return ast.parse(source)
@@ -96,7 +96,7 @@ def _parsed(source: str) -> ast.AST:
 
 def _imported(source: str, package: str) -> Iterator[str]:
     """What a module of a package may import, also within functions."""
-    for node in ast.walk(_parsed(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

@@ -34,7 +34,7 @@ from merge_runner.prompts.blocks import BLOCKS, VARIANTS, Block, Variant, blocks
 from merge_runner.records import canonical_json
 from merge_runner.registry import FAULTS, Catalogue, collecting, installing, require
 from merge_runner.scenarios.merge.conditions import CONDITIONS
-from merge_runner.source import STUDY_PLUGINS
+from merge_runner.source import STUDY_PLUGINS, parsed
 from merge_runner.study.crossing import OPPONENT, chosen_models, level_text
 from merge_runner.study.file import (
     PLUGIN,
@@ -203,7 +203,7 @@ def _import_others(source: str) -> None:
     """Import what a plug-in imports from elsewhere: what that registers is no part of the study."""
     names: list[str] = []
     with suppress(*FAULTS):  # it is told, with its line, when the plug-in runs
-        for node in ast.parse(source).body:
+        for node in parsed(source).body:
             if isinstance(node, ast.Import):
                 names += [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
