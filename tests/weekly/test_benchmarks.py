@@ -1,6 +1,7 @@
 """The benchmarks still run; how fast anything is, no test asserts."""
 
 from collections import defaultdict
+from dataclasses import replace
 
 import pytest
 
@@ -8,7 +9,7 @@ from benchmarks.__main__ import CASES
 from benchmarks.cases import Bench
 from benchmarks.goals import GOALS, judged
 from benchmarks.processes import served
-from benchmarks.soak import soak
+from benchmarks.soak import FAULTS, soak
 
 
 @pytest.fixture
@@ -27,7 +28,8 @@ def test_cases_are_measured_and_every_goal_is_about_cases_that_are_run(bench):
 
 
 def test_a_soak_is_killed_and_counts_what_its_server_saw(bench, monkeypatch):
-    monkeypatch.setattr("benchmarks.soak.FAULT_RATE", 0.1)
+    half = {fault: rate / 2 for fault, rate in FAULTS.rates.items()}
+    monkeypatch.setattr("benchmarks.soak.FAULTS", replace(FAULTS, rates=half))
     figures = soak(2, lives_s=0.5)(bench)
     assert figures["kills"] > 0
     assert figures["requests"] > figures["calls_made"] > 2 * 8

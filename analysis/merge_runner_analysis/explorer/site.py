@@ -54,7 +54,7 @@ LISTS = {"Tables and figures": "tables", "Notes": "notes"}
 
 
 class Compiled(jinja2.BytecodeCache):
-    """Templates that this process has compiled: an export and a server share them."""
+    """Templates that this process has compiled, for every study that it shows."""
 
     kept: ClassVar[dict[str, bytes]] = {}
 
